@@ -174,7 +174,7 @@ def published(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
 
 
 def _has_compiler() -> bool:
-    from kineverse.compile.toolchain import toolchain
+    from kineverse.compilation.toolchain import toolchain
 
     return toolchain() is not None
 

@@ -10,15 +10,15 @@ import sys
 
 # They take about the same time.
 PROGRAMS = (
-    "from kineverse.control.contact_rows import row_library\n"
+    "from kineverse.control.contact_constraints import row_library\n"
     "from kineverse.geometry.bindings import collision_library\n"
     "from kineverse.planning.bindings import planning_functions\n"
     "row_library.prepare(wait=True)\n"
     "collision_library.prepare(wait=True)\n"
     "planning_functions()\n",
     "import numpy as np, kineverse as kv\n"
-    "from kineverse.estimation.identification.bindings import library\n"
-    "from kineverse.estimation.tracking.bindings import native_library\n"
+    "from kineverse.estimation.identification.native import library\n"
+    "from kineverse.estimation.tracking.native import native_library\n"
     "library.prepare(wait=True)\n"
     "native_library.prepare(wait=True)\n"
     "kv.compile(np.sin(kv.position('a')) ** 2, wait=True)\n",

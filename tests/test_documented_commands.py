@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from kineverse.cli import main
-from kineverse.cli.main import COMMANDS, find_added_commands, load_command, make_parser
+from kineverse.cli.command_line import COMMANDS, find_added_commands, load_command, make_parser
 from markdown_examples import ROOT, agree, examples
 from test_examples import SCRIPTS
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse._threads import CallLock
+from kineverse._runtime import CallLock
 from kineverse.model.body import Body, Box, Capsule, Shape, Sphere
 
 THREADS, CALLS = 4, 40

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import kineverse as kv
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse._synonyms import RENAMED
 
 ROOT = Path(__file__).parents[1]

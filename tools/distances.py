@@ -26,9 +26,9 @@ from scipy.spatial.transform import Rotation
 from kineverse.geometry import broadphase
 from kineverse.geometry.bindings import collision_library
 from kineverse.geometry.broadphase import ObjectTable
+from kineverse.geometry.gjk import directional_gaps
 from kineverse.geometry.narrowphase import Narrowphase
 from kineverse.geometry.shapes import Hull, Solid, solid_from_geometry, solid_from_points
-from kineverse.geometry.support import directional_gaps
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 Floats = npt.NDArray[np.float64]

@@ -84,18 +84,18 @@ def environment(folder: Path, libraries: list[str]) -> dict[str, str]:
 
 def find_warnings() -> list[str]:
     """Return the compiler's warnings about each of the hand-written sources."""
-    from kineverse.compile.c_library import SourceLibrary
-    from kineverse.compile.toolchain import FLOATING_POINT_FLAGS
-    from kineverse.control import contact_rows, qp_solver
-    from kineverse.estimation.identification import bindings as identification
-    from kineverse.estimation.tracking import bindings as tracking
+    from kineverse.compilation.c_library import SourceLibrary
+    from kineverse.compilation.toolchain import FLOATING_POINT_FLAGS
+    from kineverse.control import contact_constraints, qp
+    from kineverse.estimation.identification import native as identification
+    from kineverse.estimation.tracking import native as tracking
     from kineverse.geometry import bindings as geometry
     from kineverse.planning import bindings as planning
 
     planning._library()
     libraries = {
         id(found): (module.__name__, found)
-        for module in (contact_rows, qp_solver, identification, tracking, geometry)
+        for module in (contact_constraints, qp, identification, tracking, geometry)
         for found in vars(module).values()
         if isinstance(found, SourceLibrary)
     }

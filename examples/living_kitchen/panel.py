@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from kineverse.view.hypertext import BREAK, Html, HtmlBox, element, join_html
+from kineverse.view.html import BREAK, Html, HtmlBox, element, join_html
 
 from .identify import FamilyProbabilities
 from .report import tabulate_identification, tabulate_tracking

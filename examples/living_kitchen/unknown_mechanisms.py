@@ -12,7 +12,7 @@ import numpy as np
 
 import kineverse as kv
 from kineverse.articulations import Prismatic, Revolute, Screw
-from kineverse.articulations.mechanisms.simple_bodies import (
+from kineverse.articulations.mechanisms.mechanism import (
     BLUE,
     DARK,
     STEEL,
@@ -21,9 +21,9 @@ from kineverse.articulations.mechanisms.simple_bodies import (
     box_shape,
     rod_shape,
 )
+from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Pose, Rgba, Shape, Vector3
 from kineverse.model.frame import WORLD
-from kineverse.model.operations import SetBody
 from kineverse.spatial import rotation_z, translation
 from kineverse.view.triangle_mesh import Floats
 

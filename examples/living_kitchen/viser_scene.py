@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.view import backdrop
+from kineverse.view import lighting
 from kineverse.view.drawables import Drawable, Rgba
 from kineverse.view.poses import to_wxyz
 from kineverse.view.triangle_mesh import Floats
@@ -46,10 +46,10 @@ class SceneNodes:
 
     def __init__(self, server: Any, drawables: SceneDrawables) -> None:
         self._server, self._drawables = server, drawables
-        backdrop.set_up(server)
-        backdrop.set_floor(server, 0.0, EXTENT, True)
+        lighting.set_up(server)
+        lighting.set_floor(server, 0.0, EXTENT, True)
         away = np.subtract(CAMERA.position, CAMERA.target)
-        backdrop.set_lamp(server, float(np.arctan2(away[1], away[0])))
+        lighting.set_lamp(server, float(np.arctan2(away[1], away[0])))
         start = server.initial_camera
         start.position, start.look_at = np.array(CAMERA.position), np.array(CAMERA.target)
         start.fov = FIELD_OF_VIEW

@@ -9,18 +9,18 @@
 
 from typing import TYPE_CHECKING
 
-from . import articulations, errors, expressions, formats, logic, loops, model, spatial, symbols
-from ._version import __version__
-from .articulations import Continuous, Fixed, Floating, Limits, Planar, Prismatic, Revolute
-from .compile import CompiledFunction, compile  # noqa: A004 - the name the design gives it
-from .errors import KineverseError
-from .expressions import Expression, array
-from .expressions.functions import clip, maximum, minimum, norm, where
-from .expressions.piecewise import spline
-from .formats import load, shipped_models
-from .loops import CloseLoop
-from .model import Constraint, Model, Operation
-from .spatial import (
+from kineverse import articulations, errors, expressions, formats, logic, loops, model, spatial, symbols
+from kineverse._version import __version__
+from kineverse.articulations import Continuous, Fixed, Floating, Limits, Planar, Prismatic, Revolute
+from kineverse.compilation import CompiledFunction, compile
+from kineverse.errors import KineverseError
+from kineverse.expressions import Expression, array
+from kineverse.expressions.functions import clip, maximum, minimum, norm, where
+from kineverse.expressions.piecewise import spline
+from kineverse.formats import load, shipped_models
+from kineverse.loops import CloseLoop
+from kineverse.model import Constraint, Model, Operation
+from kineverse.spatial import (
     axis_angle,
     inverse,
     quaternion,
@@ -31,12 +31,12 @@ from .spatial import (
     transform,
     translation,
 )
-from .state import State, StateLike
-from .symbols import Symbol, parameter, position, velocity
+from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol, parameter, position, velocity
 
 if TYPE_CHECKING:
-    from . import control, estimation, geometry, grasping, manipulation, planning, reasoning, worlds
-    from .view.show import show
+    from kineverse import control, estimation, geometry, grasping, manipulation, planning, reasoning, worlds
+    from kineverse.view.page import show
 
 __all__ = [
     "CloseLoop",
@@ -140,8 +140,8 @@ def __getattr__(name: str) -> object:
         return importlib.import_module(f"kineverse.{name}")
     if name == "show":
         return importlib.import_module("kineverse.view.show").show
-    from ._synonyms import MODULE_SYNONYMS
-    from .errors import unknown_attribute_error
+    from kineverse._synonyms import MODULE_SYNONYMS
+    from kineverse.errors import unknown_attribute_error
 
     below: dict[str, str] = {}
     if not name.startswith("_"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from kineverse.cli.main import main
+from kineverse.cli.command_line import main
 
 if __name__ == "__main__":
     sys.exit(main())

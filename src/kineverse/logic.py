@@ -30,11 +30,11 @@ from typing import ClassVar
 
 import casadi as ca
 
-from .errors import ExpressionError, InvalidValueError
-from .expressions.expression import Expression, ExpressionLike, as_expression, binary, broadcast
-from .expressions.functions import absolute, tanh
-from .expressions.node import Node
-from .symbols import Symbol
+from kineverse.errors import ExpressionError, InvalidValueError
+from kineverse.expressions.expression import Expression, ExpressionLike, as_expression, binary, broadcast
+from kineverse.expressions.functions import absolute, tanh
+from kineverse.expressions.node import Node
+from kineverse.symbols import Symbol
 
 CONTRAST = 1e10
 

@@ -17,8 +17,8 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
-from .errors import InvalidValueError, ShapeError
-from .expressions.expression import (
+from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.expressions.expression import (
     Expression,
     ExpressionLike,
     access_listener,
@@ -28,9 +28,9 @@ from .expressions.expression import (
     from_casadi,
     union_nodes,
 )
-from .expressions.functions import arctan2, cos, norm, sin, sqrt, where
-from .expressions.layout import SX
-from .lie import normalize
+from kineverse.expressions.functions import arctan2, cos, norm, sin, sqrt, where
+from kineverse.expressions.layout import SX
+from kineverse.lie import normalize
 
 Direction = tuple[float, float, float]
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from ._checks import real_number
-from ._synonyms import STATE_SYNONYMS
-from .errors import (
+from kineverse._checks import real_number
+from kineverse._synonyms import STATE_SYNONYMS
+from kineverse.errors import (
     DuplicateNameError,
     ExpressionError,
     InvalidValueError,
@@ -22,9 +22,9 @@ from .errors import (
     suggest,
     unknown_attribute_error,
 )
-from .expressions.printing import html_table
-from .lie import Array
-from .symbols import Symbol, parse_symbol_name
+from kineverse.expressions.printing import html_table
+from kineverse.lie import Array
+from kineverse.symbols import Symbol, parse_symbol_name
 
 StateLike: TypeAlias = "State | Mapping[Symbol, float] | Mapping[str, float] | Mapping[Symbol | str, float]"
 """A state, or a plain mapping from symbols or their names to numbers."""

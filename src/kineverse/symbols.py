@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import casadi as ca
 
-from ._checks import real_number
-from .errors import ExpressionError, InvalidValueError
-from .expressions.expression import NO_NODES, SYMBOLS, Expression
+from kineverse._checks import real_number
+from kineverse.errors import ExpressionError, InvalidValueError
+from kineverse.expressions.expression import NO_NODES, SYMBOLS, Expression
 
 Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
 

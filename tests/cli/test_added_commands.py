@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from kineverse.cli.main import COMMANDS, find_added_commands, load_command
+from kineverse.cli.command_line import COMMANDS, find_added_commands, load_command
 
 MAIN = sys.modules["kineverse.cli.main"]
 

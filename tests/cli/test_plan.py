@@ -11,7 +11,7 @@ import pytest
 import kineverse as kv
 from arm_and_box import ARM, SRDF
 from kineverse.cli.plan_arguments import FrameTarget, parse_frame_target, parse_request, parse_robot
-from kineverse.compile.toolchain import toolchain
+from kineverse.compilation.toolchain import toolchain
 from kineverse.errors import InvalidValueError
 from kineverse.planning import Trajectory
 
@@ -75,7 +75,7 @@ def test_no_path_ends_with_status_1_and_the_reason(run):
 
 
 def test_without_a_compiler_it_says_what_works(run, monkeypatch):
-    from kineverse.compile.c_library import SourceLibrary
+    from kineverse.compilation.c_library import SourceLibrary
     from kineverse.planning import bindings
 
     bindings._library.cache_clear()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from kineverse.cli.requirements import MODULES, require
+from kineverse.cli.arguments import MODULES, require
 from kineverse.errors import CompileError, MissingDependencyError
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kineverse.planning.spheres import sphere_cache
+from kineverse.planning.spheres import object_covers
 
 ROBOT = """<robot name="r">
 <link name="base"><collision><geometry><box size=".2 .2 .1"/></geometry></collision>
@@ -29,7 +29,7 @@ def folder(tmp_path, monkeypatch):
     """Create robots and a separate cache."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "cache"))
-    sphere_cache._in_memory.clear()
+    object_covers._in_memory.clear()
     Path("robot.urdf").write_text(ROBOT.format(""))
     Path("bad.urdf").write_text(ROBOT.format(BAD))
     Path("bare.urdf").write_text(BARE)

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from kineverse.cli import streams
-from kineverse.cli.output import format_table
-from kineverse.cli.streams import escape_controls, safe_streams
+from kineverse.cli import output
+from kineverse.cli.output import escape_controls, format_table, safe_streams
 
 NAME = "a\u009b31m\u202eb"
 ROBOT = f"""<robot name="r"><link name="base"/><link name="{NAME}"/>
@@ -139,5 +138,5 @@ sys.exit(main())
 def test_unwrap_stream_returns_what_commands_were_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", own := io.StringIO())
     with safe_streams():
-        assert streams.unwrap_stream(sys.stderr) is own
-    assert streams.unwrap_stream(own) is own
+        assert output.unwrap_stream(sys.stderr) is own
+    assert output.unwrap_stream(own) is own

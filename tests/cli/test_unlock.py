@@ -5,7 +5,7 @@ import json
 import pytest
 
 import kineverse as kv
-from kineverse.cli.main import main
+from kineverse.cli.command_line import main
 
 THESIS = ("unlock", "lockboxes/thesis", "--goal", "lockbox/a=1.2")
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import strategies as st
 
 import kineverse as kv
-from kineverse.compile.toolchain import toolchain
+from kineverse.compilation.toolchain import toolchain
 from kineverse.expressions.expression import Expression, binary, unary
 
 # Machines with vectors of 64 bytes (if there are), of 32 with and without fused operations, and of 16; and what

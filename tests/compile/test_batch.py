@@ -26,8 +26,8 @@ from hypothesis import HealthCheck, given, settings
 
 import kineverse as kv
 from hypothesis_profiles import attempts
-from kineverse.compile import batch, parallel, vector_codegen
-from kineverse.compile import batch as memory
+from kineverse.compilation import batch, c_library, codegen
+from kineverse.compilation import batch as memory
 from kineverse.expressions.expression import from_casadi
 
 a, b = kv.position("door/a"), kv.position("door/b")
@@ -230,7 +230,7 @@ def test_random_programs_equal_single_calls(program: RandomProgram) -> None:
 
 @pytest.mark.compiler
 def test_programs_longer_than_one_c_function(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vector_codegen, "PART_LENGTH", 7)
+    monkeypatch.setattr(codegen, "PART_LENGTH", 7)
     # A constant of its own, for a library of its own.
     mechanism = arm()
     f = kv.compile([mechanism.pose, mechanism.jacobian * 1.03125], tier="c")
@@ -273,8 +273,8 @@ def test_large_batches_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) ->
 def test_many_threads_and_pieces(function: kv.CompiledFunction, monkeypatch: pytest.MonkeyPatch) -> None:
     x = np.random.default_rng(0).uniform(-3, 3, (5000, 7))
     wanted = [v.copy() for v in function.batch(x)]
-    monkeypatch.setattr(parallel, "cores", lambda: 4)
-    monkeypatch.setattr(parallel, "_threads", None)
+    monkeypatch.setattr(c_library, "cores", lambda: 4)
+    monkeypatch.setattr(c_library, "_threads", None)
     wrong = []
 
     def work() -> None:
@@ -290,20 +290,20 @@ def test_many_threads_and_pieces(function: kv.CompiledFunction, monkeypatch: pyt
 
 
 def test_errors_in_threads_reach_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "cores", lambda: 3)
+    monkeypatch.setattr(c_library, "cores", lambda: 3)
 
     def work(first: int, end: int) -> None:
         raise MemoryError(f"{first} {end}")
 
     with pytest.raises(MemoryError):
-        parallel.parallel_rows(work, 1000, 1)
+        c_library.parallel_rows(work, 1000, 1)
 
 
 def test_pieces_make_up_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "cores", lambda: 3)
+    monkeypatch.setattr(c_library, "cores", lambda: 3)
     for count in (0, 1, 7, 8, 1000, 1001):
         done = []
-        parallel.parallel_rows(lambda first, end, done=done: done.extend(range(first, end)), count, 4)
+        c_library.parallel_rows(lambda first, end, done=done: done.extend(range(first, end)), count, 4)
         assert sorted(done) == list(range(count))
 
 

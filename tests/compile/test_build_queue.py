@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from kineverse.compile import build_queue
-from kineverse.compile.build_queue import BuildJob, request
-from kineverse.compile.toolchain import Toolchain, toolchain
+from kineverse.compilation import build_queue
+from kineverse.compilation.build_queue import BuildJob, request
+from kineverse.compilation.toolchain import Toolchain, toolchain
 
 pytestmark = pytest.mark.compiler
 FLAGS = ("-O0",)

@@ -17,9 +17,9 @@ import pytest
 from processes import states_of_group
 
 import kineverse as kv
-from kineverse.compile import c_library, cache, call_extension, compiler_information
-from kineverse.compile.cache import LibraryCache, library_cache
-from kineverse.compile.toolchain import toolchain
+from kineverse.compilation import c_library, cache, call_extension, compiler_information
+from kineverse.compilation.cache import LibraryCache, library_cache
+from kineverse.compilation.toolchain import toolchain
 
 a, b = kv.position("door/a"), kv.position("door/b")
 

@@ -13,7 +13,7 @@ import pytest
 from compiled_programs import arm, same_bits
 
 import kineverse as kv
-from kineverse.compile import Evaluator
+from kineverse.compilation import Evaluator
 
 a, b, c = kv.position("door/a"), kv.position("door/b"), kv.velocity("door/a")
 length = kv.parameter("door/length", 2.0)

@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 import kineverse as kv
-from kineverse.compile import cache
-from kineverse.compile.c_library import SourceLibrary
-from kineverse.compile.cache import LibraryCache, library_cache, private_subfolder
-from kineverse.compile.private_folder import NotPrivateError, PrivateFolder
-from kineverse.compile.toolchain import toolchain
-from kineverse.geometry.decomposition import hull_cache
+from kineverse.compilation import cache
+from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.cache import LibraryCache, library_cache, private_subfolder
+from kineverse.compilation.private_folder import NotPrivateError, PrivateFolder
+from kineverse.compilation.toolchain import toolchain
+from kineverse.geometry.decomposition import result
 
 NOBODY = 65534
 KEY = "key"
@@ -338,8 +338,8 @@ def test_a_folder_of_decompositions_that_leads_elsewhere_is_not_used(
     library_cache()
     (folder / "decompositions").symlink_to(elsewhere)
     with caplog.at_level(logging.WARNING, "kineverse.compile"):
-        assert hull_cache.folder() != folder / "decompositions"
-        assert hull_cache.find_entry("0" * 40) is None
+        assert result.folder() != folder / "decompositions"
+        assert result.find_entry("0" * 40) is None
     assert "can be written by others" in caplog.text
     assert list(elsewhere.iterdir()) == []
 
@@ -352,6 +352,6 @@ def test_a_decomposition_that_is_a_link_counts_as_absent(
     target.write_bytes(b"content")
     (inside.path / "abc-def.hulls").symlink_to(target)
     with caplog.at_level(logging.WARNING, "kineverse.geometry"):
-        assert hull_cache.find_entry("abc", "def") is None
+        assert result.find_entry("abc", "def") is None
     assert "abc-def.hulls is a link and counts as absent." in caplog.text
     assert target.read_bytes() == b"content"

@@ -10,9 +10,9 @@ import pytest
 from compiled_programs import APPROXIMATED, BINARY, SPECIAL, UNARY, build_for, ulps
 
 import kineverse as kv
-from kineverse.compile.batch import _load
-from kineverse.compile.batch_codegen import generate_batch_source
-from kineverse.compile.program import Program
+from kineverse.compilation.batch import _load
+from kineverse.compilation.codegen import generate_batch_source
+from kineverse.compilation.program import Program
 from kineverse.expressions.expression import binary, unary
 
 x, y = kv.position("x"), kv.position("y")

@@ -15,11 +15,11 @@ from processes import states_of_group
 
 import kineverse as kv
 from hypothesis_profiles import attempts
-from kineverse.compile import build_queue, compiler_information
-from kineverse.compile.batch_codegen import generate_batch_source
-from kineverse.compile.build_queue import working_seconds
-from kineverse.compile.call_extension import call_extension
-from kineverse.compile.program import Program
+from kineverse.compilation import build_queue, compiler_information
+from kineverse.compilation.build_queue import working_seconds
+from kineverse.compilation.call_extension import call_extension
+from kineverse.compilation.codegen import generate_batch_source
+from kineverse.compilation.program import Program
 from kineverse.expressions.implicit import ImplicitFunction
 
 a, b = kv.position("door/a"), kv.position("door/b")

@@ -25,10 +25,10 @@ from compiled_programs import (
 )
 
 import kineverse as kv
-from kineverse.compile import vector_codegen, vector_program
-from kineverse.compile.batch import _load as load_batch
-from kineverse.compile.batch_codegen import generate_batch_source
-from kineverse.compile.vector_program import VectorProgram, vector_header, vector_source
+from kineverse.compilation import codegen, vector_program
+from kineverse.compilation.batch import _load as load_batch
+from kineverse.compilation.codegen import generate_batch_source
+from kineverse.compilation.vector_program import VectorProgram, vector_header, vector_source
 from kineverse.expressions.expression import Expression, binary, from_casadi, unary
 
 pytestmark = pytest.mark.compiler
@@ -140,7 +140,7 @@ def test_prepared_parameters_and_pieces_change_nothing(
     rows = np.random.default_rng(0).uniform(-3, 3, (37, 7))
     rows[:, 3:] = rows[0, 3:]
     wanted = kv.compile(outputs, mechanism.symbols, tier="interpreter").batch(rows)
-    monkeypatch.setattr(vector_codegen, "PART_LENGTH", 7)
+    monkeypatch.setattr(codegen, "PART_LENGTH", 7)
     split = VectorProgram(outputs, mechanism.symbols[:3], mechanism.symbols[3:])
     results = split.evaluate(rows[:, :3], dict(zip(mechanism.symbols[3:], rows[0, 3:], strict=True)))
     assert split.stored > 0

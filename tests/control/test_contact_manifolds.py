@@ -7,7 +7,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.articulations import OmniBase
-from kineverse.control import Controller, Goal, contact_slots
+from kineverse.control import Controller, Goal, contact_constraints
 from kineverse.geometry import Scene
 from kineverse.model.body import Body, Box, Pose, Shape
 
@@ -51,5 +51,5 @@ def least_distance(model):
 
 def test_a_base_that_turns_to_and_fro_beside_a_wall_does_not_touch_it(model, monkeypatch):
     assert least_distance(model) > 2e-3
-    monkeypatch.setattr(contact_slots, "FacingPoints", lambda *_: None)
+    monkeypatch.setattr(contact_constraints, "FacingPoints", lambda *_: None)
     assert least_distance(model) < -0.005

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kineverse.control import contact_rows
-from kineverse.control.contact_rows import ContactRows
+from kineverse.control import contact_constraints
+from kineverse.control.contact_constraints import ContactRows
 
 GAIN, RECOVERY, WEIGHT = 10.0, 5.0, 3.0
 
@@ -16,10 +16,10 @@ GAIN, RECOVERY, WEIGHT = 10.0, 5.0, 3.0
 @pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
 def either_library(request, monkeypatch):
     if request.param == "c":
-        assert contact_rows.row_library.prepare(wait=True)
+        assert contact_constraints.row_library.prepare(wait=True)
     else:
         monkeypatch.setattr(
-            contact_rows, "row_library", SimpleNamespace(code=None, prepare=lambda wait: False)
+            contact_constraints, "row_library", SimpleNamespace(code=None, prepare=lambda wait: False)
         )
 
 
@@ -54,7 +54,7 @@ def test_rows_are_the_rates_of_distances(either_library):
         assert lower[k] == pytest.approx(-GAIN * max(gap, 0.0))
         if gap < 0.0:  # half the weight times the squared difference to the wanted rate
             costs += WEIGHT * np.outer(A[k], A[k])
-            linear -= WEIGHT * RECOVERY * (contact_rows.INWARDS - gap) * A[k]
+            linear -= WEIGHT * RECOVERY * (contact_constraints.INWARDS - gap) * A[k]
     assert {bool(d < margins[a, b]) for d, (a, b) in zip(distances, owners[:used], strict=False)} == {
         True,
         False,

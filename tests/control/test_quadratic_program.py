@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from kineverse.control import qp_solver
+from kineverse.control import qp
 from kineverse.control.quadratic_program import QpSolution, make_solver
 from kineverse.errors import InvalidValueError, MissingDependencyError, ShapeError, UnknownNameError
 
@@ -267,7 +267,7 @@ def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, name_: str
 @pytest.mark.compiler
 def test_solutions_are_checked_in_c_as_in_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Violations on both sides of the tolerance, soft entries, and what is not finite."""
-    assert qp_solver._library.prepare(wait=True)
+    assert qp._library.prepare(wait=True)
     rng, answers = np.random.default_rng(0), []
     soft = np.zeros(N + M, bool)
     soft[[1, N + 2]] = True
@@ -280,8 +280,8 @@ def test_solutions_are_checked_in_c_as_in_numpy(monkeypatch: pytest.MonkeyPatch)
         if case % 10 == 0:
             [x, A, lower, upper][rng.integers(4)].flat[place % N] = [np.nan, np.inf, -np.inf][case // 10 % 3]
         found = []
-        for library in (qp_solver._library, SimpleNamespace(code=None, prepare=lambda: None)):
-            monkeypatch.setattr(qp_solver, "_library", library)
+        for library in (qp._library, SimpleNamespace(code=None, prepare=lambda: None)):
+            monkeypatch.setattr(qp, "_library", library)
             solver = make_solver("daqp", N, M, soft=soft if case % 2 else None)
             solver._bind(H, f, A, lower, upper)
             with np.errstate(all="ignore"):

@@ -67,7 +67,7 @@ MODELS = (
 )
 
 KINDS = {
-    "kineverse.model.operations": {
+    "kineverse.model.basic_operations": {
         "AddFrame": "AddFrame",
         "Attach": "Attach",
         "Constrain": "Constrain",
@@ -110,8 +110,8 @@ KINDS = {
         "ScrewAndNut": "ScrewAndNut",
         "Universal": "Universal",
     },
-    "kineverse.formats.mjcf.tendons": {"Tendon": "Tendon", "TendonCoupling": "TendonCoupling"},
-    "kineverse.estimation.identification.found_operations": {
+    "kineverse.formats.mjcf.equalities": {"Tendon": "Tendon", "TendonCoupling": "TendonCoupling"},
+    "kineverse.estimation.identification.joint_operations": {
         "FamilyJoint": "FamilyJoint",
         "MountedBall": "MountedBall",
         "MountedCylindrical": "MountedCylindrical",
@@ -140,7 +140,7 @@ PARAMETERS = {
     },
     "kineverse.model.constraint": {"Constraint": "Constraint"},
     "kineverse.model.frame": {"Frame": "Frame"},
-    "kineverse.estimation.identification.custom_family": {"Family": "Family", "FamilyMotion": "FamilyMotion"},
+    "kineverse.estimation.identification.families": {"Family": "Family", "FamilyMotion": "FamilyMotion"},
 }
 """Other classes that are parameters of these, with the names of their records."""
 
@@ -226,7 +226,7 @@ def test_records_have_frozen_names() -> None:
     parameters = {name for names in PARAMETERS.values() for name in names.values()}
     operations = {
         kind
-        for module in ("kineverse.model.operations", "kineverse.loops", "kineverse.articulations")
+        for module in ("kineverse.model.basic_operations", "kineverse.loops", "kineverse.articulations")
         for kind in KINDS[module].values()
     }
     left_out = {"Family", "FamilyMotion", "Override", "SetBody", "SetHome", "SoftLimits"}

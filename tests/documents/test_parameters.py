@@ -10,8 +10,8 @@ import pytest
 import kineverse as kv
 from kineverse import gallery
 from kineverse.formats.document import read_operations, to_json
+from kineverse.model.basic_operations import SetBody, SetRate
 from kineverse.model.body import Box, Cylinder, Mesh, Sphere
-from kineverse.model.operations import SetBody, SetRate
 
 KINDS: dict[str, type[kv.Operation]] = {
     name: kind

@@ -13,9 +13,9 @@ from jsonschema import Draft202012Validator
 
 import kineverse as kv
 from kineverse.formats.document import read_operations, schema, to_json
-from kineverse.formats.document.bodies import GEOMETRIES
 from kineverse.formats.document.node_types import BINARY, NODE_TYPES, UNARY
 from kineverse.formats.document.parameters import TAGS
+from kineverse.formats.document.values import GEOMETRIES
 from kineverse.model.operation import KINDS
 from kineverse.model.traces import trace_queries
 from kineverse.symbols import ROLES

@@ -15,7 +15,7 @@ from trace_models import KNOB, LIFT, WHEEL, agree, build, changed, read_document
 import kineverse as kv
 from kineverse.expressions.gradient import total_derivative
 from kineverse.formats.document import OpaqueOperation, to_json
-from kineverse.model.operations import SetRate
+from kineverse.model.basic_operations import SetRate
 from kineverse.model.rates import as_row
 
 Code = Callable[[kv.model.ReadRecorder], kv.model.Writes]

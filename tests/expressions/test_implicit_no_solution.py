@@ -8,8 +8,8 @@ import pytest
 from implicit_functions import u, v
 
 import kineverse as kv
-from kineverse.compile import batch
-from kineverse.compile.call_extension import call_extension
+from kineverse.compilation import batch
+from kineverse.compilation.call_extension import call_extension
 from kineverse.expressions import array
 from kineverse.expressions import functions as f
 

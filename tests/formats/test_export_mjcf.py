@@ -24,8 +24,8 @@ from round_trip import (
 
 import kineverse as kv
 from hypothesis_profiles import attempts
+from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Box, Ellipsoid, Inertia, Mesh, Shape
-from kineverse.model.operations import SetBody
 from published_data import published_path, relative_name
 
 FILES = readable_urdf_files()

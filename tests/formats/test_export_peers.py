@@ -12,8 +12,8 @@ from round_trip import SCENES, SHIPPED, load_cached, poses
 from test_export_urdf import REFUSED
 
 import kineverse as kv
+from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, Shape, Sphere
-from kineverse.model.operations import SetBody
 
 pin = pytest.importorskip("pinocchio")
 

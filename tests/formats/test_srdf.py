@@ -11,7 +11,7 @@ import pytest
 import kineverse as kv
 from kineverse.errors import FormatError, UnknownNameError
 from kineverse.formats.srdf import EndEffector, Srdf, VirtualJoint, parse_srdf, read_srdf
-from kineverse.formats.srdf.groups import MOST_GROUPS
+from kineverse.formats.srdf.reader import MOST_GROUPS
 
 
 def joint(name: str, parent: str, child: str, kind: str = "revolute", more: str = "") -> str:

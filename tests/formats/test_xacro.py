@@ -11,7 +11,7 @@ import kineverse as kv
 from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError
 from kineverse.formats import isolation
 from kineverse.formats.reader_warnings import collect_warnings
-from kineverse.formats.xacro_process import check_expression
+from kineverse.formats.xacro import check_expression
 
 XMLNS = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 LEG = f"""<robot {XMLNS}>

@@ -107,7 +107,7 @@ def test_generate_kitchen_spring_of_a_flap_carries_it_wide_open():
 
 def test_generate_kitchen_inertia_is_that_of_mujoco():
     mujoco = pytest.importorskip("mujoco")
-    from kineverse.gallery.kitchens.solids import STEEL, compute_inertia, cylinder_between, slab
+    from kineverse.gallery.kitchens.builder import STEEL, compute_inertia, cylinder_between, slab
 
     solids = (
         slab((0.1, 0.4), (-0.2, 0.1), (0, 0.05), STEEL),

@@ -19,13 +19,13 @@ from kineverse.geometry.decomposition import (
     DecompositionSettings,
     ResourceLimits,
     clear,
+    coacd_process,
     convex_decomposition,
     decompose,
     decompose_all,
     find_hulls,
-    hull_cache,
     list_entries,
-    worker,
+    result,
 )
 from kineverse.geometry.decomposition.accuracy import Polytope, is_closed, measure_accuracy
 from kineverse.geometry.decomposition.convex_decomposition import clean_hulls, reduce_hulls
@@ -257,7 +257,7 @@ def test_find_hulls_without_settings_returns_the_latest(file, plain):
     mesh = file(cube())
     decompose(mesh, DecompositionSettings(max_hulls=5))
     latest = decompose(mesh, DecompositionSettings(error=0.01))
-    assert hull_cache.find_entry(clean_mesh(mesh).digest).error == latest.decomposition.error == 0.01
+    assert result.find_entry(clean_mesh(mesh).digest).error == latest.decomposition.error == 0.01
 
 
 def test_decompose_applies_scale_and_mirroring(file, plain):
@@ -294,7 +294,7 @@ def test_cache_is_bounded_listed_and_cleared(file, plain, monkeypatch):
         "small.stl",
     ]
     room = max(kept.bytes for kept in list_entries()) + 100
-    monkeypatch.setattr(hull_cache.DECOMPOSITIONS, "most_bytes", room)
+    monkeypatch.setattr(result.DECOMPOSITIONS, "most_bytes", room)
     decompose(file(finger(), "finger.stl"))
     assert [os.path.basename(kept.decomposition.name) for kept in list_entries()] == ["finger.stl"]
     assert clear() == 1
@@ -366,7 +366,7 @@ def test_coacd_process_does_not_outlive_its_parent(tmp_path, monkeypatch):
     command = [
         sys.executable,
         "-P",
-        str(worker.PROGRAM),
+        str(coacd_process.PROGRAM),
         str(tmp_path / "in.npz"),
         "out.npz",
         "1",

@@ -14,9 +14,9 @@ from convex_shapes import EXACT, KINDS, MujocoPairs, gap, random_pose, random_sh
 from scipy.spatial.transform import Rotation
 
 from kineverse.geometry.bindings import collision_library
+from kineverse.geometry.gjk import directional_gaps, smoothed_support
 from kineverse.geometry.narrowphase import Narrowphase
 from kineverse.geometry.shapes import _triangle_solid, scale_solid, solid_from_geometry, solid_from_points
-from kineverse.geometry.support import directional_gaps, smoothed_support
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 TOOL = importlib.util.spec_from_file_location(

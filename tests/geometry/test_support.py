@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from convex_shapes import KINDS, gap, random_pose, random_shape
 
+from kineverse.geometry.gjk import directional_gaps, find_widest_gap, smoothed_support
 from kineverse.geometry.narrowphase import Narrowphase
-from kineverse.geometry.support import directional_gaps, find_widest_gap, smoothed_support
 
 PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
 

@@ -7,7 +7,7 @@ import numpy as np
 from loop_checks import loops_of
 
 import kineverse as kv
-from kineverse.model.operations import AddFrame
+from kineverse.model.basic_operations import AddFrame
 
 
 def as_mujoco(model: kv.Model) -> tuple[mujoco.MjModel, mujoco.MjData, list[str], list[str]]:

@@ -10,7 +10,7 @@ from linkages import Y, at, bar, four_bar
 
 import kineverse as kv
 from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError, UnknownNameError
-from kineverse.loops.record import find_loops
+from kineverse.loops.loop_records import find_loops
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 

@@ -12,8 +12,8 @@ from kineverse.manipulation.articulated_objects import (
     select_objects,
 )
 from kineverse.manipulation.skill_arguments import choose_tolerance
+from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Box, Shape
-from kineverse.model.operations import SetBody
 
 pytest.importorskip("coal")
 

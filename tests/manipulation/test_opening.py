@@ -13,13 +13,13 @@ from kineverse.articulations.locks import position_lock, speed_lock
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
-from kineverse.manipulation.base_samples import find_planar_base
+from kineverse.manipulation.base_sampling import find_planar_base
 from kineverse.manipulation.belief import EstimateError
+from kineverse.manipulation.opening.cartesian_paths import CartesianPaths, find_least_time
+from kineverse.manipulation.opening.grasp_selection import PlacementSampler
 from kineverse.manipulation.opening.grasped_opening import _Run
 from kineverse.manipulation.opening.hand_motion import HandMotion
-from kineverse.manipulation.opening.hand_paths import HandPaths, find_least_time
-from kineverse.manipulation.opening.placement_samples import PlacementSamples
-from kineverse.manipulation.opening.way_check import WayCheck
+from kineverse.manipulation.opening.path_collisions import PathCheck
 from kineverse.manipulation.skill_arguments import choose_tolerance
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 
@@ -252,15 +252,15 @@ def test_a_way_back_is_looked_at_anew(at_the_door, monkeypatch):
     search, handle, state, grasps = at_the_door
     placement = search.find(state, grasps, 1.0, seed=1)
     ended = state.updated({handle.coordinate: 1.0})
-    monkeypatch.setattr(WayCheck, "_find", lambda *_, **__: 0)
-    monkeypatch.setattr(WayCheck, "_note", lambda *_: "")
+    monkeypatch.setattr(PathCheck, "_find", lambda *_, **__: 0)
+    monkeypatch.setattr(PathCheck, "_note", lambda *_: "")
     assert search.retrace(ended, placement, 0.0) is None
 
 
 def test_joints_at_their_limits_leave_the_rest_of_a_step_to_the_others():
     model = kv.load("hsr")
     arm = [s for s in model.symbols_of("hsr/hand_palm_link") if s in model.degrees_of_freedom]
-    paths = HandPaths(model, "hsr/hand_palm_link", arm, (), np.ones(len(arm)))
+    paths = CartesianPaths(model, "hsr/hand_palm_link", arm, (), np.ones(len(arm)))
     hand = model.fk("hsr/hand_palm_link")
     low = paths.lower.copy()
     low[~np.isfinite(low)] = 0.0
@@ -400,7 +400,7 @@ def test_base_of_a_whole_arm_stands_in_a_part_of_the_samples():
         model = kv.load(robot)
         own = [s for s in model.symbols_of(hand) if s in model.degrees_of_freedom]
         base = find_planar_base(model, own)
-        samples = PlacementSamples(model, own, (), base)
+        samples = PlacementSampler(model, own, (), base)
         least[robot] = min(ease[own.index(base[0])] for ease in samples.eases)
         assert all(ease[own.index(s)] > 0 for ease in samples.eases for s in own if s not in base)
     assert least["pr2"] == 0.0 < least["hsr"]

@@ -11,20 +11,19 @@ import pytest
 
 import kineverse as kv
 from kineverse.articulations import OmniBase
-from kineverse.control.contact_slots import ContactSlots
+from kineverse.control.contact_constraints import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.geometry import Scene
 from kineverse.grasping import find_gripper
 from kineverse.manipulation.outcome import Outcome
-from kineverse.manipulation.pushing import push_placement, push_program
-from kineverse.manipulation.pushing.approach import plan_push_approach
+from kineverse.manipulation.pushing import base_placement, push_program
+from kineverse.manipulation.pushing.base_placement import RollOut, find_push_start, roll_out
+from kineverse.manipulation.pushing.contact_pair import ContactRates, PushPair
 from kineverse.manipulation.pushing.contact_points import PushSurface, find_push_tool
-from kineverse.manipulation.pushing.nearest_pair import ContactRates, PushPair
-from kineverse.manipulation.pushing.press import PushPress
+from kineverse.manipulation.pushing.guarded_contact import PushPress
 from kineverse.manipulation.pushing.push_controller import Pushing
-from kineverse.manipulation.pushing.push_placement import RollOut, find_push_start, roll_out
 from kineverse.manipulation.pushing.push_program import PushNumbers
-from kineverse.manipulation.pushing.push_skill import push
+from kineverse.manipulation.pushing.push_skill import plan_push_approach, push
 from kineverse.manipulation.pushing.trials import try_push
 from kineverse.manipulation.pushing.vectors import move_point
 from kineverse.manipulation.robot_sources import SHIPPED
@@ -364,12 +363,12 @@ def test_points_beyond_one_that_was_out_of_reach_are_given_up_too() -> None:
 def test_search_of_a_start_ends_where_no_push_moves_the_object(monkeypatch: pytest.MonkeyPatch) -> None:
     state, ends = opened(door=0.6), iter([0.6] * 1000)
     pushing = Pushing(room(), "door", PUSHER, state, target=0.0)
-    monkeypatch.setattr(push_placement._Sampler, "sample", lambda self: state)
-    monkeypatch.setattr(push_placement, "roll_out", lambda *args: RollOut("blocked", 9, next(ends)))
+    monkeypatch.setattr(base_placement._Sampler, "sample", lambda self: state)
+    monkeypatch.setattr(base_placement, "roll_out", lambda *args: RollOut("blocked", 9, next(ends)))
     assert find_push_start(pushing, state).samples == 60
     ends = iter([0.6, 0.5, 0.3, *[0.31] * 1000])
     assert find_push_start(pushing, state).samples == 123
-    monkeypatch.setattr(push_placement._Sampler, "sample", lambda self: push_placement._UNREACHED)
+    monkeypatch.setattr(base_placement._Sampler, "sample", lambda self: base_placement._UNREACHED)
     assert find_push_start(pushing, state, samples=3).failure == "reach"
 
 
@@ -380,8 +379,8 @@ def test_start_of_the_push_that_goes_furthest_is_taken_where_none_goes_through(
     starts = [state.updated({"robot/base/x": -k / 10}) for k in range(3)]
     pushing = Pushing(room(), "door", PUSHER, state, target=0.0)
     drawn, rolled = iter(starts), iter([RollOut("blocked", 9, end) for end in ends])
-    monkeypatch.setattr(push_placement._Sampler, "sample", lambda self: next(drawn))
-    monkeypatch.setattr(push_placement, "roll_out", lambda *args: next(rolled))
+    monkeypatch.setattr(base_placement._Sampler, "sample", lambda self: next(drawn))
+    monkeypatch.setattr(base_placement, "roll_out", lambda *args: next(rolled))
     found = find_push_start(pushing, state, samples=3, least=0.4)
     assert found.state is starts[1]
     assert not found.whole

@@ -12,7 +12,7 @@ import kineverse as kv
 from cupboards import box
 from kineverse.geometry import Scene
 from kineverse.manipulation import Session, open_object, push
-from kineverse.manipulation.swept_motion import find_obstacle
+from kineverse.manipulation.swept_volume import find_obstacle
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import KinematicWorld

@@ -13,11 +13,11 @@ from kineverse.manipulation import Session, open_unknown
 from kineverse.manipulation.opening import PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.unknown_objects import forget_joint
-from kineverse.manipulation.unknown_objects.hinge_hypotheses import guess_hinges
+from kineverse.manipulation.unknown_objects.joint_hypotheses import guess_hinges
 from kineverse.manipulation.unknown_objects.joint_learning import JointLearning
-from kineverse.manipulation.unknown_objects.part import JointPath, free_part, write_joint
 from kineverse.manipulation.unknown_objects.part_belief import PartBelief, PoseMean, measure_way
-from kineverse.manipulation.unknown_objects.pulling import ArmEndError, PartPulling
+from kineverse.manipulation.unknown_objects.pulling_policy import ArmEndError, PartPulling
+from kineverse.manipulation.unknown_objects.unmodelled_joint import JointPath, free_part, write_joint
 from kineverse.worlds import KinematicWorld, Observation, Sensors
 
 DOOR, HANDLE = "shelf_door/door", "shelf_door/door_handle"

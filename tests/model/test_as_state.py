@@ -220,7 +220,7 @@ def test_no_default_state_is_silently_not_finite() -> None:
     ],
 )
 def test_homes_without_a_pose(home: tuple[float, ...], message: str) -> None:
-    from kineverse.model.operations import SetHome
+    from kineverse.model.basic_operations import SetHome
 
     model = kv.Model()
     with model.edit() as edit:

@@ -18,7 +18,7 @@ import kineverse as kv
 import time_derivative_checks
 from hypothesis_profiles import attempts
 from kineverse.errors import InvalidValueError, UnknownNameError
-from kineverse.model.rate_nodes import to_plain
+from kineverse.model.rates import to_plain
 
 x, y, z = (kv.position(n) for n in "xyz")
 u, v = kv.velocity("u"), kv.velocity("v")

@@ -11,8 +11,7 @@ from random_models import random_speeds, random_state, random_tree
 from scipy.integrate import solve_ivp
 
 import kineverse as kv
-from kineverse.model.rate_nodes import to_plain
-from kineverse.model.rates import Rates, as_row
+from kineverse.model.rates import Rates, as_row, to_plain
 
 x, y, z = (kv.position(n) for n in "xyz")
 u, v, w = (kv.velocity(n) for n in "uvw")

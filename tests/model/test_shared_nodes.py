@@ -9,8 +9,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.formats.document import read_operations, to_json
-from kineverse.model.rate_nodes import collect_symbols, to_plain
-from kineverse.model.rates import Rates, as_row
+from kineverse.model.rates import Rates, as_row, collect_symbols, to_plain
 
 a, b = kv.position("a"), kv.position("b")
 w = kv.velocity("w")

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 import kineverse as kv
-from kineverse.model.version_cache import cached_for_version
+from kineverse.model.symbolic_view import cached_for_version
 
 
 def _frames(model):

@@ -10,7 +10,7 @@ import pytest
 
 import kineverse as kv
 from arm_and_box import ARM, INSIDE, LEFT, MOVING, RIGHT
-from kineverse.compile.toolchain import toolchain
+from kineverse.compilation.toolchain import toolchain
 from kineverse.errors import FormatError, InvalidValueError, ShapeError
 from kineverse.planning import Planner, Trajectory, motion_limits
 from kineverse.planning.path_rounding import PathSection

@@ -15,8 +15,8 @@ import kineverse as kv
 from kineverse.errors import CompileError, InvalidValueError, KineverseError, ShapeError, UnknownNameError
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Sphere
 from kineverse.planning import Mode, Planner, bindings
-from kineverse.planning.checker import CollisionChecker
-from kineverse.planning.search import RrtConnect
+from kineverse.planning.collision_checker import CollisionChecker
+from kineverse.planning.sampling_planners import RrtConnect
 
 pytestmark = pytest.mark.compiler
 
@@ -223,7 +223,7 @@ def test_many_obstacles_are_all_seen():
 
 
 def test_path_longer_than_its_room_is_an_answer(ball, monkeypatch):
-    monkeypatch.setattr("kineverse.planning.search.PATH_ROOM", 3)
+    monkeypatch.setattr("kineverse.planning.sampling_planners.PATH_ROOM", 3)
     ball.place({"q00": 0.0, "q01": 0.0})
     path = ball.plan([0, 0], [40, 0])
     assert not path

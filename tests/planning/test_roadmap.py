@@ -13,7 +13,7 @@ from kineverse.control import Hold
 from kineverse.errors import InvalidValueError
 from kineverse.model.body import Body, Box, Shape, Sphere
 from kineverse.planning import Path, Planner
-from kineverse.planning.roadmap import Roadmap
+from kineverse.planning.sampling_planners import Roadmap
 
 LEFT, RIGHT = [-1.0, 0.0], [1.0, 0.0]
 OPEN, NARROWED, CLOSED = (1.0, 1.0), (0.0, 1.0), (0.0, 0.0)

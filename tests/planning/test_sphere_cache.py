@@ -9,15 +9,15 @@ import kineverse as kv
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.objects import CollisionObjects
 from kineverse.model.body import Body, Box, Mesh, Shape
-from kineverse.planning.spheres import cover_objects, make_sphere_tree, object_covers, sphere_cache
-from kineverse.planning.spheres.sphere_cache import cover_key, find_or_make_tree
+from kineverse.planning.spheres import cover_objects, make_sphere_tree, object_covers
+from kineverse.planning.spheres.object_covers import cover_key, find_or_make_tree
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """Separate the cache of this test from all others."""
     monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path))
-    sphere_cache._in_memory.clear()
+    object_covers._in_memory.clear()
     return tmp_path
 
 
@@ -59,14 +59,14 @@ def test_equal_shapes_and_settings_are_covered_once(fits):
 
 def test_the_disk_gives_back_the_same_cover(fits):
     first = cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
-    sphere_cache._in_memory.clear()
+    object_covers._in_memory.clear()
     again = cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
     assert len(fits) == 1
     assert np.array_equal(again.centres, first.centres)
     assert np.array_equal(again.radii, first.radii)
     assert (again.protrusion, again.excess) == (first.protrusion, first.excess)
     assert not again.centres.flags.writeable
-    assert [one.name for one in sphere_cache.list_covers()] == ["part: box"]
+    assert [one.name for one in object_covers.list_covers()] == ["part: box"]
 
 
 def test_trees_are_kept_by_solids_poses_and_settings():
@@ -80,7 +80,7 @@ def test_trees_are_kept_by_solids_poses_and_settings():
         return made[-1]
 
     def find(*parts, protrusion=0.02):
-        sphere_cache._in_memory.clear()
+        object_covers._in_memory.clear()
         return find_or_make_tree(cover_key(parts, protrusion), make)
 
     first, again = find((box, np.eye(4))), find((box, np.eye(4)))
@@ -91,7 +91,7 @@ def test_trees_are_kept_by_solids_poses_and_settings():
     find((box, np.eye(4)), (box, moved))
     find((box, np.eye(4)), protrusion=None)
     assert len(made) == 4
-    sphere_cache.clear_covers()
+    object_covers.clear_covers()
     find((box, np.eye(4)))
     assert len(made) == 5
 
@@ -99,7 +99,7 @@ def test_trees_are_kept_by_solids_poses_and_settings():
 @pytest.mark.parametrize("damage", [b"", b"nonsense", None])
 def test_damaged_files_count_as_absent(fits, folder, damage, caplog):
     cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
-    sphere_cache._in_memory.clear()
+    object_covers._in_memory.clear()
     (file,) = (folder / "spheres").glob("*.spheres")
     file.write_bytes(file.read_bytes()[:-40] if damage is None else damage)
     cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
@@ -108,12 +108,12 @@ def test_damaged_files_count_as_absent(fits, folder, damage, caplog):
 
 
 def test_the_cache_is_bounded_and_can_be_emptied(monkeypatch):
-    monkeypatch.setattr(sphere_cache.COVERS, "most_bytes", 500)
+    monkeypatch.setattr(object_covers.COVERS, "most_bytes", 500)
     for k in range(5):
         cover_objects([collision_object(Box((0.1, 0.1, 0.1 + 0.01 * k)))], 0.2)
-    assert 0 < len(sphere_cache.list_covers()) < 5
-    assert sphere_cache.clear_covers() > 0
-    assert not sphere_cache.list_covers()
+    assert 0 < len(object_covers.list_covers()) < 5
+    assert object_covers.clear_covers() > 0
+    assert not object_covers.list_covers()
 
 
 def test_triangle_meshes_are_refused(tmp_path):

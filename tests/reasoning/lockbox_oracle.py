@@ -3,9 +3,8 @@
 import kineverse as kv
 from kineverse.gallery.lockboxes import Lockbox
 from kineverse.reasoning import Interval
-from kineverse.reasoning.cell_graph import CellGraph, make_graph
-from kineverse.reasoning.interlock import Undecided
-from kineverse.reasoning.move_rules import MoveRule, relevant_rules
+from kineverse.reasoning.cell_graph import CellGraph, MoveRule, make_graph, relevant_rules
+from kineverse.reasoning.interlock_records import Undecided
 
 
 def box_graph(box: Lockbox) -> CellGraph:

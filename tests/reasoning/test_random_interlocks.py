@@ -13,8 +13,8 @@ import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse import reasoning
 from kineverse.reasoning import Interval, IntervalBox, interlocks
+from kineverse.reasoning.boxes import intersect_boxes, merge_boxes, subtract_boxes
 from kineverse.reasoning.polynomial import roots
-from kineverse.reasoning.regions import intersect_boxes, merge_boxes, subtract_boxes
 
 SYMBOLS = [kv.position(name) for name in "abcd"]
 NUMBERS = st.integers(-8, 8).map(lambda k: k / 8)

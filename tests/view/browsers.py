@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kineverse.view import backdrop
+from kineverse.view import lighting
 
 PATIENCE = 60_000
 """Longest wait for anything on the page [ms]: software rendering on a busy machine is slow."""
@@ -26,7 +26,7 @@ def launched(chromium: str, *arguments: str) -> Iterator[Any]:
     """
     playwright = pytest.importorskip("playwright.sync_api", reason="driving a browser needs playwright")
     with playwright.sync_playwright() as driver, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backdrop, "LAMP_SHADOW", False)
+        patch.setattr(lighting, "LAMP_SHADOW", False)
         browser = driver.chromium.launch(
             executable_path=chromium, args=[*_ARGUMENTS, *arguments], timeout=PATIENCE
         )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import kineverse as kv
 from kineverse.errors import UnknownNameError
-from kineverse.view.drive import VelocityDrive
+from kineverse.view.animation import VelocityDrive
 from kineverse.view.poses import complete
 from kineverse.view.sliders import QuaternionAngles, Ranges
 

@@ -10,7 +10,7 @@ import kineverse as kv
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.planning import Trajectory
 from kineverse.view import view
-from kineverse.view.playback import TrajectoryPlayback
+from kineverse.view.animation import TrajectoryPlayback
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import kineverse as kv
 from kineverse.estimation import Family, FamilyParameter, identify, pose_covariance
-from kineverse.estimation.identification.identify import WEIGHTS
+from kineverse.estimation.identification.joint_identification import WEIGHTS
 from kineverse.view.plots import SIZE, FitProjection, draw_fit
 
 AXIS, POINT = np.array([0.0, 0.6, 0.8]), np.array([0.5, 0.1, -0.2])

@@ -13,8 +13,7 @@ from kineverse.cli import main
 from kineverse.errors import UnknownNameError
 from kineverse.planning import Trajectory
 from kineverse.view import view
-from kineverse.view.recorded_scene import RecordedScene
-from kineverse.view.run_drawing import LONGEST_ARROW
+from kineverse.view.run_overlay import LONGEST_ARROW, RecordedScene
 from kineverse.worlds import Contact, Recorder, read_run_recording
 
 pytest.importorskip("mcap", reason="recordings need the extra 'recording'")
@@ -84,7 +83,7 @@ def test_arrows_have_the_direction_of_vectors_and_a_bounded_length(scene):
 
 def test_a_recording_is_played_on_the_page(scene):
     pytest.importorskip("viser", reason="the page needs the extra 'view'")
-    from kineverse.view.recording_playback import play_recording
+    from kineverse.view.run_overlay import play_recording
 
     with view(scene.recording.model, port=0) as page:
         play_recording(page, scene.recording, time=0.7)
@@ -111,7 +110,7 @@ def test_a_recording_is_played_on_the_page(scene):
 
 def test_a_run_is_shown_while_it_happens(scene):
     pytest.importorskip("viser", reason="the page needs the extra 'view'")
-    from kineverse.view.live_run import LiveRun
+    from kineverse.view.run_overlay import LiveRun
 
     model = scene.recording.model
     touch = Contact("robot/neck", "cupboard/panel", X, X, 0.0, np.nan)

@@ -15,7 +15,7 @@ from small_models import cabinet, held_door
 
 import kineverse as kv
 from kineverse.view import show, view
-from kineverse.view.title import choose_title, read_title
+from kineverse.view.page import choose_title, read_title
 from kineverse.view.viewer import Viewer
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")

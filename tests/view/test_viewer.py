@@ -266,7 +266,7 @@ def test_frames_without_finite_poses_are_hidden_and_named():
 def test_overlaid_parts_move_with_their_frames_and_survive_edits():
     from kineverse.geometry.shapes import solid_from_geometry
     from kineverse.planning.spheres import cover_solid
-    from kineverse.view.sphere_drawables import draw_cover
+    from kineverse.view.drawables import draw_cover
 
     model = cabinet()
     frame = next(iter(model.bodies))

@@ -8,7 +8,7 @@ from pusher import gripper, pusher, solid
 
 import kineverse as kv
 from kineverse.geometry import Rule, Scene
-from kineverse.manipulation.swept_motion import find_obstacle
+from kineverse.manipulation.swept_volume import find_obstacle
 from kineverse.model.body import Box, Cylinder
 from kineverse.worlds import Judge, KinematicWorld
 from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps

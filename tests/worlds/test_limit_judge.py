@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.worlds.limit_judge import LimitJudge
+from kineverse.worlds.run_metrics import LimitJudge
 
 A, B = kv.position("a"), kv.position("b")
 

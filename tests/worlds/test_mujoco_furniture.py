@@ -13,8 +13,8 @@ from kineverse.geometry import Rule, Scene
 from kineverse.geometry.collision_filter import RULES, rules_as_data
 from kineverse.manipulation import SkillError
 from kineverse.manipulation.session import Session
+from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Box, Inertia, Pose, Shape
-from kineverse.model.operations import SetBody
 from kineverse.worlds import MujocoWorld
 
 pytest.importorskip("mujoco")

@@ -16,7 +16,7 @@ from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.grasping import Gripper, find_gripper
 from kineverse.lie import Array
 from kineverse.model import Body, Box, Inertia, Shape
-from kineverse.model.operations import SetBody
+from kineverse.model.basic_operations import SetBody
 from kineverse.worlds import MujocoWorld, Sensors, World
 
 mujoco = pytest.importorskip("mujoco")

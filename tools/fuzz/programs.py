@@ -13,8 +13,8 @@ import numpy as np
 import kineverse as kv
 from kineverse.expressions.expression import as_expression
 from kineverse.formats.document import to_json
+from kineverse.model.basic_operations import AddFrame, Constrain, SetData
 from kineverse.model.frame import Frame
-from kineverse.model.operations import AddFrame, Constrain, SetData
 from kineverse.model.read_recorder import ReadRecorder
 from kineverse.spatial import unit_vector
 

@@ -21,7 +21,7 @@ from kineverse.formats.sdf.operations import sdf_operations
 from kineverse.formats.sdf.reader import parse_sdf
 from kineverse.formats.urdf import parse_urdf
 from kineverse.formats.urdf.operations import urdf_operations
-from kineverse.model.operations import SetBody
+from kineverse.model.basic_operations import SetBody
 
 from . import json_trees, programs, xml_trees
 from .grammars import document, mjcf, sdf, urdf

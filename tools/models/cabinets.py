@@ -127,7 +127,7 @@ def flap(
 ) -> None:
     """Add a door that opens downwards about its lower edge, .032 before the front plane at height `z`.
 
-    Its spring, which a URDF cannot say, is in `kineverse.shipped.springs`.
+    Its spring, which a URDF cannot say, is in `kineverse.shipped.robots`.
     """
     d.moving(
         name,

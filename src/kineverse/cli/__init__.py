@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from kineverse.cli.main import main
+from .command_line import main
 
 __all__ = ["main"]

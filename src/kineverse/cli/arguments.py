@@ -1,22 +1,30 @@
-"""Options and values of the command line: model sources, ``--set NAME=VALUE``, units, limits."""
+"""Options and values of the command line.
+
+Model sources, ``--set NAME=VALUE``, units, limits; requirements of commands.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.output import format_cells, print_line
-from kineverse.errors import DuplicateNameError, InvalidValueError
+from kineverse._extras import install_command
+from kineverse.errors import CompileError, DuplicateNameError, InvalidValueError, MissingDependencyError
 from kineverse.expressions.printing import format_number
+
+from .output import format_cells, print_line
 
 if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.model.model_view import ModelView
+
 
 _NUMBER_PATTERN = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _VALUE_PATTERN = re.compile(
@@ -84,7 +92,7 @@ def parse_length(text: str) -> float:
 
 
 def parse_value(text: str) -> float:
-    """Return the number [rad] or [m] of a text such as ``0.3``, ``-pi/2``, ``1.5pi``, ``30deg``, ``12 cm``."""
+    """Return number [rad] or [m] of a text such as ``0.3``, ``-pi/2``, ``1.5pi``, ``30deg``, ``12 cm``."""
     match = _VALUE_PATTERN.fullmatch(text.strip())
     if match is None or not (match["number"] or match["pi"]) or (match["times"] and not match["number"]):
         raise InvalidValueError(
@@ -232,3 +240,51 @@ def _is_plain_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+MODULES: Mapping[str, str] = MappingProxyType(
+    {
+        "control": "daqp",
+        "decomposition": "coacd",
+        "figures": "matplotlib",
+        "geometry": "coal",
+        "mjcf": "mujoco",
+        "recording": "mcap",
+        "view": "viser",
+    }
+)
+"""The module of each extra that is not in the core, and without which the extra is of no use."""
+
+_HEAD = 1 << 16  # of a file, in which its root element begins [byte]
+
+
+def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> None:
+    """Raise if something is missing, and name all of it with how to install it."""
+    from kineverse.compilation.toolchain import NO_COMPILER, toolchain
+
+    missing = [extra for extra, needed in extras.items() if needed and not _is_installed(extra)]
+    sentences = []
+    if missing:
+        names = " and ".join(filter(None, [", ".join(map(repr, missing[:-1])), repr(missing[-1])]))
+        noun = "extras" if len(missing) > 1 else "extra"
+        modules = ", ".join(MODULES[extra] for extra in missing)
+        sentences.append(f"{what} needs the {noun} {names} ({modules}): {install_command(*missing)}")
+    if compiler and toolchain() is None:
+        sentences.append(f"{what} needs a C compiler, and {NO_COMPILER}")
+    if sentences:
+        raise (MissingDependencyError if missing else CompileError)(". ".join(sentences))
+
+
+def needs_mujoco(model: str) -> bool:
+    """Return True for the path of a file that only MuJoCo reads."""
+    from kineverse.formats.file_formats import is_mjcf
+
+    try:
+        with open(model, "rb") as file:
+            return is_mjcf(model, file.read(_HEAD))
+    except (OSError, ValueError):
+        return False
+
+
+def _is_installed(extra: str) -> bool:
+    return importlib.util.find_spec(MODULES[extra]) is not None

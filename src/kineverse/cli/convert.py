@@ -9,9 +9,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.arguments import add_model_options, load_model
-from kineverse.cli.output import show_activity, truncate_lines
 from kineverse.errors import DuplicateNameError, FormatError, InvalidValueError
+
+from .arguments import add_model_options, load_model
+from .output import show_activity, truncate_lines
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -172,7 +173,7 @@ def _print_document(model: kv.Model) -> int:
 def _format_report(
     arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: SaveResult
 ) -> list[str]:
-    from kineverse.cli.format_values import format_contents
+    from .diff_report import format_contents
 
     lines = [f"{arguments.source} → {arguments.target}", f"  {format_contents(model)}, {_format_size(size)}"]
     if saved.errors:
@@ -189,7 +190,7 @@ def _format_report(
 
 def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[str]:
     """Return a line for each thing that the file leaves out, below a heading."""
-    from kineverse.cli.format_values import format_count
+    from .diff_report import format_count
 
     count = format_count(len(saved.left_out), "thing")
     lines = [f"  {name} {reason}" for name, reason in saved.left_out.items()]
@@ -199,7 +200,7 @@ def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[st
 
 def _approximation_errors(saved: SaveResult) -> str:
     """Return the largest errors of approximated frames, with their names."""
-    from kineverse.cli.format_values import format_count, format_pose_difference
+    from .diff_report import format_count, format_pose_difference
 
     errors = saved.errors
     furthest = max(errors, key=lambda name: errors[name].position)

@@ -11,18 +11,20 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.arguments import (
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse.expressions.printing import format_number
+from kineverse.model.body import Mesh
+
+from .arguments import (
     add_cache_options,
     add_model_options,
     load_model,
     manage_cache,
+    needs_mujoco,
     parse_length,
+    require,
 )
-from kineverse.cli.output import colorize, format_cells, join_lines, show_activity, show_progress
-from kineverse.cli.requirements import needs_mujoco, require
-from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
-from kineverse.expressions.printing import format_number
-from kineverse.model.body import Mesh
+from .output import colorize, format_cells, join_lines, show_activity, show_progress
 
 if TYPE_CHECKING:
     from kineverse.geometry.decomposition import CacheEntry, Decomposition, DecompositionOutcome

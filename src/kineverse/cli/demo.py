@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from kineverse.cli import demo_living, demo_robot
-from kineverse.cli.requirements import require
-from kineverse.cli.view import add_page_options
 from kineverse.errors import InvalidValueError
+
+from . import demo_living, demo_robot
+from .arguments import require
+from .view import add_page_options
 
 HELP = """let a robot open and close the doors and drawers of a kitchen
 

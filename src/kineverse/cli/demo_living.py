@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import kineverse
-from kineverse.cli.output import format_table, show_progress
-from kineverse.cli.view import handle_interrupts, page_options, print_address
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
+
+from .output import format_table, show_progress
+from .view import handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
     from living_kitchen.track import TrackingQuality
@@ -203,8 +204,9 @@ def _contents(model: kv.Model) -> str:
 
 def _exercise_models(model: kv.Model, path: str) -> int:
     """Drive all coordinates through their ranges, write a picture, and report problems."""
-    from kineverse.cli.exercise import exercise_model
     from kineverse.view import save_picture
+
+    from .exercise import exercise_model
 
     # First, so that an unwritable path is reported before the work.
     save_picture(path, model, _initial_state(model), camera=_camera())

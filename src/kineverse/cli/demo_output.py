@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse.cli.output import join_lines, shorten_text
 from kineverse.expressions.printing import format_number
+
+from .output import join_lines, shorten_text
 
 if TYPE_CHECKING:
     from kineverse.manipulation import OpenCloseReport, Outcome, Session

@@ -9,8 +9,10 @@ import time
 from contextlib import ExitStack, redirect_stdout
 from typing import TYPE_CHECKING
 
-from kineverse.cli.demo_living import check_picture_path
-from kineverse.cli.demo_output import (
+from kineverse.errors import InvalidValueError
+
+from .demo_living import check_picture_path
+from .demo_output import (
     ALIGN,
     HEAD,
     PAGE_HEAD,
@@ -20,13 +22,12 @@ from kineverse.cli.demo_output import (
     format_row,
     report_as_data,
 )
-from kineverse.cli.output import format_table, show_activity
-from kineverse.cli.view import handle_interrupts, page_options, print_address
-from kineverse.errors import InvalidValueError
+from .output import format_table, show_activity
+from .view import handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
     from kineverse.manipulation import ArticulatedObject, OpenCloseReport, Session
-    from kineverse.view.live_run import LiveRun
+    from kineverse.view.run_overlay import LiveRun
     from kineverse.view.skill_stills import SkillStills
     from kineverse.view.viewer import Viewer
 
@@ -189,7 +190,7 @@ class RobotDemo:
 
             self._stills = SkillStills(self.model, self._robot.prefix)
         else:
-            from kineverse.view.live_run import LiveRun
+            from kineverse.view.run_overlay import LiveRun
 
             self._live = LiveRun(page, self._speed, self.gripper.hand)
 

@@ -6,9 +6,10 @@ import argparse
 import json
 import math
 
-from kineverse.cli.arguments import add_model_options, load_model
-from kineverse.cli.output import colorize, show_activity
 from kineverse.errors import InvalidValueError
+
+from .arguments import add_model_options, load_model
+from .output import colorize, show_activity
 
 HELP = """print the differences of two models: operations, frames, constraints, bodies
 
@@ -66,10 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
     if not (math.isfinite(arguments.tolerance) and arguments.tolerance >= 0.0):
         raise InvalidValueError(f"--tolerance is a number from 0 on, not {arguments.tolerance}.")
 
-    from kineverse.cli.diff_report import BehaviourComparisonReport, ModelComparisonReport
-    from kineverse.cli.format_values import format_contents
-    from kineverse.model.compare import ModelComparison
-    from kineverse.model.sampled_comparison import BehaviourComparison
+    from kineverse.model.comparison import BehaviourComparison, ModelComparison
+
+    from .diff_report import BehaviourComparisonReport, ModelComparisonReport, format_contents
 
     models = []
     for source in (arguments.a, arguments.b):

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.cli.output import show_progress
 from kineverse.model.model_view import ModelView
 from kineverse.view.poses import FramePoses, complete
 from kineverse.view.sliders import Ranges, choose_slider_range, infer_units
+
+from .output import show_progress
 
 SAMPLES_PER_RANGE = 65
 """Number of samples of each range, limits included."""

@@ -7,9 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import kineverse as kv
-from kineverse.cli.format_values import format_contents, format_count
-from kineverse.cli.output import join_lines
-from kineverse.cli.summary import find_penetrations
 from kineverse.errors import KineverseError
 from kineverse.formats.document import OpaqueOperation
 from kineverse.formats.files import read_file
@@ -18,6 +15,10 @@ from kineverse.formats.reader_warnings import Fault, collect_warnings
 from kineverse.formats.validate import ModelProblem, find_problems
 from kineverse.formats.xml_reader import read_root_tag
 from kineverse.model.registry import LoopTreatment
+
+from .diff_report import format_contents, format_count
+from .output import join_lines
+from .summary import find_penetrations
 
 FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
 

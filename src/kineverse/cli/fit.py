@@ -7,10 +7,10 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.arguments import parse_length, parse_value
-from kineverse.cli.output import show_activity
-from kineverse.cli.requirements import require
 from kineverse.errors import InvalidValueError
+
+from .arguments import parse_length, parse_value, require
+from .output import show_activity
 
 if TYPE_CHECKING:
     from kineverse.estimation.recordings import ObservationNoise, RecordedJoint, RecordedPair
@@ -76,8 +76,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the table, identify the joint, and print, draw and save it."""
-    from kineverse.cli.fit_output import fit_to_json, format_fit
     from kineverse.estimation.recordings import identify_recorded_joint, read_recording
+
+    from .fit_output import fit_to_json, format_fit
 
     if arguments.document and not arguments.document.endswith(".kv.json"):
         raise InvalidValueError(
@@ -149,7 +150,7 @@ def write_results(
         picture = Figure(lambda c: draw_fit(c, fit, pair.relative, title), SIZE)
         picture.save(arguments.picture)
     if arguments.document:
-        from kineverse.cli.fit_output import make_joint_model
+        from .fit_output import make_joint_model
 
         make_joint_model(pair.select(fit.inliers), fit).save(arguments.document)
     return {"picture": arguments.picture, "document": arguments.document}

@@ -9,19 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse.cli.output import format_table
 from kineverse.errors import InvalidValueError
 from kineverse.estimation.identification.curve import CURVE
-from kineverse.estimation.identification.found_operations import joint_operation
+from kineverse.estimation.identification.joint_operations import joint_operation
 from kineverse.expressions.printing import format_number
 from kineverse.gallery import shapes
 from kineverse.lie import Array
+from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
-from kineverse.model.operations import SetBody
 from kineverse.spatial import translation
+
+from .output import format_table
 
 if TYPE_CHECKING:
     from kineverse.estimation import Fit, IdentificationResult

@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 
-from kineverse.cli.arguments import (
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.printing import format_number
+from kineverse.lie import to_quaternion
+
+from .arguments import (
     add_model_options,
     add_set_option,
     find_limit_notes,
@@ -13,9 +17,6 @@ from kineverse.cli.arguments import (
     parse_assignments,
     print_notes,
 )
-from kineverse.errors import InvalidValueError
-from kineverse.expressions.printing import format_number
-from kineverse.lie import to_quaternion
 
 HELP = """print the pose of a frame at given positions
 

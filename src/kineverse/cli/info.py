@@ -7,13 +7,15 @@ import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.arguments import add_model_options, load_model
-from kineverse.cli.output import format_table, truncate_lines
 from kineverse.expressions.printing import format_number
 
+from .arguments import add_model_options, load_model
+from .output import format_table, truncate_lines
+
 if TYPE_CHECKING:
-    from kineverse.cli.summary import ModelSummary
     from kineverse.geometry import DistanceResult
+
+    from .summary import ModelSummary
 
 HELP = """print the contents of a model: frames, degrees of freedom, constraints, size
 
@@ -42,8 +44,9 @@ def run(arguments: argparse.Namespace) -> int:
     if is_gallery_list(arguments.model):
         return print_articulations(arguments.json)
 
-    from kineverse.cli.summary import summarize_model
     from kineverse.formats.reader_warnings import collect_warnings
+
+    from .summary import summarize_model
 
     with collect_warnings() as remarks:
         model = load_model(arguments, arguments.model)
@@ -158,7 +161,7 @@ def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
 
 def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
     """Return the number of pairs in contact, and the deepest one."""
-    from kineverse.cli.summary import CONTACT_DEPTH
+    from .summary import CONTACT_DEPTH
 
     pair, depth = pairs[0], -pairs[0].distance
     deepest = f"{pair.a} and {pair.b}" + (

@@ -12,26 +12,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from kineverse.cli.arguments import add_model_options, add_set_option, print_notes
-from kineverse.cli.manipulate_output import PhaseLines, report_outcome
-from kineverse.cli.manipulate_setup import ManipulationScene, make_scene
-from kineverse.cli.manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
-from kineverse.cli.output import show_activity
-from kineverse.cli.requirements import needs_mujoco, require
-from kineverse.cli.view import (
+from kineverse.errors import InvalidValueError, MissingDependencyError
+from kineverse.expressions.printing import format_number
+
+from .arguments import add_model_options, add_set_option, needs_mujoco, print_notes, require
+from .manipulate_output import PhaseLines, report_outcome
+from .manipulate_setup import ManipulationScene, make_scene
+from .manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
+from .output import show_activity
+from .view import (
     add_page_options,
     handle_interrupts,
     page_options,
     print_address,
     print_mesh_problems,
 )
-from kineverse.errors import InvalidValueError, MissingDependencyError
-from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief
     from kineverse.manipulation.outcome import Outcome
-    from kineverse.manipulation.swept_motion import Obstacle
+    from kineverse.manipulation.swept_volume import Obstacle
     from kineverse.worlds import World
     from kineverse.worlds.recorder import RecordedStep
 
@@ -311,7 +311,7 @@ def _act(
 
 def _find_obstacle(scene: ManipulationScene) -> Obstacle | None:
     """Return what is in the way of the object at the start of a scene; None if nothing is."""
-    from kineverse.manipulation.swept_motion import find_obstacle
+    from kineverse.manipulation.swept_volume import find_obstacle
 
     return find_obstacle(scene.model, scene.coordinate, scene.start, scene.target, robot=scene.robot)
 
@@ -324,9 +324,8 @@ def _view(
     stack: ExitStack,
 ) -> Outcome | None:
     """Run the skill on a page, then play it there until Ctrl-C; return None if it was interrupted before."""
-    from kineverse.view.live_run import LiveRun
-    from kineverse.view.recording_playback import play_recording
-    from kineverse.view.title import read_title
+    from kineverse.view.page import read_title
+    from kineverse.view.run_overlay import LiveRun, play_recording
     from kineverse.view.viewer import Viewer
     from kineverse.worlds import read_run_recording
     from kineverse.worlds.recorder import import_mcap

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse.cli.manipulate_setup import ManipulationScene, is_shut
-from kineverse.cli.output import format_table, join_lines
-from kineverse.cli.view import list_mesh_problems, print_mesh_problems
 from kineverse.expressions.printing import format_number
+
+from .manipulate_setup import ManipulationScene, is_shut
+from .output import format_table, join_lines
+from .view import list_mesh_problems, print_mesh_problems
 
 if TYPE_CHECKING:
     from kineverse.manipulation.outcome import Outcome

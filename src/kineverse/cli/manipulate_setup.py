@@ -11,10 +11,11 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.arguments import load_model, parse_assignments, parse_value, print_notes
-from kineverse.cli.output import print_line
-from kineverse.cli.plan_arguments import find_base, parse_robot, place_robot
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+
+from .arguments import load_model, parse_assignments, parse_value, print_notes
+from .output import print_line
+from .plan_arguments import find_base, parse_robot, place_robot
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -210,7 +211,7 @@ def _add_base(model: kv.Model, robot: str) -> None:
 
 def _stand_free(model: kv.Model, robot: str, state: kv.State, base: Sequence[kv.Symbol]) -> kv.State:
     """Return the state with the base of a robot where it touches nothing, the nearest of some places."""
-    from kineverse.manipulation.start_state import find_free_state
+    from kineverse.manipulation.base_sampling import find_free_state
 
     found, problem = find_free_state(model, robot, _list_places(state, base), -_DEEPEST)
     if found is not None:

@@ -11,9 +11,10 @@ from time import perf_counter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.manipulate_setup import ManipulationScene
-from kineverse.cli.output import join_lines, print_line, show_activity
 from kineverse.errors import InvalidValueError, UnknownNameError
+
+from .manipulate_setup import ManipulationScene
+from .output import join_lines, print_line, show_activity
 
 if TYPE_CHECKING:
     from kineverse.grasping import Gripper, Handle
@@ -122,8 +123,8 @@ def push_object(
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Push the object, from where the robot stands or from a place that is searched."""
+    from kineverse.manipulation.pushing.base_placement import find_push_start, roll_out
     from kineverse.manipulation.pushing.push_controller import Pushing
-    from kineverse.manipulation.pushing.push_placement import find_push_start, roll_out
     from kineverse.manipulation.pushing.push_skill import push
     from kineverse.manipulation.session import Session
 

@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse.cli.arguments import add_model_options, load_model, parse_length
-from kineverse.cli.output import show_activity
-from kineverse.cli.plan_arguments import (
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.printing import format_number
+
+from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
+from .output import format_table, show_activity
+from .plan_arguments import (
     FrameTarget,
     Request,
     add_robot_option,
@@ -25,9 +28,7 @@ from kineverse.cli.plan_arguments import (
     parse_frame_target,
     parse_request,
 )
-from kineverse.cli.plan_output import path_to_json, print_path
-from kineverse.cli.requirements import needs_mujoco, require
-from kineverse.cli.view import (
+from .view import (
     add_page_options,
     handle_interrupts,
     list_mesh_problems,
@@ -35,12 +36,12 @@ from kineverse.cli.view import (
     print_address,
     print_mesh_problems,
 )
-from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.control import Hold
     from kineverse.planning import Path, Planner
+
 
 HELP = """find a path without collisions
 
@@ -322,7 +323,7 @@ def _moved_frame(problem: _Problem) -> str:
 
 def _trace(problem: _Problem, path: Path) -> Any:
     """Return the way of the moved frame as a drawable."""
-    from kineverse.view.motion_drawables import draw_frame_path
+    from kineverse.view.drawables import draw_frame_path
 
     states = [path.at(fraction) for fraction in np.linspace(0.0, 1.0, 60)]
     return draw_frame_path(problem.model, _moved_frame(problem), states)
@@ -331,7 +332,7 @@ def _trace(problem: _Problem, path: Path) -> Any:
 def _write_picture(file: str, problem: _Problem, path: Path) -> None:
     """Write a picture of some configurations on the way."""
     from kineverse.view import save_picture
-    from kineverse.view.motion_drawables import draw_ghosts
+    from kineverse.view.drawables import draw_ghosts
 
     model, planner = problem.model, problem.planner
     overlay = [_trace(problem, path)]
@@ -345,7 +346,7 @@ def _write_picture(file: str, problem: _Problem, path: Path) -> None:
 
 def _view(arguments: argparse.Namespace, problem: _Problem, path: Path) -> None:
     """Play the path in the browser; without one, show how far the search came."""
-    from kineverse.view.title import read_title
+    from kineverse.view.page import read_title
     from kineverse.view.viewer import Viewer
 
     label, model = read_title(arguments.model), problem.model
@@ -357,3 +358,72 @@ def _view(arguments: argparse.Namespace, problem: _Problem, path: Path) -> None:
         if path.found:
             page.play(path.trajectory(), loop=True)
         page.wait()
+
+
+_COLUMNS = 6
+"""Number of points of a path in a table."""
+
+
+def print_path(arguments: argparse.Namespace, path: Path, preparation: float) -> None:
+    """Print what was found."""
+    goal = " ".join(arguments.to)
+    if not path.found:
+        print(f"{goal}: not found. {path.why}")
+        if not arguments.move:
+            print(f"  moves      {_list_moving(path)}; --move names others")
+        return
+    clearance = path.clearance()
+    near = "nothing within 50 cm" if math.isinf(clearance) else f"{format_number(1e3 * clearance, 4)} mm"
+    print(f"{goal}: found")
+    for name, value in (
+        ("moves", _list_moving(path)),
+        ("points", str(len(path))),
+        ("length", f"{format_number(path.length, 4)} (rad, m)"),
+        ("duration", f"{format_number(float(path.times[-1]), 4)} s"),
+        ("clearance", near),
+        ("planned", _format_time(path.seconds)),
+        ("prepared", _format_time(preparation)),
+    ):
+        print(f"  {name:<9}  {value}")
+    if arguments.verbose:
+        print(_format_way(path))
+    if arguments.save is not None:
+        print(f"trajectory: {arguments.save}")
+
+
+def _list_moving(path: Path) -> str:
+    more = f" and {len(path.symbols) - 3} more" if len(path.symbols) > 3 else ""
+    return ", ".join(map(str, path.symbols[:3])) + more
+
+
+def _format_time(seconds: float) -> str:
+    return f"{format_number(1e3 * seconds, 3)} ms" if seconds < 1 else f"{format_number(seconds, 3)} s"
+
+
+def _format_way(path: Path) -> str:
+    """Return a table of the positions at some points of a path."""
+    chosen = np.unique(np.linspace(0, len(path) - 1, _COLUMNS).round().astype(int))
+    head = ["time [s]", *(format_number(float(t), 3) for t in path.times[chosen])]
+    rows = [
+        [str(symbol), *(format_number(float(v), 4) for v in column[chosen])]
+        for symbol, column in zip(path.symbols, path.points.T, strict=True)
+    ]
+    return format_table(head, rows, "<" + ">" * len(chosen))
+
+
+def path_to_json(path: Path, preparation: float) -> dict[str, Any]:
+    """Return a path as plain data."""
+    clearance = path.clearance() if path.found else math.inf
+    return {
+        "found": path.found,
+        "why": path.why,
+        "coordinates": [str(symbol) for symbol in path.symbols],
+        "points": path.points.tolist(),
+        "times": path.times.tolist() if path.found else None,
+        "length": path.length,
+        "clearance": clearance if math.isfinite(clearance) else None,
+        "seconds": path.seconds,
+        "preparation_seconds": preparation,
+        # The end, as 'kineverse reach' writes it: --from takes the file.
+        "positions": dict(zip(map(str, path.symbols), path.points[-1].tolist(), strict=True)),
+    }

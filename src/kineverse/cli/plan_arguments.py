@@ -10,8 +10,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from kineverse.cli.arguments import parse_assignments, parse_value
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
+
+from .arguments import parse_assignments, parse_value
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -101,7 +102,7 @@ def add_robot_option(parser: argparse.ArgumentParser) -> None:
 
 
 def include_robot(arguments: argparse.Namespace, model: kv.Model) -> tuple[str, dict[kv.Symbol, float]]:
-    """Put the robot of ``--robot`` into a model, and return its prefix and the place of its base by symbol."""
+    """Put the robot of ``--robot`` into a model; return its prefix and the place of its base by symbol."""
     source, place = parse_robot(arguments.robot)
     before, frames = {*model.articulations}, {*model.frames}
     names = model.include(source, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
@@ -241,7 +242,7 @@ def choose_coordinates(
 
     These are the named ones, and the free ones that frames depend on, but for some that stay still.
     """
-    from kineverse.planning.configuration import free_coordinates
+    from kineverse.planning.planning_space import free_coordinates
 
     frames = {t.frame for t in targets} | {frame for t in holds for frame in (t.frame, t.target)}
     needed = {s for frame in frames for s in model.symbols_of(frame)}

@@ -6,12 +6,12 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.arguments import add_model_options, load_model, parse_assignments, parse_value
-from kineverse.cli.plan_arguments import add_robot_option, include_robot
-from kineverse.cli.requirements import needs_mujoco, require
-from kineverse.cli.view import list_mesh_problems, print_mesh_problems
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
+
+from .arguments import add_model_options, load_model, needs_mujoco, parse_assignments, parse_value, require
+from .plan_arguments import add_robot_option, include_robot
+from .view import list_mesh_problems, print_mesh_problems
 
 if TYPE_CHECKING:
     import kineverse as kv

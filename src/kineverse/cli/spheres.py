@@ -10,20 +10,22 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.arguments import (
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse.expressions.printing import format_number
+
+from .arguments import (
     add_cache_options,
     add_model_options,
     add_set_option,
     load_model,
     manage_cache,
+    needs_mujoco,
     parse_assignments,
     parse_length,
+    require,
 )
-from kineverse.cli.output import colorize, format_cells, join_lines, show_activity, show_progress
-from kineverse.cli.requirements import needs_mujoco, require
-from kineverse.cli.view import add_page_options, handle_interrupts, page_options, print_address
-from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
-from kineverse.expressions.printing import format_number
+from .output import colorize, format_cells, join_lines, show_activity, show_progress
+from .view import add_page_options, handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -200,7 +202,7 @@ def _cover_to_json(cover: SphereCover) -> dict[str, Any]:
 
 
 def _drawables(links: Iterable[LinkCover]) -> Iterator[Any]:
-    from kineverse.view.sphere_drawables import draw_cover
+    from kineverse.view.drawables import draw_cover
 
     return (draw_cover(link.link, link.cover) for link in links if link.cover is not None)
 
@@ -215,7 +217,7 @@ def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: I
 def _view(
     arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], links: Iterable[LinkCover]
 ) -> None:
-    from kineverse.view.title import read_title
+    from kineverse.view.page import read_title
     from kineverse.view.viewer import Viewer
 
     label = read_title(arguments.model)
@@ -226,7 +228,7 @@ def _view(
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-    from kineverse.planning.spheres.sphere_cache import CachedCover, clear_covers, cover_folder, list_covers
+    from kineverse.planning.spheres.object_covers import CachedCover, clear_covers, cover_folder, list_covers
 
     def describe(one: CachedCover) -> tuple[dict[str, Any], tuple[str, ...]]:
         spheres, protrusion, excess = len(one.cover), one.cover.protrusion, one.cover.excess

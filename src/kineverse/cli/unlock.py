@@ -9,8 +9,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.arguments import add_model_options, load_model, parse_assignments
 from kineverse.errors import InvalidValueError, KineverseError
+
+from .arguments import add_model_options, load_model, parse_assignments
 
 if TYPE_CHECKING:
     from kineverse.manipulation import UnlockingExecution

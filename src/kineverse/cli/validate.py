@@ -6,12 +6,12 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.arguments import add_model_options
-from kineverse.cli.format_values import format_count
-from kineverse.cli.output import colorize, format_table, show_progress, truncate_lines
+from .arguments import add_model_options
+from .diff_report import format_count
+from .output import colorize, format_table, show_progress, truncate_lines
 
 if TYPE_CHECKING:
-    from kineverse.cli.file_validation import ValidationResult
+    from .file_validation import ValidationResult
 
 HELP = """read files strictly, and list their mistakes and problems
 
@@ -61,8 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Validate the files, print the results, and return the worst status."""
-    from kineverse.cli.file_validation import validate_file
     from kineverse.geometry.shapes import import_coal
+
+    from .file_validation import validate_file
 
     files = show_progress(arguments.files, "validating", "file")
     if arguments.contacts:

@@ -11,20 +11,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from kineverse.cli.arguments import (
+from kineverse.errors import InvalidValueError
+
+from .arguments import (
     add_model_options,
     add_set_option,
     find_limit_notes,
     load_model,
+    needs_mujoco,
     parse_assignments,
     parse_length,
     print_notes,
+    require,
 )
-from kineverse.cli.info import is_gallery_list, print_articulations, print_models
-from kineverse.cli.output import show_progress
-from kineverse.cli.plan_arguments import add_robot_option, include_robot
-from kineverse.cli.requirements import needs_mujoco, require
-from kineverse.errors import InvalidValueError
+from .info import is_gallery_list, print_articulations, print_models
+from .output import show_progress
+from .plan_arguments import add_robot_option, include_robot
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
@@ -124,8 +126,8 @@ def run(arguments: argparse.Namespace) -> int:
     }
     require("kineverse view", extras)
     from kineverse.view import meshes
+    from kineverse.view.page import read_title
     from kineverse.view.poses import complete
-    from kineverse.view.title import read_title
 
     label = read_title(arguments.model)
     recording = _read_recording(arguments)
@@ -169,7 +171,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"kineverse: note: not finite at this state, and hidden: {names}", file=sys.stderr)
         speed = {"speed": arguments.speed, "loop": arguments.loop}
         if recording is not None:
-            from kineverse.view.recording_playback import play_recording
+            from kineverse.view.run_overlay import play_recording
 
             play_recording(page, recording, time=arguments.time, **speed)
         elif trajectory is not None:
@@ -242,7 +244,7 @@ def _write_picture(
     """Write a picture of the state, and print what it cannot show."""
     from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
     from kineverse.view import save_picture
-    from kineverse.view.recorded_scene import RecordedScene
+    from kineverse.view.run_overlay import RecordedScene
     from kineverse.worlds import RunRecording
 
     options: dict[str, Any] = {"collisions": arguments.collisions, "near": near}
@@ -276,7 +278,7 @@ def print_address(page: _Page, browser: bool) -> None:
     """Print the address of a page, and open it if there is a display."""
     print(f"{page.address}   (Ctrl-C ends)", flush=True)
     if browser:
-        from kineverse.view.show import open_page
+        from kineverse.view.page import open_page
 
         open_page(page.address)
 

@@ -2,11 +2,8 @@
 
 from .command import Command
 from .controller import Controller
-from .ik_result import IkResult
-from .inverse_kinematics import InverseKinematics, inverse_kinematics
-from .targets import Target
-from .task_functions import look_at, same_orientation, same_pose, same_position
-from .tasks import Goal, Hold, Keep, Task
+from .ik_solver import IkResult, InverseKinematics, inverse_kinematics
+from .tasks import Goal, Hold, Keep, Target, Task, look_at, same_orientation, same_pose, same_position
 from .unlocking import unlock
 
 __all__ = [

@@ -15,7 +15,7 @@ from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .contact_slots import ContactSlots
+from .contact_constraints import ContactSlots
 from .position_program import PositionProgram
 from .quadratic_program import make_solver
 

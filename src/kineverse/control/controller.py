@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._gc import no_collection
-from kineverse._threads import CallLock, one_at_a_time
-from kineverse.compile import CompiledFunction
-from kineverse.compile.function import WantedTier
+from kineverse._runtime import CallLock, no_collection, one_at_a_time
+from kineverse.compilation import CompiledFunction
+from kineverse.compilation.function import WantedTier
 from kineverse.errors import (
     InvalidValueError,
     ShapeError,
@@ -29,14 +28,13 @@ from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol, parameter
 
 from .command import Command, StepTimes, TaskErrors
-from .contact_slots import ContactSlots, check_slots
+from .contact_constraints import ContactSlots, check_slots
 from .control_loop import LoopReport, run_control_loop
-from .diagnosis import Diagnosis
 from .formulation import Formulation
+from .infeasibility import Diagnosis
 from .quadratic_program import make_solver
 from .regularization import Costs, acceleration_limits, check_weight, find_posture, joint_weights
-from .targets import Target
-from .tasks import Task
+from .tasks import Target, Task
 from .velocity_program import RECOVERY_WEIGHT, VelocityProgram, arrange_inputs
 
 _DT = "control/dt"

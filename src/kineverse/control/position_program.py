@@ -21,7 +21,7 @@ from functools import reduce
 import casadi as ca
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.errors import (
     DuplicateNameError,
     InvalidValueError,
@@ -33,8 +33,7 @@ from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import TOLERANCE, is_equality
-from kineverse.model.rate_nodes import to_plain
-from kineverse.model.rates import Rates
+from kineverse.model.rates import Rates, to_plain
 from kineverse.model.speed_limits import INFINITE, ZERO, raw_max, raw_min
 from kineverse.model.velocity_rows import velocity_rows
 from kineverse.symbols import Symbol, parameter

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from kineverse.errors import UnknownNameError, suggest
 
-from .daqp_solver import DaqpSolver
-from .qp_solver import SOFT_WEIGHT, QpSolution, QpSolver
+from .qp import SOFT_WEIGHT, DaqpSolver, QpSolution, QpSolver
 from .slack_solvers import OsqpSolver, ProxqpSolver
 
 __all__ = ["SOFT_WEIGHT", "SOLVERS", "QpSolution", "QpSolver", "make_solver"]

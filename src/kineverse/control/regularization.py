@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from kineverse.compile.evaluator import bind
+from kineverse.compilation.evaluator import bind
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.expressions.graph import dense_column

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .qp_solver import QpSolution, QpSolver, Status, Vector, import_solver
+from .qp import QpSolution, QpSolver, Status, Vector, import_solver
 
 
 class _SlackSolver(QpSolver):

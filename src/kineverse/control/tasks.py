@@ -1,8 +1,4 @@
-"""Tasks of a controller: goals, holds and keeps on any expression.
-
-A task says what is wanted of an expression e of a model's symbols. It knows nothing of joints: the speeds
-that serve it are the keys of its gradient (task function approach: Samson, Le Borgne, Espiau 1991).
-"""
+"""Tasks of controllers and inverse kinematics: goals, holds, keeps, their targets and task functions."""
 
 from __future__ import annotations
 
@@ -10,9 +6,16 @@ import math
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
 from kineverse.errors import ExpressionError, InvalidValueError, ShapeError
-from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
+from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
+from kineverse.expressions.functions import arctan2, sqrt, where
 from kineverse.model.constraint import Constraint
+from kineverse.spatial import as_transform, inverse, log_so3, unit_vector
+from kineverse.symbols import Symbol, parameter
 
 _LONGEST = 100
 """Largest number of characters of an expression in a message."""
@@ -238,3 +241,153 @@ def _check_number(task: object, name: str, value: ExpressionLike, least: float) 
         raise InvalidValueError(
             f"{task!r}: the {name} is a finite number of at least {least:g}, not {value!r}."
         )
+
+
+_LAST_ROW = [0.0, 0.0, 0.0, 1.0]
+_LENGTH_TOLERANCE, _ANGLE_TOLERANCE = 1.1e-5, 1e-6
+"""Tolerances of the squared lengths and of the scalar products of a rotation's rows."""
+
+
+class Target:
+    """Array of parameters: a pose, a point or other numbers that change without another compilation.
+
+    Use :attr:`expression` in tasks, and :meth:`.Controller.set` while the controller runs. Elsewhere
+    :meth:`values` gives the entries of a state.
+
+    Parameters
+    ----------
+    name
+        Path of the parameters.
+    value
+        Initial value: a number, a vector, or a 4×4 transform, whose last row stays (0, 0, 0, 1). Constant
+        expressions are values, too.
+
+    Attributes
+    ----------
+    expression
+        The parameters in the shape of the value.
+    parameters
+        The parameters, row by row.
+    """
+
+    expression: Expression
+    parameters: tuple[Symbol, ...]
+
+    def __init__(self, name: str, value: npt.ArrayLike | Expression) -> None:
+        self.name = name
+        initial = self._as_array(value)
+        self._shape, self._transform = initial.shape, initial.shape == (4, 4)
+        numbers = self._check(initial, initial.shape)
+        self.parameters = tuple(parameter(f"{name}/{k}", v) for k, v in enumerate(numbers.tolist()))
+        entries: list[Expression | float] = [*self.parameters, *(_LAST_ROW if self._transform else ())]
+        self.expression = array(entries).reshape(*initial.shape) if initial.shape else array(entries)[0]
+
+    def values(self, value: npt.ArrayLike | Expression) -> dict[Symbol, float]:
+        """Return the values of the parameters for a value of the target.
+
+        Raises
+        ------
+        ShapeError, InvalidValueError
+            For a value of another shape, a NaN, or a 4×4 matrix that is no transform.
+        """
+        return dict(zip(self.parameters, self.numbers(value).tolist(), strict=True))
+
+    def numbers(self, value: npt.ArrayLike | Expression) -> npt.NDArray[np.float64]:
+        """Return the values of the parameters in their order; for errors see :meth:`values`."""
+        return self._check(self._as_array(value), self._shape)
+
+    def _as_array(self, value: npt.ArrayLike | Expression) -> npt.NDArray[np.float64]:
+        if isinstance(value, Expression) and not value.symbols:
+            value = value()
+        try:
+            return np.asarray(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InvalidValueError(
+                f"The target '{self.name}' is a number or an array of numbers, not {value!r}."
+            ) from error
+
+    def _check(self, value: npt.NDArray[np.float64], shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
+        if value.shape != shape:
+            raise ShapeError(f"The target '{self.name}' has shape {shape}, not {value.shape}.")
+        flat = value.ravel()
+        if not math.isfinite(flat.dot(flat)) and not np.isfinite(flat).all():
+            raise InvalidValueError(f"The target '{self.name}' has to be finite.")
+        if self._transform:
+            if not _is_transform(value):
+                raise InvalidValueError(f"The target '{self.name}' is a transform, and this matrix is none.")
+            return flat[:12]
+        return flat
+
+    def __repr__(self) -> str:
+        return f"Target({self.name!r}, {self.expression.shape})"
+
+
+def _is_transform(matrix: npt.NDArray[np.float64]) -> bool:
+    """Return whether a finite (4, 4) matrix is a transform, ten times as fast as by numpy's functions."""
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), last = matrix.tolist()
+    lengths = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
+    products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
+    return bool(
+        last == _LAST_ROW
+        and max(abs(length - 1.0) for length in lengths) <= _LENGTH_TOLERANCE
+        and max(map(abs, products)) <= _ANGLE_TOLERANCE
+        and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0.0
+    )
+
+
+def same_position(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
+    """Return the position of b minus that of a in the common frame, shape (3,) [m]."""
+    return as_transform(b_T)[:3, 3] - as_transform(a_T)[:3, 3]
+
+
+def same_orientation(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
+    """Return the rotation vector of b in a, shape (3,) [rad]; see :func:`.log_so3`."""
+    return log_so3(as_transform(a_T)[:3, :3].T @ as_transform(b_T)[:3, :3])
+
+
+def same_pose(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
+    """Return the pose of b in a as 6 numbers: position [m], then rotation vector [rad].
+
+    All are zero where both poses are equal.
+
+    Parameters
+    ----------
+    a_T, b_T
+        Poses in a common frame, 4×4 expressions or arrays.
+    """
+    a_T_b = inverse(a_T) @ as_transform(b_T)
+    return as_expression(np.concatenate([a_T_b[:3, 3], log_so3(a_T_b[:3, :3])]))
+
+
+def look_at(
+    camera_T: ExpressionLike, point: ExpressionLike, axis: ExpressionLike = (1.0, 0.0, 0.0)
+) -> Expression:
+    """Return the rotation vector that turns the viewing axis of a camera towards a point.
+
+    It is in the camera's frame, shape (3,); its length is the angle between axis and ray [rad]. The rotation
+    about the ray stays free. Straight behind the camera the direction of the turn is undefined.
+
+    Parameters
+    ----------
+    camera_T
+        Pose of the camera, 4×4.
+    point
+        Point in the frame of the pose, shape (3,) [m], away from the camera.
+    axis
+        Viewing axis in the camera's frame, shape (3,).
+    """
+    pose = as_transform(camera_T)
+    forward = unit_vector(axis, "The viewing axis")
+    ray = pose[:3, :3].T @ (as_expression(point) - pose[:3, 3])
+    turn = as_expression(np.cross(forward, ray))
+    cosine = forward @ ray
+    sine2 = turn @ turn
+    # atan(t)/t is 1 at t = 0; the branch avoids 0/0 and keeps the derivative there.
+    aligned = _is_greater(cosine, 0.0) * _is_greater(1e-12 * cosine * cosine, sine2)
+    sine = sqrt(where(aligned, 1.0, sine2))
+    return turn * where(aligned, 1 / where(aligned, cosine, 1.0), arctan2(sine, cosine) / sine)
+
+
+def _is_greater(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return 1 where a > b, else 0; for selections, without gradient and trend."""
+    return binary(ca.OP_LT, b, a)

@@ -46,7 +46,7 @@ _SWEEPS = 3
 
 @dataclass(frozen=True)
 class LockSide:
-    """One direction in which a constraint holds a coordinate, and the trend of the condition that frees it."""
+    """Direction in which a constraint holds a coordinate, and the trend of the condition that frees it."""
 
     name: str  # name of the constraint, with the side
     coordinate: Symbol

@@ -26,8 +26,8 @@ from functools import reduce
 import casadi as ca
 import numpy as np
 
-from kineverse.compile import CompiledFunction, compile  # noqa: A004
-from kineverse.compile.function import WantedTier
+from kineverse.compilation import CompiledFunction, compile
+from kineverse.compilation.function import WantedTier
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
 from kineverse.expressions.functions import norm
 from kineverse.lie import Array

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 from kineverse._synonyms import MODULE_SYNONYMS
 from kineverse.errors import unknown_attribute_error
+from kineverse.formats import urdf
 
-from . import urdf
 from .file_formats import register_file_formats
 from .loader import load
 from .locate import locate_model, shipped_models

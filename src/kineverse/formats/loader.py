@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.errors import FormatError, InvalidValueError, KineverseError, MissingDependencyError
 from kineverse.model import registry
 from kineverse.model.edit import Edit

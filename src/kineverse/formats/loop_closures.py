@@ -12,11 +12,11 @@ from kineverse.errors import FormatError, KineverseError, NoSolutionError
 from kineverse.expressions.expression import Expression, array
 from kineverse.loops.close_loop import APART, CloseLoop, LoopConstraint
 from kineverse.loops.equations import residual_rows
-from kineverse.loops.record import find_loops
+from kineverse.loops.loop_records import find_loops
+from kineverse.model.basic_operations import SetHome
 from kineverse.model.edit import Edit
 from kineverse.model.model_view import ModelView
 from kineverse.model.operation import Operation
-from kineverse.model.operations import SetHome
 from kineverse.model.projection import project
 from kineverse.model.registry import LoopTreatment
 from kineverse.model.sampling import StateSamples

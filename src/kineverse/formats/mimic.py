@@ -10,8 +10,8 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from kineverse.formats.xml_reader import quote
-from kineverse.formats.xml_values import LARGEST, SMALLEST
+from .xml_reader import quote
+from .xml_values import LARGEST, SMALLEST
 
 K = TypeVar("K", bound=Hashable)
 

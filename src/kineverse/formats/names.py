@@ -6,8 +6,9 @@ from collections.abc import Callable, Container, Iterable
 from typing import TypeAlias
 
 from kineverse.errors import ExpressionError, FormatError
-from kineverse.formats.xml_reader import quote
 from kineverse.symbols import position
+
+from .xml_reader import quote
 
 
 def check_prefix(prefix: object) -> None:

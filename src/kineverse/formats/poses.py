@@ -10,8 +10,12 @@ import math
 from functools import lru_cache
 from struct import Struct
 
-from kineverse.lie import snap
+import numpy as np
+
+from kineverse.lie import snap, to_quaternion, to_rpy
 from kineverse.model.body import Pose, Vector3
+
+from .description import Matrix
 
 _KEY = Struct("6d")
 
@@ -129,3 +133,25 @@ def rotate_direction(a_T_b: Pose, b_v: Vector3) -> Vector3:
 def is_identity(pose: Pose) -> bool:
     """Return True if a pose is the identity up to rounding."""
     return all(abs(a - b) <= _SAME for a, b in zip(pose.rows, IDENTITY.rows, strict=True))
+
+
+ROTATION_TOLERANCE = 1e-13
+"""Largest deviation of an entry of a written rotation matrix."""
+
+
+def rpy_angles(pose: Matrix) -> Vector3:
+    """Return roll, pitch and yaw about the fixed axes [rad], also at a pitch of π/2."""
+    roll, pitch, yaw = map(snap, to_rpy(pose[:3, :3]).tolist())
+    return roll, pitch, yaw
+
+
+def unit_quaternion(pose: Matrix) -> tuple[float, float, float, float]:
+    """Return the unit quaternion (x, y, z, w) of a rotation, with w >= 0."""
+    x, y, z, w = map(snap, to_quaternion(pose[:3, :3]).tolist())
+    return x, y, z, w
+
+
+def rotation_deviation(pose: Matrix) -> float:
+    """Return the largest deviation of an entry from the written rotation; the given matrix may be none."""
+    written = pose_from_rpy((0.0, 0.0, 0.0), rpy_angles(pose)).matrix
+    return float(np.abs(written[:3, :3] - pose[:3, :3]).max())

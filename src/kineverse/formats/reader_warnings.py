@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
-from kineverse.formats.xml_reader import Element, ElementError, label
+from .xml_reader import Element, ElementError, label
 
 _log = logging.getLogger("kineverse.formats")
 

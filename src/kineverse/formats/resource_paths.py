@@ -18,7 +18,10 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from kineverse.errors import FormatError
-from kineverse.formats.root_folder import (
+from kineverse.model.body import Body, Mesh, Shape
+
+from .reader_warnings import warn
+from .root_folder import (
     NOWHERE,
     Folder,
     declared_roots,
@@ -28,10 +31,7 @@ from kineverse.formats.root_folder import (
     outside_root_error,
     split_path_variable,
 )
-from kineverse.formats.xml_reader import quote
-from kineverse.model.body import Body, Mesh, Shape
-
-from .reader_warnings import warn
+from .xml_reader import quote
 
 MAX_DEPTH = 4
 """Depth of the search for packages below a folder of a workspace variable."""

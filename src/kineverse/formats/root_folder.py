@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 from kineverse.errors import FormatError
-from kineverse.formats.xml_reader import quote
+
+from .xml_reader import quote
 
 Folder: TypeAlias = "str | os.PathLike[str]"
 

@@ -11,12 +11,13 @@ from typing import Any
 
 from kineverse._checks import real_number
 from kineverse.errors import FormatError, InvalidValueError
-from kineverse.formats.description import WrittenFile
-from kineverse.formats.files import replace_file
-from kineverse.formats.reader_warnings import warn
 from kineverse.model import registry
 from kineverse.model.model_view import ModelView
 from kineverse.model.registry import FileFormat, SaveResult
+
+from .description import WrittenFile
+from .files import replace_file
+from .reader_warnings import warn
 
 
 def save(

@@ -10,12 +10,13 @@ import numpy as np
 
 from kineverse.errors import KineverseError, summarize_error
 from kineverse.expressions.printing import format_number
-from kineverse.formats.resource_paths import locate_mesh
-from kineverse.loops.record import find_loops
+from kineverse.loops.loop_records import find_loops
 from kineverse.model.body import Inertia, Mesh
 from kineverse.model.model_view import ModelView
 from kineverse.model.sampling import StateSamples
 from kineverse.state import State
+
+from .resource_paths import locate_mesh
 
 SAMPLED_STATES = 32
 """Number of random states within the limits in which poses and loops are checked."""

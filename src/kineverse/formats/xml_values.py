@@ -16,13 +16,12 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import TypeVar
 
-from kineverse.formats import poses
-from kineverse.formats.reader_warnings import ReaderWarnings
-from kineverse.formats.xml_reader import TEXT, Element, ElementError, find_child, quote
 from kineverse.lie import snap
 from kineverse.model.body import Pose, Vector3
 
-from .xml_reader import abbreviate
+from . import poses
+from .reader_warnings import ReaderWarnings
+from .xml_reader import TEXT, Element, ElementError, abbreviate, find_child, quote
 
 LARGEST = 1e50
 """Largest magnitude of coordinates, positions, and factors between positions."""

@@ -16,9 +16,9 @@ from collections.abc import Iterator
 from functools import cache
 
 from kineverse.errors import UnknownNameError, suggest
+from kineverse.gallery import bases, linkages, mechanisms, multi_axis, single_axis, transmissions
 from kineverse.model.operation import Operation
 
-from . import bases, linkages, mechanisms, multi_axis, single_axis, transmissions
 from .scene import Build, SceneBuilder
 
 __all__ = ["names", "operations", "summary"]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from kineverse.articulations import Ackermann, Continuous, DifferentialDrive, Mecanum, OmniBase, Revolute
-from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL
+from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL
 
 from .scene import SceneBuilder
 from .shapes import GREEN, ORANGE, RED, WHITE, Shapes, Y, Z, arrow, bone, box, disc, rod, sphere, wheel

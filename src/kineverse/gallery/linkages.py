@@ -9,7 +9,7 @@ import math
 from typing import Any
 
 from kineverse.articulations import Prismatic, Revolute
-from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL, WOOD
+from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL, WOOD
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Rgba
 from kineverse.spatial import rotation_x, rotation_z, translation

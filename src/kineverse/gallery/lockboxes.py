@@ -23,12 +23,12 @@ import numpy as np
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.expressions.expression import Expression
 from kineverse.logic import less
+from kineverse.model.basic_operations import AddFrame, Constrain
 from kineverse.model.body import Body
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
-from kineverse.model.operations import AddFrame, Constrain
 from kineverse.spatial import translation
 from kineverse.symbols import position
 

@@ -16,7 +16,7 @@ from kineverse.articulations.mechanisms import (
     ScissorLift,
     ScrewAndNut,
 )
-from kineverse.articulations.mechanisms.simple_bodies import STEEL
+from kineverse.articulations.mechanisms.mechanism import STEEL
 
 from .scene import SceneBuilder
 from .shapes import RED, box, rod, sphere

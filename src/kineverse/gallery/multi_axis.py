@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kineverse.articulations import Ball, Floating, Limits, Planar, Universal
-from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL, WOOD
+from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL, WOOD
 
 from .scene import SceneBuilder
 from .shapes import GREEN, ORANGE, RED, WHITE, X, Y, arrow, bone, box, disc, rod, sphere

@@ -9,10 +9,10 @@ from kineverse.articulations import Joint
 from kineverse.articulations.mechanisms import Mechanism
 from kineverse.expressions.expression import Expression
 from kineverse.loops import CloseLoop
+from kineverse.model.basic_operations import AddFrame, SetBody
 from kineverse.model.body import Body, Pose
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import Operation
-from kineverse.model.operations import AddFrame, SetBody
 from kineverse.spatial import translation
 from kineverse.symbols import Symbol, position
 

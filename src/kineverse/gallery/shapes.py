@@ -12,8 +12,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.articulations.mechanisms import simple_bodies
-from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL, WOOD
+from kineverse.articulations.mechanisms import mechanism
+from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL, WOOD
 from kineverse.lie import rotation_z, transform
 from kineverse.model.body import Box, Capsule, Cylinder, Geometry, Pose, Rgba, Shape, Sphere, Vector3
 
@@ -48,8 +48,8 @@ Point: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
 ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
 GREEN: Rgba = (0.35, 0.62, 0.38, 1.0)
-WHITE = simple_bodies.PALE
-RED = simple_bodies.RED
+WHITE = mechanism.PALE
+RED = mechanism.RED
 """Colour of marks that make a rotation visible."""
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -75,7 +75,7 @@ def sphere(radius: float, at: Point = ORIGIN, color: Rgba = STEEL) -> Shapes:
 
 def rod(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
     """Return a cylinder from one point to another."""
-    return (simple_bodies.rod_shape(_triple(start), _triple(end), radius, color),)
+    return (mechanism.rod_shape(_triple(start), _triple(end), radius, color),)
 
 
 def bone(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:

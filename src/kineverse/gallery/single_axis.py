@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from kineverse.articulations import Continuous, Cylindrical, Fixed, Limits, Prismatic, Revolute, Screw
-from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL, WOOD
+from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL, WOOD
 
 from .scene import SceneBuilder
 from .shapes import GREEN, ORANGE, RED, WHITE, X, Y, Z, box, disc, rod, sphere, wheel

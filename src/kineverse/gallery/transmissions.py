@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.articulations import Cam, Continuous, Gearbox, RackAndPinion, Revolute
-from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL
+from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL
 from kineverse.spatial import rotation_y, translation
 
 from .scene import SceneBuilder

@@ -5,7 +5,7 @@ from kineverse.errors import unknown_attribute_error
 
 from .collision_filter import RULES, Rule, rules_as_data
 from .distance_expressions import PairDistance
-from .prepared_query import PreparedQuery
+from .distance_queries import PreparedQuery
 from .results import DistanceResult, DistanceResults, NearestPoint, RayHit
 from .scene import Scene
 

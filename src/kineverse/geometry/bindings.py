@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile.c_library import SourceLibrary
-from kineverse.compile.toolchain import NO_COMPILER
+from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.toolchain import NO_COMPILER
 from kineverse.errors import CompileError
 
 from . import broadphase

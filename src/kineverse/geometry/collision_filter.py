@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
-from kineverse.loops.record import find_loops
+from kineverse.loops.loop_records import find_loops
 from kineverse.model.body import Pose
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.model_view import ModelView
@@ -73,7 +73,7 @@ def parse_known_rules(entries: Any, model: ModelView) -> tuple[Rule, ...]:
 
 
 def read_rules(model: ModelView) -> tuple[Rule, ...]:
-    """Return the rules that a model keeps: first those of included models, below their prefix, then its own."""
+    """Return rules that a model keeps: first those of included models, below their prefix, then its own."""
     found: list[Rule] = []
     for name, entries in model.data.items():
         if name.endswith(f"/{RULES}"):

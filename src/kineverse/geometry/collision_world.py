@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_entries
-from kineverse._threads import CallLock
-from kineverse.compile.function import CompiledFunction
-from kineverse.compile.function import compile as compile_expressions
+from kineverse._runtime import CallLock
+from kineverse.compilation.function import CompiledFunction
+from kineverse.compilation.function import compile as compile_expressions
 from kineverse.errors import (
     InvalidValueError,
     KineverseError,
@@ -23,7 +23,7 @@ from kineverse.errors import (
 )
 from kineverse.lie import inverse
 from kineverse.model.model_view import ModelView
-from kineverse.model.version_cache import cached_for_version
+from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 

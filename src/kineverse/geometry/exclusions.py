@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 
 from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError, summarize_error
+from kineverse.model.basic_operations import Override, SetBody
 from kineverse.model.body import Body, Geometry, Mesh
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
-from kineverse.model.operations import Override, SetBody
 
 from .broadphase import Flags
 from .collision_filter import Rule, adjacent_pairs, allowed_pairs, read_rules

@@ -18,10 +18,16 @@ import numpy as np
 
 from kineverse.model.body import Sphere
 
-from .gjk import gjk_distance, gjk_distance_to_faces
+from .gjk import (
+    PlacedSolid,
+    directional_gaps,
+    find_widest_gap,
+    gjk_distance,
+    gjk_distance_to_faces,
+    smoothed_support,
+)
 from .mesh_files import Faces, Floats
 from .shapes import Solid, import_coal, scale_solid, solid_from_geometry
-from .support import PlacedSolid, directional_gaps, find_widest_gap, smoothed_support
 
 APART_TOLERANCE, DEPTH_TOLERANCE = 1e-12, 1e-6
 """Tolerances of coal's iterations, for separated solids and for penetration [m].
@@ -317,7 +323,7 @@ class Narrowphase:
 
 
 def distance_to_point(solid: Solid, pose: Floats, point: Floats) -> tuple[float, Floats, Floats]:
-    """Return the signed distance of a point from a placed solid [m], its nearest point, and the normal there."""
+    """Return signed distance of a point from a placed solid [m], its nearest point, and the normal there."""
     ball = solid_from_geometry(Sphere(_POINT_RADIUS))
     # The radius of the solid bounds the translations of _measure_shifted, not that of the ball.
     point_ball = replace(ball, radius=solid.radius)

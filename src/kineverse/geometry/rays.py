@@ -29,7 +29,7 @@ _PARALLEL = 1e-14
 
 
 def intersect_ray(solid: Solid, origin: Floats, direction: Floats) -> RayEntry | None:
-    """Return the first point of a ray in a solid: distance [m], 0 from inside, and normal; None if it misses."""
+    """Return first point of a ray in a solid: distance [m], 0 from inside, and normal; None if it misses."""
     surface = solid.surface
     if isinstance(surface, Faces):
         return _intersect_triangles(surface, origin, direction)

@@ -14,8 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from kineverse._extras import install_command
-from kineverse.compile.cache import private_subfolder
-from kineverse.compile.content_cache import ContentCache
+from kineverse.compilation.cache import ContentCache, private_subfolder
 from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Geometry, Mesh, Sphere
 

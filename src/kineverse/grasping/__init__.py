@@ -1,7 +1,7 @@
 """Grasping: grippers, handles, and grasps of handles (layer 5)."""
 
-from .grasps import Grasp, sample_grasps
-from .gripper import Gripper, find_gripper, find_grippers
+from .grasp_sampling import Grasp, sample_grasps
+from .gripper_detection import Gripper, find_gripper, find_grippers
 from .handles import Handle, find_handle, find_handles
 
 __all__ = [

@@ -14,12 +14,12 @@ from kineverse.geometry import Scene
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
-from kineverse.model.version_cache import cached_for_version
+from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .bars import Part, ProtrudingBar, find_bars, find_parts, free_length
-from .finger_pairs import path_to_root
+from .finger_branches import path_to_root
+from .graspable_features import Part, ProtrudingBar, find_bars, find_parts, free_length
 
 _FREE = 0.15
 """Free space in front of a bar that a hand needs [m]."""

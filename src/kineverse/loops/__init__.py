@@ -3,7 +3,7 @@
 from kineverse.model import registry
 
 from .close_loop import CloseLoop, LoopConstraint
-from .solve_branch import SolvedLoop, solve_loop
+from .loop_solution import SolvedLoop, solve_loop
 
 __all__ = ["CloseLoop", "LoopConstraint", "SolvedLoop", "solve_loop"]
 

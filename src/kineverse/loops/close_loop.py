@@ -18,8 +18,8 @@ from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol
 
 from .equations import AXES, as_ends, as_mask, residual_rows, upright_signs
-from .record import make_constrained_record, make_loop_record
-from .solve_branch import SolvedLoop, solve_loop
+from .loop_records import make_constrained_record, make_loop_record
+from .loop_solution import SolvedLoop, solve_loop
 
 __all__ = ["AXES", "CloseLoop"]
 

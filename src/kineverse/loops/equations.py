@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, NoSolutionError
 from kineverse.expressions.expression import Expression, array
 from kineverse.lie import Array

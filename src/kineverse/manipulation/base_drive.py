@@ -19,10 +19,11 @@ import numpy as np
 
 from kineverse.geometry import Scene
 from kineverse.lie import Array
-from kineverse.manipulation.session import Session, Speeds
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
+
+from .session import Session, Speeds
 
 _SPEED, _TURN = 0.3, 0.8
 """Largest speeds of a drive [m/s], [rad/s]."""

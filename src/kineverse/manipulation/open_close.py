@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from kineverse.errors import KineverseError
-from kineverse.manipulation.opening.grasped_opening import open_object
 from kineverse.state import State
 from kineverse.worlds import World
 
 from .articulated_objects import ArticulatedObject
 from .belief import Belief
+from .opening.grasped_opening import open_object
 from .outcome import Outcome
 from .session import Session
 

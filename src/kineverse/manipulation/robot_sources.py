@@ -10,7 +10,7 @@ from kineverse.articulations import DifferentialDrive, OmniBase
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.formats import load
 from kineverse.geometry.exclusions import remove_unusable_shapes
-from kineverse.grasping.gripper import Gripper, find_gripper
+from kineverse.grasping.gripper_detection import Gripper, find_gripper
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.spatial import translation

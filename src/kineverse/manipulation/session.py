@@ -6,9 +6,12 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from threading import Thread
 from time import perf_counter, thread_time
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from kineverse._checks import finite_number
 from kineverse.control import Command
@@ -21,11 +24,40 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, World
 
 from .belief import Belief, TrueBelief
-from .hand_reference import HandReference
 from .outcome import SkillError
 
 if TYPE_CHECKING:
     from .opening.base_placement import BasePlacement
+
+
+@dataclass(slots=True, eq=False)
+class HandReference:
+    """Way of a hand that a controller follows."""
+
+    poses: Array  # world poses (K, 4, 4) along the way [m]
+    share: float = 0.0  # share of the way that lies behind, in [0, 1]
+
+    @property
+    def pose(self) -> Array:
+        """Pose (4, 4) of the way that is wanted now."""
+        pose: Array = self.poses[round(self._place)].copy()
+        pose[:3, 3] = self.ahead[0]
+        return pose
+
+    @property
+    def ahead(self) -> Array:
+        """Points (k, 3) of the rest of the way [m], the present one first."""
+        points, place = self.poses[:, :3, 3], self._place
+        before = int(place)
+        after = min(before + 1, len(points) - 1)
+        here = points[before] + (place - before) * (points[after] - points[before])
+        rest: Array = np.concatenate([here[None], points[after:]])
+        return rest
+
+    @property
+    def _place(self) -> float:
+        return float(np.clip(self.share, 0.0, 1.0)) * (len(self.poses) - 1)
+
 
 Speeds = Mapping[Symbol, float]
 

@@ -6,17 +6,17 @@ from kineverse._synonyms import MODULE_SYNONYMS
 from kineverse.errors import unknown_attribute_error
 
 from .articulation import Articulation
+from .basic_operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, Pose, Shape, Sphere
-from .compare import compare_models
+from .comparison import compare_models
 from .constraint import Constraint
 from .diff import Change, Diff
 from .edit import Edit
 from .frame import WORLD, Frame
 from .frame_dependence import count_moved_bodies, moved_frames
-from .integrator import Integrator
+from .integration import Integrator
 from .model import Model, Snapshot
 from .operation import Operation, Writes
-from .operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .rates import Rates
 from .read_recorder import ReadRecorder
 from .violations import ConstraintChecker, Violation, Violations

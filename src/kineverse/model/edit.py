@@ -6,20 +6,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kineverse._checks import check_flag
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse._synonyms import EDIT_SYNONYMS
 from kineverse.errors import DuplicateNameError, EditError, unknown_attribute_error
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
 
 from . import registry
+from .basic_operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .body import Body, Pose
 from .constraint import Constraint
 from .diff import Change, Diff, find_moved_tags
 from .frame import WORLD, Frame, TransformLike
 from .history import History, HistoryEntry
 from .operation import Operation
-from .operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .rates import as_row
 from .registry import LoopTreatment
 

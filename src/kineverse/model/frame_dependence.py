@@ -12,7 +12,7 @@ from kineverse.symbols import Symbol
 from .body import is_empty_body
 from .frame import WORLD, Frame
 from .model_view import ModelView
-from .rate_nodes import collect_symbols
+from .rates import collect_symbols
 
 
 class FrameDependence:

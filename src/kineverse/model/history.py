@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.errors import (
     DuplicateNameError,
     EditError,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.errors import EditError, ExpressionError, UnknownAttributeError
 from kineverse.symbols import Symbol
 

@@ -18,20 +18,18 @@ from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameE
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.intervals.arithmetic import RealInterval
+from kineverse.intervals.enclosure import enclose_bound
 from kineverse.state import State, StateLike, as_state, check_meant
 from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
 from . import registry
-from .bound_ranges import enclose_bound
 from .constraint import Constraint, ConstraintLike, as_constraint
-from .integration import StateIntegrator
-from .integrator import Integrator
+from .integration import Integrator, StateIntegrator
 from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, EqualityConstraints, project
 from .registry import SaveResult
-from .symbolic_view import SymbolicView
+from .symbolic_view import SymbolicView, cached_for_version
 from .velocity_rows import Recovery, VelocityRows, velocity_rows
-from .version_cache import cached_for_version
 from .violations import ConstraintChecker, Violations, find_violations
 
 
@@ -316,7 +314,7 @@ class ModelView(SymbolicView):
         }
 
     def integrate(self, state: StateLike, speeds: StateLike, dt: float, *, clip: bool = False) -> State:
-        """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integrator`.
+        """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integration`.
 
         **Limits and other constraints are ignored.** At 100 rad/s, a door with a limit of 1.57 rad is at 100
         rad after one second, and :meth:`violations` reports it.

@@ -19,18 +19,13 @@ from kineverse.errors import (
     suggest,
 )
 from kineverse.expressions.expression import Expression, ExpressionLike
-from kineverse.model.articulation import Articulation
-from kineverse.model.body import Body
-from kineverse.model.constraint import Constraint
-from kineverse.model.frame import Frame
-from kineverse.model.rate_nodes import to_plain
 from kineverse.symbols import Symbol
 
-from .articulation import check_home
-from .body import Pose
-from .constraint import ConstraintLike, as_constraint
-from .frame import TransformLike
-from .rates import as_entry
+from .articulation import Articulation, check_home
+from .body import Body, Pose
+from .constraint import Constraint, ConstraintLike, as_constraint
+from .frame import Frame, TransformLike
+from .rates import as_entry, to_plain
 
 if TYPE_CHECKING:
     from .history import HistoryEntry

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from kineverse._checks import as_tolerance
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.errors import NoSolutionError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, array
 from kineverse.lie import Array
@@ -44,7 +44,7 @@ class ResidualRow:
 
 
 class EqualityConstraints:
-    """Equality constraints of a model, and the other constraints on their coordinates, as numeric functions."""
+    """Equality constraints of a model and others on their coordinates, as numeric functions."""
 
     def __init__(
         self,

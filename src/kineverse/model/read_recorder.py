@@ -16,8 +16,7 @@ from .constraint import Constraint
 from .frame import WORLD, Frame
 from .kinematics import branches, relative_pose
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, KINDS, RATES
-from .rate_nodes import collect_symbols, to_plain
-from .rates import RateEntry, Rates
+from .rates import RateEntry, Rates, collect_symbols, to_plain
 
 if TYPE_CHECKING:
     from .operation import Cell

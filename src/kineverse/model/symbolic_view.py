@@ -6,8 +6,8 @@ Numeric queries are in :mod:`kineverse.model.model_view`.
 from __future__ import annotations
 
 import threading
-from collections.abc import Hashable, ItemsView, Iterator, Mapping, Sequence, ValuesView
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Hashable, ItemsView, Iterator, Mapping, Sequence, ValuesView
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -459,3 +459,19 @@ class SymbolicView:
         except (KeyError, TypeError):
             raise unknown_name_error(FRAMES, name, self._head[FRAMES]) from None
         return frame
+
+
+Result = TypeVar("Result")
+
+
+def cached_for_version(model: SymbolicView, key: Hashable, compute: Callable[[], Result]) -> Result:
+    """Return a result about the present version of a model; it is computed for the first call with a key.
+
+    The result lives no longer than the model, and may refer to it.
+    """
+    model._settle()
+    kept = model._derived  # an edit replaces it, so that no result of an old version is entered later
+    if key not in kept:
+        kept[key] = compute()
+    found: Result = kept[key]
+    return found

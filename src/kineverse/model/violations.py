@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_tolerance
-from kineverse.compile.function import WantedTier
+from kineverse.compilation.column_functions import compile_columns, insert_values
+from kineverse.compilation.function import WantedTier
 from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.graph import lower
@@ -22,7 +23,6 @@ from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
 from .constraint import Constraint
-from .vector_function import compile_columns, insert_values
 
 
 class Violation(NamedTuple):

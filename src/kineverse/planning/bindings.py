@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.compile.c_library import SourceLibrary
-from kineverse.compile.interruption import WATCH, raise_signal
-from kineverse.compile.toolchain import NO_COMPILER, NO_UNDEFINED_FLAGS
-from kineverse.compile.vector_program import vector_header
-from kineverse.control.contact_rows import row_library
+from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.interruption import WATCH, raise_signal
+from kineverse.compilation.toolchain import NO_COMPILER, NO_UNDEFINED_FLAGS
+from kineverse.compilation.vector_program import vector_header
+from kineverse.control.contact_constraints import row_library
 from kineverse.errors import CompileError
 from kineverse.geometry.bindings import collision_library
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile.vector_program import VectorProgram
-from kineverse.control.task_functions import look_at
-from kineverse.control.tasks import Hold
+from kineverse.compilation.vector_program import VectorProgram
+from kineverse.control.tasks import Hold, look_at
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression
 from kineverse.expressions.functions import maximum, sqrt
@@ -24,8 +23,8 @@ from kineverse.state import State
 from kineverse.symbols import Symbol, parameter
 
 from .bindings import ProjectionStruct, planning_functions
-from .checker import CollisionChecker
-from .obstacles import Floats32
+from .collision_checker import CollisionChecker
+from .collision_geometry import Floats32
 
 TOLERANCE = 1e-4
 """Largest residual of a projection in float [m], [rad]."""

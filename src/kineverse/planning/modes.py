@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_entries
-from kineverse.compile.build_queue import working_seconds
+from kineverse.compilation.build_queue import working_seconds
 from kineverse.control.configuration_space import find_coordinates
 from kineverse.control.tasks import Hold
 from kineverse.errors import DuplicateNameError, InvalidValueError
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .checker import BodyPairs
+from .collision_checker import BodyPairs
 from .manifold import FrameHold
 from .planning_scene import PlanningScene
 

@@ -26,7 +26,7 @@ from .path_rounding import (
     section_times,
 )
 from .trajectories import MotionLimits, Trajectory, motion_limits
-from .trajectories.motion_limits import RAMP
+from .trajectories.kinematic_limits import RAMP
 
 DEVIATION = 0.1
 """Largest distance of a trajectory from the corners of its path, where nothing is in the way [rad], [m]."""

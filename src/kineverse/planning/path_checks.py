@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._threads import CallLock
+from kineverse._runtime import CallLock
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 
-from .checker import RESOLUTION, BodyPairs, CollisionChecker
+from .collision_checker import RESOLUTION, BodyPairs, CollisionChecker
 
 if TYPE_CHECKING:
-    from .judge import SceneJudge
     from .manifold import Manifold
+    from .state_validity import SceneJudge
 
 _ROUNDING = 1e-6
 
 
 class PathChecks:
-    """Checks of configurations in the surroundings of a path, wherever the planner has placed things since."""
+    """Checks of configurations in the surroundings of a path, wherever things are placed now."""
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from kineverse.symbols import Symbol
 
 from .path_checks import PathChecks
 from .trajectories import BlendedPath, Trajectory, round_corners, time_parameterize
-from .trajectories.motion_limits import MotionLimits
+from .trajectories.kinematic_limits import MotionLimits
 
 RESIDUAL = 1e-5
 """Largest residual of holds on rounded corners [m], [rad]."""

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_entries, as_tolerance
-from kineverse._gc import no_collection
-from kineverse._threads import CallLock, one_at_a_time
+from kineverse._runtime import CallLock, no_collection, one_at_a_time
 from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
@@ -25,16 +24,16 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bindings import planning_functions
-from .checker import BodyPairs, CollisionChecker
-from .configuration import PlanningSpace, read_configurations, read_state
-from .endpoints import describe_barrier
-from .judge import describe_contacts
+from .collision_checker import BodyPairs, CollisionChecker
 from .manifold import FrameHold, hold_frames
 from .modes import Mode, ModeSearch
 from .path import Path
 from .path_rounding import PathSection
 from .planning_scene import PlanningScene
-from .roadmap import Roadmap
+from .planning_space import PlanningSpace, read_configurations, read_state
+from .sampling_planners import Roadmap
+from .start_goal import describe_barrier
+from .state_validity import describe_contacts
 
 _TASK_GOALS = 32
 """Number of configurations that are looked for where tasks are the goal."""

@@ -12,31 +12,29 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._threads import CallLock
-from kineverse.compile.build_queue import working_seconds
+from kineverse._runtime import CallLock
+from kineverse.compilation.build_queue import working_seconds
 from kineverse.control.tasks import Hold
-from kineverse.errors import InvalidValueError
+from kineverse.errors import InvalidValueError, NoSolutionError
 from kineverse.geometry import Rule, Scene
-from kineverse.geometry.prepared_query import flag_subtree
+from kineverse.geometry.distance_queries import flag_subtree
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
+from kineverse.model.sampling import StateSamples
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .checker import BodyPairs, CollisionChecker, LateCheckError
-from .configuration import BEYOND, FULL_TURN, HALF_TURN, PlanningSpace
-from .connection import MORE_PATIENCE, PATIENCE, checked_by, connect, connect_on_manifold
-from .endpoints import Endpoints
-from .judge import SceneJudge, describe_contacts
+from .collision_checker import BodyPairs, CollisionChecker, LateCheckError
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
-from .overlapping_pairs import find_overlapping_pairs, find_separate_pairs
 from .path import Path
 from .path_checks import PathChecks
-from .roadmap import Roadmap
-from .search import MOST_EDGES
-from .solutions import MOST_BATCHES, find_solutions
+from .planning_space import BEYOND, FULL_TURN, HALF_TURN, PlanningSpace
+from .query import MORE_PATIENCE, PATIENCE, checked_by, connect, connect_on_manifold
+from .sampling_planners import MOST_EDGES, Roadmap
+from .start_goal import MOST_BATCHES, Endpoints, find_solutions
+from .state_validity import SceneJudge, describe_contacts
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
@@ -359,3 +357,47 @@ def _are_apart(model: ModelView, a: str, b: str) -> bool:
     """Return True if no one of two frames carries the other."""
     lookup = model.frames.__getitem__
     return WORLD not in (a, b) and a != b and a not in ancestors(b, lookup) and b not in ancestors(a, lookup)
+
+
+_SAMPLES = 64
+_APART = 1e-4
+"""Distance beyond the margin at which bodies do not just rest on each other [m]."""
+
+
+def find_overlapping_pairs(scene: Scene, space: PlanningSpace) -> tuple[Rule, ...]:
+    """Return rules for pairs of bodies that touch wherever the coordinates are, those of the others as well.
+
+    So a robot that stands in a wall by default, and is placed elsewhere, does not lose the pairs with the
+    wall.
+    """
+    home = scene.model.default_state()
+    samples = StateSamples(scene.model, count=_SAMPLES)
+    columns = {s: samples.values_of(s).tolist() for s in home if s.has_derivative and not s.order}
+    states = [home.updated({s: values[k] for s, values in columns.items()}) for k in range(samples.size)]
+    pairs = {frozenset(pair) for pair in scene.pairs_affected_by(space.symbols)}
+    found = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
+    return tuple(rule for rule in found if frozenset((rule.a, rule.b)) in pairs)
+
+
+def find_separate_pairs(
+    scene: Scene, space: PlanningSpace, rules: tuple[Rule, ...], state: State, Q: Array, margin: float
+) -> frozenset[frozenset[str]]:
+    """Return the pairs of bodies of some rules that are apart at some of the configurations (N, n) [m].
+
+    Samples miss a small gap, in which a start may be.
+    """
+    found = set()
+    for q in Q if rules else ():
+        if _has_poses(scene, state.updated(dict(zip(space.symbols, q.tolist(), strict=True)))):
+            results = scene.distances((rule.a, rule.b) for rule in rules)
+            found |= {frozenset((r.a, r.b)) for r in results if r.distance > margin + _APART}
+    return frozenset(found)
+
+
+def _has_poses(scene: Scene, state: State) -> bool:
+    """Return True if all loops close at a state."""
+    try:
+        scene.update(state)
+    except NoSolutionError:
+        return False
+    return True

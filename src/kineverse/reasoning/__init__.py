@@ -4,12 +4,10 @@ from kineverse._synonyms import MODULE_SYNONYMS
 from kineverse.errors import unknown_attribute_error
 
 from .boxes import Interval, IntervalBox
-from .certify import contradictions
 from .find_interlocks import interlocks
-from .interlock import Hold, Interlock, Interlocks, Undecided
-from .opening_order import opening_order
-from .plan_check import plan_violations
-from .refutation import InvariantSet, refutation_gaps
+from .interlock_records import Hold, Interlock, Interlocks, Undecided, opening_order
+from .interlock_verification import contradictions
+from .plan_verification import InvariantSet, plan_violations, refutation_gaps
 from .unlocking_plan import UnlockingPlan, UnlockingStep, plan_unlocking
 
 __all__ = [

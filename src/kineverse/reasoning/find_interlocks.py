@@ -13,17 +13,14 @@ from kineverse.expressions.substitution import apply_substitution
 from kineverse.intervals.graph import TermGraph
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
-from kineverse.model.rate_nodes import to_plain
-from kineverse.model.rates import Rates
+from kineverse.model.rates import Rates, to_plain
 from kineverse.symbols import Symbol
 
-from .boxes import Interval, IntervalBox
+from .boxes import Interval, IntervalBox, Region, intersect_boxes, merge_boxes
 from .case_split import Case
 from .constraint_effects import PositionEffect, SpeedEffect, find_position_effects, find_speed_effect
-from .domain import Domain, UnitSphere
-from .interlock import Hold, Interlock, Interlocks, Undecided
-from .periodicity import TURN, PeriodicCoordinates, is_periodic
-from .regions import Region, intersect_boxes, merge_boxes
+from .domain import TURN, Domain, PeriodicCoordinates, UnitSphere, is_periodic
+from .interlock_records import Hold, Interlock, Interlocks, Undecided
 
 
 def find_orientations(rates: Rates) -> tuple[UnitSphere, ...]:

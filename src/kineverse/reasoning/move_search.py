@@ -11,8 +11,7 @@ from functools import cached_property
 from itertools import count
 from typing import Literal, TypeAlias
 
-from .cell_graph import CellGraph, CellStep, Move
-from .move_rules import MoveRule
+from .cell_graph import CellGraph, CellStep, Move, MoveRule
 
 Verdict: TypeAlias = Literal["found", "refuted", "undecided"]
 Edge: TypeAlias = tuple[int, int, int, CellStep]

@@ -17,14 +17,12 @@ from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 from .boxes import Interval
-from .cell_graph import CellGraph, Move, make_graph
+from .cell_graph import CellGraph, Move, MoveRule, make_graph, make_rules, relevant_rules
+from .constraint_evaluation import start_point
 from .find_interlocks import constant_limits, interlocks
-from .interlock import Interlock, Interlocks, Undecided
-from .move_rules import MoveRule, make_rules, relevant_rules
+from .interlock_records import Interlock, Interlocks, Undecided
 from .move_search import MoveSearch, MoveSearchResult, Verdict, find_circle
-from .plan_check import plan_violations
-from .point_evaluation import start_point
-from .refutation import InvariantSet, Region, refutation_gaps
+from .plan_verification import InvariantSet, Region, plan_violations, refutation_gaps
 
 BUDGET = 10.0
 """Default budget of a plan [s]."""

@@ -16,13 +16,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from kineverse.state import StateLike
-from kineverse.view.camera import Camera
-from kineverse.view.pictures import picture, save_picture
-from kineverse.view.show import show
+
+from .camera import Camera
+from .page import show
+from .pictures import picture, save_picture
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
-    from kineverse.view.viewer import Viewer
+
+    from .viewer import Viewer
 
 __all__ = ["Camera", "picture", "save_picture", "show", "view"]
 
@@ -41,6 +43,6 @@ def view(
 
     Parameters, result and errors are those of :class:`kineverse.view.viewer.Viewer`.
     """
-    from kineverse.view.viewer import Viewer
+    from .viewer import Viewer
 
     return Viewer(model, state, port=port, label=label, camera=camera, host=host, degrees=degrees)

@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.model.model_view import ModelView
-from kineverse.view.camera import Camera, fit_camera
-from kineverse.view.drawables import Drawable
-from kineverse.view.rasterizer import Projection, TriangleSoup, rasterize
-from kineverse.view.triangle_mesh import Floats
+
+from .camera import Camera, fit_camera
+from .drawables import Drawable
+from .rasterizer import Projection, TriangleSoup, rasterize
+from .triangle_mesh import Floats
 
 ELEVATION = 0.42
 

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
-from kineverse.view.triangle_mesh import Floats
+
+from .triangle_mesh import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
-"""Drawable parts of a model: visual shapes, collision hulls and frame axes."""
+"""Drawable parts: visual shapes, collision hulls, frame axes, sphere covers, frame paths, ghosts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -17,10 +17,14 @@ from kineverse.geometry.mesh_files import Faces
 from kineverse.geometry.objects import collision_shapes
 from kineverse.geometry.shapes import Solid, solid_from_geometry, solid_from_points, solid_surface
 from kineverse.lie import translation
-from kineverse.model.body import Body, Box, Mesh, Shape
+from kineverse.model.body import Body, Box, Mesh, Shape, Sphere
 from kineverse.model.model_view import ModelView
-from kineverse.view.meshes import LoadedMesh, load_mesh, mesh_geometry
-from kineverse.view.triangle_mesh import Floats, TriangleMesh, build_creased_mesh
+from kineverse.planning.spheres import SphereCover
+from kineverse.state import State
+
+from .meshes import LoadedMesh, load_mesh, mesh_geometry
+from .poses import FramePoses, complete
+from .triangle_mesh import Floats, TriangleMesh, build_creased_mesh
 
 
 def load_hull(mesh: Mesh) -> LoadedMesh:
@@ -177,3 +181,53 @@ def create_axes(model: ModelView, corners: Floats, poses: Mapping[str, Floats]) 
         shift = translation(0.5 * length * np.eye(3)[axis])
         bars.append((mesh_geometry(Box((size[0], size[1], size[2]))).transform(shift), color))
     return [Drawable(name, surface, color, "visual") for name in poses for surface, color in bars]
+
+
+SPHERES: Rgba = (0.16, 0.47, 0.86, 0.3)
+"""Colour of the spheres of a cover."""
+
+
+def draw_cover(frame: str, cover: SphereCover) -> Drawable:
+    """Return the spheres of a cover in a frame as one drawable."""
+    return Drawable(frame, build_spheres(cover.centres, cover.radii), SPHERES, "collision")
+
+
+def build_spheres(centres: Floats, radii: Floats) -> TriangleMesh:
+    """Return the surfaces of spheres with centres (N, 3) and radii (N,) [m]."""
+    unit = mesh_geometry(Sphere(1.0))
+    count, size = len(centres), len(unit.vertices)
+    vertices = centres[:, None] + radii[:, None, None] * unit.vertices
+    return TriangleMesh(
+        vertices.reshape(-1, 3),
+        (unit.faces + size * np.arange(count)[:, None, None]).reshape(-1, 3),
+        np.tile(unit.normals, (count, 1)),
+        closed=True,
+    )
+
+
+TRACE: Rgba = (0.93, 0.42, 0.13, 1.0)
+"""Colour of the way of a frame."""
+
+_RADIUS, _OPACITY = 0.006, 0.3
+_WORLD = "world"
+
+
+def draw_frame_path(model: ModelView, frame: str, states: Iterable[State]) -> Drawable:
+    """Return the origins of a frame at some states as small spheres."""
+    poses = FramePoses(model, [frame])
+    origins = np.array([poses.evaluate(complete(model, state))[0, :3, 3] for state in states])
+    surface = build_spheres(origins, np.full(len(origins), _RADIUS))
+    return Drawable(_WORLD, surface, TRACE, "visual")
+
+
+def draw_ghosts(model: ModelView, bodies: Sequence[str], states: Iterable[State]) -> list[Drawable]:
+    """Return translucent visual shapes of some bodies at some states."""
+    parts = [part for part in collect_drawables(model) if part.frame in bodies]
+    poses = FramePoses(model, bodies)
+    found = []
+    for state in states:
+        world_T = dict(zip(bodies, poses.evaluate(complete(model, state)), strict=True))
+        for part in parts:
+            surface = replace(part.surface.transform(world_T[part.frame]), colors=None)
+            found.append(replace(part, frame=_WORLD, surface=surface, color=(*part.color[:3], _OPACITY)))
+    return found

@@ -12,7 +12,8 @@ from kineverse.errors import KineverseError
 from kineverse.geometry.mesh_files import MeshFile, find_mesh_file, load_mesh_parts, unit_length
 from kineverse.model.body import Geometry, Mesh
 from kineverse.model.model_view import ModelView
-from kineverse.view.triangle_mesh import (
+
+from .triangle_mesh import (
     Floats,
     TriangleMesh,
     build_creased_mesh,

@@ -7,12 +7,11 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from kineverse.view.drive import VelocityDrive
-from kineverse.view.hypertext import Html, HtmlBox, element
-from kineverse.view.proximity_panel import ProximityPanel
-from kineverse.view.scene import ViewerScene
-from kineverse.view.sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step
-from kineverse.view.violations import format_missing_meshes, format_significant, format_violations
+from .animation import VelocityDrive
+from .html import Html, HtmlBox, element, format_missing_meshes, format_significant, format_violations
+from .proximity_panel import ProximityPanel
+from .scene import ViewerScene
+from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step
 
 BEYOND = 0.2
 """Fraction of their range by which sliders are widened on demand, to violate limits."""

@@ -17,8 +17,11 @@ from kineverse.errors import FormatError, InvalidValueError, ShapeError
 from kineverse.formats.files import replace_file
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
-from kineverse.view.auto_camera import choose_camera, weigh_drawables
-from kineverse.view.backdrop import (
+
+from .auto_camera import choose_camera, weigh_drawables
+from .camera import Camera
+from .drawables import Drawable, collect_drawables, create_axes
+from .lighting import (
     DirectionalLight,
     compute_outlines,
     draw_background,
@@ -27,12 +30,10 @@ from kineverse.view.backdrop import (
     to_display,
     to_linear,
 )
-from kineverse.view.camera import Camera
-from kineverse.view.drawables import Drawable, collect_drawables, create_axes
-from kineverse.view.poses import FramePoses, complete
-from kineverse.view.proximity import ProximityMarkers, ProximityQuery, create_marker_drawables
-from kineverse.view.rasterizer import Projection, TriangleSoup, rasterize
-from kineverse.view.triangle_mesh import Floats, Integers, Singles, dot_rows
+from .poses import FramePoses, complete
+from .proximity import ProximityMarkers, ProximityQuery, create_marker_drawables
+from .rasterizer import Projection, TriangleSoup, rasterize
+from .triangle_mesh import Floats, Integers, Singles, dot_rows
 
 
 def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:

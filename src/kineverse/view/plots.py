@@ -64,7 +64,7 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class FitProjection:
-    """Fit in the axes of a picture: u to the right, v upwards, w towards the viewer; w is the joint's axis."""
+    """Fit in a picture's axes: u to the right, v upwards, w towards the viewer; w is the joint's axis."""
 
     fit: Fit
     origin: Array  # origin in the parent, (3,), and u, v, w as columns, (3, 3)

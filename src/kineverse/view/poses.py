@@ -14,7 +14,8 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import parse_symbol_name
-from kineverse.view.triangle_mesh import Floats
+
+from .triangle_mesh import Floats
 
 
 def to_wxyz(matrices: npt.ArrayLike) -> Floats:

@@ -19,9 +19,10 @@ from kineverse.model.body import Cone, Cylinder
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
-from kineverse.view.drawables import Drawable
-from kineverse.view.meshes import mesh_geometry
-from kineverse.view.triangle_mesh import Floats, TriangleMesh, mesh_placeholder
+
+from .drawables import Drawable
+from .meshes import mesh_geometry
+from .triangle_mesh import Floats, TriangleMesh, mesh_placeholder
 
 RADIUS = 0.1
 """Default distance within which pairs are shown [m]."""

@@ -15,8 +15,9 @@ from kineverse.geometry import DistanceResult
 from kineverse.geometry.exclusions import is_installed
 from kineverse.geometry.shapes import import_coal
 from kineverse.model.model_view import ModelView
-from kineverse.view.hypertext import BREAK, FONT, Html, HtmlBox, element, join_html
-from kineverse.view.proximity import (
+
+from .html import BREAK, FONT, Html, HtmlBox, element, format_significant, join_html
+from .proximity import (
     BALL,
     CONTACT,
     HEAD,
@@ -31,8 +32,7 @@ from kineverse.view.proximity import (
     distance_color,
     format_millimetres,
 )
-from kineverse.view.scene import ViewerScene
-from kineverse.view.violations import format_significant
+from .scene import ViewerScene
 
 LINES = 12
 """Lines of the list; further pairs are counted, not listed."""

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.view.camera import Camera
-from kineverse.view.drawables import Drawable
-from kineverse.view.triangle_mesh import Floats, Integers
+from .camera import Camera
+from .drawables import Drawable
+from .triangle_mesh import Floats, Integers
 
 FRAGMENTS = 1_500_000
 """Pixels handled at once: a compromise between numpy's overhead and the size of the caches."""

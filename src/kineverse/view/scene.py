@@ -10,19 +10,20 @@ from typing import Any, Literal
 import numpy as np
 
 from kineverse.model.model_view import ModelView
-from kineverse.view import backdrop
-from kineverse.view.auto_camera import (
+
+from . import lighting
+from .auto_camera import (
     ClientCameras,
     choose_camera,
     find_extreme_points,
     reframe,
     weigh_drawables,
 )
-from kineverse.view.camera import Camera
-from kineverse.view.drawables import Drawable, Kind, choose_axis_length, collect_drawables
-from kineverse.view.poses import FramePoses, to_wxyz
-from kineverse.view.rasterizer import TriangleSoup
-from kineverse.view.triangle_mesh import Floats, Integers, TriangleMesh
+from .camera import Camera
+from .drawables import Drawable, Kind, choose_axis_length, collect_drawables
+from .poses import FramePoses, to_wxyz
+from .rasterizer import TriangleSoup
+from .triangle_mesh import Floats, Integers, TriangleMesh
 
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
@@ -45,7 +46,7 @@ class ViewerScene:
         self._visuals_shown, self._collisions_shown, self._ground_shown = True, False, True
         self._decomposed, self._transparent = False, False
         self._overlay: tuple[Drawable, ...] = ()
-        backdrop.set_up(server)
+        lighting.set_up(server)
         self.refresh(model, values)
 
     def refresh(self, model: ModelView, values: Mapping[str, float]) -> None:
@@ -181,7 +182,7 @@ class ViewerScene:
     def show_ground(self, shown: bool) -> None:
         """Show or hide the floor."""
         self._ground_shown = shown
-        backdrop.set_floor(self._server, self._floor, self._extent, shown)
+        lighting.set_floor(self._server, self._floor, self._extent, shown)
 
     def _fade(self) -> None:
         transparent = self._frames_shown or self._transparent
@@ -263,7 +264,7 @@ class ViewerScene:
         start.position, start.look_at = np.array(camera.position), np.array(camera.target)
         start.fov = camera.field_of_view
         away = np.subtract(camera.position, camera.target)
-        backdrop.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
+        lighting.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
 
     def _set_framing(self, first: Camera, framing: Callable[[float], Camera]) -> None:
         if self._cameras is None:

@@ -14,7 +14,8 @@ from typing import Any
 
 from kineverse._extras import install_command
 from kineverse.errors import InvalidValueError, KineverseError, MissingDependencyError
-from kineverse.view.access_control import AccessControl
+
+from .access_control import AccessControl
 
 logger = logging.getLogger(__name__)
 

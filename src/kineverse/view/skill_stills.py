@@ -14,15 +14,16 @@ from kineverse.model.frame_dependence import moved_frames
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.view.auto_camera import TRIAL_HEIGHT, find_extreme_points
-from kineverse.view.camera import Camera, fit_camera
-from kineverse.view.drawables import Drawable, collect_drawables
-from kineverse.view.pictures import draw_picture, join_pictures, write_png
-from kineverse.view.poses import FramePoses
-from kineverse.view.rasterizer import Projection, TriangleSoup, rasterize
-from kineverse.view.run_drawing import RunDrawing, RunMoment
-from kineverse.view.triangle_mesh import Floats
 from kineverse.worlds.recorder import RecordedStep
+
+from .auto_camera import TRIAL_HEIGHT, find_extreme_points
+from .camera import Camera, fit_camera
+from .drawables import Drawable, collect_drawables
+from .pictures import draw_picture, join_pictures, write_png
+from .poses import FramePoses
+from .rasterizer import Projection, TriangleSoup, rasterize
+from .run_overlay import RunDrawing, RunMoment
+from .triangle_mesh import Floats
 
 SIZE = (400, 300)
 """Size of a still [pixels]."""

@@ -17,8 +17,9 @@ import kineverse as kv
 from kineverse.errors import NoSolutionError
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
-from kineverse.view.poses import roll_pitch_yaw
-from kineverse.view.triangle_mesh import Floats
+
+from .poses import roll_pitch_yaw
+from .triangle_mesh import Floats
 
 UNLIMITED_RANGE = {"rad": np.pi, "m": 2.0, "": 2.0}
 """Half of the range of a slider without limits [rad], [m]."""

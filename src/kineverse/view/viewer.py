@@ -14,21 +14,19 @@ from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.planning.trajectories.trajectory import Trajectory
 from kineverse.state import State, StateLike
-from kineverse.view import server as web
-from kineverse.view.animation import RangeAnimation, select_animated
-from kineverse.view.camera import Camera
-from kineverse.view.drawables import Drawable
-from kineverse.view.drive import VelocityDrive
-from kineverse.view.hypertext import element
-from kineverse.view.panel import Panel
-from kineverse.view.playback import PlaybackLayer, TrajectoryPlayback
-from kineverse.view.poses import complete, keep_known
-from kineverse.view.proximity_panel import ProximityPanel
-from kineverse.view.scene import ViewerScene
-from kineverse.view.sliders import QuaternionAngles, Ranges, infer_units
-from kineverse.view.title import choose_title
-from kineverse.view.triangle_mesh import Floats
-from kineverse.view.violations import format_failure, format_violations
+
+from . import server as web
+from .animation import PlaybackLayer, RangeAnimation, TrajectoryPlayback, VelocityDrive, select_animated
+from .camera import Camera
+from .drawables import Drawable
+from .html import element, format_failure, format_violations
+from .page import choose_title
+from .panel import Panel
+from .poses import complete, keep_known
+from .proximity_panel import ProximityPanel
+from .scene import ViewerScene
+from .sliders import QuaternionAngles, Ranges, infer_units
+from .triangle_mesh import Floats
 
 logger = logging.getLogger(__name__)
 

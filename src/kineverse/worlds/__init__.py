@@ -1,11 +1,11 @@
 """Worlds in which skills are tried: they know nothing of controllers (layer 5)."""
 
-from .judge import Judge
 from .kinematic_world import Event, KinematicWorld
 from .mechanism_world import MechanismWorld
 from .mujoco_world import MujocoWorld
 from .recorder import Recorder
 from .recording import RunRecording, read_run_recording
+from .run_metrics import Judge
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
 from .world import Contact, Observation, World

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from kineverse.errors import NoSolutionError
 from kineverse.geometry import Scene
 from kineverse.geometry.collision_filter import adjacent_pairs, apply_rules
-from kineverse.geometry.prepared_query import (
+from kineverse.geometry.distance_queries import (
     PairFlags,
     PreparedQuery,
     flag_between,
@@ -39,7 +39,7 @@ from kineverse.lie import Array
 from kineverse.model.body import Mesh
 from kineverse.model.frame import is_of_robot
 from kineverse.model.sampling import StateSamples
-from kineverse.model.version_cache import cached_for_version
+from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 

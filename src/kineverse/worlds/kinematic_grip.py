@@ -17,18 +17,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import array
-from kineverse.grasping.gripper import Gripper
-from kineverse.grasping.pads import find_finger_range
+from kineverse.grasping.fingertip_geometry import find_finger_range
+from kineverse.grasping.gripper_detection import Gripper
 from kineverse.lie import Array, inverse
 from kineverse.model.model_view import ModelView
 from kineverse.spatial import log_so3, skew
 from kineverse.symbols import Symbol
 
-from .object_gaps import Gaps
-from .object_motion import SKIN, ObjectMotion
+from .quasistatic import SKIN, ObjectMotion
+from .quasistatic_constraints import Gaps
 
 TOUCH = 1e-4
 """Gap below which bodies touch [m]."""

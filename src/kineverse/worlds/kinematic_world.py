@@ -23,7 +23,7 @@ from kineverse._checks import as_entries, finite_number
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
-from kineverse.grasping.gripper import Gripper, find_grippers
+from kineverse.grasping.gripper_detection import Gripper, find_grippers
 from kineverse.lie import Array
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
@@ -32,7 +32,7 @@ from kineverse.symbols import Symbol
 
 from .furniture_overlaps import FurnitureOverlaps
 from .kinematic_grip import TOUCH, KinematicGrip
-from .object_motion import ObjectMotion
+from .quasistatic import ObjectMotion
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
 from .world import Contact, Observation

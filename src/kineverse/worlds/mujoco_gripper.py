@@ -9,13 +9,12 @@ import numpy as np
 
 from kineverse.errors import InvalidValueError
 from kineverse.formats.mjcf.mujoco_api import mujoco
-from kineverse.grasping.gripper import Gripper
+from kineverse.grasping.gripper_detection import Gripper
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .mujoco_contacts import MujocoContacts
-from .mujoco_coordinates import MujocoCoordinates
 from .mujoco_servos import sampled_inertia
+from .mujoco_state import MujocoContacts, MujocoCoordinates
 
 TOUCH_FORCE = 1.0
 """Normal force of each finger [N] above which a body between them is held."""

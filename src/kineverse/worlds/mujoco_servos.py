@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import finite_number
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.errors import ExpressionError, InvalidValueError, UnknownNameError, suggest
 from kineverse.expressions.expression import as_expression
 from kineverse.formats.mjcf.mujoco_api import mujoco
@@ -35,7 +35,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
-from .mujoco_coordinates import MujocoCoordinates
+from .mujoco_state import MujocoCoordinates
 
 BANDWIDTH = 80.0
 """Bandwidth w [1/s]: a robot stands still some 50 ms after its speeds are zero."""

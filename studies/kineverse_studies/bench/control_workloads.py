@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from kineverse.articulations import Floating, OmniBase
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.formats import load
 from kineverse.lie import Array, translation
 from kineverse.model.frame import WORLD

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.control import Command, Controller, Goal, Hold
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.functions import norm

@@ -21,7 +21,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from kineverse._extras import install_studies
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.errors import KineverseError
 from kineverse.lie import Array
 

@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.control import Hold
 from kineverse.formats import load
 from kineverse.geometry import RULES, Rule, rules_as_data

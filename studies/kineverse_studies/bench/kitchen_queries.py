@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from kineverse.articulations import OmniBase
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.control import Goal, InverseKinematics, Keep, Target
 from kineverse.errors import UnknownNameError
 from kineverse.formats.locate import locate_model

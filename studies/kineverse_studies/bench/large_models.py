@@ -10,7 +10,7 @@ from time import perf_counter
 
 import numpy as np
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.articulations import Revolute
 from kineverse.expressions import Expression
 from kineverse.formats.document import from_bytes, read_operations, to_bytes, to_json

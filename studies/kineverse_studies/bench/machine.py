@@ -9,8 +9,8 @@ from importlib import metadata
 
 from kineverse import position, rotation_z
 from kineverse._version import __version__
-from kineverse.compile import CompilerInformation, compile, compiler_information  # noqa: A004
-from kineverse.compile.call_extension import call_extension
+from kineverse.compilation import CompilerInformation, compile, compiler_information
+from kineverse.compilation.call_extension import call_extension
 
 VERSIONS = (
     "casadi",

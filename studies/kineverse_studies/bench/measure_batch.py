@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kineverse.compile import compile, compiler_information  # noqa: A004
+from kineverse.compilation import compile, compiler_information
 from kineverse.lie import Array
 
 from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders

@@ -11,9 +11,9 @@ from time import perf_counter
 
 import numpy as np
 
-from kineverse.compile import CompiledFunction, Evaluator, compile  # noqa: A004
-from kineverse.compile.program import Program
-from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS, optimisation_level, toolchain
+from kineverse.compilation import CompiledFunction, Evaluator, compile
+from kineverse.compilation.program import Program
+from kineverse.compilation.toolchain import NO_UNDEFINED_FLAGS, optimisation_level, toolchain
 from kineverse.expressions import array
 from kineverse.lie import Array
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.lie import Array
 
 from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders

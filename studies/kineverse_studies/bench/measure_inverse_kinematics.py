@@ -10,7 +10,7 @@ from time import thread_time_ns
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.control import Goal, InverseKinematics, Target, same_pose
 from kineverse.errors import MissingDependencyError, UnknownNameError
 from kineverse.lie import Array

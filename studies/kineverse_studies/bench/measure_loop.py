@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from kineverse.articulations import Revolute
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.lie import Array
 from kineverse.loops import CloseLoop
 from kineverse.model.body import Pose

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.formats import load
 from kineverse.lie import Array, retract

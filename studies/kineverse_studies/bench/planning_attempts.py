@@ -52,7 +52,7 @@ def attempt_with_kineverse(
 
 def attempt_first_path(planner: Planner, start: Array, goal: Array, seconds: float, seed: int) -> Attempt:
     """Return the attempt of our search alone: its path is neither shortened nor judged, as those of peers."""
-    from kineverse.planning.search import RrtConnect
+    from kineverse.planning.sampling_planners import RrtConnect
 
     # The goals of the planner: the given one where it is nearest, and full turns away from there.
     nearest = planner.space.equivalents(goal, start, most=1)

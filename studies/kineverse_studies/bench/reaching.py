@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.formats import load
 from kineverse.lie import Array
 from kineverse.model.model import Model

@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 
-from kineverse.compile.toolchain import toolchain
+from kineverse.compilation.toolchain import toolchain
 from kineverse.errors import CompileError, MissingDependencyError, UnknownNameError, suggest
 
 from .harness import BenchmarkSettings

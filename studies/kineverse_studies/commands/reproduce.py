@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kineverse.cli.arguments import require
 from kineverse.cli.output import format_markdown, format_table, show_progress
-from kineverse.cli.requirements import require
 from kineverse.errors import MissingDependencyError, UnknownNameError
 from kineverse.expressions.printing import format_number
 

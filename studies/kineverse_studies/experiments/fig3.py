@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kineverse.articulations import GarageDoor
-from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.compilation import CompiledFunction, compile
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model

@@ -7,7 +7,7 @@ import pytest
 from synthetic_recordings import recording
 
 from kineverse.estimation import identify, pose_covariance
-from kineverse.estimation.identification import maximum_likelihood
+from kineverse.estimation.identification import marginal_likelihood
 from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
 from kineverse.estimation.identification.observations import check_observations
 
@@ -46,7 +46,7 @@ def test_identify_of_degenerate_positions_is_finite(where, whole):
 def test_marginal_likelihood_of_three_positions_is_finite(family):
     seen = recording("spherical", count=3, position=0.1, orientation=0.02, seed=3)
     problem = check_observations(seen.parent, seen.child[:, :3, 3], seen.covariance, seen.covariance)
-    likeliest = maximum_likelihood.maximum_likelihood(
+    likeliest = marginal_likelihood.maximum_likelihood(
         problem, [*initial_guesses(family, MotionStatistics(problem))]
     ).solution
-    assert np.isfinite(maximum_likelihood.maximise_marginal_likelihood(problem, likeliest).log_evidence)
+    assert np.isfinite(marginal_likelihood.maximise_marginal_likelihood(problem, likeliest).log_evidence)

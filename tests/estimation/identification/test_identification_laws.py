@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_recordings import Recording, angle_between, off_axis, recording, transform
 
 from kineverse.estimation import IdentificationResult, Identifier, identify
-from kineverse.estimation.identification.comparison import solve_families
+from kineverse.estimation.identification.model_selection import solve_families
 from kineverse.estimation.identification.observations import check_observations
 
 MOVING = ("prismatic", "revolute")

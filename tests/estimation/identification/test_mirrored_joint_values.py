@@ -11,15 +11,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from synthetic_recordings import recording, transform
 
-from kineverse.estimation.identification.ambiguities import (
+from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion
+from kineverse.estimation.identification.joint_values import (
     choose_mirrored_values,
     evaluate_each_observation,
     mirrored_values,
 )
-from kineverse.estimation.identification.evidence import evidence_excess
-from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion
+from kineverse.estimation.identification.least_squares import JointValuePrior, levenberg_marquardt
+from kineverse.estimation.identification.marginal_likelihood import evidence_excess
 from kineverse.estimation.identification.observations import check_observations
-from kineverse.estimation.identification.optimise import JointValuePrior, levenberg_marquardt
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute"])

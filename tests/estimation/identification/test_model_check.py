@@ -11,7 +11,7 @@ from synthetic_recordings import JOINTS, recording
 
 import kineverse as kv
 from kineverse.estimation import Identifier, identify, pose_covariance
-from kineverse.estimation.identification.goodness_of_fit import chi_squared_tail, f_distribution_tail
+from kineverse.estimation.identification.model_selection import chi_squared_tail, f_distribution_tail
 from kineverse.lie import retract
 
 

@@ -15,14 +15,15 @@ from synthetic_recordings import noisy
 import kineverse as kv
 from kineverse.estimation import KinematicGraph, identify_graph, pose_covariance
 from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion
+from kineverse.estimation.identification.kinematic_graph.graph import tree_path
 from kineverse.estimation.identification.kinematic_graph.loop_closures import (
     CONSTRAINED_COMPONENTS,
+    DependentCoordinates,
     ObservedLoop,
+    Twists,
     close_loops,
 )
-from kineverse.estimation.identification.kinematic_graph.loop_mobility import DependentCoordinates, Twists
 from kineverse.estimation.identification.kinematic_graph.pairwise import identify_pair
-from kineverse.estimation.identification.kinematic_graph.spanning_trees import tree_path
 from kineverse.estimation.identification.observations import check_tracks, exact_track
 
 Array = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ from synthetic_recordings import recording
 from kineverse.errors import ShapeError
 from kineverse.estimation import Identifier, identify
 from kineverse.estimation.identification.observations import check_observations
-from kineverse.estimation.identification.online import ObservationBuffer
+from kineverse.estimation.identification.online_identification import ObservationBuffer
 from kineverse.estimation.identification.solver import solver
 
 

@@ -10,20 +10,19 @@ from synthetic_recordings import JOINTS, recording
 
 from kineverse.errors import ShapeError
 from kineverse.estimation import identify
-from kineverse.estimation.identification import maximum_likelihood
+from kineverse.estimation.identification import marginal_likelihood
 from kineverse.estimation.identification import solver as native
-from kineverse.estimation.identification.bindings import library
-from kineverse.estimation.identification.evidence import evidence_excess, laplace_evidence
 from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion, Parametrisation
 from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
-from kineverse.estimation.identification.maximum_likelihood import Scored
-from kineverse.estimation.identification.observations import Observations, check_observations
-from kineverse.estimation.identification.optimise import (
+from kineverse.estimation.identification.least_squares import (
     InitialGuess,
     JointValuePrior,
     levenberg_marquardt,
     solve_from_best_start,
 )
+from kineverse.estimation.identification.marginal_likelihood import Scored, evidence_excess, laplace_evidence
+from kineverse.estimation.identification.native import library
+from kineverse.estimation.identification.observations import Observations, check_observations
 from kineverse.estimation.identification.solver import solver
 
 HOW = ("both noisy", "parent known", "positions", "each with its own noise")
@@ -122,7 +121,7 @@ def test_linearised_poses_in_c_agree_with_numpy(family: str, how: str) -> None:
 def test_maximum_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     begin = [*initial_guesses(family, MotionStatistics(seen))]
-    same(maximum_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin))
+    same(marginal_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin))
 
 
 @pytest.mark.compiler
@@ -132,20 +131,20 @@ def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> No
     seen = seen_as(how, family)
     near = solve_from_best_start(seen, [*initial_guesses(family, MotionStatistics(seen))])
     slow, fast = (
-        maximum_likelihood.maximise_marginal_likelihood(seen, near),
+        marginal_likelihood.maximise_marginal_likelihood(seen, near),
         solver.maximise_marginal_likelihood(seen, near),
     )
     assert slow.solution.joint_prior.marginal
     same(slow, fast, atol=0.02)
     # One more observation, and the first ones are where they were.
     part = seen.select(slice(0, 10))
-    before = maximum_likelihood.maximise_marginal_likelihood(
+    before = marginal_likelihood.maximise_marginal_likelihood(
         part, solve_from_best_start(part, [*initial_guesses(family, MotionStatistics(part))])
     ).solution
     start = InitialGuess(before.motion, np.concatenate([before.values, slow.solution.values[10:]]))
     parent = np.concatenate([before.parent, seen.parent[10:]])
     given = seen, start, parent, before.joint_prior, 10
-    same(maximum_likelihood.continue_from(*given), solver.continue_from(*given), atol=0.02)
+    same(marginal_likelihood.continue_from(*given), solver.continue_from(*given), atol=0.02)
 
 
 @pytest.mark.compiler
@@ -155,11 +154,11 @@ def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> No
 def test_precise_positions_in_c_agree_with_numpy(family: str, whole: bool) -> None:
     seen = precise(family, whole)
     begin = [*initial_guesses(family, MotionStatistics(seen))]
-    slow, fast = maximum_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin)
+    slow, fast = marginal_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin)
     same(slow, fast, atol=0.02)
     near = slow.solution
     same(
-        maximum_likelihood.maximise_marginal_likelihood(seen, near),
+        marginal_likelihood.maximise_marginal_likelihood(seen, near),
         solver.maximise_marginal_likelihood(seen, near),
         atol=0.02,
         log=0.2,
@@ -215,7 +214,7 @@ def test_evidence_of_an_unconverged_solution_is_reduced_in_c(family: str) -> Non
     early = replace(reached.solution, converged=False, cost=reached.solution.cost + 20.0)
     # Its widths have settled, so no step is taken.
     slow, fast = (
-        maximum_likelihood.maximise_marginal_likelihood(seen, early),
+        marginal_likelihood.maximise_marginal_likelihood(seen, early),
         solver.maximise_marginal_likelihood(seen, early),
     )
     assert evidence_excess(early) == pytest.approx(10.0, abs=0.5)

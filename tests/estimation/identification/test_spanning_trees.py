@@ -9,7 +9,7 @@ import pytest
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.special import logsumexp
 
-from kineverse.estimation.identification.kinematic_graph.spanning_trees import (
+from kineverse.estimation.identification.kinematic_graph.graph import (
     edge_probabilities,
     orient_tree,
     replacement_probabilities,

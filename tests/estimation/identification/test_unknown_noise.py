@@ -12,15 +12,15 @@ from synthetic_recordings import recording
 
 from kineverse.errors import KineverseError
 from kineverse.estimation import Identifier, identify, pose_covariance
-from kineverse.estimation.identification.bindings import library
-from kineverse.estimation.identification.comparison import prepare_data, solve_with_inliers
-from kineverse.estimation.identification.identify import WEIGHTS
 from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
+from kineverse.estimation.identification.joint_identification import WEIGHTS
+from kineverse.estimation.identification.least_squares import InitialGuess
+from kineverse.estimation.identification.model_selection import prepare_data, solve_with_inliers
+from kineverse.estimation.identification.native import library
+from kineverse.estimation.identification.noise_estimation import UNKNOWN_NOISE, scale_noise
 from kineverse.estimation.identification.observations import check_observations
-from kineverse.estimation.identification.optimise import InitialGuess
 from kineverse.estimation.identification.result import NoiseDeviations
 from kineverse.estimation.identification.solver import solver
-from kineverse.estimation.identification.unknown_noise import UNKNOWN_NOISE, scale_noise
 from kineverse.lie import transform
 from kineverse_studies.experiments.joint_types.answers import Setting, TypeAnswer, identify_case
 from kineverse_studies.experiments.joint_types.report import report_answers

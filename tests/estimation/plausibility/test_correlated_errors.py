@@ -18,10 +18,10 @@ from kineverse.estimation import (
     check_plausibility,
     pose_covariance,
 )
+from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.observations import check_observations
-from kineverse.estimation.plausibility.correlation import CorrelationSettings
 from kineverse.estimation.plausibility.known_motion import KnownJoint
-from kineverse.estimation.plausibility.known_residuals import compute_residuals
+from kineverse.estimation.plausibility.residuals import compute_residuals
 from kineverse.lie import exp_so3
 from kineverse_studies.experiments.stream.observations import (
     DOOR,

@@ -12,7 +12,7 @@ from synthetic_observations import NoisyObserver
 import kineverse as kv
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError
 from kineverse.estimation import ObservedExpression, Outliers, Tracker
-from kineverse.estimation.tracking.track_loss import chi_squared_quantile
+from kineverse.estimation.tracking.estimate import chi_squared_quantile
 
 
 def make_door(upper: float = 1.5) -> kv.Model:

@@ -13,7 +13,7 @@ from synthetic_observations import NoisyObserver, add_pose_noise
 
 import kineverse as kv
 from kineverse.estimation import ObservedExpression, ObservedPose, Outliers, Tracker, pose_covariance
-from kineverse.estimation.tracking.quadratic_program import solve_bounded_qp
+from kineverse.estimation.tracking.bounds import solve_bounded_qp
 
 
 def make_slides() -> kv.Model:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.cli.requirements import require
+from kineverse.cli.arguments import require
 from kineverse_studies.bench import BENCHMARKS, DisagreementError, run_benchmarks, select_benchmarks
 from kineverse_studies.bench.control_workloads import WORKLOADS
 from kineverse_studies.bench.harness import ProgramError, has_peer, run_program

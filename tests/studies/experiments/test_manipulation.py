@@ -14,8 +14,8 @@ from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
 from kineverse.gallery.lockboxes import THESIS, draw_lockbox
 from kineverse.geometry import Rule, Scene
 from kineverse.manipulation import Outcome, TrackedBelief, TrueBelief
+from kineverse.manipulation.base_sampling import find_free_state
 from kineverse.manipulation.robot_sources import SHIPPED
-from kineverse.manipulation.start_state import find_free_state
 from kineverse.worlds import read_run_recording
 from kineverse_studies.commands.reproduce import format_report
 from kineverse_studies.experiments import Options, kitchens, reproduce, table1_open, table1_push

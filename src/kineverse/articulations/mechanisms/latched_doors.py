@@ -12,8 +12,21 @@ from kineverse.errors import InvalidValueError
 from kineverse.model.body import Rgba, Shape
 from kineverse.spatial import X, Z, rotation_about, translation_along
 
-from .mechanism import Mechanism, MechanismPart, constant_value
-from .simple_bodies import DARK, PALE, RED, STEEL, WOOD, box_shape, case, panel, rod_shape, shift
+from .mechanism import (
+    DARK,
+    PALE,
+    RED,
+    STEEL,
+    WOOD,
+    Mechanism,
+    MechanismPart,
+    box_shape,
+    case,
+    constant_value,
+    panel,
+    rod_shape,
+    shift,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """C text of evidence and of the stages of identification, and the complete source."""
 
-from kineverse.compile.interruption import WATCH
+from kineverse.compilation.interruption import WATCH
 
 from .identification_algebra import ALGEBRA
 from .identification_joint_values import JOINT_RANGES, MIRRORED_VALUES, SLIDING_POINT

@@ -1,8 +1,8 @@
 """Identification of joints and kinematic graphs from noisy poses."""
 
-from .custom_family import Family, FamilyParameter
-from .identify import identify
-from .online import Identifier
+from .families import Family, FamilyParameter
+from .joint_identification import identify
+from .online_identification import Identifier
 from .result import Fit, IdentificationResult
 
 __all__ = ["Family", "FamilyParameter", "Fit", "IdentificationResult", "Identifier", "identify"]

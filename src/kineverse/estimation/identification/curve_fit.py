@@ -18,11 +18,10 @@ import numpy as np
 from kineverse.lie import Array, log_so3, mean_rotation, quaternion
 
 from .curve import KNOTS, LEVER, CurveMotion, NaturalSpline, PathWidths, aligned_quaternions
-from .evidence import laplace_evidence
-from .maximum_likelihood import Scored
+from .least_squares import Solution, levenberg_marquardt
+from .marginal_likelihood import Scored, laplace_evidence
 from .motion_model import FamilyMember
 from .observations import Observations
-from .optimise import Solution, levenberg_marquardt
 
 FEWEST_POSES = 5
 """Least number of observations of a curve."""

@@ -13,8 +13,8 @@ import numpy as np
 from kineverse.lie import Array, inverse, log_so3, mean_rotation, rotation_along_z, transform
 
 from .families import JOINT_FAMILIES, GroupMotion, JointFamily
+from .least_squares import InitialGuess
 from .observations import Observations
-from .optimise import InitialGuess
 
 ARC_RADII = (2.0, 8.0)
 """Radii of arcs that are tried, in standard deviations along the arc: 90° and 25° evenly observed."""

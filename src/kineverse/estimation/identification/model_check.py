@@ -25,27 +25,23 @@ import numpy as np
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
-from .comparison import (
+from .curve import CURVE
+from .curve_fit import FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
+from .families import Family, FamilyMotion
+from .least_squares import Solution
+from .marginal_likelihood import Scored
+from .model_selection import (
     SAME_RATIO,
     FamilySolution,
+    GoodnessOfFit,
     IdentificationData,
+    measure_fit,
     solve_families,
     solve_with_inliers,
     weigh_families,
 )
-from .curve import CURVE
-from .curve_fit import FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
-from .custom_family import Family, FamilyMotion
-from .goodness_of_fit import GoodnessOfFit, measure_fit
-from .maximum_likelihood import Scored
 from .motion_model import FamilyMember
-from .observations import Observations
-from .optimise import Solution
-from .outlier_rejection import RowIndices, densest_half, log_inlier_prior
-from .projection import classify_inliers, project_observations
-from .result import SURE, Fit, IdentificationResult, LazyFit
-from .solver import solver
-from .unknown_noise import (
+from .noise_estimation import (
     STATED_NOISE,
     NoisePosterior,
     NoiseSolution,
@@ -53,6 +49,10 @@ from .unknown_noise import (
     estimate_noise,
     scale_noise,
 )
+from .observations import Observations
+from .outlier_rejection import RowIndices, densest_half, log_inlier_prior
+from .result import SURE, Fit, IdentificationResult, LazyFit, classify_inliers, project_observations
+from .solver import solver
 
 REFUTED = 1e-3
 """Largest probability of χ² at which the noise is refuted."""

@@ -24,13 +24,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.estimation.linear_algebra import invert_matrices
-from kineverse.estimation.robust import CHI_SQUARED_6, Outliers
+from kineverse.estimation.noise import CHI_SQUARED_6, Outliers
 from kineverse.lie import Array
 
-from .maximum_likelihood import Scored
+from .least_squares import STEPS, InitialGuess, JointValuePrior, Solution
+from .marginal_likelihood import Scored
 from .motion_model import FamilyMember
 from .observations import Observations
-from .optimise import STEPS, InitialGuess, JointValuePrior, Solution
 from .solver import solver
 
 UNEVEN = 3.0

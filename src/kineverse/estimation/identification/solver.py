@@ -13,17 +13,16 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from kineverse.compile.interruption import raise_signal
+from kineverse.compilation.interruption import raise_signal
 from kineverse.lie import Array
 
-from . import ambiguities, maximum_likelihood, optimise, range_prior
-from .bindings import MOTION_SIZE, Given, Problem, library, pack_motion, problem_of, unpack_motion
-from .evidence import Evidence, laplace_evidence
+from . import joint_values, least_squares, marginal_likelihood
 from .families import PITCHES, REACH, GroupMotion, JointFamily
-from .maximum_likelihood import Scored
+from .least_squares import InitialGuess, JointValuePrior, Solution
+from .marginal_likelihood import Evidence, Scored, laplace_evidence
 from .motion_model import FamilyMember, LinearisedPoses
+from .native import MOTION_SIZE, Given, Problem, library, pack_motion, problem_of, unpack_motion
 from .observations import Observations
-from .optimise import InitialGuess, JointValuePrior, Solution
 
 # Header entries after those of the motion. Prior mean and precision have room for six joint values.
 _COST, _CONVERGED, _MARGINAL, _LOG = range(MOTION_SIZE, MOTION_SIZE + 4)
@@ -97,20 +96,20 @@ class SolutionBuffer:
 _CONSTANTS = {
     "reach_scale": REACH,
     "pitch_scale": PITCHES,
-    "close": optimise.CLOSE,
-    "steps": optimise.STEPS,
-    "first_steps": optimise.FIRST_STEPS,
-    "little": range_prior.LITTLE,
-    "widths": len(range_prior.GRID),
-    "grid": range_prior.GRID.ctypes.data,
-    "slid": ambiguities.SLIDING_TOLERANCE,
-    "sliding_turns": ambiguities.SLIDING_TURNS,
-    "better": ambiguities.BETTER,
-    "mirrored_turns": ambiguities.MIRROR_TURNS,
-    "mirrored_steps": ambiguities.MIRROR_STEPS,
-    "narrowest": maximum_likelihood.NARROWEST,
-    "settled": maximum_likelihood.SETTLED,
-    "turns": maximum_likelihood.TURNS,
+    "close": least_squares.CLOSE,
+    "steps": least_squares.STEPS,
+    "first_steps": least_squares.FIRST_STEPS,
+    "little": joint_values.LITTLE,
+    "widths": len(joint_values.GRID),
+    "grid": joint_values.GRID.ctypes.data,
+    "slid": joint_values.SLIDING_TOLERANCE,
+    "sliding_turns": joint_values.SLIDING_TURNS,
+    "better": joint_values.BETTER,
+    "mirrored_turns": joint_values.MIRROR_TURNS,
+    "mirrored_steps": joint_values.MIRROR_STEPS,
+    "narrowest": marginal_likelihood.NARROWEST,
+    "settled": marginal_likelihood.SETTLED,
+    "turns": marginal_likelihood.TURNS,
     "weight": 1.0,
 }
 # Largest number of doubles of a work memory that is kept between stages.
@@ -135,12 +134,12 @@ class IdentificationSolver:
         start: InitialGuess,
         parent: Array,
         joint_prior: JointValuePrior,
-        steps: int = optimise.STEPS,
+        steps: int = least_squares.STEPS,
     ) -> Solution[FamilyMember]:
         """Run :func:`.optimise.levenberg_marquardt`."""
         motion = start.motion
         if not _has_kernel(motion):
-            return optimise.levenberg_marquardt(
+            return least_squares.levenberg_marquardt(
                 observations, motion, start.values, parent, joint_prior, steps
             )
         problem, buffer = (
@@ -155,7 +154,7 @@ class IdentificationSolver:
         """Run :func:`.maximum_likelihood.maximum_likelihood`."""
         motions = [start.motion for start in starts if _has_kernel(start.motion)]
         if len(motions) < len(starts):
-            return maximum_likelihood.maximum_likelihood(observations, starts)
+            return marginal_likelihood.maximum_likelihood(observations, starts)
         motion = motions[0]
         buffer = SolutionBuffer(
             motion, JointValuePrior.vague(motion.joints), starts[0].values, observations.parent
@@ -173,7 +172,7 @@ class IdentificationSolver:
     ) -> Scored:
         """Run :func:`.maximum_likelihood.maximise_marginal_likelihood`."""
         if not _is_kernel_solution(solution):
-            return maximum_likelihood.maximise_marginal_likelihood(observations, solution)
+            return marginal_likelihood.maximise_marginal_likelihood(observations, solution)
         buffer = SolutionBuffer.from_solution(solution)
         _run(library.code.refine, _problem(observations, solution.motion), buffer)
         return Scored(buffer.solution, buffer.log_evidence)
@@ -189,7 +188,7 @@ class IdentificationSolver:
         """Run :func:`.maximum_likelihood.continue_from`."""
         motion = start.motion
         if not _has_kernel(motion):
-            return maximum_likelihood.continue_from(observations, start, parent, joint_prior, known)
+            return marginal_likelihood.continue_from(observations, start, parent, joint_prior, known)
         problem, buffer = (
             _problem(observations, motion),
             SolutionBuffer(motion, joint_prior, start.values, parent),

@@ -1,7 +1,7 @@
 """Plausibility of a served model, and replacements of its joints."""
 
+from .check import check_plausibility
 from .monitor import PlausibilityMonitor
-from .plausibility import check_plausibility
 from .report import ImplausibleError, JointVerdict, Plausibility
 
 __all__ = ["ImplausibleError", "JointVerdict", "Plausibility", "PlausibilityMonitor", "check_plausibility"]

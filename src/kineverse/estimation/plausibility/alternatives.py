@@ -1,6 +1,6 @@
 """Comparison of the served joint with its alternatives.
 
-As in :mod:`kineverse.estimation.identification.evidence`, the prior of joint values is a Gaussian of unknown
+As in :mod:`..identification.marginal_likelihood`, the prior of joint values is a Gaussian of unknown
 mean and width, here truncated at the limits. So the amplitude of a motion is no evidence: a door that moved a
 little is not compared with one that moved all the way. Identified joints have an improper prior of their mean
 pose. Here the pose is uniform in a cube of 2 m and over all rotations, so that both densities have the same
@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import KineverseError
+from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.kinematic_graph.pairwise import (
     LOG_ANYWHERE,
     FamilyChoice,
@@ -25,25 +26,22 @@ from kineverse.estimation.identification.kinematic_graph.pairwise import (
 )
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
-from kineverse.estimation.identification.projection import project_observations
-from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult
+from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult, project_observations
 from kineverse.estimation.linear_algebra import (
     invert_matrices,
     log_determinants,
     multiply_vectors,
     sum_log_determinants,
 )
-from kineverse.estimation.robust import Outliers
+from kineverse.estimation.noise import Outliers
 from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .correlation import CorrelationSettings
 from .known_motion import KnownJoint
-from .known_residuals import SIZES, KnownResiduals, compute_residuals, orthogonal_residuals
 from .replacement import build_replacement, extend_fit, follows_another
-from .report import JointVerdict
-from .testability import TestableJoint
+from .report import JointVerdict, TestableJoint
+from .residuals import SIZES, KnownResiduals, compute_residuals, orthogonal_residuals
 
 
 def reject_outliers(residuals: KnownResiduals, outliers: Outliers | None) -> RowIndices:

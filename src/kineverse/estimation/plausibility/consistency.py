@@ -16,19 +16,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.errors import KineverseError
 from kineverse.estimation.linear_algebra import multiply_vectors
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.lie import Array, pose_difference
 from kineverse.model.model import Model
 from kineverse.model.operation import ARTICULATIONS
-from kineverse.model.rate_nodes import to_plain
+from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
 from .known_motion import KnownJoint, is_own_limit
-from .known_residuals import KnownResiduals
-from .testability import TestableJoint
+from .report import TestableJoint
+from .residuals import KnownResiduals
 
 # Range of the linearity test in standard deviations, and the accepted relative nonlinearity.
 _RANGE, _NONLINEAR = 2.0, 0.5

@@ -10,16 +10,16 @@ from typing import Self
 
 import numpy as np
 
-from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.compilation import CompiledFunction, compile
 from kineverse.errors import KineverseError
+from kineverse.estimation.identification.least_squares import Solution, levenberg_marquardt
 from kineverse.estimation.identification.motion_model import LinearisedPoses, ParameterPrior
 from kineverse.estimation.identification.observations import Observations
-from kineverse.estimation.identification.optimise import Solution, levenberg_marquardt
 from kineverse.expressions.expression import array, as_expression
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model import Model
-from kineverse.model.rate_nodes import to_plain
+from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
 # Number of initial values of a single coordinate, and of several coordinates.

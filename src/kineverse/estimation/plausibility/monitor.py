@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
+from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import (
     Observations,
@@ -22,28 +23,26 @@ from kineverse.estimation.identification.observations import (
     pair_tracks,
 )
 from kineverse.estimation.linear_algebra import singularity_named
-from kineverse.estimation.robust import Outliers, as_outliers
+from kineverse.estimation.noise import Outliers, as_outliers
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 
 from .alternatives import JointObservations, judge_joint
-from .consistency import ConsistencyTests, TimedResiduals
-from .correlation import CorrelationSettings
-from .exchanged_frames import find_exchanged_frames
-from .known_motion import KnownJoint
-from .known_residuals import KnownResiduals, compute_residuals
-from .plausibility import (
+from .check import (
     FALSE_ALARMS,
     check_decorrelation_time,
     check_false_alarms,
     check_time,
+    find_exchanged_frames,
     pair_outliers,
     undetermined_verdict,
 )
-from .report import JointVerdict, Plausibility
-from .sequential_test import CorrelatedTest
-from .testability import TestableJoint, TestableJoints, find_testable_joints
+from .consistency import ConsistencyTests, TimedResiduals
+from .e_process import CorrelatedTest
+from .known_motion import KnownJoint
+from .report import JointVerdict, Plausibility, TestableJoint, TestableJoints, find_testable_joints
+from .residuals import KnownResiduals, compute_residuals
 
 
 @dataclass

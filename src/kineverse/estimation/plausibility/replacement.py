@@ -17,15 +17,14 @@ import numpy as np
 
 from kineverse.articulations import Joint
 from kineverse.articulations.joint import OneDofJoint
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.estimation.identification.families import WX, GroupMotion
-from kineverse.estimation.identification.found_operations import joint_operation, rigid_pose
+from kineverse.estimation.identification.joint_operations import joint_operation, rigid_pose
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices
-from kineverse.estimation.identification.projection import project_observations
-from kineverse.estimation.identification.result import Fit
+from kineverse.estimation.identification.result import Fit, project_observations
 from kineverse.estimation.linear_algebra import squared_errors
-from kineverse.estimation.robust import CHI_SQUARED_6
+from kineverse.estimation.noise import CHI_SQUARED_6
 from kineverse.expressions.expression import Expression
 from kineverse.lie import Array, exp_so3, inverse, log_so3, transform
 from kineverse.model.articulation import Articulation
@@ -33,12 +32,12 @@ from kineverse.model.body import Pose
 from kineverse.model.frame import Frame
 from kineverse.model.model import Model
 from kineverse.model.operation import ARTICULATIONS, CONSTRAINTS, FRAMES, RATES, Operation, Writes
-from kineverse.model.rate_nodes import to_plain
+from kineverse.model.rates import to_plain
 from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol
 
 from .known_motion import KnownJoint
-from .testability import TestableJoint
+from .report import TestableJoint
 
 
 @dataclass(frozen=True)

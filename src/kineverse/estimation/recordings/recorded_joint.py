@@ -23,17 +23,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.errors import InvalidValueError
+from kineverse.estimation.correlation import LEAST_EFFECTIVE, correlation_time
 from kineverse.estimation.identification import Fit, IdentificationResult, identify
 from kineverse.estimation.identification.curve import CURVE
-from kineverse.estimation.identification.identify import WEIGHTS
+from kineverse.estimation.identification.joint_identification import WEIGHTS
 from kineverse.estimation.identification.model_check import CALIBRATED
 from kineverse.estimation.identification.observations import check_observations
-from kineverse.estimation.identification.projection import complete_fit
-from kineverse.estimation.noise import pose_covariance
-from kineverse.estimation.robust import Outliers
+from kineverse.estimation.identification.result import complete_fit
+from kineverse.estimation.noise import Outliers, pose_covariance
 from kineverse.lie import Array
 
-from .correlation import LEAST_EFFECTIVE, correlation_time
 from .recording import Indices, RecordedPair, spaced_indices
 
 MAX_ROTATION_STEP = 2.0

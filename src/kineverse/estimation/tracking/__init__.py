@@ -1,10 +1,10 @@
 """State estimation of a known model from noisy measurements."""
 
-from kineverse.estimation.robust import Outliers
+from kineverse.estimation.noise import Outliers
 
 from .estimate import Estimate
+from .hypothesis_bank import HypothesisBank
 from .measurements import ObservedExpression, ObservedPose, ObservedPosition
-from .model_bank import HypothesisBank
 from .tracker import Tracker
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""State bounds as rows in the tangent space, and speeds held by locks."""
+"""Bounds on the state as rows in the tangent space, QPs within them, and speeds held by locks."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.expressions.expression import array, as_expression
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
-from kineverse.model.rate_nodes import to_plain
+from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
-from .gaussian import InformationState
-from .layout import Layout, build_layout
+from .information_state import InformationState
 from .measurements import MeasurementModel
 from .process_model import ProcessModel
-from .tangent import TangentSpace, build_tangent_space
+from .state_space import Layout, TangentSpace, build_layout, build_tangent_space
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
@@ -231,3 +230,54 @@ class SpeedLocks:
         bounds = self._bounds(np.concatenate([belief.x, inputs])).reshape(-1, 2)
         still = np.abs(bounds).max(axis=1) < _STILL
         return self._all - {v for v, is_locked in zip(self._speeds, still.tolist(), strict=True) if is_locked}
+
+
+_LEAST = 1e-12
+
+
+def solve_bounded_qp(
+    inverse: Array, gradient: Array, rows: Array, lower: Array, upper: Array
+) -> Array | None:
+    """Minimise ½xᵀAx + gᵀx subject to lower <= rows x <= upper; return None if it is infeasible."""
+    x = -inverse @ gradient
+    normals = np.concatenate([rows, -rows])
+    bounds = np.concatenate([lower, -upper])
+    scale = _LEAST * (1.0 + np.where(np.isfinite(bounds), np.abs(bounds), 0.0))
+    active: list[int] = []
+    multipliers = np.empty(0)
+    for _ in range(100 * len(bounds) + 100):
+        slack = normals @ x - bounds
+        slack[active] = 0.0
+        worst = int(np.argmin(slack + scale)) if len(slack) else -1
+        if worst < 0 or slack[worst] >= -scale[worst]:
+            return x
+        normal, added = normals[worst], 0.0
+        while True:
+            held = normals[active]
+            direction = inverse @ normal
+            if active:
+                relation = np.linalg.lstsq(held @ inverse @ held.T, held @ direction, rcond=None)[0]
+                direction = direction - inverse @ held.T @ relation
+            else:
+                relation = np.empty(0)
+            along = float(direction @ normal)
+            blocking = [
+                (m / r, k) for k, (m, r) in enumerate(zip(multipliers, relation, strict=True)) if r > _LEAST
+            ]
+            partial, leaving = min(blocking, default=(np.inf, -1))
+            is_free = along > _LEAST * float(normal @ inverse @ normal)
+            full = -(float(normal @ x) - bounds[worst]) / along if is_free else np.inf
+            step = min(partial, full)
+            if not np.isfinite(step):
+                return None
+            if is_free:
+                x = x + step * direction
+            multipliers = multipliers - step * relation
+            added += step
+            if full <= partial:
+                active.append(worst)
+                multipliers = np.append(multipliers, added)
+                break
+            del active[leaving]
+            multipliers = np.delete(multipliers, leaving)
+    return None

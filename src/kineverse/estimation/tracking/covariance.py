@@ -26,11 +26,11 @@ from kineverse.estimation.linear_algebra import inverse_spd, symmetric
 from kineverse.lie import Array
 
 from .bounds import GroupBounds
-from .gaussian import InformationState
-from .layout import Layout
+from .information_state import InformationState
 from .observability import UnobservableDirections
 from .process_model import ProcessModel
 from .residuals import MeasurementReader, Measurements, Residuals
+from .state_space import Layout
 from .static_batch import StaticRecord
 
 # Step length and largest distance along the ridge, in deviations.

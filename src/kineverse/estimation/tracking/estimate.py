@@ -1,23 +1,98 @@
-"""Estimated state, its covariance and confidence."""
+"""Estimated state with covariance and confidence, track loss, and recently measured poses."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
+import numpy.typing as npt
 
+from kineverse.compilation import compile
 from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array
+from kineverse.model.frame import WORLD
+from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .gaussian_sum import GaussianSum
+from .gaussian_sum_filter import StepResult, UpdateStep
 from .residuals import Measurements
-from .step import StepResult, UpdateStep
-from .track_loss import TrackLoss
+from .state_space import Layout
+
+Groups = npt.NDArray[np.bool_]
+
+# Quantile of the standard normal distribution that is exceeded once in a million.
+_QUANTILE = 4.753
+
+
+@dataclass(frozen=True, eq=False)
+class TrackLoss:
+    """Refuted updates of each group."""
+
+    refuted: npt.NDArray[np.int64]  # number of updates in a row that refute the estimate (groups,)
+    is_lost: Groups  # True for each lost group (groups,)
+
+    @staticmethod
+    def none(count: int) -> TrackLoss:
+        """Return the state of groups of which none is lost."""
+        return TrackLoss(np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
+
+    @cached_property
+    def is_clear(self) -> bool:
+        """True if no group is lost or refuted."""
+        return not (self.refuted.any() or self.is_lost.any())
+
+    def after(self, measured: Groups, refuted: Groups, lost_after: int) -> TrackLoss:
+        """Return the state after an update with masks of measured and of refuted groups (groups,).
+
+        A group that is lost stays lost until measurements agree with it.
+        """
+        count = np.where(measured, np.where(refuted, self.refuted + 1, 0), self.refuted)
+        return TrackLoss(count, (self.is_lost | (count >= lost_after)) & (refuted | ~measured))
+
+    def with_restarted(self, groups: Groups) -> TrackLoss:
+        """Return the state after a restart of some groups; they stay lost."""
+        return TrackLoss(np.where(groups, 0, self.refuted), self.is_lost)
+
+
+def find_measured(layout: Layout, reading: Measurements) -> Groups:
+    """Return True for each group that was measured (groups,)."""
+    result = np.zeros(len(layout.groups), dtype=bool)
+    result[np.array(layout.group_of)[reading.mask]] = True
+    return result
+
+
+def find_refuted(layout: Layout, reading: Measurements, result: StepResult, has_outliers: bool) -> Groups:
+    """Return True for each group whose estimate an update refutes (groups,).
+
+    With an outlier model, all measurements of the group are rejected. Without one, the normalised innovation
+    squared exceeds its quantile of one in a million.
+    """
+    if has_outliers and not result.outliers:
+        return np.zeros(len(layout.groups), dtype=bool)
+    if not has_outliers:
+        # The quantile of any number of degrees of freedom is beyond this.
+        if not (result.nis > result.dof + 20.0).any():
+            return np.zeros(len(layout.groups), dtype=bool)
+        return np.asarray(result.nis > chi_squared_quantile(result.dof))
+    kept = reading.mask.copy()
+    kept[list(result.outliers)] = False
+    measured = find_measured(layout, reading)
+    measured[np.array(layout.group_of)[kept]] = False
+    return measured
+
+
+def chi_squared_quantile(dof: Array) -> Array:
+    """Return the quantiles of χ² that are exceeded once in a million, for degrees of freedom (n,).
+
+    Wilson and Hilferty, The distribution of chi-square, 1931.
+    """
+    variance = 2.0 / (9.0 * np.maximum(dof, 1.0))
+    return np.asarray(dof * (1.0 - variance + _QUANTILE * np.sqrt(variance)) ** 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,3 +260,56 @@ class Estimate:
         at = "" if self.stamp is None else f" at {self.stamp:g} s"
         values = ", ".join(f"{s}={value:.4g}±{self.deviation[s]:.2g}" for s, value in self.state.items())
         return f"<Estimate{at}: {values}{', lost' if self.lost else ''}>"
+
+
+@dataclass(frozen=True, eq=False)
+class RecentPoses:
+    """Poses of frames that one observer measured."""
+
+    relative_to: str  # name of the observing frame
+    poses: Mapping[str, Array]  # poses by name of the frame (N, 4, 4), in order; NaN where missing
+    covariances: Mapping[str, Array]  # (6, 6), (N, 6, 6)
+    times: Array | None  # (N,) [s]; None if they have none
+
+
+def collect_recent_poses(
+    model: ModelView, layout: Layout, readings: Sequence[tuple[float | None, Measurements, Array]]
+) -> RecentPoses:
+    """Return the poses of readings with their times, of the first observer among the observations."""
+    poses = {i: one for i, one in enumerate(layout.observations) if one.is_pose}
+    observer = next((one.relative_to for one in poses.values()), "")
+    has_times = all(stamp is not None for stamp, _, _ in readings)
+    stamps: Array = np.array(
+        [stamp if has_times else k for k, (stamp, _, _) in enumerate(readings)], dtype=float
+    )
+    # Readings of one time are one row.
+    times, rows = np.unique(stamps, return_inverse=True)
+    measured, covariances = {}, {}
+    inputs = np.zeros((len(times), len(layout.inputs)))
+    for row, (_, _, values) in zip(rows.tolist(), readings, strict=True):
+        inputs[row] = values
+    for i, one in poses.items():
+        if one.relative_to == observer:
+            measured[one.frame] = np.full((len(times), 4, 4), np.nan)
+            weights = []
+            for row, (_, reading, _) in zip(rows.tolist(), readings, strict=True):
+                if reading.mask[i]:
+                    pose = reading.values[layout.measurement_slices[i]].reshape(4, 4)
+                    measured[one.frame][row] = pose
+                    weights.append(reading.whitening[layout.whitening_slices[i]].reshape(6, 6))
+            white: Array = np.array(weights).reshape(-1, 6, 6)
+            given = np.linalg.inv(white.transpose(0, 2, 1) @ white)
+            mean = given.mean(axis=0) if weights else one.covariance
+            if one.is_stated or not np.allclose(mean, one.covariance, rtol=1e-9):
+                covariances[one.frame] = mean
+    if observer in model.frames and len(times):
+        place = model.fk(observer)
+        if place.symbols and {*place.symbols} <= {*layout.inputs}:
+            # No joint between an observer that moves and a part could be tested.
+            places = compile(place, layout.inputs).batch(inputs)
+            turns = np.zeros((len(times), 6, 6))
+            turns[:, :3, :3] = turns[:, 3:, 3:] = places[:, :3, :3]
+            measured = {name: places @ seen for name, seen in measured.items()}
+            covariances = {name: turns @ one @ turns.mT for name, one in covariances.items()}
+            observer = WORLD
+    return RecentPoses(observer, measured, covariances, times if has_times else None)

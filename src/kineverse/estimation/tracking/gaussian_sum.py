@@ -21,10 +21,10 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .covariance import RidgeCovariance
-from .gaussian import InformationState
-from .layout import CoordinateGroup, Layout
+from .information_state import InformationState
 from .process_model import ProcessModel
 from .residuals import MeasurementReader, Residuals
+from .state_space import CoordinateGroup, Layout
 
 MOST_COMPONENTS = 8
 """Largest number of components of a group."""

@@ -16,15 +16,14 @@ import numpy as np
 
 from kineverse.errors import InvalidValueError, ModelError
 from kineverse.estimation.linear_algebra import inverse_spd
-from kineverse.estimation.robust import Outliers, cauchy_weight
+from kineverse.estimation.noise import Outliers, cauchy_weight
 from kineverse.lie import Array
 
-from .bounds import BoundRows, GroupBounds, StateBounds
-from .gaussian import InformationState, QuadraticCost
-from .layout import Layout
+from .bounds import BoundRows, GroupBounds, StateBounds, solve_bounded_qp
+from .information_state import InformationState, QuadraticCost
 from .process_model import ProcessModel
-from .quadratic_program import solve_bounded_qp
 from .residuals import Measurements, Residuals
+from .state_space import Layout
 
 # Iteration ends at steps below this many standard deviations.
 _CONVERGED = 1e-5

@@ -16,10 +16,10 @@ from kineverse.errors import KineverseError
 from kineverse.lie import Array
 
 from .bounds import GroupBounds
-from .gaussian import InformationState
-from .layout import CoordinateGroup, Layout
+from .information_state import InformationState
 from .map_update import MapResult
 from .process_model import ProcessModel
+from .state_space import CoordinateGroup, Layout
 
 # A direction is unobservable while its deviation exceeds this part of the initial one.
 _UNOBSERVABLE = 0.05
@@ -114,7 +114,7 @@ class StationaryPoints:
     def restart_states(
         self, before: InformationState, after: InformationState, groups: Sequence[int], inputs: Array
     ) -> list[InformationState]:
-        """Return the prior belief about points on both sides of the estimate, along unobservable directions."""
+        """Return prior belief about points on both sides of the estimate, along unobservable directions."""
         beliefs: list[InformationState] = []
         for number in groups:
             group, x = self._layout.groups[number], before.x[self._layout.groups[number].x]

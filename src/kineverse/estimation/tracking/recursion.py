@@ -1,11 +1,13 @@
-"""Recursion of a tracker's state: prediction to a time, update, and restart of lost groups."""
+"""Recursion of a tracker's state: prediction, update, restart of lost groups, measurements that come late."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -15,12 +17,90 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bounds import SpeedLocks
-from .estimate import TrackerState
-from .gaussian import InformationState
-from .initial_belief import InitialBelief
+from .estimate import TrackerState, TrackLoss, find_measured, find_refuted
+from .gaussian_sum_filter import StepResult, UpdateStep
+from .information_state import InformationState
+from .initialization import InitialBelief
 from .residuals import Measurements
-from .step import StepResult, UpdateStep
-from .track_loss import TrackLoss, find_measured, find_refuted
+
+
+class Stamped(Protocol):
+    """State with the time [s] it belongs to; None if it has none."""
+
+    @property
+    def stamp(self) -> float | None:
+        """Time [s]."""
+
+
+StampedState = TypeVar("StampedState", bound=Stamped)
+
+
+@dataclass(frozen=True, eq=False)
+class Step(Generic[StampedState]):
+    """Step of a filter."""
+
+    stamp: float  # time at its end [s]
+    before: StampedState  # state before it
+    apply: Callable[
+        [StampedState], StampedState
+    ]  # function of the state before it that returns the state at its end
+    predict: Callable[[StampedState, float], StampedState]
+
+
+class FixedLag(Generic[StampedState]):
+    """Steps of the last seconds, which are repeated after a late measurement."""
+
+    def __init__(self, lag: float) -> None:
+        self.lag = lag
+        self._steps: tuple[Step[StampedState], ...] = ()
+
+    def copy(self) -> FixedLag[StampedState]:
+        """Return an independent buffer with the same steps."""
+        other = FixedLag[StampedState](self.lag)
+        other._steps = self._steps
+        return other
+
+    def clear(self) -> None:
+        """Forget all steps."""
+        self._steps = ()
+
+    def append(self, step: Step[StampedState]) -> None:
+        """Add a step, and drop those too old for any late measurement."""
+        oldest = step.stamp - self.lag
+        self._steps = (*(one for one in self._steps if one.stamp >= oldest), step)
+
+    def insert(self, stamp: float, apply: Callable[[StampedState], StampedState]) -> StampedState:
+        """Apply a late measurement at its time, repeat all later steps, and return the state at their end."""
+        later = [one for one in self._steps if one.stamp > stamp]
+        if later and later[-1].stamp - stamp > self.lag:
+            raise InvalidValueError(
+                f"A measurement at {stamp:g} s is later than the lag of {self.lag:g} s: leave it out, or "
+                "give the tracker a longer lag=."
+            )
+        # A state without a time begins at the first measurement.
+        began = later[0].before.stamp if later else math.inf
+        if began is not None and began > stamp:
+            raise InvalidValueError(
+                f"A measurement at {stamp:g} s is from before the start or a reset: leave it out."
+            )
+        predict, state = later[0].predict, later[0].before
+        steps = [one for one in self._steps if one.stamp <= stamp]
+        late = Step(stamp, state, partial(_apply_late, predict, stamp, apply), predict)
+        for one in (late, *later):
+            steps.append(Step(one.stamp, state, one.apply, one.predict))
+            state = one.apply(state)
+        self._steps = tuple(steps)
+        return state
+
+
+def _apply_late(
+    predict: Callable[[StampedState, float], StampedState],
+    stamp: float,
+    apply: Callable[[StampedState], StampedState],
+    before: StampedState,
+) -> StampedState:
+    return apply(predict(before, stamp))
+
 
 NO_NOISE: Mapping[Symbol, float] = MappingProxyType({})
 """Process noise of no speed."""

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import CompiledFunction
+from kineverse.compilation import CompiledFunction
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
 from kineverse.lie import Array, inverse_right_jacobian, pose_difference, transform
 
-from .layout import Layout
 from .measurements import MeasurementModel, require_covariance, wrap_difference
+from .state_space import Layout
 
 RIGID = 1e-4
 """Largest accepted deviation of RᵀR from the identity; a pose in single precision has 1e-6."""

@@ -18,12 +18,12 @@ import numpy as np
 from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array, pose_difference, retract
 
-from .gaussian import InformationState, QuadraticCost
-from .layout import Layout
+from .information_state import InformationState, QuadraticCost
 from .map_update import MapResult, MapSolver
 from .measurements import MeasurementModel, wrap_difference
 from .observability import UnobservableDirections
 from .residuals import MeasurementReader, Measurements, Residuals, whitening
+from .state_space import Layout
 
 UpdateFunction: TypeAlias = Callable[[InformationState, Measurements, Array, list[int]], MapResult]
 

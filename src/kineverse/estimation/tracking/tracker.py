@@ -14,19 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._threads import CallLock, one_at_a_time
+from kineverse._runtime import CallLock, one_at_a_time
 from kineverse.errors import InvalidValueError
-from kineverse.estimation.robust import Outliers, as_outliers
+from kineverse.estimation.noise import Outliers, as_outliers
 from kineverse.lie import Array
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
-from .bindings import native_library
 from .bounds import SpeedLocks, arrange_state
-from .estimate import Estimate, TrackerState
-from .fixed_lag import FixedLag, Step
-from .gaussian import InformationState
-from .initial_belief import GivenValues, make_initial_belief
+from .estimate import Estimate, RecentPoses, TrackerState, TrackLoss, collect_recent_poses
+from .gaussian_sum_filter import UpdateStep
+from .information_state import InformationState
+from .initialization import GivenValues, make_initial_belief
 from .measurements import (
     ObservedLike,
     build_measurement_models,
@@ -34,18 +33,16 @@ from .measurements import (
     require_mapping,
     require_number,
 )
-from .process_noise import (
+from .native import native_library
+from .process_model import (
     INITIAL_SPEED_TIME,
     Process,
     check_process,
     default_process_noise,
     require_noise,
 )
-from .recent_poses import RecentPoses, collect_recent_poses
-from .recursion import Recursion
+from .recursion import FixedLag, Recursion, Step
 from .residuals import Measurements
-from .step import UpdateStep
-from .track_loss import TrackLoss
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView

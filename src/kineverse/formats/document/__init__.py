@@ -10,9 +10,9 @@ content (:mod:`.encoding`), and is optional. Reading a document runs no code and
 ``.kv.msgpack`` file is the same in binary form.
 """
 
+from .json_values import schema
 from .opaque_operation import OpaqueOperation
 from .reader import from_bytes, read_operations, read_packed_operations
-from .schema import schema
 from .writer import document_hash, to_bytes, to_json, write_document
 
 __all__ = [

@@ -12,10 +12,10 @@ from collections.abc import Iterable
 from typing import Any
 
 from kineverse.expressions.expression import Expression
-from kineverse.model.rate_nodes import collect_symbols
+from kineverse.model.rates import collect_symbols
 from kineverse.symbols import Symbol
 
-from .schema import InvalidDocumentError
+from .json_values import InvalidDocumentError
 
 MAX_NODES = 1 << 22
 MAX_LISTS = 10_000_000

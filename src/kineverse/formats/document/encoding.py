@@ -17,7 +17,7 @@ from kineverse.errors import MissingDependencyError
 from kineverse.model.operation import KINDS
 
 from .budget import MAX_LISTS
-from .schema import InvalidDocumentError
+from .json_values import InvalidDocumentError
 
 HASH = "sha256"
 _LEAD, _TAIL = f',\n"{HASH}":"', '"}\n'

@@ -11,7 +11,7 @@ import casadi as ca
 from kineverse.expressions import layout
 from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
 from kineverse.expressions.node import Node
-from kineverse.model.rate_nodes import Composed
+from kineverse.model.rates import Composed
 from kineverse.symbols import Symbol
 
 from .budget import (
@@ -25,7 +25,7 @@ from .budget import (
     MAX_NESTING,
     Budget,
 )
-from .schema import InvalidDocumentError, check_integer, check_length, check_list, describe_value
+from .json_values import InvalidDocumentError, check_integer, check_length, check_list, describe_value
 
 
 class NodeGraph:

@@ -51,7 +51,7 @@ from kineverse.expressions.node import Augment, Node
 from kineverse.expressions.nonsmooth import Extremum, Norm, Power, Select
 from kineverse.expressions.piecewise import Piecewise
 from kineverse.logic import And, Less, Not, Or
-from kineverse.model.rate_nodes import Carried, Composed, Dependent
+from kineverse.model.rates import Carried, Composed, Dependent
 from kineverse.model.traces import ReadNode
 from kineverse.symbols import Symbol
 

@@ -18,8 +18,7 @@ from kineverse.expressions.node import Augment, Node
 from kineverse.expressions.nonsmooth import Extremum, Norm, Power, Select
 from kineverse.expressions.piecewise import Piecewise, check_pieces
 from kineverse.logic import And, Less, Not, Or
-from kineverse.model.rate_nodes import Carried, Composed, Dependent, collect_symbols
-from kineverse.model.rates import Rates, as_row
+from kineverse.model.rates import Carried, Composed, Dependent, Rates, as_row, collect_symbols
 from kineverse.model.traces import ReadNode
 from kineverse.symbols import ROLES, Symbol
 
@@ -33,8 +32,7 @@ from .budget import (
     MAX_QUESTIONS,
     MAX_STEPS,
 )
-from .node_graph import NodeGraph
-from .schema import (
+from .json_values import (
     InvalidDocumentError,
     check_entity_name,
     check_integer,
@@ -45,6 +43,7 @@ from .schema import (
     check_type,
     describe_value,
 )
+from .node_graph import NodeGraph
 
 UNARY: dict[str, int] = {
     "neg": ca.OP_NEG,

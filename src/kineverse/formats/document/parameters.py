@@ -19,6 +19,7 @@ from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.loops import CloseLoop, LoopConstraint
 from kineverse.model.articulation import Articulation
+from kineverse.model.basic_operations import AddFrame, Attach, Constrain, SetData, SetRate
 from kineverse.model.body import (
     Body,
     Box,
@@ -35,13 +36,11 @@ from kineverse.model.body import (
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
 from kineverse.model.operation import Cell, Operation
-from kineverse.model.operations import AddFrame, Attach, Constrain, SetData, SetRate
 
-from .bodies import decode_pose, encode_pose
 from .budget import MAX_DEPTH, check_depth
+from .json_values import InvalidDocumentError, check_keys, check_length, check_list, check_text
 from .node_graph import NodeGraph
-from .schema import InvalidDocumentError, check_keys, check_length, check_list, check_text
-from .values import DATUM_TAGS, Ref, Rename, decode_datum, encode_datum
+from .values import DATUM_TAGS, Ref, Rename, decode_datum, decode_pose, encode_datum, encode_pose
 
 TAGS = ("pose", "mapping", "record", "written", "unwritten", *DATUM_TAGS)
 

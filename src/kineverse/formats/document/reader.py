@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.files import MAX_BYTES
@@ -20,16 +20,16 @@ from kineverse.model.operation import BODIES, FRAMES, KINDS, RATES, Cell, find_e
 from kineverse.model.read_recorder import ABSENT, Read
 from kineverse.model.registry import FileContent
 from kineverse.model.traces import Trace
-from kineverse.model.traces.placeholder import find_read_nodes
+from kineverse.model.traces.trace import find_read_nodes
 from kineverse.symbols import symbol_name
 
 from .budget import COST_OF_NAME, MAX_NODES, check_counts, spend_rate_coupling
 from .encoding import HASH, check_hash, unpack_document
+from .json_values import InvalidDocumentError, check_entity_name, check_keys, check_list, check_text
 from .node_graph import NodeGraph
 from .node_types import read_node
 from .opaque_operation import OpaqueOperation
 from .parameters import decode_parameter
-from .schema import InvalidDocumentError, check_entity_name, check_keys, check_list, check_text
 from .traces import TraceConsistency, check_read_nodes, decode_queries, merge_reads
 from .values import Rename, decode_value
 from .writer import FORMAT, VERSION

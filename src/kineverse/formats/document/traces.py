@@ -22,14 +22,13 @@ from kineverse.model.kinematics import branches
 from kineverse.model.operation import FRAMES, Cell, find_expressions
 from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Reads
 from kineverse.model.traces import Access, Query, Trace, TraceStep
-from kineverse.model.traces.placeholder import find_read_nodes
 from kineverse.model.traces.replay import ExpressionPair, writes_agree
-from kineverse.model.traces.trace import run_query, substitute_results
+from kineverse.model.traces.trace import find_read_nodes, run_query, substitute_results
 from kineverse.model.traces.trace_queries import DATA_QUERIES, EXPRESSION_QUERIES, QUERY_KINDS, QueryResult
 
 from .budget import COST_OF_FRAME, COST_OF_NAME, COST_OF_NODE_BELOW, MAX_QUESTIONS, MAX_WORK
+from .json_values import InvalidDocumentError, check_integer, check_length, check_list
 from .node_graph import NodeGraph
-from .schema import InvalidDocumentError, check_integer, check_length, check_list
 from .values import Ref
 
 _KIND_OF = {question: kind for kind, question in DATA_QUERIES.items()}

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.files import replace_file

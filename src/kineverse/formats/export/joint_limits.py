@@ -109,7 +109,7 @@ def assign_limits(
     target: FormatCapabilities,
     unsupported: UnsupportedFeatures,
 ) -> None:
-    """Assign limits to joints: to the joint that a limit is named for, else to the joint of its coordinate."""
+    """Assign limits: to the joint that a limit is named for, else to the joint of its coordinate."""
     joints = {joint.name: joint for joint in description.joints}
     independent = {joint.symbol: joint for joint in description.joints if joint.is_independent}
     for item in found:

@@ -24,9 +24,10 @@ from kineverse.formats.description import (
     SumLimit,
 )
 from kineverse.formats.names import TakenNames
+from kineverse.formats.poses import ROTATION_TOLERANCE, rotation_deviation
 from kineverse.intervals.graph import TermGraph
 from kineverse.loops.equations import AXES
-from kineverse.loops.record import LOOP_KINDS, LoopRecord, find_loops
+from kineverse.loops.loop_records import LOOP_KINDS, LoopRecord, find_loops
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
@@ -54,7 +55,6 @@ from .joint_limits import (
     has_given_gradient,
     intersect_limits,
 )
-from .poses import ROTATION_TOLERANCE, rotation_deviation
 
 
 def sort_parents_first(model: ModelView) -> list[str]:

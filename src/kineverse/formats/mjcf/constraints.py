@@ -12,14 +12,13 @@ from kineverse.formats.names import NameFaultHandler, UniqueNames
 from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
 from kineverse.model.body import Pose
 
-from .bodies import MjcfBodies
-from .compile import CompiledMjcf
+from .bodies import MjcfBodies, mujoco_pose
+from .compiled_document import CompiledMjcf
 from .custom_elements import merge_loop_closures
 from .description import MjcfClosure, MjcfCoupling, MjcfDynamics, MjcfTendon, Quartic
 from .elements import ElementRemark, MjcfElement
 from .held_bodies import compute_rest_poses
 from .mujoco_api import mujoco
-from .shapes import mujoco_pose
 
 _CLOSURE_TOLERANCE = 1e-6
 """Largest distance between the ends of a closed loop [m], [rad]; files have six digits."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+from kineverse.formats.description import DisjointSets
 from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
-from kineverse.formats.tree import DisjointSets
 from kineverse.model.body import Pose
 
 from .description import WORLD, MjcfClosure, MjcfLink, MjcfScene

@@ -10,21 +10,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from kineverse.errors import FormatError
 from kineverse.formats import poses
 from kineverse.formats.files import read_file
+from kineverse.formats.isolation import IsolatedCallError, call_isolated
 from kineverse.formats.poses import compose_poses
 from kineverse.formats.xml_reader import quote
+from kineverse.formats.xml_writer import Tag, format_xml
 from kineverse.lie import transform
 from kineverse.model.body import Mesh, Pose
 
+from . import mujoco_api
 from .elements import MjcfElement, find_below_root
 from .mujoco_api import mujoco
-from .plugin_meshes import Triangles, make_plugin_meshes
 from .preprocess import MeshReference, PreprocessedMjcf
 
 _FORMATS = (".stl", ".obj", ".msh")
@@ -207,3 +209,46 @@ def place_mesh(asset: MeshAsset, body_T_mesh: Pose, folder: str, root: str) -> t
     return Mesh(asset.uri, (a, b, c), folder, root), compose_poses(
         body_T_mesh, Pose.from_matrix(mesh_T_file + 0.0)
     )
+
+
+Triangles: TypeAlias = "tuple[list[float], list[int]]"
+"""Coordinates of the vertices [m] and numbers of the corners of the faces, each in a row."""
+
+
+def make_plugin_meshes(plugins: list[MeshReference]) -> dict[MeshReference, Triangles | str]:
+    """Return the triangles of the meshes that plugins make, or the reason why there are none."""
+    jobs = [[plugin.plugin, list(plugin.settings)] for plugin in plugins]
+    try:
+        made = call_isolated(__name__, "compile_plugin_meshes", jobs)
+    except IsolatedCallError as error:
+        made = [str(error)] * len(plugins)
+    return {p: m if isinstance(m, str) else (m[0], m[1]) for p, m in zip(plugins, made, strict=True)}
+
+
+def compile_plugin_meshes(jobs: list[tuple[str, list[tuple[str, str]]]]) -> list[Any]:
+    """Return for each plugin and its settings the vertices and faces of its mesh, or MuJoCo's error."""
+    engine = mujoco_api.mujoco()
+    made: list[Any] = []
+    for plugin, settings in jobs:
+        root = Tag("mujoco")
+        instance = root.add("extension").add("plugin", plugin=plugin).add("instance", name="p")
+        for key, value in settings:
+            instance.add("config", key=key, value=value)
+        root.add("asset").add("mesh", name="m").add("plugin", instance="p")
+        root.add("worldbody").add("geom", type="mesh", mesh="m")
+        try:
+            model = engine.MjModel.from_xml_string(format_xml(root).decode())
+        except (ValueError, RuntimeError, engine.FatalError, engine.UnexpectedError) as error:
+            made.append(mujoco_api.extract_reason(str(error)))
+            continue
+        # MuJoCo takes the principal axes of such a mesh for its own, other than those of all other meshes.
+        spec = engine.MjSpec()
+        spec.add_mesh(
+            name="m",
+            uservert=model.mesh_vert.ravel().tolist(),
+            userface=model.mesh_face.ravel().tolist(),
+        )
+        spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_MESH, meshname="m")
+        principal = spec.compile()
+        made.append((principal.mesh_vert.ravel().tolist(), principal.mesh_face.ravel().tolist()))
+    return made

@@ -90,7 +90,7 @@ _MESH_NAME = re.compile(r"\bmesh_\d+\b")
 
 
 def find_load_error(root: Tag, folder: Path, converted: Mapping[Path, bytes]) -> str | None:
-    """Return the error with which MuJoCo loads a document; None if there is none or MuJoCo is not installed."""
+    """Return error with which MuJoCo loads a document; None if there is none or MuJoCo is not installed."""
     try:
         engine = mujoco()
     except MissingDependencyError:

@@ -14,26 +14,25 @@ from kineverse.articulations import Ball, Continuous, Floating, Prismatic, Revol
 from kineverse.articulations import Joint as JointOperation
 from kineverse.expressions.expression import array
 from kineverse.expressions.gradient import total_derivative
+from kineverse.formats.description import path_between
 from kineverse.formats.names import NameMap
 from kineverse.formats.poses import IDENTITY, compose_poses
-from kineverse.formats.tree import path_between
 from kineverse.loops.close_loop import CloseLoop
 from kineverse.loops.equations import AXES
+from kineverse.model.basic_operations import AddFrame, Constrain, SetBody, SetHome
 from kineverse.model.body import Pose, Vector3, is_empty_body
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD as MODEL_WORLD
 from kineverse.model.frame import Frame
 from kineverse.model.operation import Operation
-from kineverse.model.operations import AddFrame, Constrain, SetBody, SetHome
 from kineverse.model.registry import FileContent
 from kineverse.spatial import axis_angle
 from kineverse.symbols import position, symbol_name
 
 from .description import COORDINATE_SUFFIXES, WORLD, MjcfClosure, MjcfCoupling, MjcfJoint, MjcfLink, MjcfScene
+from .equalities import FollowerJoints, Tendon, TendonCoupling
 from .held_bodies import attach_held_bodies
-from .joint_equalities import FollowerJoints
 from .reader import parse_mjcf
-from .tendons import Tendon, TendonCoupling
 
 
 def loop_operations(scene: MjcfScene, model_name: NameMap, followers: FollowerJoints) -> Iterator[Operation]:

@@ -13,13 +13,12 @@ from kineverse.formats.files import read_file
 from kineverse.formats.reader_warnings import Fault, warn
 from kineverse.formats.root_folder import find_text_root
 
-from .bodies import MjcfBodies
-from .compile import compile_document
+from .bodies import MjcfBodies, MjcfShapes
+from .compiled_document import compile_document
 from .constraints import MjcfConstraints
 from .description import MjcfScene
 from .elements import MjcfElement
 from .preprocess import MjcfPreprocessor
-from .shapes import MjcfShapes
 
 
 def read_mjcf(

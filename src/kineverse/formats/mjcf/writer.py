@@ -27,9 +27,14 @@ from kineverse.formats.description import (
 )
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
 from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
-from kineverse.formats.export.poses import unit_quaternion
-from kineverse.formats.mjcf.body_writer import MjcfBodyWriter, add_pose
-from kineverse.formats.mjcf.custom_elements import (
+from kineverse.formats.names import TakenNames
+from kineverse.formats.poses import unit_quaternion
+from kineverse.formats.xml_writer import Tag, format_xml
+from kineverse.model.frame import WORLD
+from kineverse.model.model_view import ModelView
+
+from .body_writer import MjcfBodyWriter, add_pose
+from .custom_elements import (
     ENDS,
     MASSLESS,
     add_loop,
@@ -37,11 +42,7 @@ from kineverse.formats.mjcf.custom_elements import (
     add_speeds,
     format_range,
 )
-from kineverse.formats.mjcf.mujoco_api import find_blamed_mesh, find_load_error
-from kineverse.formats.names import TakenNames
-from kineverse.formats.xml_writer import Tag, format_xml
-from kineverse.model.frame import WORLD
-from kineverse.model.model_view import ModelView
+from .mujoco_api import find_blamed_mesh, find_load_error
 
 MJCF_CAPABILITIES = FormatCapabilities(
     "MJCF", sum_limits=True, one_way_speeds=True, loop_joints=True, polynomial_degree=4

@@ -1,14 +1,13 @@
-"""SDF joint elements as checked joints.
-
-Only the elements that apply to the type of a joint are read: the axis of a fixed joint is ignored.
-"""
+"""SDF joints: axes, gearboxes, and the spanning tree that they make."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 from kineverse.errors import suggest
+from kineverse.formats.description import DisjointSets
 from kineverse.formats.mimic import MimicRelation, is_valid_factor
 from kineverse.formats.poses import rotate_direction
 from kineverse.formats.xml_reader import Element, ElementError, find_child, quote
@@ -17,11 +16,12 @@ from kineverse.formats.xml_values import (
     read_child_bool,
     read_child_limit,
     read_child_number,
+    read_child_text,
     read_text,
 )
 from kineverse.model.body import Vector3
 
-from .description import AXIS_COUNT, SdfAxis, SdfJoint, SdfJointType
+from .description import AXIS_COUNT, WORLD, SdfAxis, SdfJoint, SdfJointType, SdfLink, SdfRoot
 from .pose_graph import PoseNode, find_early, find_joint_end, pose_between
 
 _SUFFIXES = {1: ("",), 2: ("/first", "/second")}
@@ -213,3 +213,169 @@ def find_reference_body(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -
     part = find_child(node.element, "gearbox_reference_body")
     assert part is not None
     return attachments[node.scope.find(read_text(part), part, node.element)]
+
+
+_PARALLEL = 1e-4
+_HINGE_TYPES = ("revolute", "continuous")
+
+
+def resolve_gearboxes(
+    hinges: Sequence[ResolvedJoint], attachments: dict[PoseNode, PoseNode]
+) -> list[ResolvedJoint]:
+    """Replace gearboxes by hinges that follow others.
+
+    A gearbox that couples two other hinges is removed, and the hinge of its child follows that of its parent.
+    """
+    between: dict[frozenset[PoseNode], int] = {}
+    result: list[ResolvedJoint | None] = list(hinges)
+    for index, hinge in enumerate(hinges):
+        if hinge.joint.kind in _HINGE_TYPES:
+            between.setdefault(frozenset((hinge.parent, hinge.child)), index)
+    for index, hinge in enumerate(hinges):
+        if hinge.joint.kind != "gearbox":
+            continue
+        node = hinge.node
+        if not read_child_text(node.element, "gearbox_reference_body"):
+            with node.document.locate_errors(node.element):
+                mistake = ElementError(
+                    node.element, "has no <gearbox_reference_body>: nothing says what it turns against."
+                )
+                node.document.remarks.mend(mistake, "it is left out")
+            result[index] = None
+            continue
+        body = find_reference_body(node, attachments)
+        with node.document.locate_errors(node.element):
+            ratio = read_child_number(node.element, "gearbox_ratio", 1.0)
+        if not ratio:
+            node.refuse("has the ratio 0, so nothing would turn.")
+        driving = between.get(frozenset((body, hinge.parent)))
+        if driving is None:
+            node.refuse(
+                f"there is no hinge between its reference body {quote(body.path)} and its parent "
+                f"{quote(hinge.parent.path)}, whose angle it would pass on."
+            )
+        first, second = hinge.joint.axes
+        driver = hinges[driving]
+        factor = -ratio * _sense(driver, hinge, body, first)
+        driven = between.get(frozenset((body, hinge.child)))
+        if driven is None:
+            joint = replace(
+                hinge.joint,
+                parent=body.path or "world",
+                pose_in_parent=pose_between(body, node),
+                axes=(replace(second, suffix=""),),
+                gear=MimicRelation(driver.joint.name, factor),
+            )
+            result[index] = replace(hinge, joint=joint, parent=body)
+            continue
+        found = result[driven]
+        assert found is not None
+        axis = found.joint.axes[0]
+        if axis.mimic is not None:
+            node.refuse(f"its child's hinge {quote(found.joint.name)} follows another joint already.")
+        factor *= _sense(found, hinge, body, second)
+        axis = replace(axis, mimic=MimicRelation(driver.joint.name, factor))
+        result[driven] = replace(found, joint=replace(found.joint, axes=(axis,)))
+        result[index] = None
+    return [hinge for hinge in result if hinge is not None]
+
+
+def _sense(hinge: ResolvedJoint, gearbox: ResolvedJoint, body: PoseNode, axis: SdfAxis) -> float:
+    """Return the sign of a hinge's angle from the reference body about an axis of the gearbox, 1 or -1."""
+    hinge_axis = rotate_direction(pose_between(gearbox.node, hinge.node), hinge.joint.axes[0].xyz)
+    cosine = _dot(hinge_axis, axis.xyz)
+    if abs(cosine) < 1.0 - _PARALLEL:
+        angle = math.degrees(math.acos(min(abs(cosine), 1.0)))
+        gearbox.node.refuse(
+            f"its axis is {angle:.3g}° away from that of the hinge {quote(hinge.joint.name)}, "
+            "where they have to be parallel."
+        )
+    return math.copysign(1.0, cosine) * (1.0 if hinge.parent is body else -1.0)
+
+
+def _dot(a: Vector3, b: Vector3) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def build_spanning_tree(
+    links: Sequence[SdfLink],
+    joints: Iterable[SdfJoint],
+    static: Iterable[str],
+    remark: Callable[[SdfJoint, str], None],
+) -> tuple[tuple[SdfRoot, ...], tuple[SdfJoint, ...], tuple[SdfJoint, ...]]:
+    """Return the roots, the joints from the roots outwards, and the joints that close loops."""
+    connected, rigid = DisjointSets(), DisjointSets()
+    for link in links:
+        if link.static:
+            connected.union(WORLD, link.name)
+            rigid.union(WORLD, link.name)
+    joints = list(joints)
+    for joint in joints:
+        if joint.kind == "fixed":
+            rigid.union(joint.parent, joint.child)
+    joints_at: dict[str, list[SdfJoint]] = {}
+    children: set[str] = {link.name for link in links if link.static}
+    loops: list[SdfJoint] = []
+    for joint in joints:
+        if connected.union(joint.parent, joint.child):
+            joints_at.setdefault(joint.parent, []).append(joint)
+            joints_at.setdefault(joint.child, []).append(joint)
+            children.add(joint.child)
+        elif rigid.find(joint.parent) != rigid.find(joint.child):
+            loops.append(joint)
+        else:
+            remark(joint, "is left out: its links are rigidly connected anyway.")
+    roots = [SdfRoot(link.name) for link in links if link.static]
+    starts = [WORLD, *(root.link for root in roots)]
+    ordered = _outwards(starts, joints_at, remark)
+    reached = {connected.find(WORLD)}
+    fixed = {connected.find(name) for name in static}
+    for link in links:
+        group = connected.find(link.name)
+        if group not in reached and link.name not in children:
+            reached.add(group)
+            roots.append(SdfRoot(link.name, free=group not in fixed))
+            ordered += _outwards([link.name], joints_at, remark)
+    return tuple(roots), tuple(ordered), tuple(loops)
+
+
+def _outwards(
+    starts: Sequence[str], joints_at: dict[str, list[SdfJoint]], remark: Callable[[SdfJoint, str], None]
+) -> list[SdfJoint]:
+    """Return the joints from some links outwards, depth first, each reversed if it leads inwards."""
+    ordered: list[SdfJoint] = []
+    visited: set[str] = set(starts)
+    stack = [(start, joint) for start in reversed(starts) for joint in reversed(joints_at.get(start, ()))]
+    while stack:
+        near, joint = stack.pop()
+        far = joint.child if joint.parent == near else joint.parent
+        if far in visited:
+            continue
+        visited.add(far)
+        if joint.parent != near:
+            remark(
+                joint, f"leads from {quote(near)} to {quote(far)} here, since that is the way from the root."
+            )
+            joint = reverse_joint(joint)
+        ordered.append(joint)
+        stack.extend((far, other) for other in reversed(joints_at.get(far, ())))
+    return ordered
+
+
+def reverse_joint(joint: SdfJoint) -> SdfJoint:
+    """Return a joint with parent and child exchanged: the same coordinates about opposite axes."""
+    return replace(
+        joint,
+        parent=joint.child,
+        child=joint.parent,
+        pose_in_parent=joint.pose_in_child,
+        pose_in_child=joint.pose_in_parent,
+        axes=tuple(_negate_axis(axis) for axis in reversed(joint.axes)),
+        is_reversed=not joint.is_reversed,
+    )
+
+
+def _negate_axis(axis: SdfAxis) -> SdfAxis:
+    """Return an axis of the opposite direction."""
+    x, y, z = axis.xyz
+    return replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z))

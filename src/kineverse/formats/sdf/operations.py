@@ -25,18 +25,18 @@ from kineverse.articulations import (
 )
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
+from kineverse.formats.description import path_between
 from kineverse.formats.mimic import MimicRelation
 from kineverse.formats.names import NameMap
 from kineverse.formats.poses import IDENTITY, invert_pose, is_identity
-from kineverse.formats.tree import path_between
 from kineverse.formats.xml_reader import quote
 from kineverse.loops.close_loop import CloseLoop
 from kineverse.loops.equations import AXES
+from kineverse.model.basic_operations import AddFrame, SetBody
 from kineverse.model.body import is_empty_body
 from kineverse.model.frame import WORLD as MODEL_WORLD
 from kineverse.model.frame import Frame
 from kineverse.model.operation import Operation
-from kineverse.model.operations import AddFrame, SetBody
 from kineverse.model.registry import FileContent
 from kineverse.symbols import position, symbol_name
 

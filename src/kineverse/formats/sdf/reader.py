@@ -23,9 +23,8 @@ from kineverse.formats.xml_values import read_attribute_bool, read_child_bool, r
 
 from .bodies import read_sdf_body
 from .description import WORLD, SdfFrame, SdfJoint, SdfLink, SdfScene
-from .gearbox import resolve_gearboxes
-from .include import find_included
-from .joints import read_sdf_joint
+from .include import find_included, read_urdf_as_sdf
+from .joints import build_spanning_tree, read_sdf_joint, resolve_gearboxes
 from .pose_graph import (
     NodeKind,
     PoseGraph,
@@ -37,8 +36,6 @@ from .pose_graph import (
     resolve_attachments,
     resolve_pose_graph,
 )
-from .tree import build_spanning_tree
-from .urdf_include import read_urdf_as_sdf
 
 _MAX_DEPTH = 100
 MAX_INCLUDED = 100_000

@@ -1,6 +1,6 @@
 """URDF, the Unified Robot Description Format of ROS."""
 
-from kineverse.formats.urdf.description import (
+from .description import (
     UrdfDynamics,
     UrdfJoint,
     UrdfLimits,
@@ -9,7 +9,7 @@ from kineverse.formats.urdf.description import (
     UrdfRobot,
     UrdfSafetyController,
 )
-from kineverse.formats.urdf.reader import parse_urdf, read_urdf
+from .reader import parse_urdf, read_urdf
 
 __all__ = [
     "UrdfDynamics",

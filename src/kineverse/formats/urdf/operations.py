@@ -26,17 +26,16 @@ from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.names import NumberedNames, drop_empty_parts
 from kineverse.formats.reader_warnings import Fault, warn
-from kineverse.formats.urdf.description import UrdfJoint, UrdfLink, UrdfRobot
 from kineverse.formats.xml_reader import quote
+from kineverse.model.basic_operations import AddFrame, SetBody, SoftLimits
 from kineverse.model.body import Pose, is_empty_body
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import Operation
-from kineverse.model.operations import AddFrame, SetBody, SoftLimits
 from kineverse.model.registry import FileContent
-from kineverse.shipped.bases import mobile_base
-from kineverse.shipped.springs import joint_spring
+from kineverse.shipped.robots import joint_spring, mobile_base
 from kineverse.symbols import position
 
+from .description import UrdfJoint, UrdfLink, UrdfRobot
 from .reader import parse_urdf
 
 _AXIS_JOINTS: dict[str, type[OneDofJoint]] = {

@@ -17,12 +17,12 @@ from kineverse.formats.files import read_file
 from kineverse.formats.names import NumberedNames
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import find_text_root
-from kineverse.formats.urdf.bodies import UrdfLinkReader
-from kineverse.formats.urdf.description import UrdfJoint, UrdfLink, UrdfRobot
-from kineverse.formats.urdf.joints import read_urdf_joint
-from kineverse.formats.urdf.mimic import resolve_mimic_joints
-from kineverse.formats.urdf.tree import keep_one_parent, order_from_root
 from kineverse.formats.xml_reader import Element, ElementError, Visit, label, parse_xml, quote
+
+from .bodies import UrdfLinkReader
+from .description import UrdfJoint, UrdfLink, UrdfRobot
+from .joints import read_urdf_joint, resolve_mimic_joints
+from .tree import keep_one_parent, order_from_root
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))

@@ -9,9 +9,10 @@ from collections.abc import Sequence
 
 from kineverse.errors import FormatError, suggest
 from kineverse.formats.reader_warnings import ReaderWarnings
-from kineverse.formats.urdf.description import UrdfJoint, UrdfLink
 from kineverse.formats.xml_reader import quote
 from kineverse.model.frame import WORLD
+
+from .description import UrdfJoint, UrdfLink
 
 _SHOWN = 8
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.articulations.multi_axis import rotation_from_z
 from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.description import (
@@ -34,11 +34,9 @@ from kineverse.formats.description import (
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
 from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
 from kineverse.formats.export.mesh_paths import mesh_reference
-from kineverse.formats.export.poses import ROTATION_TOLERANCE, rpy_angles
 from kineverse.formats.names import TakenNames
+from kineverse.formats.poses import ROTATION_TOLERANCE, rpy_angles
 from kineverse.formats.reader_warnings import collect_warnings
-from kineverse.formats.urdf.operations import urdf_operations
-from kineverse.formats.urdf.reader import parse_urdf
 from kineverse.formats.xml_writer import Tag, format_xml
 from kineverse.lie import translation
 from kineverse.model.body import (
@@ -58,6 +56,9 @@ from kineverse.model.body import (
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
+
+from .operations import urdf_operations
+from .reader import parse_urdf
 
 _IDENTITY = Pose()
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")

@@ -20,10 +20,9 @@ from kineverse.errors import UnknownNameError
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .builder import KitchenBuilder
+from .builder import KitchenBuilder, draw_style
 from .layout import draw_layout
 from .room import add_countertop, add_room
-from .style import draw_style
 from .units import add_base_unit, add_tall_unit, add_wall_unit
 
 __all__ = ["example_seeds", "generate_kitchen", "is_seed", "kitchen_operations"]

@@ -13,11 +13,20 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from kineverse.articulations import Prismatic, Revolute
-from kineverse.articulations.mechanisms.simple_bodies import shift
+from kineverse.articulations.mechanisms.mechanism import shift
 from kineverse.model.body import Pose, Vector3
 
-from .builder import KitchenBuilder
-from .solids import BIRCH, Material, MaterialShape, Span, compute_inertia, cylinder_between, open_box, slab
+from .builder import (
+    BIRCH,
+    KitchenBuilder,
+    Material,
+    MaterialShape,
+    Span,
+    compute_inertia,
+    cylinder_between,
+    open_box,
+    slab,
+)
 
 GAP = 0.003
 """Gap between fronts, and between a front and its carcass [m]."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from kineverse.articulations.mechanisms.simple_bodies import shift
+from kineverse.articulations.mechanisms.mechanism import shift
 from kineverse.model.body import Pose
 from kineverse.model.frame import WORLD
 
-from .builder import KitchenBuilder
-from .layout import KitchenLayout, Opposite, Row, Unit
-from .solids import (
+from .builder import (
     BAR,
     CLEAR,
     FLOOR,
@@ -17,6 +15,7 @@ from .solids import (
     PLINTH,
     STEEL,
     TILE,
+    KitchenBuilder,
     Material,
     MaterialShape,
     Span,
@@ -24,6 +23,7 @@ from .solids import (
     open_box,
     slab,
 )
+from .layout import KitchenLayout, Opposite, Row, Unit
 from .units import BACK, DEPTH
 
 ROOM = "room"

@@ -9,13 +9,12 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from kineverse.articulations.mechanisms import FoldingDoor
-from kineverse.articulations.mechanisms.simple_bodies import shift
+from kineverse.articulations.mechanisms.mechanism import shift
 from kineverse.model.body import Pose
 
-from .builder import KitchenBuilder
+from .builder import BOARD, ENAMEL, FOAM, GLASS, STEEL, KitchenBuilder, Span, open_box, slab
 from .fronts import FRONT, GAP, WALL, Area, door, drawer, flap
 from .layout import Unit
-from .solids import BOARD, ENAMEL, FOAM, GLASS, STEEL, Span, open_box, slab
 
 DEPTH = 0.56
 """Depth of the carcasses on the floor [m]."""

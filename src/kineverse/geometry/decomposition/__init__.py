@@ -6,10 +6,9 @@ the cache, and :func:`find_hulls` reads it.
 """
 
 from .accuracy import Accuracy
+from .coacd_process import DecompositionError, ResourceLimits
 from .convex_decomposition import DecompositionOutcome, decompose, decompose_all, find_hulls
-from .hull_cache import CacheEntry, clear, folder, list_entries
-from .result import Decomposition, DecompositionSettings
-from .worker import DecompositionError, ResourceLimits
+from .result import CacheEntry, Decomposition, DecompositionSettings, clear, folder, list_entries
 
 __all__ = [
     "Accuracy",

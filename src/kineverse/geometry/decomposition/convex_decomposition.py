@@ -14,11 +14,11 @@ from kineverse.errors import FormatError, InvalidValueError, KineverseError, Mis
 from kineverse.geometry.mesh_files import Floats
 from kineverse.model.body import Mesh
 
-from . import hull_cache
+from . import result
 from .accuracy import Polytope, measure_accuracy, nearest_surface_points
+from .coacd_process import DecompositionError, ResourceLimits, run_coacd
 from .mesh_cleanup import CleanMesh, clean_mesh
 from .result import Decomposition, DecompositionSettings
-from .worker import DecompositionError, ResourceLimits, run_coacd
 
 # A hull that protrudes from another by less than this part of its size is inside of it.
 _INSIDE = 1e-9
@@ -110,7 +110,7 @@ def find_hulls(mesh: Mesh, settings: DecompositionSettings | None = None) -> tup
         If the mesh cannot be read or decomposed.
     """
     surface = clean_mesh(mesh)
-    found = hull_cache.find_entry(surface.digest, settings.key(surface.size) if settings else None)
+    found = result.find_entry(surface.digest, settings.key(surface.size) if settings else None)
     return found.hulls if found else None
 
 
@@ -149,14 +149,14 @@ def decompose(
     """
     surface = clean_mesh(mesh)
     digest, key = surface.digest, settings.key(surface.size)
-    found = None if force else hull_cache.find_entry(digest, key)
+    found = None if force else result.find_entry(digest, key)
     if found is not None:
         return DecompositionOutcome(mesh, found, cached=True)
     try:
         made = _decompose_surface(surface, settings, limits, stop)
     except DecompositionError as error:
         raise DecompositionError(f"{surface.name}: {error}") from error
-    hull_cache.add_entry(digest, key, made)
+    result.add_entry(digest, key, made)
     return DecompositionOutcome(mesh, made)
 
 

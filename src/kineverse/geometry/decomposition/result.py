@@ -5,11 +5,15 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import math
 from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
+from kineverse.compilation.cache import ContentCache, private_subfolder
 from kineverse.errors import FormatError, InvalidValueError
 from kineverse.geometry.mesh_files import Floats
 
@@ -136,3 +140,55 @@ class Decomposition:
             return Decomposition(hulls, **facts)
         except Exception as error:  # zip, numpy and json raise all kinds of errors for a damaged archive.
             raise FormatError("This is no decomposition.") from error
+
+
+DECOMPOSITIONS = ContentCache(
+    partial(private_subfolder, "decompositions"),
+    ".hulls",
+    256 * 2**20,
+    logging.getLogger("kineverse.geometry"),
+    "The decomposition %s %s and counts as absent.",
+)
+"""The cache."""
+
+
+@dataclass(frozen=True, slots=True)
+class CacheEntry:
+    """Cached decomposition, and the size of its file [bytes]."""
+
+    decomposition: Decomposition
+    bytes: int
+
+
+def find_entry(mesh: str, settings: str | None = None) -> Decomposition | None:
+    """Return the cached decomposition of a mesh, or None."""
+    if settings is not None:
+        return DECOMPOSITIONS.read(_key(mesh, settings), Decomposition.from_bytes)
+    keys = [key for key in DECOMPOSITIONS.list_keys() if key.startswith(_key(mesh, ""))]
+    found = [DECOMPOSITIONS.read(key, Decomposition.from_bytes) for key in keys]
+    return max((some for some in found if some), key=lambda some: some.made, default=None)
+
+
+def add_entry(mesh: str, settings: str, decomposition: Decomposition) -> None:
+    """Write a decomposition atomically; see :func:`find_entry`."""
+    DECOMPOSITIONS.write(_key(mesh, settings), decomposition.to_bytes())
+
+
+def list_entries() -> list[CacheEntry]:
+    """Return all entries of the cache, sorted by the name of the mesh file."""
+    kept = [CacheEntry(*entry) for entry in DECOMPOSITIONS.read_all(Decomposition.from_bytes)]
+    return sorted(kept, key=lambda one: (one.decomposition.name, one.decomposition.made))
+
+
+def clear() -> int:
+    """Remove all entries, and return their number."""
+    return DECOMPOSITIONS.clear()
+
+
+def folder() -> Path:
+    """Return the path of the cache folder."""
+    return DECOMPOSITIONS.folder.path
+
+
+def _key(mesh: str, settings: str) -> str:
+    return f"{mesh[:40]}-{settings}"

@@ -13,8 +13,7 @@ from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .base_placement import BasePlacement
-from .placement import PlacementSearch
+from .base_placement import BasePlacement, PlacementSearch
 
 _PLANNING = 2.0
 """Largest time to plan the way to the handle [s]."""

@@ -1,14 +1,33 @@
-"""Results of searches of base placements."""
+"""Base placement: a base, a grasp and a way of the arm along which a held object can be moved."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import count, product
+from time import perf_counter
 
-from kineverse.grasping import Grasp
-from kineverse.lie import Array
+import numpy as np
+import numpy.typing as npt
+
+from kineverse._checks import as_count
+from kineverse.errors import InvalidValueError
+from kineverse.geometry import Scene
+from kineverse.grasping import Grasp, Gripper
+from kineverse.lie import Array, inverse
+from kineverse.manipulation.base_sampling import BaseSampler, find_planar_base
+from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules
+from kineverse.model.frame import is_of_robot
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
 from kineverse.symbols import Symbol
+
+from .cartesian_paths import TOLERANCE, CartesianPaths
+from .grasp_selection import PlacementSampler
+from .path_collisions import OWN_MARGIN, CandidatePath, PathCheck, PathContacts, interpolate_poses
 
 NO_WAY, NO_PLACE = "no way to the handle", "no free place of the base"
 """Reasons of placements that are refused, and of bases that touch something."""
@@ -83,3 +102,430 @@ class BasePlacement:
             f"Found after {self.samples} {what}" if self else f"None of {self.samples} {what} goes through"
         )
         return f"{found}; failed: {failed}." if failed else f"{found}."
+
+
+_STEP = 0.05
+"""Distance of neighbouring values of the object along its way [m], [rad]."""
+_RANDOM_STATES = 24
+"""Number of random states in which links that are always near to each other are sought."""
+_BESIDE = 0.1
+"""Largest change of each coordinate of the base in these states [m], [rad]."""
+_START_ITERATIONS = 30
+_CORRECTIONS = 6
+"""Iterations from a configuration to one near it."""
+_STARTS = 4
+"""Arms that are tried for each base."""
+_MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
+"""Shares of the object's way from which the arms of successive batches set out to both ends."""
+_WHOLE = 300
+"""Number of bases after which a way to a part of the motion is taken, and after which the search ends if no
+arm has reached the handle anywhere: at the middle of its way, or at a quarter of it."""
+_NOWHERE = 300
+"""Number of bases after which the search ends if each one touched something wherever it was drawn."""
+_AROUND, _HERE = 0.6, 100
+"""Distance of the hand from the handle up to which the base may stay [m], and the number of arms there."""
+_LEAST_SHARE = 0.2
+"""Least share of the motion that one grasp is for."""
+_MOST_CHECKS, _MOST_REFUSED = 150, 3
+"""Most ways that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
+
+
+class PlacementSearch:
+    """Search of base placements for a gripper of a robot in a model.
+
+    Parameters
+    ----------
+    model
+        Model of the robot and of everything around it.
+    gripper
+        The gripper.
+    state
+        State of everything; the robot's idle coordinates keep these values.
+    margin
+        Least distance of the robot from everything else on its way [m].
+
+    Attributes
+    ----------
+    moving, standing
+        Coordinates that move along ways, and those of a base that only stands somewhere.
+    scene
+        Scene of the checks, with the rules for pairs that overlap always.
+    """
+
+    def __init__(self, model: ModelView, gripper: Gripper, state: State, margin: float = 0.006) -> None:
+        self.model, self.gripper, self.margin = model, gripper, margin
+        own = model.symbols_of(gripper.hand)
+        free = {s for s in own if s in model.degrees_of_freedom and s not in gripper.joints}
+        self.standing = tuple(s for s in own if s in model.rates and s in free)
+        self.moving = tuple(s for s in own if s in free and s not in self.standing)
+        self.base = find_planar_base(model, own)
+        self.coordinates = (*self.moving, *self.standing)
+        self.samples = PlacementSampler(model, self.moving, self.standing, self.base)
+        self.paths = CartesianPaths(model, gripper.hand, self.moving, self.standing, self.samples.eases[0])
+        self.scene = Scene(model)
+        bodies = self.scene.bodies
+        self.own = tuple(b for b in bodies if gripper.robot and is_of_robot(b, gripper.robot))
+        others = tuple(b for b in bodies if b not in self.own)
+        if not others:
+            raise InvalidValueError("The model has nothing but the robot, so there is nothing to hold.")
+        self.others = others
+        add_rules = self.scene.collision_world.add_rules
+        add_rules((*find_overlapping_links(self.scene, self.own, state), *furniture_rules(bodies, self.own)))
+        add_rules(self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN))
+        self.contacts = PathContacts(model, self.scene, gripper, self.own, others, margin)
+        self.bases = BaseSampler(self.scene, self.base, self.own, others, margin)
+        self._reach: float | None = None
+
+    def _random_states(self, state: State) -> Iterator[State]:
+        """Yield states with random arms, and the base a little beside its place.
+
+        So what is always near is the robot's own or the floor, and not a wall that it stands at.
+        """
+        random = np.random.default_rng(0)
+        bounded = [s for s in self.moving if np.isfinite(self.model.limits(s)).all() and s not in self.base]
+        lower, upper = np.array([self.model.limits(s) for s in bounded]).reshape(-1, 2).T
+        for _ in range(_RANDOM_STATES):
+            arm = dict(zip(bounded, random.uniform(lower, upper).tolist(), strict=True))
+            beside = random.uniform(-_BESIDE, _BESIDE, len(self.base)).tolist()
+            yield state.updated(arm | {s: state[s] + by for s, by in zip(self.base, beside, strict=True)})
+
+    def find_too_high(self, state: State, coordinate: Symbol, values: Array) -> str:
+        """Return why an object on its way is out of reach above the hand; empty if it is not.
+
+        Parameters
+        ----------
+        state
+            State of everything.
+        coordinate, values
+            Coordinate of the object, and its values (N,) on the way [m], [rad].
+        """
+        moved = [b for b in self.scene.bodies_moved_by([coordinate]) if b in self.others]
+        value, lowest = find_highest_passage(self.scene, moved, state, coordinate, values)
+        if self._reach is None:
+            self._reach = find_highest_reach(self.scene, self.paths, self.gripper, state)
+        if lowest <= self._reach:
+            return ""
+        return (
+            f"Too high: at {value:.3f} '{coordinate}' is nowhere lower than {lowest:.2f} m, and "
+            f"'{self.gripper.hand}' reaches {self._reach:.2f} m at most."
+        )
+
+    def find(
+        self,
+        state: State,
+        grasps: Sequence[Grasp],
+        target: float,
+        *,
+        accept: Callable[[BasePlacement], bool] = lambda placement: True,
+        samples: int = 600,
+        batch: int = 100,
+        seed: int = 0,
+        report: Callable[[str], object] = lambda text: None,
+    ) -> BasePlacement:
+        """Return a placement from which the object can be moved from its value to a target, or towards it.
+
+        Bases are sampled in front of the handle, arms at random. Where none of the first batch leads to the
+        target and the hand is near, so that it has just let go, the base may stay as well. All of them
+        follow the way of the handle at once, and the straight ways to it and from it; those that arrive are
+        checked for contacts, the quickest first. Where none of many bases arrives, the one with the longest
+        way is returned. The search ends early if no arm reaches the handle on its way, or if the base touches
+        something at all of the first places.
+
+        Parameters
+        ----------
+        state
+            State of everything at the beginning.
+        grasps
+            Grasps that may be taken, the best first.
+        target
+            Wanted value of the object's coordinate [m], [rad].
+        accept
+            Function that says whether a placement is taken; the search goes on if not.
+        samples, batch
+            Largest number of bases, and how many are tried at once.
+        seed
+            Seed of the samples.
+        report
+            Is called with a text on the progress after each batch.
+
+        Raises
+        ------
+        InvalidValueError
+            For less than one sample.
+        """
+        samples, batch = as_count("samples", samples, 1), as_count("batch", batch, 1)
+        random = np.random.default_rng(as_count("seed", seed, 0))
+        search = _Search(self, state, grasps, target, accept, random)
+        if not self.base:
+            samples = batch
+        for number in count():
+            whole = number * batch < min(_WHOLE, samples)
+            found = search.take(whole)
+            ended = number * batch >= samples or (not whole and not search.reached)
+            ended = ended or (number * batch >= _NOWHERE and search.nowhere)
+            if number and found is None and not ended:
+                report(search.nothing.why)
+            if found is not None or ended or search.refused >= _MOST_REFUSED:
+                break
+            self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
+            search.add(min(batch, samples - number * batch), _MIDDLES[number % len(_MIDDLES)])
+            if number == 1:
+                search.add_here()
+        return found or search.nothing
+
+    def retrace(
+        self,
+        state: State,
+        earlier: BasePlacement,
+        target: float,
+        accept: Callable[[BasePlacement], bool] = lambda placement: True,
+    ) -> BasePlacement | None:
+        """Return the way of an earlier placement backwards, from the object's value to a target.
+
+        What was possible once is possible backwards, also where an open door leaves no way to another place.
+        Contacts are looked for anew, and None is returned if there are any.
+
+        Parameters
+        ----------
+        state
+            State of everything at the beginning.
+        earlier
+            Placement whose way leads back to the target, see :meth:`.BasePlacement.find_end_backwards`.
+        target, accept
+            As for :meth:`find`.
+
+        Raises
+        ------
+        InvalidValueError
+            For a placement of another hand, or one that was not found.
+        """
+        grasp = earlier.grasp
+        if grasp is None or grasp.gripper.hand != self.gripper.hand:
+            raise InvalidValueError(f"The placement that leads back has to be one of '{self.gripper.hand}'.")
+        self.paths.ease = self.samples.eases[0]
+        return _Search(self, state, [grasp], target, accept, np.random.default_rng(0)).retrace(earlier)
+
+
+class _Search:
+    """Search for one grasped motion: candidates, the best first, and why the others failed."""
+
+    def __init__(
+        self,
+        owner: PlacementSearch,
+        state: State,
+        grasps: Sequence[Grasp],
+        target: float,
+        accept: Callable[[BasePlacement], bool],
+        random: np.random.Generator,
+    ) -> None:
+        self.owner, self.state, self.grasps, self.random = owner, state, grasps, random
+        self.begin, self.tried, self.reached = perf_counter(), 0, False
+        self.nowhere = bool(owner.base)
+        self.accept, self.refused = accept, 0
+        self.coordinate = grasps[0].handle.coordinate
+        start = float(state[self.coordinate])
+        self.values = np.linspace(start, target, max(2, math.ceil(abs(target - start) / _STEP) + 1))
+        self.last = len(self.values) - 1
+        self.least = max(1, math.ceil(_LEAST_SHARE * self.last))
+        handle = owner.model.fk(grasps[0].handle.frame)
+        self.handles = np.array([handle(state.updated({self.coordinate: v})) for v in self.values])
+        self.poses = np.array([grasp.pose for grasp in grasps])
+        self.approaches = np.array([grasp.approach for grasp in grasps])
+        self.check = PathCheck(owner.contacts, owner.paths, state, grasps, self.values, self.handles)
+        self.free, self.reasons = self.check.free, self.check.reasons
+        self.heap: list[tuple[int, float, int, CandidatePath]] = []
+        self.number = count()
+
+    @property
+    def nothing(self) -> BasePlacement:
+        """Placement that was not found."""
+        none = np.zeros((0, len(self.owner.coordinates)))
+        return BasePlacement(
+            None, self.owner.coordinates, none, none, self.values, none, none, self.tried, self.reasons,
+            perf_counter() - self.begin, not self.owner.base,
+        )  # fmt: skip
+
+    # -- sampling ------------------------------------------------------------------------------------------
+
+    def add_here(self) -> None:
+        """Sample arms and grasps where the base stands, if the hand is near the handle."""
+        hand = np.asarray(self.owner.model.fk(self.grasps[0].gripper.hand)(self.state))
+        if np.linalg.norm(hand[:3, 3] - self.handles[0, :3, 3]) > _AROUND:
+            return
+        samples = self.owner.samples
+        choice = samples.choose_grasps(self.random, self.grasps, self.free, _HERE, True)
+        if len(choice):
+            self._keep(*samples.stay(self.random, self.state, _HERE), choice, 0)
+
+    def add(self, batch: int, middle_share: float) -> None:
+        """Sample bases, arms and grasps, and keep those that reach along the way."""
+        paths, handles = self.owner.paths, self.handles
+        middle = round(middle_share * self.last)
+        samples = self.owner.samples
+        choice = samples.choose_grasps(self.random, self.grasps, self.free, batch * _STARTS, not self.tried)
+        self.tried += batch
+        if not len(choice):
+            return
+        hands = handles[middle] @ self.poses[choice]
+        outside = handles[middle] @ self.approaches[choice]
+        # A base that stands has to be free on all the way.
+        stops = (middle, 0, self.last) if samples.stands(paths.ease) else (middle,)
+        states = [self.state.updated({self.coordinate: float(self.values[k])}) for k in stops]
+        Q, base = samples.draw(self.random, states, hands, outside, _STARTS, self.owner.bases)
+        if self.nowhere:
+            places = samples.find_places(Q, base)[::_STARTS]
+            self.nowhere = bool(self.owner.bases.find_touching(states, places).all())
+            if self.nowhere:
+                self.reasons[NO_PLACE] += len(places)
+                return
+        self._keep(Q, base, choice, middle)
+
+    def _keep(self, Q: Array, base: Array, choice: npt.NDArray[np.intp], middle: int) -> None:
+        """Keep those arms (N, n) that reach along the way, from a value with the index ``middle`` on."""
+        paths, handles = self.owner.paths, self.handles
+        Q, error = paths.solve(Q, base, handles[middle] @ self.poses[choice], _START_ITERATIONS)
+        good = self._count(error < 1e-3, "out of reach")
+        self.reached |= bool(good.any())
+        Q, base, choice = Q[good], base[good], choice[good]
+        before, reached = paths.follow(Q, base, handles[None, middle::-1] @ self.poses[choice, None])
+        good = self._count(reached == middle + 1, "the arm ends on the way")
+        Q, base, choice, before = Q[good], base[good], choice[good], before[good]
+        line = interpolate_poses(handles[0] @ self.poses[choice], handles[0] @ self.approaches[choice])
+        back, reached = paths.follow(before[:, -1], base, line)
+        good = self._count(reached == line.shape[1], "no straight approach")
+        Q, base, choice, before, back = Q[good], base[good], choice[good], before[good], back[good]
+        poses = self.poses[choice]
+        after, passed = paths.follow(Q, base, handles[None, middle:] @ poses[:, None])
+        ends = np.minimum(middle + passed - 1, self.free[choice])
+        good = self._count(ends >= self.least, "the arm ends on the way")
+        way = np.concatenate([before[:, :0:-1], after], axis=1)
+        if not good.any():
+            return
+        score = self.owner.samples.cost(self.state, way, back[:, -1], ends) + 0.02 * choice
+        for k in np.flatnonzero(good):
+            self._push(CandidatePath(int(choice[k]), base[k], back[k], way[k], int(ends[k])), float(score[k]))
+
+    def _count(self, good: npt.NDArray[np.bool_], reason: str) -> npt.NDArray[np.bool_]:
+        self.reasons[reason] += int((~good).sum()) // _STARTS
+        return good
+
+    def _push(self, candidate: CandidatePath, score: float) -> None:
+        heappush(self.heap, (-candidate.end, score, next(self.number), candidate))
+
+    def retrace(self, earlier: BasePlacement) -> BasePlacement | None:
+        """Return the way of an earlier placement backwards, without contacts; None if there is none."""
+        paths, count = self.owner.paths, len(self.owner.moving)
+        base = earlier.way[0, count:]
+        order = np.argsort(earlier.values)
+        rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.way.T[:count]]
+        hands = self.handles @ self.poses[0]
+        way = self._correct(np.stack(rows, axis=1), base, hands)
+        # The hand comes on the way on which it left, in the same place beside the handle.
+        retreat = earlier.retreat[:, :count]
+        poses = paths.find_poses(retreat, base)
+        back = self._correct(retreat, base, hands[0] @ np.linalg.inv(poses[0]) @ poses)
+        if way is None or back is None:
+            return None
+        found = self._check(CandidatePath(0, base, back, way, self.last))
+        if found is None or len(found.values) <= self.last or not self.accept(found):
+            return None
+        return found
+
+    def _correct(self, Q: Array, base: Array, poses: Array) -> Array | None:
+        """Return configurations near to some (K, n) at which the hand is at poses; None if one fails."""
+        found, error = self.owner.paths.solve(Q, np.tile(base, (len(Q), 1)), poses, _CORRECTIONS)
+        return found if error.max() < TOLERANCE else None
+
+    # -- checks --------------------------------------------------------------------------------------------
+
+    def take(self, whole: bool) -> BasePlacement | None:
+        """Return the best candidate without contacts, None without any."""
+        for _ in range(_MOST_CHECKS):
+            if not self.heap or (whole and -self.heap[0][0] < self.last) or self.refused >= _MOST_REFUSED:
+                break
+            _, score, _, candidate = heappop(self.heap)
+            free = int(self.free[candidate.choice])
+            if candidate.end <= free:
+                found = self._check(candidate)
+                if found is not None and self.accept(found):
+                    return found
+                if found is not None:
+                    self.refused += 1
+                    self.reasons[NO_WAY] += 1
+                    continue
+            candidate.end = min(candidate.end, int(self.free[candidate.choice]))
+            if candidate.end >= self.least:
+                self._push(candidate, score)
+        return None
+
+    def _check(self, candidate: CandidatePath) -> BasePlacement | None:
+        """Return the placement of a candidate without contacts; otherwise shorten its way."""
+        retreat = self.check.find_retreat(candidate)
+        if retreat is None:
+            return None
+        end, base = candidate.end, candidate.base
+        parts = (candidate.back[::-1], candidate.way[: end + 1], retreat)
+        full = [np.hstack([a, np.tile(base, (len(a), 1))]) for a in parts]
+        return BasePlacement(
+            self.grasps[candidate.choice], self.owner.coordinates, full[0][0], full[0],
+            self.values[: end + 1], full[1], full[2], self.tried, self.reasons, perf_counter() - self.begin,
+        )  # fmt: skip
+
+
+_ARMS = 200
+"""Number of random arms from which the highest one is sought."""
+_STEPS = np.geomspace(0.5, 2e-3, 60)
+"""Largest changes of a coordinate in the steps of the ascent [m], [rad]."""
+
+
+def find_highest_reach(scene: Scene, paths: CartesianPaths, gripper: Gripper, state: State) -> float:
+    """Return the greatest height of a point of a gripper over all arms [m].
+
+    It is sought by steepest ascent from random arms. Boxes stand for the shapes, so the height is rather too
+    great than too small. Contacts are left out.
+    """
+    hand_T_world = inverse(np.asarray(scene.model.fk(gripper.hand)(state)))
+    corners = [
+        _find_corners(scene, gripper.bodies, state.updated(gripper.values_at(gap)))
+        for gap in (0.0, gripper.width)
+    ]
+    points = np.vstack(corners) @ hand_T_world[:3, :3].T + hand_T_world[:3, 3]
+    random = np.random.default_rng(0)
+    bounded = np.isfinite(paths.lower) & np.isfinite(paths.upper)
+    lower, upper = np.where(bounded, paths.lower, -np.pi), np.where(bounded, paths.upper, np.pi)
+    Q = random.uniform(lower, upper, (_ARMS, len(lower)))
+    highest = -np.inf
+    for most in _STEPS.tolist():
+        heights, slopes = paths.find_heights(Q, state.vector(paths.still), points)
+        highest = max(highest, float(heights.max()))
+        outward = ((paths.lower >= Q) & (slopes < 0.0)) | ((paths.upper <= Q) & (slopes > 0.0))
+        slopes = np.where(outward, 0.0, slopes)
+        steepest = np.abs(slopes).max(axis=1, initial=1e-9)
+        Q = np.clip(Q + most * slopes / steepest[:, None], paths.lower, paths.upper)
+    return highest
+
+
+def find_highest_passage(
+    scene: Scene, bodies: Iterable[str], state: State, coordinate: Symbol, values: Array
+) -> tuple[float, float]:
+    """Return value (of some) at which an object is the highest, and the height of its lowest point [m]."""
+    names = tuple(bodies)
+    lowest = [
+        _find_corners(scene, names, state.updated({coordinate: v}))[:, 2].min() for v in values.tolist()
+    ]
+    highest = int(np.argmax(lowest))
+    return float(values[highest]), float(lowest[highest])
+
+
+def _find_corners(scene: Scene, bodies: Iterable[str], state: State) -> Array:
+    """Return the corners (N, 3) of the boxes around the shapes of bodies at a state, in the world."""
+    scene.update(state)
+    world = scene.collision_world
+    world.prepare()
+    signs = np.array(list(product((-1.0, 1.0), repeat=3)))
+    found = []
+    for body in bodies:
+        for item in world.members[world.body_index(body)] if body in world.bodies else ():
+            solid, pose = world.solid(item), world.table.poses[item]
+            found.append((solid.centre + signs * solid.half) @ pose[:, :3].T + pose[:, 3])
+    return np.vstack(found)

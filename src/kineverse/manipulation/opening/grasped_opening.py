@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any
 
 import numpy as np
 
 from kineverse._checks import as_count
+from kineverse.control import Controller
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
-from kineverse.grasping import Handle, find_gripper, find_handle
+from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
 from kineverse.manipulation.outcome import Outcome, SkillError, SlipError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
@@ -22,18 +23,52 @@ from kineverse.manipulation.skill_arguments import (
     explain_fixed,
     find_object_coordinate,
 )
-from kineverse.manipulation.swept_motion import BlockedError, find_obstacle
-from kineverse.model.version_cache import cached_for_version
+from kineverse.manipulation.swept_volume import BlockedError, find_obstacle
+from kineverse.model.frame import is_of_robot
+from kineverse.model.model_view import ModelView
+from kineverse.model.symbolic_view import cached_for_version
+from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
-from kineverse.worlds.judge import JudgedOverlap
+from kineverse.worlds.run_metrics import JudgedOverlap
 
-from .approach_planner import Approach
-from .base_placement import BasePlacement
-from .hand_motion import HandMotion
-from .held_motion import move_held
-from .opener import Opener
-from .push_fallback import PushFallback
+from .approach_planner import Approach, ApproachPlanner
+from .base_placement import BasePlacement, PlacementSearch
+from .hand_motion import HandMotion, move_held
+from .push_regrasp import PushRegrasp
+
+_GRASPS = 96
+_KEPT = 15
+"""Number of sets of grasps that are kept."""
+
+
+class Opener:
+    """Searches and controllers of a gripper in a model, made once."""
+
+    def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
+        self.model, self.gripper = model, gripper
+        self.search = PlacementSearch(model, gripper, state)
+        self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
+        self._approaches: ApproachPlanner | None = None
+        self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
+
+    @property
+    def approaches(self) -> ApproachPlanner:
+        """Planner of the robot's ways with the hand empty."""
+        if self._approaches is None:
+            self._approaches = ApproachPlanner(self.search)
+        return self._approaches
+
+    def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:
+        """Return the grasps of a handle where everything but the robot is as in a state, up to a slant."""
+        robot = self.gripper.robot
+        others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
+        key = handle.frame, handle.coordinate, seed, slant, others
+        if key not in self._grasps:
+            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
+            self._grasps = {**dict([*self._grasps.items()][-_KEPT:]), key: found}
+        return self._grasps[key]
+
 
 _SLANT = math.radians(50.0)
 """Largest slant of grasps where those from across the handle lead nowhere [rad]."""
@@ -303,7 +338,7 @@ class _Run:
 
     def _push(self, failure: SkillError, attempt: int) -> None:
         """Push the object on where no grasp leads, or raise SkillError after the last attempt."""
-        fallback = PushFallback(self.motion, self.target, self.tolerance)
+        fallback = PushRegrasp(self.motion, self.target, self.tolerance)
         value = float(self.session.state[self.handle.coordinate])
         try:
             fallback.find_start(self.seed + attempt)

@@ -15,14 +15,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.control import Target
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Scene
+from kineverse.geometry.gjk import smoothed_support
 from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.shapes import Solid
-from kineverse.geometry.support import smoothed_support
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State

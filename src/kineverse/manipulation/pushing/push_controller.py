@@ -22,14 +22,14 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
 from kineverse.lie import Array
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules, match_bodies
-from kineverse.manipulation.swept_motion import Obstacle, find_obstacle
+from kineverse.manipulation.swept_volume import Obstacle, find_obstacle
 from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
@@ -37,10 +37,10 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation
 
-from .contact_choice import CONE, CONE_END, ContactChoice
+from .contact_pair import ContactRates, PairFinder, PushPair, PushView, make_view
 from .contact_points import PushPoint, PushSurface, find_push_tool
-from .nearest_pair import ContactRates, PairFinder, PushPair, PushView, make_view
-from .press import PushPress, TipAnchor
+from .contact_selection import CONE, CONE_END, ContactSelection
+from .guarded_contact import PushPress, TipAnchor
 from .push_program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
 from .vectors import ZERO, Vector, add, inner_product, length, move_point, scale, subtract
 
@@ -193,7 +193,7 @@ class Pushing:
         self._rates = ContactRates(slots, self._program.columns, self._hand)
         self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
         self._swept: tuple[tuple[float, ...], Obstacle | None] = (), None
-        self.choice = ContactChoice(self.surface)
+        self.choice = ContactSelection(self.surface)
         self.press = PushPress(dt, self.surface.sign)
         self.reset()
         with contextlib.suppress(KineverseError):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.control import Command, Controller, Goal, Keep, Target
 from kineverse.control.formulation import find_speeds
 from kineverse.control.tasks import Task

@@ -1,4 +1,4 @@
-"""Pushing skill: an articulated object is pushed to a value of its coordinate in a world."""
+"""Pushing skill: a robot pushes an articulated object to a value of its coordinate."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from kineverse.control import Goal
 from kineverse.errors import KineverseError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
@@ -23,15 +24,56 @@ from kineverse.manipulation.skill_arguments import (
     explain_fixed,
     find_object_coordinate,
 )
-from kineverse.manipulation.swept_motion import find_obstacle
-from kineverse.planning import Path
+from kineverse.manipulation.swept_volume import find_obstacle
+from kineverse.planning import Path, Planner
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
-from .approach import plan_push_approach
-from .press import STILL
+from .guarded_contact import STILL
 from .push_controller import Pushing
+
+_STANDOFF = 0.03
+_TILT = math.radians(60.0)
+"""Largest angle between the pusher's axis and the direction of the push."""
+_CONFIGURATIONS = 48
+
+
+def plan_push_approach(
+    pushing: Pushing, state: State, *, points: int = 4, seconds: float = 0.5, seed: int = 0
+) -> tuple[Path, int]:
+    """Return a path of the robot to a contact point, and the index of the point.
+
+    Coordinates that rates drive, such as those of a base on rolling wheels, stand still. Without a way the
+    path is that of the last point, and says why.
+    """
+    model, tool = pushing.model, pushing.tool
+    moving = [s.position for s in pushing.speeds if s.position != pushing.coordinate]
+    free = [s for s in moving if s in model.degrees_of_freedom and s not in model.rates]
+    planner = Planner(model, free, rules=pushing.scene.rules, leave_out=pushing.leave_out)
+    planner.place(state)
+    tip, axis = tool.locate_tip(model), tool.point_axis(model)
+    at = pushing.surface.at(state)
+    path: Path | None = None
+    chosen, goal = -1, None
+    for chosen in pushing.rank(state)[:points]:
+        point, normal = at.points[chosen], at.normals[chosen]
+        goal = Goal(tip, point + _STANDOFF * normal, name="tip")
+        found = planner.solutions(goal, _CONFIGURATIONS, seconds=seconds, seed=seed)
+        if not len(found):
+            continue
+        states = [state.updated(dict(zip(planner.symbols, q, strict=True))) for q in found.tolist()]
+        facing = np.array([-normal @ axis(at_goal) for at_goal in states])
+        good = found[facing > math.cos(_TILT)]
+        here = state.vector(planner.symbols)
+        ends = [planner.space.nearest_turn(q, here) for q in (good if len(good) else found)]
+        path = planner.plan(None, ends, seconds=seconds, seed=seed)
+        if path.found:
+            break
+    if path is None:
+        path = planner.plan(None, [goal] if goal else [], seconds=seconds, seed=seed)  # says why
+    return path, chosen
+
 
 _SETTLED, _SETTLED_ESTIMATE = 5, 25
 """Number of steps for which the value, or its estimate, is within half of the tolerance when a push ends."""

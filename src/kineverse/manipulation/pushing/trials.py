@@ -17,8 +17,8 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import World
 
+from .base_placement import find_push_start
 from .push_controller import Pushing
-from .push_placement import find_push_start
 from .push_skill import push
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.estimation import PlausibilityMonitor, pose_covariance
 from kineverse.lie import Array, inverse, pose_difference, retract, rotation_angle, skew
 from kineverse.model.frame import WORLD, is_of_robot
@@ -17,7 +17,7 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Sensors, World
 from kineverse.worlds.sensor_sampler import find_camera
 
-from .part import JointPath, UnknownPart
+from .unmodelled_joint import JointPath, UnknownPart
 
 _FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4
 """Least standard deviations of observed poses [m], [rad]: no camera is exact."""
@@ -126,7 +126,7 @@ class PartBelief:
         return next(seen, WORLD) if self._beside is None else self._beside
 
     def slip(self, part_T_hand: Array, point: Array) -> float:
-        """Return how far a point (3,) of the part is from its place in the hand [m], inf if it is not seen."""
+        """Return distance [m] of a point (3,) of the part from its place in the hand, inf if it is not seen."""
         if self.held is None or self.held.pose is None or self.held.missed >= _LOST_LOOKS:
             return math.inf
         place = np.append(point, 1.0)

@@ -12,17 +12,17 @@ from kineverse.errors import InvalidValueError
 from kineverse.estimation import Fit
 from kineverse.geometry import Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
+from kineverse.manipulation.opening.cartesian_paths import row_at
 from kineverse.manipulation.opening.hand_motion import HandMotion
-from kineverse.manipulation.opening.hand_paths import row_at
-from kineverse.manipulation.swept_motion import find_obstacle
+from kineverse.manipulation.swept_volume import find_obstacle
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .part import JointPath, write_joint
 from .part_belief import PartBelief
+from .unmodelled_joint import JointPath, write_joint
 
 _FIRST_SPEED, PULL_SPEED, _SPEED_UP = 0.02, 0.05, 0.04
 """Speeds of the straight pull at first and after a way [m/s], [m]."""

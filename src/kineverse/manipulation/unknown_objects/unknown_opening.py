@@ -6,14 +6,13 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.approach_planner import Approach, ApproachPlanner
-from kineverse.manipulation.opening.hand_motion import HandMotion
-from kineverse.manipulation.opening.hand_retreat import find_retreat
+from kineverse.manipulation.opening.hand_motion import HandMotion, find_retreat
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import check_positive
@@ -21,13 +20,12 @@ from kineverse.model.frame import WORLD, is_of_robot
 from kineverse.model.model import Model
 from kineverse.worlds import Judge, Sensors
 
-from .hinge_hypotheses import guess_hinges, least_share
+from .joint_hypotheses import guess_hinges, least_share, revise_joint, watch_joint
 from .joint_learning import JointLearning, LearnedJoint
-from .joint_revision import revise_joint, watch_joint
-from .part import JointPath, UnknownPart, find_joint, free_part
 from .part_belief import PartBelief, measure_way
 from .pull_controllers import point_speed
-from .pulling import LEAST_OPENING, LOOKING, ArmEndError, PartPulling
+from .pulling_policy import LEAST_OPENING, LOOKING, ArmEndError, PartPulling
+from .unmodelled_joint import JointPath, UnknownPart, find_joint, free_part
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
 """Opening that is wanted by default [m], [rad]."""

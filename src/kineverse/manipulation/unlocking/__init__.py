@@ -1,8 +1,7 @@
 """Mechanisms whose parts lock each other: execution of plans, exploration of locks that nobody described."""
 
 from .lock_exploration import LearnedLock, LockExploration, LockTry, explore_locks
-from .part_mover import PartMover
-from .plan_execution import ExecutedMove, UnlockingExecution, execute_unlocking
+from .plan_execution import ExecutedMove, PartMover, UnlockingExecution, execute_unlocking
 
 __all__ = [
     "ExecutedMove",

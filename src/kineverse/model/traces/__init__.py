@@ -5,9 +5,8 @@ model, and its writes as expressions of the results. A trace can be evaluated on
 class.
 """
 
-from .placeholder import ReadNode
 from .recorder import record_trace
-from .trace import Trace, TraceStep, UntraceableError
+from .trace import ReadNode, Trace, TraceStep, UntraceableError
 from .trace_queries import Access, Query
 
 __all__ = ["Access", "Query", "ReadNode", "Trace", "TraceStep", "UntraceableError", "record_trace"]

@@ -11,9 +11,16 @@ from kineverse.expressions.expression import Expression, as_expression
 from kineverse.model.operation import Cell, Operation, map_expressions
 from kineverse.model.read_recorder import ReadRecorder
 
-from .placeholder import ReadNode, fill_read_nodes, find_read_nodes
 from .replay import replay_agrees, writes_agree
-from .trace import Trace, TraceStep, UntraceableError, substitute_results
+from .trace import (
+    ReadNode,
+    Trace,
+    TraceStep,
+    UntraceableError,
+    fill_read_nodes,
+    find_read_nodes,
+    substitute_results,
+)
 from .trace_queries import FAILED, Access, Query, QueryResult, TracingReader
 
 _SERIAL = count(1)

@@ -21,8 +21,7 @@ import numpy as np
 from kineverse.geometry.mesh_files import Floats, Integers
 
 from .certificate import distances, find_uncovered
-from .cover_mesh import CoverMesh
-from .cover_starts import CoverStarts
+from .cover_sampling import CoverMesh, CoverStarts
 from .polytope import CoverRegion
 
 _ROUNDS, _FEW_ROUNDS, _STEPS = 14, 10, 6

@@ -1,20 +1,29 @@
-"""Covers of collision objects, kept by the content of their shapes."""
+"""Covers of collision objects, cached by the content of their shapes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import PurePath
+import hashlib
+import json
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
 
 import numpy as np
 
-from kineverse.errors import InvalidValueError
+from kineverse.compilation.cache import ContentCache, private_subfolder
+from kineverse.errors import FormatError, InvalidValueError
 from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.objects import CollisionObject
-from kineverse.geometry.shapes import Solid
+from kineverse.geometry.shapes import Hull, Solid
 from kineverse.model.body import Mesh
 
-from .sphere_cache import cover_key, find_cover, keep_cover
 from .sphere_cover import MOST, SphereCover, check_cover_settings, cover_solids
+from .sphere_tree import SphereTree
 
 _DIGITS = 12
 """Digits to which poses in a body are told apart."""
@@ -81,3 +90,145 @@ def _name(items: Sequence[CollisionObject]) -> str:
     geometry = items[0].shape.geometry
     kind = PurePath(geometry.uri).name if isinstance(geometry, Mesh) else geometry.kind
     return f"{items[0].body}: {kind}" + (f" and {len(items) - 1} more" if len(items) > 1 else "")
+
+
+_OPEN, _LOG = partial(private_subfolder, "spheres"), logging.getLogger("kineverse.planning")
+
+COVERS = ContentCache(_OPEN, ".spheres", 64 * 2**20, _LOG, "The sphere cover %s %s and counts as absent.")
+TREES = ContentCache(_OPEN, ".tree", 64 * 2**20, _LOG, "The sphere tree %s %s and counts as absent.")
+"""Covers and trees on the disk."""
+
+# Raise the number when the covers or trees of equal solids and settings change.
+_VERSION = 5
+_MOST_IN_MEMORY = 4096
+
+_in_memory: OrderedDict[str, SphereCover | SphereTree] = OrderedDict()
+_lock = threading.Lock()
+
+Kept = TypeVar("Kept", SphereCover, SphereTree)
+
+
+@dataclass(frozen=True, slots=True)
+class CachedCover:
+    """Cover in the cache, with what it covers and the size of its file [bytes]."""
+
+    name: str
+    cover: SphereCover
+    bytes: int
+
+
+def cover_key(
+    solids: Sequence[tuple[Solid, Floats]], protrusion: float | None, most: int | None = None
+) -> str:
+    """Return the key of the cover or tree of convex solids at poses (4, 4) [m].
+
+    Settings are the largest protrusion [m] and number of spheres; None for the default.
+    """
+    settings = (_VERSION, None if protrusion is None else float(protrusion).hex(), most)
+    digest = hashlib.sha256(repr(settings).encode())
+    for solid, pose in solids:
+        digest.update(f" {type(solid.surface).__name__} ".encode() + pose.tobytes())
+        if isinstance(solid.surface, Hull):
+            assert solid.core is not None
+            digest.update(np.ascontiguousarray(solid.core.corners).tobytes())
+        else:
+            digest.update(repr(solid.surface).encode())
+    return digest.hexdigest()[:40]
+
+
+def find_cover(key: str) -> SphereCover | None:
+    """Return the cover of a key, see :func:`cover_key`, from memory or the disk; None if there is none."""
+    return _find(COVERS, key, lambda content: _parse_cover(content)[1])
+
+
+def keep_cover(key: str, name: str, cover: SphereCover) -> None:
+    """Keep a cover in memory, and atomically on the disk, with the name of what it covers."""
+    _remember(key, cover)
+    head = {"name": name, "protrusion": cover.protrusion, "excess": cover.excess, "sizes": [len(cover)]}
+    COVERS.write(key, _pack(head, cover.centres, cover.radii))
+
+
+def find_or_make_tree(key: str, make: Callable[[], SphereTree]) -> SphereTree:
+    """Return the tree of a key, see :func:`cover_key`, from memory or the disk, or a new one."""
+    tree = _find(TREES, key + "t", _parse_tree)
+    if tree is None:
+        tree = make()
+        _remember(key + "t", tree)
+        head = {
+            "order": tree.order.tolist(),
+            "first": tree.first.tolist(),
+            "ball": [*tree.ball_centre.tolist(), tree.ball_radius],
+            "sizes": [len(tree.radii), len(tree.coarse_radii)],
+        }
+        spheres = (tree.centres, tree.radii, tree.coarse_centres, tree.coarse_radii)
+        TREES.write(key + "t", _pack(head, *spheres))
+    return tree
+
+
+def list_covers() -> list[CachedCover]:
+    """Return all covers on the disk, sorted by the name of what they cover."""
+    kept = [CachedCover(*named, size) for named, size in COVERS.read_all(_parse_cover)]
+    return sorted(kept, key=lambda one: (one.name, len(one.cover), one.cover.protrusion))
+
+
+def clear_covers() -> int:
+    """Remove all covers and trees from memory and from the disk, and return the number of covers."""
+    with _lock:
+        _in_memory.clear()
+    TREES.clear()
+    return COVERS.clear()
+
+
+def cover_folder() -> Path:
+    """Return the path of the cache folder."""
+    return COVERS.folder.path
+
+
+def _find(cache: ContentCache, key: str, parse: Callable[[bytes], Kept]) -> Kept | None:
+    with _lock:
+        if key in _in_memory:
+            _in_memory.move_to_end(key)
+            return _in_memory[key]  # type: ignore[return-value]
+    found = cache.read(key, parse)
+    if found is not None:
+        _remember(key, found)
+    return found
+
+
+def _remember(key: str, content: SphereCover | SphereTree) -> None:
+    with _lock:
+        _in_memory[key] = content
+        _in_memory.move_to_end(key)
+        while len(_in_memory) > _MOST_IN_MEMORY:
+            _in_memory.popitem(last=False)
+
+
+def _pack(head: dict[str, Any], *arrays: Floats) -> bytes:
+    """Return a line of JSON and the numbers of some arrays; an archive of numpy takes longer to read."""
+    return json.dumps(head).encode() + b"\n" + b"".join(array.astype("<f8").tobytes() for array in arrays)
+
+
+def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]]:
+    """Return the head that :func:`_pack` was given, and centres (N, 3) and radii (N,) for each size in it."""
+    try:
+        line, _, numbers = content.partition(b"\n")
+        head = json.loads(line)
+        rows = np.frombuffer(numbers, dtype="<f8")
+        spheres = []
+        for size in head["sizes"]:
+            spheres.append((rows[: 3 * size].reshape(size, 3), rows[3 * size : 4 * size]))
+            rows = rows[4 * size :]
+    except (ValueError, KeyError, TypeError) as error:
+        raise FormatError("These are no spheres.") from error
+    return head, spheres
+
+
+def _parse_cover(content: bytes) -> tuple[str, SphereCover]:
+    head, ((centres, radii),) = _unpack(content)
+    return head["name"], SphereCover(centres, radii, head["protrusion"], head["excess"])
+
+
+def _parse_tree(content: bytes) -> SphereTree:
+    head, ((centres, radii), (coarse_centres, coarse_radii)) = _unpack(content)
+    order, first, ball = (np.array(head[name]) for name in ("order", "first", "ball"))
+    return SphereTree(centres, radii, order, coarse_centres, coarse_radii, first, ball[:3], float(ball[3]))

@@ -2,7 +2,7 @@
 
 from .blends import BlendedPath, round_corners
 from .follower import TrajectoryFollower
-from .motion_limits import MotionLimits, motion_limits
+from .kinematic_limits import MotionLimits, motion_limits
 from .time_parameterization import time_parameterize
 from .trajectory import Trajectory
 

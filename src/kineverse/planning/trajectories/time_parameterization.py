@@ -24,8 +24,7 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .blends import BlendedPath, Validity, round_corners
-from .path_grid import PathGrid, divide_path
-from .reachability import maximal_squared_speeds
+from .reachability import PathGrid, divide_path, maximal_squared_speeds
 from .trajectory import Trajectory
 
 _CELLS = 250

@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from kineverse.compile import compiler_information
+from kineverse.compilation import compiler_information
 from kineverse.errors import CompileError
 from kineverse.lie import Array
 from kineverse_studies.bench.workloads import BenchmarkRobot

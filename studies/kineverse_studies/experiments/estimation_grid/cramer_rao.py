@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kineverse.lie import Array, retract
-from kineverse_studies.experiments.estimation_grid.samples import Cell, JointSamples, joint_motions
+
+from .samples import Cell, JointSamples, joint_motions
 
 STEP = 1e-5
 """Step of the central differences [m], [rad]. Their error is of second order."""

@@ -14,15 +14,16 @@ from kineverse.errors import KineverseError
 from kineverse.estimation import identify, pose_covariance
 from kineverse.estimation.identification.result import Fit
 from kineverse.lie import Array
-from kineverse_studies.experiments.estimation_grid.cramer_rao import (
+from kineverse_studies.experiments.registry import Progress
+from kineverse_studies.experiments.worker_pool import worker_pool
+
+from .cramer_rao import (
     Bound,
     compute_attainable_bound,
     compute_bound,
 )
-from kineverse_studies.experiments.estimation_grid.results import CellResult
-from kineverse_studies.experiments.estimation_grid.samples import Cell, Joint, JointSamples, draw_samples
-from kineverse_studies.experiments.registry import Progress
-from kineverse_studies.experiments.worker_pool import worker_pool
+from .results import CellResult
+from .samples import Cell, Joint, JointSamples, draw_samples
 
 SEED = 2011
 SAMPLES = 50

@@ -8,14 +8,17 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kineverse.view.plots import Figure
-from kineverse_studies.experiments.estimation_grid.fits import (
+from kineverse_studies.experiments.registry import Options, Progress
+from kineverse_studies.experiments.report import Report, ReportTable
+
+from .fits import (
     SAMPLES,
     SEED,
     fit_all,
     make_grid,
     make_quick_grid,
 )
-from kineverse_studies.experiments.estimation_grid.results import (
+from .results import (
     LEAST_RIGHT,
     MOST_OVER,
     NEAR,
@@ -26,9 +29,7 @@ from kineverse_studies.experiments.estimation_grid.results import (
     rms,
     summarize_cells,
 )
-from kineverse_studies.experiments.estimation_grid.samples import LEVER, TO_AXIS, Cell
-from kineverse_studies.experiments.registry import Options, Progress
-from kineverse_studies.experiments.report import Report, ReportTable
+from .samples import LEVER, TO_AXIS, Cell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

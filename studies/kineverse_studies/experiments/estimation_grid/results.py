@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.lie import Array
-from kineverse_studies.experiments.estimation_grid.samples import Cell
+
+from .samples import Cell
 
 Flags = npt.NDArray[np.bool_]
 

@@ -12,10 +12,10 @@ from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
-from kineverse_studies.experiments.fig4.paper_ekf import PaperEkf
 from kineverse_studies.experiments.registry import Progress
 
 from .consistency import LEVELS
+from .paper_ekf import PaperEkf
 from .protocol import (
     DT,
     OBSERVATIONS,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, ModelError, ShapeError, UnknownNameError, suggest
 from kineverse.expressions import Expression, array
 from kineverse.lie import Array

@@ -11,13 +11,14 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.compilation import CompiledFunction, compile
 from kineverse.errors import ModelError
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.lie import Array, exp_so3, retract, transform
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
-from kineverse_studies.experiments.fig4.paper_ekf import SPREAD, STEPS, PaperEkf
+
+from .paper_ekf import SPREAD, STEPS, PaperEkf
 
 Generator: TypeAlias = np.random.Generator
 

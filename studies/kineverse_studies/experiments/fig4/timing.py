@@ -10,12 +10,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from kineverse._gc import no_collection
+from kineverse._runtime import no_collection
 from kineverse.lie import Array
-from kineverse_studies.experiments.fig4.paper_ekf import PaperEkf
 from kineverse_studies.experiments.registry import Progress
 
 from .accuracy import simulate_observations
+from .paper_ekf import PaperEkf
 from .protocol import DT, LEVELS, ObservedModel, PoseNoise, make_tracker
 
 Step: TypeAlias = Callable[[Array], None]

@@ -12,9 +12,10 @@ from kineverse.estimation import identify, pose_covariance
 from kineverse.estimation.identification.result import SURE, NoiseDeviations
 from kineverse.estimation.identification.solver import solver
 from kineverse.lie import Array
-from kineverse_studies.experiments.joint_types.samples import JointCase, draw_case
 from kineverse_studies.experiments.registry import Progress
 from kineverse_studies.experiments.worker_pool import worker_pool
+
+from .samples import JointCase, draw_case
 
 CASES = 1000
 

@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse.estimation.identification.unknown_noise import UNKNOWN_NOISE
+from kineverse.estimation.identification.noise_estimation import UNKNOWN_NOISE
 from kineverse.view.plots import Figure
-from kineverse_studies.experiments.joint_types.answers import CASES, Setting, TypeAnswer, identify_cases
-from kineverse_studies.experiments.joint_types.samples import (
+from kineverse_studies.experiments.registry import Options, Progress
+from kineverse_studies.experiments.report import Report, ReportTable
+
+from .answers import CASES, Setting, TypeAnswer, identify_cases
+from .samples import (
     BETA,
     COUNTS,
     LEVERS,
@@ -22,8 +25,6 @@ from kineverse_studies.experiments.joint_types.samples import (
     RANGES,
     SEED,
 )
-from kineverse_studies.experiments.registry import Options, Progress
-from kineverse_studies.experiments.report import Report, ReportTable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -15,8 +15,8 @@ from kineverse.errors import KineverseError, NoSolutionError
 from kineverse.geometry import Rule
 from kineverse.grasping import find_handle
 from kineverse.manipulation import find_articulated_objects
+from kineverse.manipulation.base_sampling import find_free_state
 from kineverse.manipulation.robot_sources import RobotSource
-from kineverse.manipulation.start_state import find_free_state
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol

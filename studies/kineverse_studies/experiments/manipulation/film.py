@@ -14,13 +14,12 @@ from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.view.camera import Camera, fit_camera
-from kineverse.view.drawables import Drawable, Rgba, collect_drawables
+from kineverse.view.drawables import Drawable, Rgba, build_spheres, collect_drawables
 from kineverse.view.pictures import picture
 from kineverse.view.plots import Figure
 from kineverse.view.poses import FramePoses, complete
 from kineverse.view.proximity import build_arrow
 from kineverse.view.rasterizer import Projection, TriangleSoup, rasterize
-from kineverse.view.sphere_drawables import build_spheres
 
 from .trials import Moment
 

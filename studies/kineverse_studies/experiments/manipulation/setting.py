@@ -12,7 +12,7 @@ from typing import Any
 
 from kineverse.errors import FormatError
 from kineverse.manipulation import Belief, Outcome, Session, TrackedBelief, TrueBelief
-from kineverse.manipulation.pushing.nearest_pair import PushView
+from kineverse.manipulation.pushing.contact_pair import PushView
 from kineverse.model.model import Model
 from kineverse.state import StateLike
 from kineverse.worlds import KinematicWorld, MujocoWorld, Recorder, Sensors, World

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.lie import Array, exp_so3, retract, transform
 from kineverse.model.model import Model
 

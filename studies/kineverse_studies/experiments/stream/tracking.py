@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
-from kineverse.estimation.tracking.process_noise import Process
+from kineverse.estimation.tracking.process_model import Process
 from kineverse.expressions.expression import array
 from kineverse.lie import Array
 from kineverse.model.model import Model

@@ -14,13 +14,14 @@ from kineverse.estimation.identification.result import Fit, IdentificationResult
 from kineverse.view.plots import Figure, FitProjection, draw_axial_view, draw_side_view
 from kineverse_studies.experiments.registry import Options, Progress
 from kineverse_studies.experiments.report import Report, ReportTable
-from kineverse_studies.experiments.sturm.noise_statements import (
+
+from .noise_statements import (
     StatementAnswer,
     answer_statements,
     statement_numbers,
     statement_table,
 )
-from kineverse_studies.experiments.sturm.recordings import (
+from .recordings import (
     ORIENTATION,
     POSITION,
     SOURCE,

@@ -16,7 +16,8 @@ from kineverse.estimation import identify
 from kineverse.estimation.recordings import ObservationNoise, RecordedPair, identify_recorded_joint
 from kineverse.estimation.recordings.recorded_joint import residual_noise
 from kineverse_studies.experiments.report import ReportTable
-from kineverse_studies.experiments.sturm.recordings import Label
+
+from .recordings import Label
 
 GUESS = (0.005, math.radians(1.0))
 """Guessed noise of positions [m] and orientations [rad]."""

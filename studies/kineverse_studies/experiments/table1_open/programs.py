@@ -12,7 +12,7 @@ from time import thread_time
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compilation import compile
 from kineverse.control import Controller, Goal, Hold, same_orientation, same_pose
 from kineverse.expressions import array
 from kineverse.model.model import Model

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kineverse.view.plots import Figure
-from kineverse.worlds.judge import CONTACT_GAP
+from kineverse.worlds.run_metrics import CONTACT_GAP
 from kineverse_studies.experiments.manipulation.columns import ROW, TIMES, Column, step_times
 from kineverse_studies.experiments.manipulation.tables import (
     make_group_table,

@@ -1,24 +1,19 @@
-"""Rigid bodies, joints between them, and identification of the kinematic graph.
-
-Every pair of parts is identified. Parts without relative motion form a rigid body. Bodies are connected by
-the spanning tree of largest evidence. The density of all poses is a product over the connections of the tree:
-that of the child in the parent, as if the parent's pose were known. So the connections are independent given
-the tree, and the probability of each is its share in the sum over all trees. A pair outside the tree closes a
-loop if its mobility is lower than that of the path in the tree.
-"""
+"""Kinematic graph: rigid bodies, joints between them, and its maximum spanning tree."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.articulations import Fixed, Floating
 from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError
-from kineverse.estimation.identification.found_operations import rigid_pose
+from kineverse.estimation.identification.joint_operations import rigid_pose
 from kineverse.estimation.identification.observations import PosesLike, PoseTrack, check_tracks, exact_track
 from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult
 from kineverse.estimation.linear_algebra import singularity_named
@@ -27,16 +22,160 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .loop_closures import LoopClosure, ObservedLoop, close_loops
-from .loop_mobility import closes_loop
+from .loop_closures import LoopClosure, ObservedLoop, close_loops, closes_loop
 from .pairwise import FamilyChoice, PartPair, identify_pair, identify_pairs
-from .spanning_trees import (
-    edge_probabilities,
-    orient_tree,
-    replacement_probabilities,
-    spanning_tree,
-    tree_path,
-)
+
+NodeT = TypeVar("NodeT", bound=Hashable)
+
+
+def spanning_tree(
+    nodes: Iterable[NodeT], gains: Mapping[frozenset[NodeT], float], leaves: Collection[NodeT] = ()
+) -> list[frozenset[NodeT]]:
+    """Return the connections of the spanning tree, or forest, with the largest sum of gains.
+
+    It is the structure of largest likelihood if the density is a product over connections (Chow and Liu
+    1968). Leaves have one connection at most.
+    """
+    group = {node: {node} for node in nodes}
+    chosen = []
+    for connection in sorted(gains, key=lambda c: -gains[c]):
+        a, b = connection
+        if group[a] is group[b] or any(len(group[leaf]) > 1 for leaf in connection if leaf in leaves):
+            continue
+        chosen.append(connection)
+        group[a] |= group[b]
+        for node in group[b]:
+            group[node] = group[a]
+    return chosen
+
+
+def split_tree(
+    connection: frozenset[NodeT], tree: Iterable[frozenset[NodeT]]
+) -> tuple[frozenset[NodeT], frozenset[NodeT]]:
+    """Return the nodes on either side of a connection of a tree."""
+    rest = [c for c in tree if c != connection]
+    parts = []
+    for node in connection:
+        reached = {node}
+        while new := {n for c in rest if c & reached for n in c} - reached:
+            reached |= new
+        parts.append(frozenset(reached))
+    return parts[0], parts[1]
+
+
+def edge_probabilities(
+    nodes: Iterable[NodeT], gains: Mapping[frozenset[NodeT], float], leaves: Collection[NodeT] = ()
+) -> dict[frozenset[NodeT], float]:
+    """Return the probability of each connection over all maximal spanning forests.
+
+    The probability of a tree is proportional to exp(Σ gains of its connections), with a uniform prior over
+    trees. By the matrix-tree theorem (Kirchhoff 1847) a connection ij of weight w is in a tree with
+    probability w / c. Here c is the conductance between i and j in a network with these weights. It is
+    computed by eliminating all other nodes one by one (star-mesh transform). This only adds and multiplies
+    positive numbers, so logarithms lose no digits for gains that differ by orders of magnitude.
+
+    Leaves have one connection at most, so each leaf is independent. The probabilities add up to the number of
+    connections of a tree.
+    """
+    order = {node: k for k, node in enumerate(node for node in nodes if node not in leaves)}
+    logs = np.full((len(order), len(order)), -np.inf)
+    of_leaf: dict[NodeT, float] = {}
+    for connection, gain in gains.items():
+        for leaf in connection & {*leaves}:
+            of_leaf[leaf] = float(np.logaddexp(of_leaf.get(leaf, -np.inf), gain))
+        if connection <= order.keys():
+            i, j = (order[node] for node in connection)
+            logs[i, j] = logs[j, i] = gain
+    found = {}
+    for connection, gain in gains.items():
+        if connection <= order.keys():
+            i, j = (order[node] for node in connection)
+            total = _log_conductance(logs, i, j)
+        else:
+            (leaf,) = connection & {*leaves}
+            total = of_leaf[leaf]
+        found[connection] = math.exp(min(0.0, gain - total))
+    return found
+
+
+def replacement_probabilities(
+    connection: frozenset[NodeT],
+    tree: Iterable[frozenset[NodeT]],
+    gains: Mapping[frozenset[NodeT], float],
+    leaves: Collection[NodeT] = (),
+) -> dict[frozenset[NodeT], float]:
+    """Return the probabilities of the connections that replace one, in trees without it.
+
+    They connect the two sides of the removed one and are sorted by probability. Their sum is at least the
+    probability that the one is absent.
+    """
+    one, other = split_tree(connection, tree)
+    around = {c: gain for c, gain in gains.items() if c <= one | other}
+    missing = 1.0 - edge_probabilities(one | other, around, leaves)[connection]
+    del around[connection]
+    found = edge_probabilities(one | other, around, leaves)
+    apart = {*leaves} - connection
+    across = {c: missing * p for c, p in found.items() if c & one and c & other and not c & apart}
+    return dict(sorted(across.items(), key=lambda pair: -pair[1]))
+
+
+def _log_conductance(logs: Array, start: int, end: int) -> float:
+    """Return the log conductance between two nodes, from the log conductances of all connections."""
+    order = [*(k for k in range(len(logs)) if k not in (start, end)), start, end]
+    left = logs[np.ix_(order, order)]
+    for _ in order[2:]:
+        spokes, left = left[0, 1:], left[1:, 1:]
+        total = np.logaddexp.reduce(spokes)
+        if total > -np.inf:
+            left = np.logaddexp(left, spokes[:, None] + spokes - total)
+    return float(left[0, 1])
+
+
+def tree_path(tree: Iterable[frozenset[NodeT]], start: NodeT, end: NodeT) -> list[NodeT]:
+    """Return the nodes on the path between two nodes of a tree; an empty list if they are not connected."""
+    connections = list(tree)
+    before: dict[NodeT, NodeT] = {start: start}
+    reached = [start]
+    while reached and end not in before:
+        node = reached.pop()
+        for connection in connections:
+            for neighbour in connection - {node} if node in connection else ():
+                if neighbour not in before:
+                    before[neighbour] = node
+                    reached.append(neighbour)
+    if end not in before:
+        return []
+    way = [end]
+    while way[-1] != start:
+        way.append(before[way[-1]])
+    return way[::-1]
+
+
+def orient_tree(
+    first: Iterable[NodeT], nodes: Sequence[NodeT], tree: Iterable[frozenset[NodeT]]
+) -> tuple[tuple[NodeT, ...], list[tuple[NodeT, NodeT]]]:
+    """Return the roots and the connections directed away from them.
+
+    In each component of the forest, the node that comes first in ``first`` is the root.
+    """
+    connections = list(tree)
+    roots: list[NodeT] = []
+    directed: list[tuple[NodeT, NodeT]] = []
+    reached: set[NodeT] = set()
+    for node in first:
+        if node in reached:
+            continue
+        roots.append(node)
+        reached.add(node)
+        waiting = [node]
+        while waiting:
+            parent = waiting.pop(0)
+            for child in nodes:
+                if child not in reached and frozenset((parent, child)) in connections:
+                    directed.append((parent, child))
+                    reached.add(child)
+                    waiting.append(child)
+    return tuple(roots), directed
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
-from kineverse.estimation.identification.comparison import prepare_data, solve_with_inliers, weigh_families
 from kineverse.estimation.identification.curve import CURVE
-from kineverse.estimation.identification.custom_family import Family
-from kineverse.estimation.identification.identify import family_weights
+from kineverse.estimation.identification.families import Family
+from kineverse.estimation.identification.joint_identification import family_weights
 from kineverse.estimation.identification.model_check import without_curve
+from kineverse.estimation.identification.model_selection import (
+    prepare_data,
+    solve_with_inliers,
+    weigh_families,
+)
 from kineverse.estimation.identification.observations import Observations, PoseTrack, pair_tracks
 from kineverse.estimation.identification.result import Fit, IdentificationResult
 from kineverse.estimation.linear_algebra import squared_errors
-from kineverse.estimation.robust import Outliers
+from kineverse.estimation.noise import Outliers
 from kineverse.lie import Array, skew
 
 FamilyChoice = Iterable[str] | Mapping[str, float] | None

@@ -1,0 +1,370 @@
+"""Entry point of the command line: parser, errors, exit status."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import re
+import signal
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from traceback import walk_tb
+from types import MappingProxyType, ModuleType
+from typing import Any, Protocol, TextIO, cast
+
+from kineverse._extras import STUDIES, install_command, install_studies
+from kineverse._version import __version__
+from kineverse.errors import (
+    FormatError,
+    KineverseError,
+    MissingDependencyError,
+    UnknownNameError,
+    suggest,
+)
+
+from . import (
+    convert,
+    decompose,
+    demo,
+    diff,
+    fit,
+    fk,
+    info,
+    manipulate,
+    plan,
+    reach,
+    spheres,
+    unlock,
+    validate,
+    view,
+)
+from .arguments import MODULES
+from .output import join_lines, safe_streams
+
+
+class CommandModule(Protocol):
+    """Module or object that is a command."""
+
+    @property
+    def HELP(self) -> str:
+        """Summary, and after it the description."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the options."""
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Run the command and return its exit status."""
+
+
+def _by_name(*modules: ModuleType) -> dict[str, Any]:
+    return {module.__name__.rpartition(".")[2]: module for module in modules}
+
+
+COMMANDS: dict[str, CommandModule] = {
+    **_by_name(info, fk, reach, plan, unlock),
+    **manipulate.COMMANDS,
+    **_by_name(
+        view,
+        convert,
+        diff,
+        validate,
+        decompose,
+        spheres,
+        fit,
+        demo,
+    ),
+}
+
+ENTRY_POINTS = "kineverse.commands"
+"""Group of entry points by which other distributions add commands; each names a :class:`CommandModule`."""
+
+STUDY_COMMANDS = ("bench", "reproduce")
+"""Commands of the distribution of studies, which need not be installed."""
+
+ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
+"""Exit statuses: the request failed; Ctrl-C; the output pipe was closed (128 and the signal's number)."""
+
+_PACKAGE = __name__.partition(".")[0]
+
+_NEGATIVE_VALUE = re.compile(r"-\s*(\d|\.\d|(pi|π|inf|nan)\b)")
+
+# The commands report missing meshes themselves; a missing compiler does not change their results.
+QUIET = ("kineverse.view.meshes", "kineverse.compilation.toolchain")
+
+EXAMPLES = """\
+A MODEL is the name of a shipped model (kitchen, pr2, articulations/screw ...) or the path of a file.
+
+examples:
+  kineverse info kitchen                              its frames, degrees of freedom, constraints
+  kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
+  kineverse reach fetch fetch/gripper_link --pose 0.7 0.2 0.9
+  kineverse plan shelf_door --to shelf_door/door=80deg
+  kineverse unlock lockboxes/thesis --goal lockbox/a=1.2
+  kineverse push kitchen --robot hsr --what kitchen/fridge_door
+  kineverse view kitchen                              move it in the browser
+  kineverse convert kitchen kitchen.kv.json           write it in another format
+  kineverse diff kitchen kitchen.kv.json              differences of two models
+  kineverse fit poses.csv --child door                learn a joint from recorded poses
+  kineverse demo --headless                           a robot opens and closes a door, a flap, a drawer
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status.
+
+    Parameters
+    ----------
+    argv
+        Arguments without the name of the program; those of the process if None. If there are none, the help
+        is printed.
+
+    Returns
+    -------
+    0 on success; 2 if the request cannot be fulfilled, with the reason in one line on standard error; 130
+    after Ctrl-C; 141 if the output pipe was closed.
+    """
+    words = sys.argv[1:] if argv is None else list(argv)
+    try:
+        with safe_streams(), _end_by_exception(argv is None):
+            status = _run(words)
+            try:
+                sys.stdout.flush()
+            except BrokenPipeError:
+                status = PIPE_CLOSED
+            except OSError as error:
+                if status != ERROR:
+                    print(f"kineverse: {format_error(error)}", file=sys.stderr)
+                status = ERROR
+            else:
+                return status
+    except FormatError as error:  # standard output is closed
+        print(f"kineverse: {format_error(error)}", file=sys.stderr)
+        return ERROR
+    _discard_stdout()
+    return status
+
+
+def _run(words: Sequence[str]) -> int:
+    """Run the command of some words and return its status; print the reason of a failure."""
+    try:
+        if not set(words) - {"-v", "--verbose"}:
+            make_parser(_list_added_commands()).print_help()
+            return 0
+        arguments = _parse_arguments(words)
+        with _log_warnings_to(sys.stderr, arguments.verbose):
+            status: int = arguments.run(arguments)
+    except SystemExit as stop:  # argparse would end the process.
+        return stop.code if isinstance(stop.code, int) else ERROR
+    except BrokenPipeError:
+        return PIPE_CLOSED
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+        return INTERRUPTED
+    except (KineverseError, OSError) as error:
+        print(f"kineverse: {format_error(error)}", file=sys.stderr)
+        return ERROR
+    except ImportError as error:
+        reason = _explain_import(error)
+        if reason is None:
+            raise
+        print(f"kineverse: {reason}", file=sys.stderr)
+        return ERROR
+    return status
+
+
+def _explain_import(error: ImportError) -> str | None:
+    """Return why a module of others cannot be imported, with the extra that it belongs to; None for ours."""
+    if (error.name or _PACKAGE).partition(".")[0] == _PACKAGE:
+        return None
+    importers = [error.name or ""]
+    importers += [str(frame.f_globals.get("__name__")) for frame, _ in walk_tb(error.__traceback__)]
+    modules = {name.partition(".")[0] for name in importers}
+    extra = next((extra for extra, module in MODULES.items() if module in modules), None)
+    if extra is None:
+        return f"{join_lines(error)}. 'pip check' says what is installed in part."
+    return f"The extra '{extra}' is not installed completely ({join_lines(error)}): {install_command(extra)}"
+
+
+@contextmanager
+def _end_by_exception(enabled: bool) -> Iterator[None]:
+    """Have SIGTERM and SIGHUP end the process like an exception, so that temporary folders are removed."""
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+    def end(number: int, frame: object) -> None:
+        signal.signal(number, signal.SIG_DFL)  # the next one ends it at once
+        raise SystemExit(128 + number)
+
+    # A process that was started to outlive its terminal ignores SIGHUP, and goes on to do so.
+    before = {n: signal.getsignal(n) for n in numbers if enabled and signal.getsignal(n) == signal.SIG_DFL}
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def find_added_commands() -> Mapping[str, EntryPoint]:
+    """Return the entry points of commands that other distributions add, by name, without importing them."""
+    found = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    return {name: found[name] for name in sorted(found) if name not in COMMANDS}
+
+
+def load_command(name: str) -> CommandModule:
+    """Return a command of this package, or import one that another distribution adds."""
+    if name in COMMANDS:
+        return COMMANDS[name]
+    added = find_added_commands()
+    if name not in added:
+        if name in STUDY_COMMANDS:
+            raise MissingDependencyError(
+                f"'kineverse {name}' is a command of {STUDIES}, which is not installed: {install_studies()}"
+            )
+        raise UnknownNameError(f"There is no command {name!r}. {_suggest_command(name, added)}")
+    point = added[name]
+    distribution = point.dist.name if point.dist else point.value
+    try:
+        command = point.load()
+    except Exception as error:  # somebody else's code
+        reason = join_lines(error) or "no reason given"
+        raise MissingDependencyError(
+            f"'kineverse {name}' is a command of {distribution}, and {point.value} cannot be imported "
+            f"({type(error).__name__}: {reason}). Install {distribution} again."
+        ) from error
+    lacking = [part for part in ("HELP", "add_arguments", "run") if not hasattr(command, part)]
+    if lacking:
+        raise MissingDependencyError(
+            f"'kineverse {name}' is a command of {distribution}, and {point.value} has no "
+            f"{', '.join(lacking)}. Install {distribution} again."
+        )
+    return cast(CommandModule, command)
+
+
+def make_parser(added: Mapping[str, CommandModule] = MappingProxyType({})) -> argparse.ArgumentParser:
+    """Return the parser of the whole command line, with commands that other distributions add."""
+    top = argparse.ArgumentParser(
+        prog="kineverse",
+        description="View, move and query articulation models.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("--version", action="version", version=f"kineverse {__version__}")
+    top.add_argument("-v", "--verbose", action="store_true", help="print more messages on standard error")
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name, command in {**COMMANDS, **added}.items():
+        summary, _, description = command.HELP.partition("\n")
+        sub = commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary}\n{description}".strip(),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.add_arguments(sub)
+        sub.set_defaults(run=command.run, command=sub)
+    return top
+
+
+def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
+    """Parse the arguments of the command line."""
+    name = next((word for word in words if not word.startswith("-")), None)
+    # Other distributions are asked for an unknown name and for the list of commands only: that takes 20 ms.
+    if name is None:
+        added = _list_added_commands()
+    else:
+        added = {} if name in COMMANDS else {name: load_command(name)}
+    # A leading space tells argparse that -30deg, -pi/2 or -1e-3 is a value and no option.
+    words = [f" {word}" if _NEGATIVE_VALUE.match(word) else word for word in words]
+    arguments, unknown = make_parser(added).parse_known_args(words)
+    if unknown:
+        sub: argparse.ArgumentParser = arguments.command
+        word = unknown[0].partition("=")[0]
+        if ":=" in unknown[0]:
+            raise UnknownNameError(
+                f"{sub.prog} takes the arguments of a template with its path, in quotes: "
+                f"'robot.urdf.xacro {unknown[0]}'."
+            )
+        if not word.startswith("-"):
+            raise UnknownNameError(
+                f"{sub.prog} has no use for {word!r}. '{sub.prog} --help' says what it takes."
+            )
+        options = [option for option in sub._option_string_actions if option.startswith("--")]
+        raise UnknownNameError(f"{sub.prog} has no option {word!r}. {suggest(word, options, 'option')}")
+    return arguments
+
+
+@dataclass(frozen=True)
+class _ListedCommand:
+    """Command of another distribution in the list of commands, which is not imported for that."""
+
+    HELP: str
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare nothing."""
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Do nothing: only ``--help`` lists the command."""
+        return ERROR
+
+
+def _list_added_commands() -> dict[str, CommandModule]:
+    added = find_added_commands()
+    listed: dict[str, CommandModule] = {
+        name: _ListedCommand(f"command of {point.dist.name if point.dist else point.value}")
+        for name, point in added.items()
+    }
+    for name in STUDY_COMMANDS:
+        if name not in listed:
+            listed[name] = _ListedCommand(f"command of {STUDIES}, which is not installed")
+    return listed
+
+
+def _suggest_command(name: str, added: Iterable[str]) -> str:
+    """Return advice on a command that does not exist."""
+    from kineverse.formats.locate import shipped_models
+
+    if name in shipped_models() or os.path.exists(name):
+        return f"It is a model or file: 'kineverse info {name}' says what it consists of."
+    known = dict.fromkeys([*COMMANDS, *added, *STUDY_COMMANDS])
+    return f"{suggest(name, known, 'command')} 'kineverse --help' says what each does."
+
+
+def format_error(error: BaseException) -> str:
+    """Return the message of an error on one line."""
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror}"
+    return join_lines(error) or type(error).__name__
+
+
+@contextmanager
+def _log_warnings_to(stream: TextIO, verbose: bool) -> Iterator[None]:
+    """Print warnings of the library on a stream; those of :data:`QUIET` loggers only if verbose."""
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(logging.Formatter("kineverse: %(message)s"))
+    log, quiet = logging.getLogger("kineverse"), [logging.getLogger(name) for name in QUIET]
+    levels = [(logger, logger.level) for logger in (log, *quiet)]
+    log.addHandler(handler)
+    log.setLevel(logging.INFO if verbose else logging.WARNING)
+    for logger in quiet:
+        logger.setLevel(logging.INFO if verbose else logging.ERROR)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        for logger, level in levels:
+            logger.setLevel(level)
+
+
+def _discard_stdout() -> None:
+    """Redirect standard output to the null device, so that the interpreter can flush it at exit."""
+    try:
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
+    except (OSError, ValueError):
+        pass  # Under a test, standard output may not be a file.

@@ -1,7 +1,0 @@
-"""Compilation of expressions to fast functions."""
-
-from .c_library import CompilerInformation, compiler_information
-from .evaluator import Evaluator
-from .function import CompiledFunction, compile  # noqa: A004 - the name the design gives it
-
-__all__ = ["CompiledFunction", "CompilerInformation", "Evaluator", "compile", "compiler_information"]

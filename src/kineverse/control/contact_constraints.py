@@ -1,0 +1,258 @@
+"""Constraints of controllers that keep near pairs of bodies apart."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.compilation import compile
+from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.function import WantedTier
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.geometry import Rule, Scene
+from kineverse.geometry.bindings import FacingPoints
+from kineverse.geometry.distance_queries import PairFlags, flag_between, flag_matching
+from kineverse.geometry.results import DistanceResults
+from kineverse.lie import Array
+from kineverse.model.frame_dependence import FrameDependence
+from kineverse.symbols import Symbol
+
+from .velocity_program import INWARDS, RECOVERY_WEIGHT
+
+_SOURCE = r"""
+#include <stdint.h>
+
+typedef struct {
+  int64_t n, width, bodies, used; /* speeds, all variables, bodies, rows */
+  const int64_t *group;           /* of each body, among the twists */
+  const double *twists, *margins; /* (groups, 6, n), (bodies, bodies) */
+  double *H, *f, *A, *lower;
+  const double *distances, *witnesses;
+  const int32_t *owners;
+  double gain, recovery, weight, inwards;
+} Rows;
+
+static void add(double *row, const double *twist, int64_t n, const double *p, const double *m, double sign) {
+  const double wrench[6] = {m[0], m[1], m[2], p[1] * m[2] - p[2] * m[1], p[2] * m[0] - p[0] * m[2],
+                            p[0] * m[1] - p[1] * m[0]};
+  for (int i = 0; i < 6; i++)
+    for (int64_t j = 0; j < n; j++) row[j] += sign * wrench[i] * twist[i * n + j];
+}
+
+__attribute__((visibility("default"))) void write_rows(const Rows *r) {
+  const int64_t n = r->n;
+  for (int64_t k = 0; k < r->used; k++) {
+    const int32_t a = r->owners[2 * k], b = r->owners[2 * k + 1];
+    const double *witness = r->witnesses + 9 * k, gap = r->distances[k] - r->margins[r->bodies * a + b];
+    double *row = r->A + r->width * k;
+    for (int64_t j = 0; j < n; j++) row[j] = 0.0;
+    add(row, r->twists + 6 * n * r->group[b], n, witness + 3, witness + 6, 1.0);
+    add(row, r->twists + 6 * n * r->group[a], n, witness, witness + 6, -1.0);
+    r->lower[k] = gap > 0.0 ? -r->gain * gap : 0.0;
+    if (!(gap < 0.0)) continue;
+    const double rate = r->recovery * (r->inwards - gap);
+    for (int64_t i = 0; i < n; i++) {
+      for (int64_t j = 0; j < n; j++) r->H[r->width * i + j] += r->weight * row[i] * row[j];
+      r->f[i] -= r->weight * rate * row[i];
+    }
+  }
+}
+"""
+
+
+class _Struct(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("n", "width", "bodies", "used")),
+        *((name, ctypes.c_void_p) for name in ("group", "twists", "margins", "H", "f", "A", "lower")),
+        *((name, ctypes.c_void_p) for name in ("distances", "witnesses", "owners")),
+        *((name, ctypes.c_double) for name in ("gain", "recovery", "weight", "inwards")),
+    )
+
+
+def _declare(code: Any) -> None:
+    code.write_rows.argtypes, code.write_rows.restype = (ctypes.c_void_p,), None
+
+
+row_library = SourceLibrary(_SOURCE, _declare)
+
+
+class ContactRows:
+    """Writer of the rows of near pairs into the arrays of a quadratic program, which it keeps."""
+
+    def __init__(
+        self,
+        group: npt.NDArray[np.intp],
+        twists: Array,
+        margins: Array,
+        H: Array,
+        f: Array,
+        A: Array,
+        lower: Array,
+    ) -> None:
+        self._group, self._twists, self._margins = group.astype(np.int64), twists, margins
+        self._H, self._f, self._A, self._lower = H, f, A, lower
+        self._struct = struct = _Struct(n=twists.shape[2], width=A.shape[1], bodies=len(group))
+        struct.inwards = INWARDS
+        arrays = {"group": self._group, "twists": twists, "margins": margins}
+        for name, values in (arrays | {"H": H, "f": f, "A": A, "lower": lower}).items():
+            setattr(struct, name, values.ctypes.data)
+        self._address = ctypes.addressof(struct)
+        row_library.prepare(wait=True)  # now, so that numbers never change
+
+    def write(
+        self, found: DistanceResults, used: int, *, gain: float, recovery: float, weight: float
+    ) -> None:
+        """Write the rows of the first pairs, and add those within their margins to the costs."""
+        if row_library.code is None:
+            self._write_by_numpy(found, used, gain, recovery, weight)
+            return
+        struct = self._struct
+        struct.used, struct.gain, struct.recovery, struct.weight = used, gain, recovery, weight
+        struct.owners = _address(found.body_indices)
+        struct.distances, struct.witnesses = _address(found.distances), _address(found.witnesses)
+        row_library.code.write_rows(self._address)
+
+    def _write_by_numpy(
+        self, found: DistanceResults, used: int, gain: float, recovery: float, weight: float
+    ) -> None:
+        n = self._twists.shape[2]
+        owners, normals = found.body_indices[:used], found.normals[:used]
+        ends = ((owners[:, 1], found.points_b[:used]), (owners[:, 0], found.points_a[:used]))
+        grows, shrinks = (
+            np.einsum(
+                "ki,kij->kj", np.hstack([normals, np.cross(p, normals)]), self._twists[self._group[owner]]
+            )
+            for owner, p in ends
+        )
+        rows = self._A[:used, :n] = grows - shrinks
+        gap = found.distances[:used] - self._margins[owners[:, 0], owners[:, 1]]
+        self._lower[:used] = -gain * np.maximum(gap, 0.0)
+        near = gap < 0.0
+        inside = rows[near]
+        self._H[:n, :n] += weight * (inside.T @ inside)
+        self._f[:n] -= weight * recovery * ((INWARDS - gap[near]) @ inside)
+
+
+def _address(array: npt.NDArray[Any]) -> int:
+    """Return the address of an array that is not empty, in a third of the time of ``array.ctypes.data``."""
+    return ctypes.addressof(ctypes.c_char.from_buffer(array.data))
+
+
+class ContactSlots:
+    """Rows of the nearest pairs of bodies."""
+
+    found: DistanceResults  # near pairs of the last update, nearest first, all of them
+
+    def __init__(
+        self,
+        scene: Scene,
+        speeds: Sequence[Symbol],
+        count: int,
+        *,
+        margin: float,
+        radius: float,
+        gain: float,
+        twist: Callable[[str], Expression] | None = None,
+        rules: Iterable[Rule] = (),
+        tier: WantedTier = "auto",
+    ) -> None:
+        if not isinstance(scene, Scene):
+            raise InvalidValueError(f"scene= is a kineverse.geometry.Scene of the model, not {scene!r}.")
+        check_slots(count)
+        if not (math.isfinite(margin) and margin < radius):
+            raise InvalidValueError(
+                f"Pairs count from a radius on that is larger than their margin, not {radius!r} m beside "
+                f"{margin!r} m."
+            )
+        model = scene.model
+        self._version = model.version
+        self.scene, self.count = scene, count
+        self.margin, self.radius, self.gain = margin, radius, gain
+        motion = FrameDependence(model, speeds)
+        self._query = scene.watch(radius=radius, moving=speeds, rules=rules, per_shape=True)
+        self._query.prepare()
+        watched = set(self._query.pairs.ravel().tolist())
+        moved = [motion.moving_ancestors(b) if k in watched else () for k, b in enumerate(scene.bodies)]
+        groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
+        self._group = np.array([groups[group] for group in moved], dtype=np.intp)
+        self._margins = np.full((len(scene.bodies), len(scene.bodies)), self.margin)
+        # Pairs with a margin of their own press on each other, and slide.
+        self._facing = FacingPoints(self._margins, self.margin)
+        self._rows: ContactRows
+        self._selected: dict[tuple[tuple[str, ...], tuple[str, ...]], PairFlags] = {}
+        members = dict(zip(moved, scene.bodies, strict=True))
+        twists: list[Expression] = [as_expression(np.zeros((6, len(speeds))))]
+        twist = twist or (lambda body: model.jacobian(body, form="world", symbols=speeds))
+        twists += [twist(members[group]) for group in groups if group]
+        stacked = array([e for twist in twists for e in twist.ravel()]).reshape(len(twists), 6, len(speeds))
+        self.inputs = tuple(sorted({*scene.inputs, *stacked.symbols}, key=lambda s: s.sort_key))
+        self.function = compile([stacked], tier=tier)
+        self._twists = self.function.bind()
+        place = {s: k for k, s in enumerate(self.inputs)}
+        self._scene_values = np.array([place[s] for s in scene.inputs], dtype=np.intp)
+        self._twist_values = np.array([place[s] for s in self.function.inputs], dtype=np.intp)
+
+    def update(self, values: Array) -> None:
+        """Find the near pairs at the values of :attr:`inputs`."""
+        if self.scene.model.version != self._version:
+            raise InvalidValueError(
+                "The model of the scene was edited since, so the rows of contacts are not about its bodies. "
+                "Build anew, or with a scene of model.snapshot()."
+            )
+        self.found = self._query.at(values[self._scene_values], self.radius, self._facing)
+        self._twists.input[:] = values[self._twist_values]
+        self._twists()
+
+    def set_margin(self, one: str | Iterable[str], other: str | Iterable[str], margin: float) -> None:
+        """Set the distance that some pairs keep [m]; negative for bodies that press on each other."""
+        if not (math.isfinite(margin) and margin < self.radius):
+            raise InvalidValueError(f"A margin is smaller than the radius {self.radius!r} m, not {margin!r}.")
+        bodies = self.scene.bodies
+        ones, others = (tuple([names] if isinstance(names, str) else names) for names in (one, other))
+        if (ones, others) not in self._selected:
+            self._selected[ones, others] = flag_between(
+                flag_matching(bodies, ones), flag_matching(bodies, others)
+            )
+        self._margins[self._selected[ones, others]] = margin
+
+    def twist(self, body: int) -> Array:
+        """Return the twist (v, ω) of a body, (6, n) over the columns in the world, at the last update.
+
+        The velocities of a point p of the body are ``v + ω × p``.
+        """
+        return np.asarray(self._twists.outputs[0][self._group[body]])
+
+    def twists(self, bodies: Sequence[int]) -> Array:
+        """Return the twists of some bodies, (k, 6, n), see :meth:`twist`."""
+        return np.asarray(self._twists.outputs[0][self._group[bodies]])
+
+    def bind(self, H: Array, f: Array, A: Array, lower: Array) -> None:
+        """Choose the arrays of the program into which :meth:`write` writes."""
+        self._rows = ContactRows(
+            self._group, self._twists.outputs[0], self._margins, *map(_contiguous, (H, f, A, lower))
+        )
+
+    def write(self, recovery: float, weight: float = RECOVERY_WEIGHT) -> None:
+        """Write the rows of the nearest pairs into the program, and the soft goals into its costs."""
+        used = min(len(self.found), self.count)
+        if used:
+            self._rows.write(self.found, used, gain=self.gain, recovery=recovery, weight=weight)
+
+
+def check_slots(count: object) -> None:
+    """Raise InvalidValueError for a number of contact slots that is no natural number."""
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise InvalidValueError(f"contacts= is a number of rows, 0 or more, not {count!r}.")
+
+
+def _contiguous(array: Array) -> Array:
+    """Return an array that C can write to."""
+    if not array.flags.c_contiguous or array.dtype != np.float64:
+        raise InvalidValueError("Rows of contacts are written in place, into contiguous arrays of doubles.")
+    return array

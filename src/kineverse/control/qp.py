@@ -1,0 +1,320 @@
+"""The interface of QP solvers.
+
+The problem is to minimise ``1/2 x'Hx + f'x`` subject to ``lower <= [x; A x] <= upper``. The first n entries
+of the bounds are those of x itself, the other m those of the rows of A. A bound may be infinite, and rows
+whose bounds are equal are equalities.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+from abc import ABC, abstractmethod
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kineverse._extras import install_command
+from kineverse.compilation.c_library import SourceLibrary
+from kineverse.errors import InvalidValueError, MissingDependencyError, ShapeError
+
+Vector = NDArray[np.float64]
+Status = Literal["solved", "infeasible", "failed"]
+
+SOFT_WEIGHT = 1e6
+"""The default weight of the squared violation of a soft row."""
+
+
+class QpSolution(NamedTuple):
+    """The outcome of a quadratic program."""
+
+    x: Vector  # minimiser, of shape (n,); zeros unless solved
+    multipliers: Vector  # multipliers of [x
+    iterations: int  # number of iterations
+    status: Status
+
+
+_SOURCE = r"""
+#include <math.h>
+#include <stdint.h>
+
+typedef struct {
+  int64_t n, m;
+  const double *A, *lower, *upper, *hard; /* hard: 1, and 0 for soft entries */
+  double *values, *low, *high;            /* [x; A x], and bounds that are no further than a limit */
+} Rows;
+
+/* Squared violation of the hard entries, relative to 1 plus the square of [x; A x]; NaN where anything is. */
+__attribute__((visibility("default"))) double violation(const Rows *r) {
+  double square = 0.0, sum = 0.0;
+  for (int64_t k = 0; k < r->n + r->m; k++) {
+    if (k >= r->n) {
+      const double *row = r->A + r->n * (k - r->n);
+      double value = 0.0;
+      for (int64_t j = 0; j < r->n; j++) value += row[j] * r->values[j];
+      r->values[k] = value;
+    }
+    const double value = r->values[k];
+    const double above = value - r->upper[k], below = r->lower[k] - value;
+    const double beyond = !(above <= 0.0) ? above : !(below <= 0.0) ? below : 0.0;
+    square += value * value;
+    sum += r->hard[k] * beyond * beyond;
+  }
+  return square < INFINITY ? sum / (1.0 + square) : NAN;
+}
+
+__attribute__((visibility("default"))) void bound(const Rows *r, double limit) {
+  for (int64_t k = 0; k < r->n + r->m; k++) {
+    r->low[k] = r->lower[k] < -limit ? -limit : r->lower[k];
+    r->high[k] = r->upper[k] > limit ? limit : r->upper[k];
+  }
+}
+"""
+
+
+class _Rows(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("n", "m")),
+        *((name, ctypes.c_void_p) for name in ("A", "lower", "upper", "hard", "values", "low", "high")),
+    )
+
+
+def _declare(code: Any) -> None:
+    code.violation.argtypes, code.violation.restype = (ctypes.c_void_p,), ctypes.c_double
+    code.bound.argtypes, code.bound.restype = (ctypes.c_void_p, ctypes.c_double), None
+
+
+_library = SourceLibrary(_SOURCE, _declare)
+
+
+class QpSolver(ABC):
+    """A solver of quadratic programs of one size, started from its last solution."""
+
+    def __init__(
+        self,
+        n: int,
+        m: int,
+        soft: ArrayLike | None = None,
+        soft_weight: ArrayLike = SOFT_WEIGHT,
+        soft_linear: ArrayLike = 0.0,
+    ) -> None:
+        if n < 1 or m < 0:
+            raise InvalidValueError(
+                f"A quadratic program has n >= 1 unknowns and m >= 0 rows, not {n} and {m}."
+            )
+        self.n, self.m = n, m
+        self.soft = np.zeros(n + m, bool) if soft is None else np.array(soft, bool)
+        if self.soft.shape != (n + m,):
+            raise ShapeError(
+                f"soft has the shape {self.soft.shape}, not ({n + m},): one entry per bound of [x; A x]."
+            )
+        self._weight = np.broadcast_to(np.asarray(soft_weight, float), n + m).copy()
+        self._linear = np.broadcast_to(np.asarray(soft_linear, float), n + m).copy()
+        if not (np.isfinite(self._weight) & (self._weight > 0)).all():
+            raise InvalidValueError("The weights of soft rows are finite and above 0.")
+        if not (np.isfinite(self._linear) & (self._linear >= 0)).all():
+            raise InvalidValueError("The linear weights of soft rows are finite and at least 0.")
+        self._bound: tuple[Any, ...] = (None,) * 5
+        self._hard, self._any_soft = (~self.soft).astype(float), bool(self.soft.any())
+        self._values, self._low, self._high = np.zeros((3, n + m))
+        self._x = self._values[:n]
+        self._entries = _Rows(n, m)
+        arrays = {"hard": self._hard, "values": self._values, "low": self._low, "high": self._high}
+        for name, array in arrays.items():
+            setattr(self._entries, name, array.ctypes.data)
+        self._address = ctypes.addressof(self._entries)
+        # What takes numpy 5 us of a step of 30 takes C 1.
+        _library.prepare()
+        self._prepare()
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """Import the library and allocate memory, at the end of the construction."""
+
+    def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
+        """Minimise ``1/2 x'Hx + f'x`` subject to ``lower <= [x; A x] <= upper``.
+
+        The arrays are read in place: rewrite the same ones for each solve, since other ones are checked anew.
+        The solution's arrays are its own.
+        """
+        h, g, a, low, high = self._bound
+        if H is not h or f is not g or A is not a or lower is not low or upper is not high:
+            self._bind(H, f, A, lower, upper)
+        return self._solve(H, f, A, lower, upper)
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget the last solution, so that the next solve starts from scratch."""
+
+    @abstractmethod
+    def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
+        """Solve a problem with arrays of the right shapes and any numbers."""
+
+    def _satisfies(self, x: Vector) -> bool:
+        """Return whether x satisfies the problem's hard rows; any NaN, there or in x, makes that False."""
+        self._x[:] = x
+        code = _library.code
+        if code is not None:
+            return bool(code.violation(self._address) <= _FEASIBLE)
+        values, (_, _, A, lower, upper) = self._values, self._bound
+        A.dot(x, values[self.n :])
+        size = values.dot(values)
+        if not size < np.inf:
+            return False
+        violations = self._hard * np.maximum(np.maximum(values - upper, lower - values), 0.0)
+        return bool(violations.dot(violations) <= _FEASIBLE * (1.0 + size))
+
+    def _bound_by(self, limit: float) -> tuple[Vector, Vector]:
+        """Return the problem's bounds within a limit, in arrays that the next call overwrites."""
+        code, (*_, lower, upper) = _library.code, self._bound
+        if code is not None:
+            code.bound(self._address, limit)
+        else:
+            np.maximum(lower, -limit, out=self._low)
+            np.minimum(upper, limit, out=self._high)
+        return self._low, self._high
+
+    @staticmethod
+    def _unsolvable(H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> Status | None:
+        """Return the status of a problem that no solver needs to see; None for any other."""
+        if not all(np.isfinite(array).all() for array in (H, f, A)):
+            return "failed"
+        if np.isnan(lower).any() or np.isnan(upper).any() or (H.diagonal() <= 0.0).any():
+            return "failed"
+        ordered = (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
+        return None if ordered.all() else "infeasible"
+
+    def _nothing(self, status: Status, iterations: int = 0) -> QpSolution:
+        return QpSolution(np.zeros(self.n), np.zeros(self.n + self.m), iterations, status)
+
+    def _bind(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> None:
+        n, m = self.n, self.m
+        for name, array, shape in (
+            ("H", H, (n, n)),
+            ("f", f, (n,)),
+            ("A", A, (m, n)),
+            ("lower", lower, (n + m,)),
+            ("upper", upper, (n + m,)),
+        ):
+            if not isinstance(array, np.ndarray) or array.dtype != np.float64 or not array.flags.c_contiguous:
+                raise InvalidValueError(
+                    f"{name} is read in place, so it is a C-contiguous array of doubles: "
+                    f"numpy.ascontiguousarray({name}, float)."
+                )
+            if array.shape != shape:
+                raise ShapeError(f"{name} has the shape {array.shape}, not {shape} (n = {n}, m = {m}).")
+        self._bound = (H, f, A, lower, upper)
+        for name, array in (("A", A), ("lower", lower), ("upper", upper)):
+            setattr(self._entries, name, array.ctypes.data)
+
+
+def import_solver(name: str, extra: str) -> ModuleType:
+    """Import the library of a solver."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"This QP solver needs {name.partition('.')[0]}: {install_command(extra)}"
+        ) from error
+
+
+_FEASIBLE = 1e-8**2
+
+
+class DaqpSolver(QpSolver):
+    """The dual active-set solver DAQP (Arnström, Bemporad, Axehill 2022), started from the last active set.
+
+    Its tolerance of violations is 1e-9, in the units of the rows.
+    """
+
+    def _prepare(self) -> None:
+        self._daqp = import_solver("daqp", "control")
+        self._model: Any = None
+        self._warm = False
+
+    def reset(self) -> None:  # noqa: D102
+        self._warm = False
+
+    def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
+        if self._warm:
+            # A bound of the last active set that is infinite now gives wrong solutions, reported as solved.
+            low, high = self._bound_by(_INFINITY)
+            # The solver keeps these arrays, and the active set of the last solve.
+            model = self._model
+            if model.update(H, f, A if self.m else None, high, low) == 0:
+                x, _, flag, info = model.solve()
+                if (flag == 1 or flag == 2) and self._satisfies(x):
+                    return QpSolution(x, info["lam"], info["iterations"], "solved")
+        self._warm = False
+        status = self._unsolvable(H, f, A, lower, upper)
+        if status is not None:
+            return self._nothing(status)
+        return self._solve_anew(H, f, A, lower, upper)
+
+    def _solve_anew(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
+        one = np.ones(self.n + self.m)
+        usual = _SOFT_SETTINGS if self._any_soft else _SETTINGS
+        flags: set[int] = set()
+        # Where equalities are nearly dependent, it succeeds after it has eliminated them.
+        for settings in (usual, _REDUCED_SETTINGS):
+            flag, x, multipliers, iterations = self._start(H, f, A, lower, upper, one, settings)
+            if flag >= 1 and self._satisfies(x):
+                self._warm = settings is usual
+                return QpSolution(x, multipliers, iterations, "solved")
+            flags.add(flag)
+        # Its tolerances are absolute: data of many decades are scaled to unknowns and rows of length 1.
+        unit = 1.0 / np.sqrt(H.diagonal())
+        rows = A * unit
+        length = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+        scale = np.concatenate([1.0 / unit, 1.0 / np.where(length > 0.0, length, 1.0)])
+        scaled = np.ascontiguousarray(H * np.outer(unit, unit)), f * unit, rows * scale[self.n :, None]
+        for settings in _SCALED_SETTINGS:
+            flag, x, multipliers, iterations = self._start(
+                *scaled, lower * scale, upper * scale, scale, settings
+            )
+            x = x * unit
+            if flag >= 1 and self._satisfies(x):
+                return QpSolution(x, multipliers * scale, iterations, "solved")
+            flags.add(flag)
+            if flags <= _INFEASIBLE:
+                break
+        return self._nothing("infeasible" if flags & _INFEASIBLE else "failed", iterations)
+
+    def _start(
+        self,
+        H: Vector,
+        f: Vector,
+        A: Vector,
+        lower: Vector,
+        upper: Vector,
+        scale: Vector,
+        settings: dict[str, float],
+    ) -> tuple[int, Vector, Vector, int]:
+        """Solve a problem from scratch, whose entries of [x; A x] are multiples of the user's."""
+        model = self._model = self._daqp.Model()
+        model.settings = settings
+        sense = np.where(self.soft, _SOFT, 0).astype(np.intc)
+        if settings is _REDUCED_SETTINGS:
+            sense[(lower == upper) & ~self.soft] = _EQUALITY
+        flag, _ = model.setup(H, f, A, upper, lower, sense)
+        if flag < 0:
+            return flag, np.zeros(self.n), np.zeros(self.n + self.m), 0
+        if self._any_soft:
+            reciprocal, linear = scale**2 / self._weight, self._linear / scale
+            model.soft_weights(reciprocal, reciprocal, linear, linear)
+        x, _, flag, info = model.solve()
+        return flag, x, info["lam"], info["iterations"]
+
+
+_SOFT, _EQUALITY = 8, 5
+_INFINITY = 1e8
+"""Bounds beyond are none in warm starts: far from all speeds and lengths, but near enough for doubles."""
+_INFEASIBLE = {-1, -6}
+_SETTINGS = {"primal_tol": 1e-9}
+_REDUCED_SETTINGS = {"primal_tol": 1e-9, "eq_reduction": 1}
+_SOFT_SETTINGS = {"primal_tol": 1e-9, "sing_tol": 1e-13}
+"""Pivots of soft rows are as small as the reciprocals of their weights."""
+_SCALED_SETTINGS = ({"primal_tol": 1e-9, "sing_tol": 1e-13}, {"primal_tol": 1e-6, "sing_tol": 1e-13})
+"""Rows that are nearly parallel are told apart; a larger tolerance prevents cycles."""

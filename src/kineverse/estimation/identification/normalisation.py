@@ -1,0 +1,172 @@
+"""Normal form of observations and fits: unit of length, and gauge of the parameters."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from kineverse.lie import Array, exp_so3, orthonormalize, rotation_along_z, transform, translation
+
+from .curve import CurveMotion
+from .families import VZ, WX, WZ, FamilyMotion, GroupMotion
+from .least_squares import Solution
+from .motion_model import FamilyMember
+from .observations import Observations
+from .result import Fit
+
+# For rotations of 15° or more, the lever is within four times the median distance from the middle.
+_TIMES = 4.0
+# Standard deviation, in units of length, that is added to all stated ones: floating point cannot hold a noise
+# that is smaller beside motions of the size of the unit.
+_ROUNDING = 1e-7
+
+
+def length_scale(observations: Observations) -> float:
+    """Return four times the median distance of relative positions from their median [m], at least 1."""
+    positions = observations.relative[:, :3, 3]
+    off = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    return max(1.0, _TIMES * float(np.median(off)))
+
+
+def convert_to_unit(observations: Observations, unit: float) -> Observations:
+    """Return observations with lengths in a unit [m]."""
+    if unit == 1.0:
+        return observations
+    scale = np.array([1.0 / unit] * 3 + [1.0] * 3)
+    by = np.outer(scale, scale)
+    rounding = np.diag([_ROUNDING**2] * 3 + [0.0] * 3)
+    of_parent = observations.parent_covariance
+    of_parent = None if of_parent is None else of_parent * by + rounding
+    rows = observations.rows
+    of_child = observations.child_covariance * by[:rows, :rows] + rounding[:rows, :rows]
+    return Observations(
+        _scale_positions(observations.parent, 1.0 / unit),
+        _scale_positions(observations.child, 1.0 / unit),
+        of_parent,
+        of_child,
+    )
+
+
+def log_density(count: float, unit: float) -> float:
+    """Return the log ratio of densities of ``count`` poses, given a mean pose, in metres and in units."""
+    return 3.0 * (1 - count) * math.log(unit)
+
+
+def convert_to_metres(fit: Fit, unit: float) -> Fit:
+    """Return a fit with lengths in a unit [m], converted to metres."""
+    if unit == 1.0:
+        return fit
+    residuals = fit.residuals.copy()
+    residuals[:, :3] *= unit
+    motion = fit.motion
+    if isinstance(motion, FamilyMotion):
+        return replace(fit, residuals=residuals, motion=replace(motion, unit=motion.unit / unit))
+    if isinstance(motion, CurveMotion):
+        curve = motion.scaled(unit)
+        return replace(
+            fit,
+            parameters=curve.named_parameters(),
+            covariance=unit**2 * fit.covariance,
+            joint_values=unit * fit.joint_values,
+            deviations=unit * fit.deviations,
+            residuals=residuals,
+            motion=curve,
+        )
+    if not isinstance(motion, GroupMotion):
+        return replace(fit, residuals=residuals)
+    scale = np.array([unit if _is_length(name) else 1.0 for name in fit.coordinates])
+    slides = np.array([unit if j < WX else 1.0 for j in motion.parametrisation.joints])
+    motion = replace(
+        motion,
+        left=_scale_positions(motion.left, unit),
+        right=_scale_positions(motion.right, unit),
+        pitch=unit * motion.pitch,
+    )
+    return replace(
+        fit,
+        parameters=motion.named_parameters(),
+        covariance=fit.covariance * np.outer(scale, scale),
+        frame=motion.left,
+        joint_values=fit.joint_values * slides,
+        deviations=fit.deviations * slides,
+        residuals=residuals,
+        motion=motion,
+    )
+
+
+def _scale_positions(poses: Array, factor: float) -> Array:
+    result = poses.copy()
+    result[..., :3, 3] *= factor
+    return result
+
+
+def _is_length(coordinate: str) -> bool:
+    """Return True if a coordinate of a joint is a length, or a length per revolution."""
+    return coordinate == "pitch" or coordinate.rpartition(".")[0] == "point" or coordinate in _PLACES
+
+
+_PLACES = ("child.x", "child.y", "child.z")
+
+
+def fix_gauge(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
+    """Return the same motion in a unique parametrisation.
+
+    The largest component of the axis is positive and the mean of the joint values is 0. The origin of the
+    joint's frame is the point of the axis nearest to the child at 0. For a prismatic joint it is the origin
+    of the child.
+    """
+    motion = solution.motion
+    if not isinstance(motion, GroupMotion):
+        return solution
+    name = motion.group.name
+    if name in ("rigid", "free", "spherical"):
+        return solution
+    values = np.concatenate([solution.values, solution.joint_prior.mean[None]])
+    shift = solution.values.mean(axis=0)
+    if name == "planar":
+        shift[2:] = 0.0  # rotations and translations do not commute
+    middle = np.zeros(6)
+    middle[list(motion.parametrisation.joints)] = shift
+    middle[VZ] += motion.pitch * middle[WZ]
+    # Rotations drift under repeated multiplication in warm starts.
+    left, right = orthonormalize(motion.left), orthonormalize(motion.right)
+    motion = replace(motion, left=left @ transform(exp_so3(middle[3:]), middle[:3]), right=right)
+    values = values - shift
+    motion = _fix_origin(motion)
+    axis = motion.left[:3, 2]
+    flip = bool(axis[np.argmax(np.abs(axis))] < 0.0)
+    if motion.rows == 6:
+        motion, values = _fix_rotation(motion, values, flip)
+    elif flip:
+        motion, values = _rotate_frame(motion, values, np.diag([1.0, -1.0, -1.0]))
+    joint_prior = replace(solution.joint_prior, mean=values[-1])
+    values = values[:-1]
+    return replace(
+        solution, motion=motion, values=values, joint_prior=joint_prior, linear=motion.linearise(values)
+    )
+
+
+def _fix_origin(motion: GroupMotion) -> GroupMotion:
+    """Move the origin of the joint's frame along the gauge freedom to the point nearest to the child."""
+    place = motion.right[:3, 3]
+    free = (1, 1, 1) if motion.group.name == "prismatic" else (0, 0, 1)
+    way = place * free
+    return replace(motion, left=motion.left @ translation(way), right=translation(-way) @ motion.right)
+
+
+def _fix_rotation(motion: GroupMotion, values: Array, flip: bool) -> tuple[GroupMotion, Array]:
+    """Rotate the joint's frame about its axis to the orientation that depends on the axis alone."""
+    canonical = rotation_along_z(-motion.left[:3, 2] if flip else motion.left[:3, 2])
+    return _rotate_frame(motion, values, motion.left[:3, :3].T @ canonical)
+
+
+def _rotate_frame(motion: GroupMotion, values: Array, turn: Array) -> tuple[GroupMotion, Array]:
+    change = transform(turn, np.zeros(3))
+    joints = list(motion.parametrisation.joints)
+    twist = np.zeros((len(values), 6))
+    twist[:, joints] = values
+    twist[:, :3], twist[:, 3:] = twist[:, :3] @ turn, twist[:, 3:] @ turn
+    left, right = motion.left @ change, change.T @ motion.right
+    return replace(motion, left=left, right=right), twist[:, joints]

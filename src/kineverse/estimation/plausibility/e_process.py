@@ -1,0 +1,237 @@
+"""Sequential test by an e-process with Ville's bound.
+
+If the joint is as served, ρ of each observation is standard normal. The alternatives are:
+
+- the joint, or the child on it, is displaced: ρ = G δ + noise with an unknown δ, Gaussian with some size;
+- nothing constrains the child: ρ is normal with a larger deviation;
+- joint values exceed their limits, or contradict other estimates, by z standard deviations: the gain
+  exp(λ z - λ²/2) has the mean 1 at a limit, and less inside.
+
+Each alternative may begin at any observation j, with the prior weight 1/(j (j+1)). M is the ratio of the
+density of all observations under the mixture of alternatives to that under the served joint. If the joint is
+as served, M is a supermartingale that begins at 1, for any joint values. By Ville's inequality, the
+probability that M ever reaches 1/α is then at most α, for any number of observations. This holds to first
+order, as poses are linearised around the best joint values.
+
+Observations may be outliers of unknown distribution, each with the probability ε. So the gain L of an
+alternative by one observation is cut off at some c. For any distribution of the outliers
+
+    E[min(L, c)] <= (1 - ε) + ε c
+
+and min(L, c) divided by this bound is a fair bet again (Huber's censored ratio). A small c costs little per
+observation and detects small deviations slowly; a large c detects gross ones at once. The capital is split
+among several c.
+
+If errors are correlated and m observations tell as much as an independent one, see :mod:`.correlation`, L is
+replaced by L^(1/m). By Hölder's inequality E[Π L_i^(1/m)] <= Π E[L_i]^(1/m) <= 1 for m observations of any
+dependence. The prior weights of change points then count independent observations.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kineverse.estimation.correlation import CorrelationSettings, ErrorCorrelation
+from kineverse.estimation.noise import CHI_SQUARED_6
+from kineverse.lie import Array
+
+from .residuals import SIZES, KnownResiduals
+
+_DEVIATIONS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])
+_LOG_GROWN = 0.5 * np.log(1.0 + _DEVIATIONS**2)
+_HALF_SHRUNK = 0.5 * (1.0 - 1.0 / (1.0 + _DEVIATIONS**2))
+_SLOPES = np.array([2.0, 5.0])
+# Fraction of the capital bet on each observation: against a permanent and an occasional deviation.
+_STAKES = np.array([1.0 - 1e-9, 0.1])
+# Upper bounds on the gain by one observation, if there are outliers.
+_CUTS = np.array([1.1, 1.5, 4.0, 20.0])
+# Number of change points of a displacement, and of the newest ones, which have little evidence yet. Dropping
+# some only reduces M.
+_CHANGE_POINTS, _NEWEST = 6, 2
+_SIZES = np.array(SIZES)
+# Least weight of a tested observation, in independent ones.
+_LEAST_WEIGHT = 0.1
+
+
+class SequentialTest:
+    """Sequential test of one joint."""
+
+    def __init__(self, false_alarms: float, outlier_fraction: float = 0.0) -> None:
+        self._threshold = -math.log(false_alarms)
+        self._bet = _CensoredBet(outlier_fraction)
+        self.count = 0
+        # Number of independent looks so far, which orders the change points.
+        self._time = 0.0
+        self.implausible_since: int | None = None
+        self.detected_at: int | None = None
+        self._displacement = _DisplacementTest(self._bet)
+        self._unconstrained = _ChangePoints(len(_DEVIATIONS), self._bet)
+        self._beyond = _ChangePoints(0, self._bet)
+
+    def add(
+        self, orthogonal: Array, displacement_jacobian: Array, one_sided: Array, looks: float = 1.0
+    ) -> float:
+        """Add one observation; return log M."""
+        time = self._time + 1.0 / looks if self.count else 1.0
+        weight = math.log((time - self._time) / ((1.0 + self._time) * (1.0 + time)))
+        self._time = time
+        self.count += 1
+        if self.count == 1:
+            self._limited = np.logical_not(np.isneginf(one_sided))
+            self._beyond = _ChangePoints(int(self._limited.sum()) * len(_SLOPES), self._bet)
+        parts: list[tuple[float, float, int]] = []
+        if len(orthogonal):
+            squares = float(orthogonal @ orthogonal)
+            displaced = self._displacement.add(
+                weight, self.count - 1, orthogonal, squares, displacement_jacobian, looks
+            )
+            log = _HALF_SHRUNK * squares - len(orthogonal) * _LOG_GROWN
+            parts += [
+                (0.5, *displaced),
+                (0.3, *self._unconstrained.add(weight, self.count - 1, log / looks)),
+            ]
+        if self._limited.any():
+            z = np.maximum(one_sided[self._limited], -1e3)
+            log = np.nan_to_num(_SLOPES[:, None] * z - 0.5 * _SLOPES[:, None] ** 2, nan=0.0).ravel()
+            parts.append((0.2, *self._beyond.add(weight, self.count - 1, log / looks)))
+        if not parts:
+            return 0.0
+        total = sum(p for p, _, _ in parts)
+        logs = [math.log(p / total) + log for p, log, _ in parts]
+        # The rest of the prior weight belongs to change points still to come.
+        ratio = float(np.logaddexp.reduce([*logs, -math.log(1.0 + time)]))
+        if self.implausible_since is None and ratio >= self._threshold:
+            self.detected_at = self.count - 1
+            self.implausible_since = parts[int(np.argmax(logs))][2]
+        return ratio
+
+
+class CorrelatedTest:
+    """Sequential test of one joint with errors that are correlated in time.
+
+    Where many observations tell as much as one, only some of them are tested, with the weight of all.
+    """
+
+    def __init__(
+        self, false_alarms: float, outlier_fraction: float, correlation: CorrelationSettings
+    ) -> None:
+        self._test = SequentialTest(false_alarms, outlier_fraction)
+        self._correlation = ErrorCorrelation(correlation)
+        self._numbers: list[int] = []
+        self._owed = 0.0
+
+    @property
+    def implausible_since(self) -> int | None:
+        """Number of the first observation that the joint does not explain; None before rejection."""
+        since = self._test.implausible_since
+        return None if since is None else self._numbers[since]
+
+    def add(self, residuals: KnownResiduals, number: int, at: float) -> None:
+        """Add one observation with its number at a time; after a rejection nothing changes."""
+        if self._test.implausible_since is not None:
+            return
+        orthogonal = residuals.orthogonal[0]
+        self._owed += 1.0 / self._correlation.add(residuals.whitened[0], len(orthogonal), at)
+        if self._owed >= _LEAST_WEIGHT:
+            self._numbers.append(number)
+            looks = 1.0 / min(self._owed, 1.0)
+            self._test.add(orthogonal, residuals.displacement_jacobian[0], residuals.one_sided[0], looks)
+            self._owed = 0.0
+
+
+class _CensoredBet:
+    """Gain by one observation, censored for outliers."""
+
+    def __init__(self, outlier_fraction: float) -> None:
+        self.robust = outlier_fraction > 0.0
+        self._cuts = np.log(_CUTS) if self.robust else np.array([np.inf])
+        self._price = np.log1p(outlier_fraction * (_CUTS - 1.0)) if self.robust else np.zeros(1)
+        stakes = _STAKES if self.robust else np.ones(1)
+        with np.errstate(divide="ignore"):
+            self._kept, self._staked = np.log1p(-stakes), np.log(stakes)
+        self.cuts = len(self._cuts)
+        self.shape = len(stakes), self.cuts
+
+    def gains(self, log: Array) -> Array:
+        """Return the log gain for each cut, (..., cuts), of log density ratios."""
+        gains: Array = np.minimum(log[..., None], self._cuts) - self._price
+        return gains
+
+    def stake(self, log: Array) -> Array:
+        """Return the log gain for each stake and cut, (..., stakes, cuts)."""
+        return self.gains(np.logaddexp(self._kept, self._staked + log[..., None]))
+
+
+class _ChangePoints:
+    """Alternatives with independent observations; all change points are summed exactly."""
+
+    def __init__(self, count: int, bet: _CensoredBet) -> None:
+        self._bet = bet
+        shape = (count, *bet.shape)
+        self._logs = np.full(shape, -np.inf)
+        self._best = np.full(shape, -np.inf)
+        self._start = np.zeros(shape, dtype=int)
+
+    def add(self, weight: float, index: int, log: Array) -> tuple[float, int]:
+        """Return the log of the mixture over all, and the most likely change point."""
+        gains = self._bet.stake(log)
+        self._logs = np.logaddexp(self._logs, weight) + gains
+        newer = self._best < weight
+        self._start[newer] = index
+        self._best = np.maximum(self._best, weight) + gains
+        highest = float(self._logs.max())
+        mean = highest + math.log(float(np.exp(self._logs - highest).mean()))
+        return mean, int(self._start.flat[np.argmax(self._best)])
+
+
+class _DisplacementTest:
+    """Displacements δ ~ N(0, s² I) for several sizes s, each with several change points."""
+
+    def __init__(self, bet: _CensoredBet) -> None:
+        self._bet = bet
+        shape = _CHANGE_POINTS, len(SIZES)
+        self._starts = np.full(_CHANGE_POINTS, -1)
+        self._logs = np.full((*shape, bet.cuts), -np.inf)
+        self._means = np.zeros((*shape, 12))
+        self._prior = np.square(_SIZES)[:, None, None] * np.eye(12)
+        self._covariances = np.tile(self._prior, (_CHANGE_POINTS, 1, 1, 1))
+
+    def add(
+        self,
+        weight: float,
+        index: int,
+        orthogonal: Array,
+        squares: float,
+        displacement_jacobian: Array,
+        looks: float,
+    ) -> tuple[float, int]:
+        """Return the log of the mixture over sizes and change points, and the most likely change point."""
+        self._begin(weight, index)
+        transposed = displacement_jacobian.T
+        error = orthogonal - self._means @ transposed
+        cross_covariance = self._covariances @ transposed
+        spread = displacement_jacobian @ cross_covariance
+        spread += looks * np.eye(len(orthogonal))
+        information = np.linalg.inv(spread)
+        solved = (information @ error[..., None])[..., 0]
+        own = np.sum(error * solved, axis=2)
+        log_volume = np.linalg.slogdet(spread)[1] - len(orthogonal) * math.log(looks)
+        self._logs += self._bet.gains(0.5 * (squares / looks - own - log_volume))
+        if self._bet.robust:
+            information *= (own <= CHI_SQUARED_6)[..., None, None]
+        gain = cross_covariance @ information
+        self._means += (gain @ error[..., None])[..., 0]
+        self._covariances -= gain @ np.swapaxes(cross_covariance, 2, 3)
+        highest = float(self._logs.max())
+        total = float(np.exp(self._logs - highest).sum())
+        result = highest + math.log(total / (len(SIZES) * self._bet.cuts))
+        return result, int(self._starts[np.argmax(self._logs.max(axis=(1, 2)))])
+
+    def _begin(self, weight: float, index: int) -> None:
+        """Replace the least likely of the older change points by a new one."""
+        leading = np.where(self._starts <= index - _NEWEST, self._logs.max(axis=(1, 2)), np.inf)
+        slot = int(np.argmin(leading))
+        self._starts[slot], self._logs[slot] = index, weight
+        self._means[slot], self._covariances[slot] = 0.0, self._prior

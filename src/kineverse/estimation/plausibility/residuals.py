@@ -1,0 +1,314 @@
+"""Residuals of observations under the served model, of one observation and of many."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.estimation.identification.least_squares import CLOSE, Solution
+from kineverse.estimation.identification.motion_model import LinearisedPoses
+from kineverse.estimation.identification.observations import Observations
+from kineverse.estimation.linear_algebra import invert_matrices, log_determinants
+from kineverse.lie import Array, log_so3, pose_difference, skew
+
+from .known_motion import KnownJoint
+
+# Largest number of steps, and largest step of an angle [rad].
+_STEPS, _STEP = 12, 0.5
+# Squared residual beyond which the true pose of the parent stays at the observed one. The pose that explains
+# a gross error best is many steps away, and of no use.
+_GROSS = 1e3
+_EYE_3, _EYE_6 = np.eye(3), np.eye(6)
+
+
+class PoseSolution(NamedTuple):
+    """Most likely joint values of one observation inside the limits."""
+
+    values: Array  # joint values, (k,)
+    pose: Array  # pose of the joint there, (4, 4), and twists per unit of each joint value, (6, k)
+    by_joints: Array
+    residual: Array  # residual of the relative pose in the parent's axes, (6,), and its covariance, (6, 6)
+    covariance: Array
+
+
+def solve_observation(
+    served: KnownJoint, observations: Observations, start: Array, precision: float
+) -> PoseSolution | None:
+    """Return the solution for one observation of a joint; None if the steps do not converge."""
+    parent, child = observations.parent[0], observations.child[0]
+    of_parent = None if observations.parent_covariance is None else observations.parent_covariance[0]
+    of_child = observations.child_covariance[0]
+    low, high = served.inner_limits()
+    values, true = np.clip(start, low, high), parent
+    turned, error, own = np.zeros((6, 6)), np.empty(6), np.empty(6)
+    covariance = weights = _EYE_6
+    curbed = bool(np.any(served.is_angle))
+    for count in range(_STEPS):
+        pose, by_joints = served.evaluate(values)
+        rotation = true[:3, :3].T
+        error[:3] = rotation @ (child[:3, 3] - true[:3, 3]) - pose[:3, 3]
+        error[3:] = _rotation_vector(rotation @ child[:3, :3] @ pose[:3, :3].T)
+        if of_parent is not None or not count:
+            turned[:3, :3] = turned[3:, 3:] = rotation
+            covariance = turned @ of_child @ turned.T
+            if of_parent is not None:
+                own[:3] = rotation @ (parent[:3, 3] - true[:3, 3])
+                own[3:] = _rotation_vector(rotation @ parent[:3, :3])
+                lever = _lever(pose)
+                lifted = turned @ of_parent @ turned.T @ lever.T
+                covariance += lever @ lifted
+                error -= lever @ own
+            weights = np.linalg.inv(covariance)
+        gain, left, there = 0.0, error, values
+        if served.joints:
+            weighted = by_joints.T @ weights
+            curvature = weighted @ by_joints + precision * np.eye(served.joints)
+            slope = weighted @ error - precision * values
+            change = slope / curvature[0] if served.joints == 1 else np.linalg.solve(curvature, slope)
+            if curbed and np.abs(change).max() > _STEP:
+                change = np.where(served.is_angle, np.clip(change, -_STEP, _STEP), change)
+            there = np.minimum(np.maximum(values + change, low), high)
+            # At a limit the step is shorter than the one that the slope asks for.
+            change = there - values
+            gain += float(change @ curvature @ change)
+            left = error - by_joints @ change
+        if of_parent is not None and float(error @ weights @ error) < _GROSS:
+            blame = own + lifted @ (weights @ left)
+            gain += float(np.sum(blame**2 / np.diagonal(of_parent)))
+            if gain >= CLOSE:
+                step = np.eye(4)
+                step[:3, :3], step[:3, 3] = _rotation(blame[3:]), blame[:3]
+                true = true @ step
+        if gain < CLOSE:
+            return PoseSolution(values, pose, by_joints, error, covariance)
+        values = there
+        if not math.isfinite(gain):
+            return None
+    return None
+
+
+def complete_basis(directions: Array) -> Array:
+    """Return an orthonormal basis of the vectors that are orthogonal to k directions (6, k), (6, 6 - k)."""
+    count = directions.shape[1]
+    if not count:
+        return _EYE_6
+    if count > 1:
+        return np.linalg.qr(directions, mode="complete")[0][:, count:]
+    # Householder's reflection of the direction to the first axis.
+    v = directions[:, 0].copy()
+    v[0] += math.copysign(math.sqrt(float(v @ v)), float(v[0]))
+    square = float(v @ v)
+    return _EYE_6[:, 1:] - np.outer(v, (2.0 / square) * v[1:]) if square else _EYE_6[:, 1:]
+
+
+def displacement_jacobian(pose: Array, middle: Array) -> Array:
+    """Return the child's twist per unit twist of the joint in the parent, and of the child on it, (6, 12)."""
+    x, y, z = (pose[:3, 3] - middle).tolist()
+    result = np.zeros((6, 12))
+    result[:3, :3] = result[3:, 3:6] = _EYE_3
+    result[0, 4], result[0, 5] = z, -y
+    result[1, 3], result[1, 5] = -z, x
+    result[2, 3], result[2, 4] = y, -x
+    result[:3, 6:9] = result[3:, 9:] = pose[:3, :3]
+    return result
+
+
+def _rotation_vector(rotation: Array) -> Array:
+    """Return the rotation vector of one rotation, as :func:`kineverse.lie.log_so3`."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    cosine = 0.5 * (xx + yy + zz - 1.0)
+    if cosine < -0.99:
+        return log_so3(rotation)
+    x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
+    sine = math.sqrt(x * x + y * y + z * z)
+    factor = 1.0 if sine < 1e-9 else math.atan2(sine, cosine) / sine
+    return np.array([factor * x, factor * y, factor * z])
+
+
+def _rotation(v: Array) -> Array:
+    """Return the rotation of one rotation vector, as :func:`kineverse.lie.exp_so3`."""
+    x, y, z = v.tolist()
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
+    a, b = 1.0, 0.5
+    if angle > 1e-5:
+        a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
+
+
+def _lever(pose: Array) -> Array:
+    """Return the displacement of the child by an error of the parent, (6, 6)."""
+    x, y, z = pose[:3, 3].tolist()
+    result = np.eye(6)
+    result[0, 4], result[0, 5] = z, -y
+    result[1, 3], result[1, 5] = -z, x
+    result[2, 3], result[2, 4] = y, -x
+    return result
+
+
+SIZES = (0.01, 0.05, 0.3)
+"""Standard deviations of a displacement, for each component of a twist [m], [rad]."""
+
+# Prior information of joint values: a deviation of 100 [m] or [rad].
+_PRECISION = 1e-4
+
+
+@dataclass(frozen=True)
+class KnownResiduals:
+    """Residuals of N observations under a served joint."""
+
+    coordinates: Array  # most likely coordinates inside the limits, (N, n)
+    values: Array  # most likely joint values without limits, by linearisation, (N, k)
+    covariances: Array  # covariances of values, (N, k, k)
+    orthogonal: Array  # ρ, the whitened residual orthogonal to the joint directions, (N, 6 - k)
+    whitened: Array  # same residual in the axes of the whitened pose, (N, 6)
+    displacement_jacobian: Array
+    bound_excess: Array
+    pose_residuals: Array  # (N, 6)
+    log_scale: Array  # (N,)
+    limit_excess: Array  # (N, c)
+    disagreement: Array  # difference from the estimates of the same coordinates by others, likewise, (N, e)
+    other_values: Array  # these estimates, (N, e). consistency sets the last three
+
+    def __len__(self) -> int:
+        return len(self.orthogonal)
+
+    @property
+    def one_sided(self) -> Array:
+        """All one-sided test quantities, in standard deviations, (N, 2 k + c + 2 e)."""
+        return np.concatenate(
+            [self.bound_excess, self.limit_excess, self.disagreement, -self.disagreement], axis=1
+        )
+
+    def select(self, rows: slice | npt.NDArray[np.int_]) -> Self:
+        """Return the residuals of some of the observations."""
+        return type(self)(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def scaled(self, factor: float) -> Self:
+        """Return the residuals for covariances of the poses that are larger by a factor."""
+        root = math.sqrt(factor)
+        smaller = (
+            "orthogonal", "whitened", "displacement_jacobian", "bound_excess", "limit_excess", "disagreement",
+        )  # fmt: skip
+        return replace(
+            self,
+            covariances=factor * self.covariances,
+            log_scale=self.log_scale + 0.5 * self.orthogonal.shape[1] * math.log(factor),
+            **{name: getattr(self, name) / root for name in smaller},
+        )
+
+
+def compute_residuals(served: KnownJoint, observations: Observations) -> KnownResiduals:
+    """Compute the residuals of observations under a served joint."""
+    if len(observations) == 1 and served.is_plain and observations.rows == 6:
+        single = _compute_one(served, observations)
+        if single is not None:
+            return single
+    coordinates, solution = served.solve(observations)
+    whitening, error, directions = _whiten(solution)
+    transposed = np.swapaxes(directions, 1, 2)
+    joints = served.joints
+    covariances = invert_matrices(transposed @ directions + _PRECISION * np.eye(joints))
+    # At a limit, one Gauss-Newton step leads to the optimum without limits.
+    step = (covariances @ transposed @ error[:, :, None])[:, :, 0]
+    values = solution.values + step
+    if not served.is_plain:
+        values = _displacements(solution.linear)
+    basis = np.linalg.qr(directions, mode="complete")[0]
+    across = np.swapaxes(basis[:, :, joints:], 1, 2)
+    deviations = np.sqrt(np.einsum("nii->ni", covariances))
+    excess = np.concatenate([served.lower - values, values - served.upper], axis=1)
+    pose = solution.linear.pose
+    orthogonal = (across @ error[:, :, None])[:, :, 0]
+    return KnownResiduals(
+        coordinates,
+        values,
+        covariances,
+        orthogonal,
+        (basis[:, :, joints:] @ orthogonal[:, :, None])[:, :, 0],
+        across @ whitening @ _displacement_jacobian(pose, served.middle),
+        excess / np.tile(deviations, (1, 2)),
+        solution.residuals,
+        0.5 * (log_determinants(math.tau * solution.covariance) - log_determinants(math.tau * covariances)),
+        *(np.zeros((len(observations), 0)) for _ in range(3)),
+    )
+
+
+def _compute_one(served: KnownJoint, observations: Observations) -> KnownResiduals | None:
+    """Compute the residuals of one observation; None if its joint values are not found."""
+    start = served.initial_coordinates(observations)[0] if served.joints else np.zeros(0)
+    solution = solve_observation(served, observations, start, _PRECISION)
+    if solution is None:
+        return None
+    values, pose, by_joints, residual, covariance = solution
+    joints = served.joints
+    triangle = np.linalg.cholesky(covariance)
+    whitening = np.linalg.inv(triangle)
+    error, directions = whitening @ residual, whitening @ by_joints
+    log_scale = float(np.log(np.diagonal(triangle)).sum()) + 0.5 * (6 - joints) * math.log(math.tau)
+    covariances: Array = np.zeros((joints, joints))
+    if joints:
+        covariances = invert_matrices(directions.T @ directions + _PRECISION * np.eye(joints))
+        log_scale -= 0.5 * float(np.linalg.slogdet(covariances)[1])
+    unbounded = values + covariances @ (directions.T @ error)
+    across = complete_basis(directions)
+    orthogonal = across.T @ error
+    deviations = np.sqrt(np.diagonal(covariances))
+    excess = np.concatenate(
+        [(served.lower - unbounded) / deviations, (unbounded - served.upper) / deviations]
+    )
+    none = np.zeros((1, 0))
+    return KnownResiduals(
+        values[None],
+        unbounded[None],
+        covariances[None],
+        orthogonal[None],
+        (across @ orthogonal)[None],
+        (across.T @ whitening @ displacement_jacobian(pose, served.middle))[None],
+        excess[None],
+        residual[None],
+        np.array([log_scale]),
+        none,
+        none,
+        none,
+    )
+
+
+def orthogonal_residuals(solution: Solution[Any]) -> Array:
+    """Return the whitened residuals without their components along the joint directions, (N, 6)."""
+    _, error, directions = _whiten(solution)
+    basis = np.linalg.qr(directions)[0]
+    along: Array = basis @ (np.swapaxes(basis, 1, 2) @ error[:, :, None])
+    return error - along[:, :, 0]
+
+
+def _whiten(solution: Solution[Any]) -> tuple[Array, Array, Array]:
+    """Return W with W S Wᵀ = I, (N, 6, 6), whitened residuals (N, 6) and joint directions (N, 6, k)."""
+    whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
+    error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
+    return whitening, error, whitening @ solution.linear.by_joints
+
+
+def _displacements(linear: LinearisedPoses) -> Array:
+    """Return the joint values from the first pose to each, to first order."""
+    values: Array = pose_difference(linear.pose, linear.pose[0]) @ np.linalg.pinv(linear.by_joints[0]).T
+    return values
+
+
+def _displacement_jacobian(pose: Array, middle: Array) -> Array:
+    """Return the child's twist per unit twist of the joint in the parent, and of the child on the joint."""
+    result = np.zeros((len(pose), 6, 12))
+    result[:, :3, :3] = result[:, 3:, 3:6] = np.eye(3)
+    result[:, :3, 3:6] = -skew(pose[:, :3, 3] - middle)
+    result[:, :3, 6:9] = result[:, 3:, 9:] = pose[:, :3, :3]
+    return result

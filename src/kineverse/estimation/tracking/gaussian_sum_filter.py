@@ -1,0 +1,507 @@
+"""One prediction and update of all Gaussian-sum components."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import InvalidValueError, KineverseError
+from kineverse.estimation.noise import Outliers
+from kineverse.lie import Array
+from kineverse.symbols import Symbol
+
+from .bounds import StateBounds
+from .covariance import CovarianceInflation, RidgeCovariance
+from .gaussian_sum import Candidate, GaussianSum, MergeCriterion
+from .information_state import InformationState
+from .map_update import MapResult, MapSolver
+from .native import NativeInlierSolver, NativeMapSolver, native_library
+from .observability import StationaryPoints, UnobservableDirections, find_unexplained, move_origin
+from .process_model import ConstantVelocity, ProcessModel
+from .residuals import MeasurementReader, Measurements, Residuals
+from .state_space import Layout
+from .static_batch import StaticBatch
+
+
+@dataclass(slots=True, eq=False)
+class StepResult:
+    """Result of an update of all components."""
+
+    mixture: GaussianSum  # gaussian sum after the update
+    nis: Array  # normalised innovation squared of each group
+    dof: Array  # its degrees of freedom. Rejected measurements count with their residuals
+    outliers: tuple[int, ...]  # numbers of the observations with an inlier probability below one half
+    rounds: int  # number of model evaluations, the largest of all candidates
+
+
+_OUTSIDE = 1e-9
+# A belief closer to its mean, in deviations, is about its mean, as after an update.
+_SETTLED = 1e-5
+
+
+class UpdateStep:
+    """Prediction and update of all components of a tracker."""
+
+    def __init__(
+        self, layout: Layout, limits: StateBounds, outliers: Outliers | None, has_speeds: bool = False
+    ) -> None:
+        self.layout, self.limits, self.outliers = layout, limits, outliers
+        self.function = layout.compile_function()
+        self.process_model = ProcessModel(layout)
+        self.velocity = ConstantVelocity(layout, self.process_model) if has_speeds else None
+        self.residuals = Residuals(layout, self.function)
+        self.reader = MeasurementReader(layout)
+        self.solver = MapSolver(layout, self.residuals, self.process_model, limits)
+        self.unobservable = UnobservableDirections(layout)
+        self.static_batch = StaticBatch(
+            layout, self.residuals, self.reader, self.solver, self.unobservable, self._map_update
+        )
+        group_bounds = self.solver.group_bounds
+        parts = (layout, self.residuals, self.process_model, self.reader, group_bounds, self.unobservable)
+        self.ridge_covariance, self.inflation = RidgeCovariance(*parts), CovarianceInflation(*parts)
+        self.merge_criterion = MergeCriterion(
+            layout, self.residuals, self.reader, self.process_model, self.ridge_covariance
+        )
+        self.stationary_points = StationaryPoints(layout, self.process_model, self.unobservable, group_bounds)
+        self.native = (
+            NativeMapSolver(layout, limits, self.function, self.process_model)
+            if NativeMapSolver.suits(layout)
+            else None
+        )
+        self.inlier_solver = (
+            NativeInlierSolver(layout, self.native, outliers) if self.native and outliers else None
+        )
+        self.periods: Mapping[Symbol, float] = {}
+        self.counted: frozenset[Symbol] = frozenset()
+        if self.native:
+            native_library.prepare()
+
+    @property
+    def is_native(self) -> bool:
+        """True if unambiguous updates run in compiled C."""
+        return self.native is not None and self.native.is_ready
+
+    @property
+    def periodic(self) -> frozenset[Symbol]:
+        """Coordinates of which a single turn changes no observation."""
+        return frozenset(x for x, period in self.periods.items() if period == math.tau)
+
+    def update(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
+        """Update all components with a reading; see :meth:`.map_update.MapSolver.update`."""
+        result = self._update(mixture, reading, inputs)
+        self._keep_turns(result.mixture, mixture.best.x)
+        return result
+
+    def _update(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
+        mixture = self._forget_other_inputs(mixture, inputs)
+        if not mixture.is_single or self.outliers is not None:
+            return self._update_mixture(mixture, reading, inputs)
+        before = mixture.best
+        result = self._map_update(before, reading, inputs)
+        self.static_batch.relinearise(before, result, reading, inputs)
+        _require_finite(result.belief.numbers)
+        after = GaussianSum(self.layout, [result.belief], mixture.alive)
+        unexplained = self.stationary_points.unexplained(before, result)
+        candidates = self._restart(before, result, reading, inputs, unexplained) if unexplained else []
+        if self.counted and (turned := find_unexplained(result)):
+            candidates += self._try_other_turns(before, result, reading, inputs, turned)
+            unexplained = sorted({*unexplained, *turned})
+        if not candidates:
+            return StepResult(after, result.nis, result.dof, (), result.rounds)
+        first = self._candidate(result.belief, None, result.nis, result.dof, unexplained, inputs)
+        after, best = after.select(
+            [first, *candidates], partial(self.merge_criterion.should_merge, inputs, self.periods)
+        )
+        for number, candidate in enumerate(best):
+            if candidate:
+                result.nis[number] = candidate.nis[number]
+        return StepResult(after, result.nis, result.dof, (), result.rounds)
+
+    def _map_update(
+        self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int] | None = None
+    ) -> MapResult:
+        """Return the least-squares update of some groups; of all measured groups if None."""
+        result = None
+        if self.native is not None and self.native.is_ready:
+            result = self.native.update(belief, reading, inputs)
+        if result is None:
+            groups = self._measured_groups(reading) if groups is None else groups
+            result = self.solver.update(belief, reading, inputs, groups)
+        return result
+
+    def _restart(
+        self,
+        before: InformationState,
+        result: MapResult,
+        reading: Measurements,
+        inputs: Array,
+        groups: list[int],
+    ) -> list[Candidate]:
+        """Return candidates from restarts beside states where the measurement Jacobian vanishes."""
+        starts = self.stationary_points.restart_states(before, result.belief, groups, inputs)
+        return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
+
+    def _try_other_turns(
+        self,
+        before: InformationState,
+        result: MapResult,
+        reading: Measurements,
+        inputs: Array,
+        groups: list[int],
+    ) -> list[Candidate]:
+        """Return candidates on other turns of counted coordinates.
+
+        The orientation of a pinion has a minimum on each turn. The place of its rack tells which is least.
+        """
+        candidates: list[Candidate] = []
+        for x in self.counted:
+            i = self.layout.tangent_space.coordinates.index(x)
+            number = next(n for n, group in enumerate(self.layout.groups) if i in group.x)
+            group = self.layout.groups[number]
+            if number not in groups or group.by_speeds:
+                continue
+            place, off = result.belief.x.copy(), []
+            for turn in (0.0, math.tau):
+                place[i] = result.belief.x[i] + turn
+                errors = self.residuals.errors(
+                    self.residuals.evaluate(place, inputs), reading, group.observation_indices
+                )
+                off.append(np.concatenate([error for error, _ in errors.values()]))
+            change = off[1] - off[0]
+            turns = round(-float(off[0] @ change) / max(float(change @ change), np.finfo(float).tiny))
+            if turns:
+                place[i] = result.belief.x[i] + turns * math.tau
+                start = before.copy()
+                there = place[group.x]
+                move_origin(start, number, group, there, there - before.x[group.x], None)
+                candidates += self._restart_from(start, reading, inputs, [number])
+        return candidates
+
+    def _restart_from(
+        self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
+    ) -> list[Candidate]:
+        """Return the candidate of a restart from a state; none if the restart fails."""
+        try:
+            return [self._update_from(start, reading, inputs, groups)]
+        except KineverseError:
+            return []
+
+    def _update_from(
+        self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
+    ) -> Candidate:
+        if self.outliers is not None:
+            start = self.solver.find_robust_start(start, reading, inputs, groups)
+        result = self.solver.update(start, reading, inputs, groups, self.outliers or "gaussian")
+        candidate = self._relinearised(start, result, reading, inputs, groups)
+        if self.outliers is None:
+            # The stored measurements belong to another branch: the present residuals decide.
+            errors = self.residuals.errors(
+                candidate.predicted, reading, np.flatnonzero(reading.mask).tolist()
+            )
+            for number in groups:
+                if start.records[number] is not None:
+                    squares = (
+                        float(e @ e) for i, (e, _) in errors.items() if self.layout.group_of[i] == number
+                    )
+                    candidate.nis[number] = sum(squares)
+        return candidate
+
+    def _relinearised(
+        self,
+        before: InformationState,
+        result: MapResult,
+        reading: Measurements,
+        inputs: Array,
+        groups: list[int],
+    ) -> Candidate:
+        self.static_batch.relinearise(before, result, reading, inputs, groups)
+        _require_finite(result.belief.numbers)
+        return self._candidate(result.belief, result.weights, result.nis, result.dof, groups, inputs)
+
+    def _forget_other_inputs(self, mixture: GaussianSum, inputs: Array) -> GaussianSum:
+        """Drop static records that were taken at other values of the inputs."""
+
+        def changed(belief: InformationState) -> InformationState:
+            groups = [
+                number
+                for number, record in enumerate(belief.records)
+                if record is not None and not np.array_equal(record.inputs, inputs)
+            ]
+            return self._inflated(belief, groups)
+
+        return mixture.map(changed) if len(inputs) else mixture
+
+    def _inflated(self, belief: InformationState, groups: Iterable[int]) -> InformationState:
+        wide = belief
+        for number in groups:
+            if belief.records[number] is not None:
+                wide = belief.copy() if wide is belief else wide
+                self.inflation.inflate(number, wide)
+        return wide
+
+    def predict(
+        self,
+        belief: InformationState,
+        inputs: Array,
+        dt: float,
+        speeds: Mapping[Symbol, float],
+        noise: Mapping[Symbol, float],
+    ) -> InformationState:
+        """Predict a belief by ``dt`` seconds; it stays about the most probable point inside the limits."""
+        if self.velocity is not None:
+            result = self._inflated(belief, range(len(self.layout.groups))).copy()
+            self.velocity.periods = self.periods
+            self.velocity.predict(result, inputs, dt, speeds, noise)
+            moments = [m for one in result.speeds if one for m in (one.mean, one.gain, one.covariance)]
+            _require_finite(result.numbers, *moments)
+            result = self._constrained(result, inputs)
+            _require_finite(result.numbers)
+            return result
+        moving = self.process_model.find_moving_groups(speeds, noise)
+        noise_only = [
+            n for n in moving if belief.records[n] is not None and self.process_model.is_noise_only(n, speeds)
+        ]
+        belief = self._inflated(belief, set(moving).difference(noise_only))
+        moved = None
+        if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
+            tangent = self.layout.tangent_space.tangent
+            displacement, added_variance = (
+                np.array([by.get(v, 0.0) for v in tangent]) * dt for by in (speeds, noise)
+            )
+            moved = self.native.predict(belief, displacement, added_variance)
+        if moved is None:
+            moved = belief.copy()
+            self.process_model.predict(moved, inputs, dt, speeds, noise)
+            moved = self._constrained(moved, inputs)
+        result = moved
+        for number in noise_only:
+            # A straight posterior is Gaussian; its prediction is exact.
+            if self.inflation.is_straight(number, belief):
+                result.records[number] = None
+                continue
+            group = self.layout.groups[number]
+            added_variance = np.array([noise.get(v, 0.0) for v in group.tangent]) * dt
+            self.static_batch.add_noise(number, belief, result, added_variance)
+        _require_finite(result.numbers)
+        return result
+
+    def _constrained(self, belief: InformationState, inputs: Array) -> InformationState:
+        """Return a predicted belief about the most probable point inside the limits."""
+        if self._is_at_mean(belief):
+            return belief
+        if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
+            none = np.zeros(len(belief.vector))
+            # C leaves out groups without motion; so little noise changes no number.
+            if (result := self.native.predict(belief, none, none + np.finfo(float).tiny)) is not None:
+                return result
+        return self.solver.constrain(belief, self.reader.empty(), inputs)
+
+    def _is_at_mean(self, belief: InformationState) -> bool:
+        """Return True if a belief is about its own mean and inside bounds of single coordinates."""
+        limits = self.limits
+        if self.layout.limits or (belief.x < limits.lower).any() or (belief.x > limits.upper).any():
+            return False
+        return float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2
+
+    def is_possible(self, number: int, belief: InformationState, inputs: Array) -> bool:
+        """Return True if a group is inside its limits at a state and its model is finite there."""
+        try:
+            out = self.residuals.evaluate(belief.x, inputs)
+        except KineverseError:
+            return False
+        group = self.layout.groups[number]
+        parts = [
+            out[where]
+            for i in group.observation_indices
+            for where in (self.layout.value_slices[i], self.layout.jacobian_slices[i])
+        ]
+        if not all(np.isfinite(each).all() for each in parts):
+            return False
+        return self.solver.rows(number, belief.x[group.x], out).violation < _OUTSIDE
+
+    def _measured_groups(self, reading: Measurements) -> list[int]:
+        return [
+            n
+            for n, group in enumerate(self.layout.groups)
+            if reading.mask[list(group.observation_indices)].any()
+        ]
+
+    def _keep_turns(self, mixture: GaussianSum, predicted: Array) -> None:
+        """Take periodic coordinates to the turn nearest to their prediction (n,); in place.
+
+        Integrators, controllers and gears count turns, though nothing that is observed tells them.
+        """
+        for x, period in self.periods.items():
+            i = self.layout.tangent_space.coordinates.index(x)
+            for belief in mixture.beliefs:
+                belief.x[i] -= period * round((belief.x[i] - predicted[i]) / period)
+
+    def _update_mixture(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
+        """Update all components and keep the best candidates."""
+        measured = self._measured_groups(reading)
+        candidates, rounds = self._solve_inliers(mixture, reading, inputs, measured)
+        solved = {number for candidate in candidates for number in candidate.groups}
+        remaining = [number for number in measured if number not in solved]
+        for component, belief in enumerate(mixture.beliefs):
+            groups = mixture.groups(component, remaining)
+            if not groups:
+                continue
+            try:
+                new, count = self._explain(belief, reading, inputs, groups, component == 0)
+            except KineverseError:
+                # The best component must succeed; others that fail are dropped.
+                if component == 0:
+                    raise
+                continue
+            candidates += new
+            rounds = max(rounds, count)
+        after, best = mixture.select(
+            candidates, partial(self.merge_criterion.should_merge, inputs, self.periods)
+        )
+        nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
+        dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
+        rejected = [
+            i
+            for i, number in enumerate(self.layout.group_of)
+            if reading.mask[i] and (c := best[number]) and c.weights is not None and c.weights[i] < 0.5
+        ]
+        if rejected:
+            out = self.residuals.evaluate(after.best.x, inputs)
+            for i, (error, _) in self.residuals.errors(out, reading, rejected).items():
+                nis[self.layout.group_of[i]] += error @ error
+                dof[self.layout.group_of[i]] += len(error)
+        return StepResult(after, nis, dof, tuple(rejected), rounds)
+
+    def restart(
+        self,
+        before: GaussianSum,
+        initial: GaussianSum,
+        groups: Sequence[int],
+        reading: Measurements,
+        inputs: Array,
+    ) -> StepResult:
+        """Return the result of a reading of some groups that start anew; they keep their evidence."""
+        mask = reading.mask & np.isin(self.layout.group_of, groups)
+        evidence = {n: float(np.logaddexp.reduce(before.evidence(n))) for n in groups}
+
+        def with_evidence(belief: InformationState) -> InformationState:
+            result = belief.copy()
+            for number, log in evidence.items():
+                result.evidence[number] = log
+            return result
+
+        start = before.replace_groups(initial.map(with_evidence), groups)
+        result = self.update(start, reading._replace(mask=mask), inputs)
+        self._keep_turns(result.mixture, before.best.x)
+        return result
+
+    def find_accepted(
+        self, mixture: GaussianSum, reading: Measurements, inputs: Array
+    ) -> npt.NDArray[np.bool_]:
+        """Return True for each group of which a component accepts a measurement as an inlier (groups,).
+
+        About a broad prior that need not be the best component: all outliers are as probable at first.
+        """
+        result = np.zeros(len(self.layout.groups), dtype=bool)
+        assert self.outliers is not None
+        for component, belief in enumerate(mixture.beliefs):
+            groups = mixture.groups(component, self._measured_groups(reading))
+            indices = [i for n in groups for i in self.layout.groups[n].observation_indices]
+            out = self.residuals.evaluate(belief.x, inputs)
+            for i, (error, _) in self.residuals.errors(out, reading, indices).items():
+                scale = float(reading.log_scale[i])
+                log_density = self.outliers.log_density(self.layout.observations[i], scale)
+                weight, _ = self.outliers.weigh(float(error @ error), scale, log_density)
+                result[self.layout.group_of[i]] |= weight > 0.5
+        return result
+
+    def _solve_inliers(
+        self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]
+    ) -> tuple[list[Candidate], int]:
+        """Return the candidates that C finds for unambiguous groups."""
+        if self.inlier_solver is None or not self.is_native:
+            return [], 0
+        result, rounds = self.inlier_solver.solve(mixture, reading, inputs, groups)
+        for candidate in result:
+            as_found = MapResult(candidate.belief, candidate.nis, candidate.dof, rounds, candidate.weights)
+            self.static_batch.relinearise(mixture.best, as_found, reading, inputs, candidate.groups)
+            _require_finite(candidate.belief.numbers)
+        return result, rounds
+
+    def _explain(
+        self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int], is_best: bool
+    ) -> tuple[list[Candidate], int]:
+        """Return candidates for one component: without outliers, with outliers, and all outliers."""
+        if self.outliers is None:
+            result = self._map_update(belief, reading, inputs, groups)
+            candidates = [self._relinearised(belief, result, reading, inputs, groups)]
+            if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
+                candidates += self._restart(belief, result, reading, inputs, unexplained)
+            if is_best and self.counted:
+                turned = find_unexplained(result)
+                candidates += self._try_other_turns(belief, result, reading, inputs, turned)
+            return candidates, result.rounds
+        robust_start = self.solver.find_robust_start(belief, reading, inputs, groups)
+        candidates, rounds = [], 0
+        for start in (belief, robust_start):
+            result = self.solver.update(start, reading, inputs, groups, self.outliers)
+            candidates.append(self._relinearised(start, result, reading, inputs, groups))
+            rounds = max(rounds, result.rounds)
+        if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
+            candidates += self._restart(belief, result, reading, inputs, unexplained)
+        if is_best and self.counted:
+            turned = self._with_rejected(result, reading, groups)
+            candidates += self._try_other_turns(belief, result, reading, inputs, turned)
+        all_outliers = belief.copy()
+        none = np.zeros(len(self.layout.groups))
+        for number in groups:
+            measured = [i for i in self.layout.groups[number].observation_indices if reading.mask[i]]
+            log_outliers = sum(
+                self.outliers.log_density(self.layout.observations[i], float(reading.log_scale[i]))
+                for i in measured
+            )
+            all_outliers.evidence[number] += log_outliers
+        weights = np.zeros(len(self.layout.observations))
+        candidates.append(self._candidate(all_outliers, weights, none, none, groups, inputs))
+        return candidates, rounds
+
+    def _unexplained(
+        self, belief: InformationState, result: MapResult, reading: Measurements, groups: list[int]
+    ) -> list[int]:
+        """Return the groups with unexplained residuals or outliers."""
+        unexplained = {
+            *self.stationary_points.unexplained(belief, result),
+            *self._with_rejected(result, reading, groups),
+        }
+        return [n for n in groups if n in unexplained]
+
+    def _with_rejected(self, result: MapResult, reading: Measurements, groups: list[int]) -> list[int]:
+        """Return the groups of which an observation is rejected as an outlier."""
+        if result.weights is None:
+            return []
+        rejected = reading.mask & (result.weights < 0.5)
+        return [n for n in groups if rejected[list(self.layout.groups[n].observation_indices)].any()]
+
+    def _candidate(
+        self,
+        belief: InformationState,
+        weights: Array | None,
+        nis: Array,
+        dof: Array,
+        groups: list[int],
+        inputs: Array,
+    ) -> Candidate:
+        return Candidate(belief, self.residuals.evaluate(belief.x, inputs), weights, nis, dof, groups)
+
+
+def _require_finite(*arrays: Array) -> None:
+    if not all(np.isfinite(one).all() for one in arrays):
+        raise InvalidValueError(
+            "The step leads to numbers that are not finite, as what was seen or the covariances are too "
+            "large or too small for floating point. The belief stays as it was."
+        )

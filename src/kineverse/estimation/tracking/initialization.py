@@ -1,0 +1,341 @@
+"""Initial belief of a tracker and of restarted groups, with several starts for ambiguous angles."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse.lie import Array
+from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol
+
+from .bounds import initial_deviations, initial_point
+from .gaussian_sum import GaussianSum
+from .gaussian_sum_filter import UpdateStep
+from .information_state import InformationState
+from .measurements import require_mapping, require_positive, wrap_difference
+from .state_space import CoordinateGroup, Layout
+
+if TYPE_CHECKING:
+    from kineverse.model.model_view import ModelView
+
+
+# Largest distance between initial values of an angle [rad].
+_SPACING = math.pi / 2
+_MOST_STARTS = 32
+# Initial points are at most this many deviations from the given one.
+_FARTHEST = 5.5
+_SAME = 1e-9
+# Turns after which gears may stand as before: a gear of ratio p/q does so after q turns.
+_MOST_TURNS = 12
+# Relative positions between limits at which predictions are sampled.
+_SAMPLES = (0.125, 0.375, 0.625, 0.875)
+
+
+def find_turning_coordinates(
+    update_step: UpdateStep, x: Array, inputs: Array
+) -> tuple[dict[Symbol, float], frozenset[Symbol]]:
+    """Return coordinates without limits of which full turns change no predicted observation, or only some.
+
+    The former have the angle after which nothing changes [rad]: several turns where gears are observed. The
+    latter are angles whose turn is observed elsewhere, such as that of a pinion by the place of its rack.
+    """
+    layout, limits = update_step.layout, update_step.limits
+    periods: dict[Symbol, float] = {}
+    counted = []
+    for i in np.flatnonzero(np.isinf(limits.lower) & np.isinf(limits.upper)).tolist():
+
+        def turned(turns: int, i: int = i) -> Array:
+            there = x.copy()
+            there[i] += turns * math.tau
+            return update_step.residuals.evaluate(there, inputs)
+
+        def is_same_after(turns: int, before: Array) -> npt.NDArray[np.bool_]:
+            with np.errstate(invalid="ignore"):  # where the model is not finite
+                change = np.abs(_difference(layout, before, turned(turns)))
+            return np.asarray(change < _SAME * (1 + np.abs(x).max()))
+
+        coordinate = layout.tangent_space.coordinates[i]
+        try:
+            before = turned(0)
+            is_same = is_same_after(1, before)
+            if is_same.all():
+                periods[coordinate] = math.tau
+                continue
+            if coordinate not in layout.tangent_space.by_speeds and _turns_some(layout, i, before, is_same):
+                counted.append(coordinate)
+            # Most coordinates are no angles: one look is enough for all numbers of turns.
+            if is_same_after(math.lcm(*range(1, _MOST_TURNS + 1)), before).all():
+                turns = next(k for k in range(2, _MOST_TURNS + 1) if is_same_after(k, before).all())
+                periods[coordinate] = turns * math.tau
+        except (KineverseError, StopIteration):  # the loop does not close there, or it is no number of turns
+            continue
+    return periods, frozenset(counted)
+
+
+def _difference(layout: Layout, before: Array, after: Array) -> Array:
+    """Return the change of predicted values and Jacobians, with periodic values wrapped."""
+    result = after - before
+    for one, where in zip(layout.observations, layout.value_slices, strict=True):
+        result[where] = wrap_difference(result[where], one.period)
+    return result
+
+
+def _turns_some(layout: Layout, i: int, predicted: Array, is_same: npt.NDArray[np.bool_]) -> bool:
+    """Return True if an observation that moves with a coordinate is the same after a full turn."""
+    number, group = next((n, g) for n, g in enumerate(layout.groups) if i in g.x)
+    column = group.tangent_index(group.x.tolist().index(i))
+    for k, (one, value, jacobian) in enumerate(
+        zip(layout.observations, layout.value_slices, layout.jacobian_slices, strict=True)
+    ):
+        if layout.group_of[k] == number and is_same[value].all() and is_same[jacobian].all():
+            if predicted[jacobian].reshape(one.size, -1)[:, column].any():
+                return True
+    return False
+
+
+def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Array) -> GaussianSum:
+    """Return beliefs about several initial points, all with the same Gaussian, the given one first."""
+    layout = update_step.layout
+    beliefs, alive = [first], [np.ones(len(layout.groups), dtype=bool)]
+    ambiguous = _find_ambiguous(update_step, first, inputs)
+    for number, group in enumerate(layout.groups):
+        steps = [_offsets(update_step, first, i, i in ambiguous) for i in group.x]
+        offsets = [_to_tangent(layout, number, np.array(x)) for x in _subsample(itertools.product(*steps))]
+        component = 0
+        for offset in offsets[1:] + _half_turns(layout, number):
+            if np.abs(offset / update_step.unobservable.deviations[group.t]).max() > _FARTHEST:
+                continue
+            x, transport = update_step.process_model.retract(number, first.x[group.x], offset, inputs)
+            there = first.copy()
+            there.x[group.x] = x
+            if not update_step.is_possible(number, there, inputs):
+                continue
+            component += 1
+            if component == len(beliefs):
+                beliefs.append(first.copy())
+                alive.append(np.zeros(len(layout.groups), dtype=bool))
+            alive[component][number] = True
+            beliefs[component].x[group.x] = x
+            beliefs[component].set_group_cost(
+                group.t, first.group_cost(group.t).transported(offset, transport)
+            )
+    return GaussianSum(layout, beliefs, np.array(alive))
+
+
+def _subsample(places: Iterable[tuple[float, ...]]) -> list[tuple[float, ...]]:
+    """Return at most ``_MOST_STARTS`` points, evenly spaced, the first one first."""
+    every = list(itertools.islice(places, 4096))
+    step = math.ceil(len(every) / _MOST_STARTS)
+    return every[::step]
+
+
+def _find_ambiguous(update_step: UpdateStep, first: InformationState, inputs: Array) -> set[int]:
+    """Return the coordinates on which some prediction is not monotonic between their limits.
+
+    An example is the distance from a point, which is equal on both of its sides. All groups are evaluated at
+    once.
+    """
+    layout, limits = update_step.layout, update_step.limits
+    width = limits.upper - limits.lower
+    result: set[int] = set()
+    for k in range(max(len(group.x) for group in layout.groups)):
+        groups = [
+            g
+            for g in layout.groups
+            if k < len(g.x) and g.tangent_index(k) >= 0 and np.isfinite(width[g.x[k]])
+        ]
+        predicted: list[Array] = []
+        for share in _SAMPLES if groups else ():
+            x = first.x.copy()
+            for group in groups:
+                x[group.x[k]] = limits.lower[group.x[k]] + share * width[group.x[k]]
+            try:
+                predicted.append(update_step.residuals.evaluate(x, inputs))
+            except KineverseError:  # infeasible
+                continue
+        if predicted:
+            result.update(
+                int(g.x[k])
+                for g in groups
+                if _is_ambiguous(layout, g, g.tangent_index(k), np.array(predicted))
+            )
+    return result
+
+
+def _is_ambiguous(layout: Layout, group: CoordinateGroup, column: int, predicted: Array) -> bool:
+    """Return True if a prediction has opposite slopes at two points, or jumps against its slope."""
+    for i in group.observation_indices:
+        one = layout.observations[i]
+        slopes = predicted[:, layout.jacobian_slices[i]].reshape(len(predicted), one.size, -1)[:, :, column]
+        white = np.linalg.inv(np.linalg.cholesky(one.covariance))
+        with np.errstate(invalid="ignore"):  # where the model is not finite
+            slopes = slopes @ white.T
+            if (slopes @ slopes.T < 0.0).any():
+                return True
+            if not one.is_pose:
+                changes = (
+                    wrap_difference(np.diff(predicted[:, layout.value_slices[i]], axis=0), one.period)
+                    @ white.T
+                )
+                if (np.einsum("ij,ij->i", changes, slopes[1:] + slopes[:-1]) < 0.0).any():
+                    return True
+    return False
+
+
+def _offsets(update_step: UpdateStep, first: InformationState, i: int, is_ambiguous: bool) -> list[float]:
+    """Return the offsets of further initial values of a coordinate, 0 first."""
+    coordinate = update_step.layout.tangent_space.coordinates[i]
+    if coordinate in update_step.layout.tangent_space.by_speeds:
+        return [0.0]
+    if (period := update_step.periods.get(coordinate)) is not None:
+        count = min(round(period / _SPACING), _MOST_STARTS)
+        return [math.remainder(k / count, 1.0) * period for k in range(count)]
+    low, high = update_step.limits.lower[i], update_step.limits.upper[i]
+    if not math.isfinite(high - low):
+        return [0.0]
+    if high - low <= 2 * _SPACING + _SAME:
+        return [0.0, *(low + share * (high - low) - first.x[i] for share in _SAMPLES if is_ambiguous)]
+    count = min(math.ceil((high - low) / _SPACING), _MOST_STARTS - 1)
+    middles = low + (np.arange(count) + 0.5) * (high - low) / count - first.x[i]
+    return [0.0, *middles.tolist()]
+
+
+def _to_tangent(layout: Layout, number: int, change: Array) -> Array:
+    """Return the tangent step that changes coordinates by given amounts."""
+    group = layout.groups[number]
+    step = np.zeros(len(group.tangent))
+    for x, by in zip(group.coordinates, change.tolist(), strict=True):
+        if x not in layout.tangent_space.by_speeds:
+            step[group.tangent.index(x.derivative())] = by
+    return step
+
+
+def _half_turns(layout: Layout, number: int) -> list[Array]:
+    """Return half turns about each rate direction, such as those of quaternions."""
+    group = layout.groups[number]
+    result = []
+    for k in group.rate_directions:
+        step = np.zeros(len(group.tangent))
+        step[k] = math.pi
+        result.append(step)
+    return result
+
+
+# Distance beyond limits that may be rounding.
+_BEYOND = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class InitialBelief:
+    """Initial state and its standard deviations."""
+
+    x: Array  # coordinates (n,)
+    deviations: Array  # standard deviation of each tangent direction (t,)
+    speeds: Mapping[Symbol, float] = field(default_factory=dict)
+    speed_variances: Mapping[Symbol, float] = field(default_factory=dict)
+
+    def spread(self, update_step: UpdateStep, inputs: Array) -> GaussianSum:
+        """Return the belief about several initial points, see :mod:`.multi_start`."""
+        groups = len(update_step.layout.groups)
+        belief = InformationState((len(self.x), len(self.deviations), groups))
+        belief.x[:] = self.x
+        with np.errstate(over="ignore"):
+            variances = np.array([*self.deviations**2, *self.deviations**-2.0])
+        if not (np.isfinite(variances).all() and variances.all()):
+            raise InvalidValueError("An initial uncertainty is too large or too small for floating point.")
+        belief.information[:] = np.diag(self.deviations**-2.0)
+        if update_step.velocity is not None:
+            update_step.velocity.initialise(belief, self.speeds, self.speed_variances)
+        return spread_starts(update_step, belief, inputs)
+
+    def with_values(self, update_step: UpdateStep, values: GivenValues) -> InitialBelief:
+        """Return the belief with other values of some coordinates and speeds, and other deviations."""
+        x, deviations = self.x.copy(), self.deviations.copy()
+        for symbol, value in values.coordinates.items():
+            k = update_step.layout.tangent_space.coordinates.index(symbol)
+            x[k] = np.clip(value, update_step.limits.lower[k], update_step.limits.upper[k])
+        for k, value in values.deviations.items():
+            deviations[k] = value
+        variances = {v: deviation**2 for v, deviation in values.speed_deviations.items()}
+        speeds, speed_variances = {**self.speeds, **values.speeds}, {**self.speed_variances, **variances}
+        return InitialBelief(x, deviations, speeds, speed_variances)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenValues:
+    """Checked initial values and standard deviations."""
+
+    coordinates: Mapping[Symbol, float]  # values by symbol
+    speeds: Mapping[Symbol, float]
+    deviations: Mapping[int, float]  # standard deviations by number of the tangent direction
+    speed_deviations: Mapping[Symbol, float]  # standard deviations of speeds
+
+    @staticmethod
+    def read(update_step: UpdateStep, start: StateLike, uncertainty: StateLike) -> GivenValues:
+        """Check initial values and standard deviations."""
+        tangent_space = update_step.layout.tangent_space
+        speeds = () if update_step.velocity is None else tuple(update_step.process_model.speeds.values())
+        state = start if isinstance(start, State) else State(start)
+        given = {s: state[s] for s in (*tangent_space.coordinates, *speeds) if s in state}
+        for name in () if isinstance(start, State) else state:
+            if name not in given:
+                raise _unknown_name(name, (*tangent_space.coordinates, *speeds))
+        for symbol, value in given.items():
+            if not math.isfinite(value):
+                raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
+            if not isinstance(start, State) and symbol in tangent_space.coordinates:
+                _check_limits(update_step, symbol, value)
+        names: dict[str, int] = {}
+        for k, v in enumerate(tangent_space.tangent):
+            names[str(v.position) if v.position in tangent_space.coordinates else str(v)] = k
+        speed_names = {str(v): v for v in speeds if str(v) not in names}
+        deviations, speed_deviations = {}, {}
+        for key, value in require_mapping(uncertainty, "uncertainty=").items():
+            if str(key) in speed_names:
+                speed_deviations[speed_names[str(key)]] = require_positive(key, value)
+            elif str(key) in names:
+                deviations[names[str(key)]] = require_positive(key, value)
+            else:
+                raise _unknown_name(key, (*names, *speed_names))
+        return GivenValues(
+            {s: value for s, value in given.items() if s not in speeds},
+            {s: value for s, value in given.items() if s in speeds},
+            deviations,
+            speed_deviations,
+        )
+
+
+def _check_limits(update_step: UpdateStep, symbol: Symbol, value: float) -> None:
+    """Check that a given value is within the limits of its coordinate."""
+    k = update_step.layout.tangent_space.coordinates.index(symbol)
+    low, high = float(update_step.limits.lower[k]), float(update_step.limits.upper[k])
+    if not low - _BEYOND <= value <= high + _BEYOND:
+        raise InvalidValueError(
+            f"start= of '{symbol}' is {value:g}, beyond its limits {low:g} to {high:g} [m], [rad]."
+        )
+
+
+def _unknown_name(key: object, names: Iterable[object]) -> UnknownNameError:
+    hint = suggest(str(key), map(str, names), "coordinate")
+    return UnknownNameError(f"'{key}' is not estimated. {hint}")
+
+
+def make_initial_belief(
+    model: ModelView, update_step: UpdateStep, values: GivenValues, inputs: Array
+) -> InitialBelief:
+    """Return the initial belief, and set the periodic coordinates and initial deviations of a tracker."""
+    tangent_space, limits = update_step.layout.tangent_space, update_step.limits
+    x = initial_point(model, tangent_space, limits, values.coordinates)
+    update_step.periods, update_step.counted = find_turning_coordinates(update_step, x, inputs)
+    usual = initial_deviations(tangent_space, limits, update_step.periodic)
+    belief = InitialBelief(x, usual).with_values(update_step, values)
+    update_step.unobservable.deviations = belief.deviations
+    return belief

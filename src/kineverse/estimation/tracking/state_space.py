@@ -1,0 +1,352 @@
+"""State space: coordinates, tangent space of the manifold, and independent groups."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate, pairwise
+
+import numpy as np
+
+from kineverse.compilation import CompiledFunction, compile
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.lie import Array
+from kineverse.model.constraint import Constraint
+from kineverse.model.rates import Rates, to_plain
+from kineverse.symbols import Symbol
+
+from .information_state import TangentIndices
+from .measurements import MeasurementModel
+
+SpeedRow = Mapping[Symbol, Expression]
+
+
+@dataclass(frozen=True)
+class TangentSpace:
+    """Estimated coordinates and their tangent directions."""
+
+    coordinates: tuple[Symbol, ...]  # estimated coordinates, sorted
+    tangent: tuple[Symbol, ...]  # tangent directions, as speeds, sorted
+    rates: Rates  # rate table of the model
+    by_speeds: frozenset[Symbol]  # coordinates whose tangent directions are speeds other than their own
+
+    def resolve(self, expression: Expression) -> Expression:
+        """Substitute dependent coordinates and rate nodes of an expression."""
+        return self.rates.resolve(to_plain(expression))
+
+    def rate_row(self, coordinate: Symbol) -> SpeedRow:
+        """Return the rate of a coordinate by each tangent direction."""
+        if coordinate in self.by_speeds:
+            return self.rates[coordinate]
+        return {coordinate.derivative(): as_expression(1.0)}
+
+    def gradient(self, expression: Expression) -> dict[Symbol, Expression]:
+        """Return the derivatives of a resolved expression in the tangent directions."""
+        result: dict[Symbol, Expression] = {}
+        for key, entry in expression.gradient(heuristic=False).items():
+            coordinate = key.position
+            row = self.rate_row(coordinate) if coordinate in self.coordinates else {}
+            for speed, rate in row.items():
+                term = entry * rate if coordinate in self.by_speeds else entry
+                result[speed] = result[speed] + term if speed in result else term
+        return result
+
+
+def build_tangent_space(
+    rates: Rates, values: Sequence[Expression], inputs: Iterable[Symbol], default: Mapping[Symbol, float]
+) -> TangentSpace:
+    """Collect the coordinates that values and their rates depend on, with their tangent directions."""
+    inputs = set(inputs)
+    wanted = [s for value in values for s in value.symbols if _is_coordinate(s, inputs)]
+    result: set[Symbol] = set()
+    while wanted:
+        x = wanted.pop()
+        if x in result:
+            continue
+        result.add(x)
+        dependencies = {s for entry in rates.get(x, {}).values() for s in entry.symbols}
+        wanted += [s for s in dependencies if _is_coordinate(s, inputs)]
+    coordinates = tuple(sorted(result, key=lambda s: s.sort_key))
+    by_speeds: set[Symbol] = set()
+    for block in _blocks(coordinates, rates):
+        if all(x in rates for x in block) and _are_redundant(block, rates, values, default):
+            by_speeds.update(block)
+    tangent = {v for x in coordinates for v in (rates[x] if x in by_speeds else [x.derivative()])}
+    in_order = tuple(sorted(tangent, key=lambda s: s.sort_key))
+    return TangentSpace(coordinates, in_order, rates, frozenset(by_speeds))
+
+
+def _is_coordinate(symbol: Symbol, inputs: set[Symbol]) -> bool:
+    return symbol.has_derivative and symbol.order == 0 and symbol not in inputs
+
+
+def connected_components(items: Sequence[frozenset[Symbol]]) -> list[set[Symbol]]:
+    """Return the unions of sets that share elements, in order of first occurrence."""
+    unions: list[set[Symbol]] = []
+    for item in items:
+        touching = [u for u in unions if u & item]
+        merged = set(item).union(*touching)
+        first = unions.index(touching[0]) if touching else len(unions)
+        unions = [u for u in unions if not any(u is t for t in touching)]
+        unions.insert(first, merged)
+    return unions
+
+
+def _blocks(coordinates: tuple[Symbol, ...], rates: Rates) -> list[list[Symbol]]:
+    """Return the coordinates that are connected by common speeds."""
+    rows = {x: frozenset(rates[x] if x in rates else (x.derivative(),)) for x in coordinates}
+    return [
+        [x for x in coordinates if rows[x] & union] for union in connected_components(list(rows.values()))
+    ]
+
+
+def _are_redundant(
+    block: list[Symbol], rates: Rates, values: Sequence[Expression], default: Mapping[Symbol, float]
+) -> bool:
+    """Return True if no value changes in directions that the rates of these coordinates exclude."""
+    zero = as_expression(0.0)
+    speeds = sorted({v for x in block for v in rates[x]}, key=lambda s: s.sort_key)
+    matrix = array([[rates[x].get(v, zero) for v in speeds] for x in block])
+    dependent = [value for value in values if not set(block).isdisjoint(value.symbols)]
+    random = np.random.default_rng(0)
+    for _ in range(_SAMPLES):
+        point = {x: default.get(x, 0.0) + random.uniform(-0.3, 0.3) for x in block}
+        rate_matrix = _evaluate_at(matrix, point, default)
+        left, singular, _ = np.linalg.svd(rate_matrix)
+        rank = int((singular > 1e-9).sum())
+        if rank < len(speeds) or rank == len(block):
+            return False
+        for direction in left[:, rank:].T:
+            ahead, behind = (
+                {x: point[x] + h * d for x, d in zip(block, direction.tolist(), strict=True)}
+                for h in (_STEP, -_STEP)
+            )
+            for value in dependent:
+                change = np.abs(
+                    _evaluate_at(value, ahead, default) - _evaluate_at(value, behind, default)
+                ).max()
+                if not change < _CONSTANT * _STEP:
+                    return False
+    return True
+
+
+_SAMPLES = 2
+_STEP, _CONSTANT = 1e-4, 1e-5
+
+
+def _evaluate_at(
+    expression: Expression, point: Mapping[Symbol, float], default: Mapping[Symbol, float]
+) -> Array:
+    values = {s: point.get(s, default.get(s, s.value or 0.0)) for s in expression.symbols}
+    result: Array = expression(values)
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class CoordinateGroup:
+    """Coordinates that share observations or limits; groups are independent of each other."""
+
+    coordinates: tuple[Symbol, ...]  # symbols of the group
+    tangent: tuple[Symbol, ...]
+    x: TangentIndices  # indices into all coordinates
+    t: TangentIndices  # into the whole tangent space
+    observation_indices: tuple[int, ...]  # numbers of its observations
+    limits: tuple[int, ...]  # numbers of its curved limits
+    rate_directions: TangentIndices
+
+    @property
+    def coordinate_indices(self) -> TangentIndices:
+        """Coordinate of each tangent direction, as an index into the group; -1 for a rate direction."""
+        speeds = [x.derivative() for x in self.coordinates]
+        rate_directions = set(self.rate_directions.tolist())
+        return np.array([-1 if k in rate_directions else speeds.index(v) for k, v in enumerate(self.tangent)])
+
+    def tangent_index(self, k: int) -> int:
+        """Return the tangent direction of the k-th coordinate; -1 if it has none."""
+        speed = self.coordinates[k].derivative()
+        return self.tangent.index(speed) if speed in self.tangent else -1
+
+    @cached_property
+    def block(self) -> tuple[TangentIndices, ...]:
+        """Open mesh that selects the group's block (t, t) of a matrix of the whole tangent space."""
+        return np.ix_(self.t, self.t)
+
+    @property
+    def by_speeds(self) -> bool:
+        """True if some of its coordinates move by rate directions."""
+        return len(self.rate_directions) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Arrangement of state, observations and inputs in vectors."""
+
+    tangent_space: TangentSpace  # coordinates and tangent directions
+    observations: tuple[MeasurementModel, ...]  # measurement models
+    limits: tuple[Constraint, ...]  # curved limits: all but bounds on a single free coordinate
+    inputs: tuple[Symbol, ...]  # symbols with given values
+    groups: tuple[CoordinateGroup, ...]  # independent groups, in the order of their first observation
+
+    @cached_property
+    def group_of(self) -> tuple[int, ...]:
+        """Number of each observation's group."""
+        result = {i: number for number, group in enumerate(self.groups) for i in group.observation_indices}
+        return tuple(result[i] for i in range(len(self.observations)))
+
+    @cached_property
+    def arguments(self) -> tuple[Symbol, ...]:
+        """Arguments of the compiled function: coordinates, then inputs."""
+        return (*self.tangent_space.coordinates, *self.inputs)
+
+    @cached_property
+    def value_slices(self) -> tuple[slice, ...]:
+        """Position of each predicted value in the output: rotation row by row, then position, or a vector."""
+        return self._slices[0]
+
+    @cached_property
+    def jacobian_slices(self) -> tuple[slice, ...]:
+        """Position of each observation's Jacobian in the output, rows by columns of its group's tangent."""
+        return self._slices[1]
+
+    @cached_property
+    def limit_slices(self) -> tuple[slice, ...]:
+        """Position of each curved limit's value, bounds and gradient in the output."""
+        return self._slices[2]
+
+    @cached_property
+    def measurement_slices(self) -> tuple[slice, ...]:
+        """Position of each observation in a reading: 4×4 row by row, or a vector."""
+        return _consecutive_slices(16 if one.is_pose else one.size for one in self.observations)
+
+    @cached_property
+    def whitening_slices(self) -> tuple[slice, ...]:
+        """Position of each observation's whitening matrix in a reading."""
+        return _consecutive_slices(one.size**2 for one in self.observations)
+
+    @cached_property
+    def _slices(self) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
+        at = 0
+        result: tuple[list[slice], list[slice], list[slice]] = [], [], []
+        sizes = []
+        for one, number in zip(self.observations, self.group_of, strict=True):
+            width = len(self.groups[number].tangent)
+            sizes += [(0, 12 if one.is_pose else one.size), (1, one.size * width)]
+        for number in range(len(self.limits)):
+            group = next(g for g in self.groups if number in g.limits)
+            sizes.append((2, 3 + len(group.tangent)))
+        for kind, size in sizes:
+            result[kind].append(slice(at, at + size))
+            at += size
+        return tuple(result[0]), tuple(result[1]), tuple(result[2])
+
+    def is_affine(self, number: int) -> bool:
+        """Return True if all measurements of a group are affine functions of its coordinates.
+
+        Frames that are shifted only, by amounts that are affine, and vectors without a period.
+        """
+        group = self.groups[number]
+        if group.by_speeds or group.limits:
+            return False
+        coordinates = set(group.coordinates)
+        for i in group.observation_indices:
+            one = self.observations[i]
+            value = self.tangent_space.resolve(one.value)
+            if one.is_pose:
+                if not coordinates.isdisjoint(value[:3, :3].symbols):
+                    return False
+            elif math.isfinite(one.period):
+                return False
+            if not coordinates.isdisjoint(self._jacobian(one, value, group).symbols):
+                return False
+        return True
+
+    def compile_function(self) -> CompiledFunction:
+        """Compile the values and derivatives of all observations and limits as one function."""
+        parts: list[Expression] = []
+        for one, number in zip(self.observations, self.group_of, strict=True):
+            value = self.tangent_space.resolve(one.value)
+            parts += [
+                _flatten_pose(value) if one.is_pose else value,
+                self._jacobian(one, value, self.groups[number]),
+            ]
+        for number, limit in enumerate(self.limits):
+            group = next(g for g in self.groups if number in g.limits)
+            slopes = self.tangent_space.gradient(limit.expression)
+            columns = [slopes.get(v, as_expression(0.0)) for v in group.tangent]
+            parts.append(array([limit.expression, limit.lower, limit.upper, *columns]))
+        return compile(np.concatenate(parts), self.arguments)
+
+    def _jacobian(self, one: MeasurementModel, value: Expression, group: CoordinateGroup) -> Expression:
+        """Return the Jacobian of a value in the group's tangent directions, flattened row by row.
+
+        For a pose this is the geometric Jacobian: linear velocity of the origin, then angular velocity.
+        """
+        gradient = self.tangent_space.gradient(value)
+        columns = []
+        for speed in group.tangent:
+            entry = gradient.get(speed)
+            if entry is None:
+                columns.append(as_expression(np.zeros(one.size)))
+            elif one.is_pose:
+                spin = entry[:3, :3] @ value[:3, :3].T
+                columns.append(array([*entry[:3, 3], spin[2, 1], spin[0, 2], spin[1, 0]]))
+            else:
+                columns.append(entry)
+        return array(columns).T.reshape(-1)
+
+
+def _consecutive_slices(sizes: Iterable[int]) -> tuple[slice, ...]:
+    ends = [0, *accumulate(sizes)]
+    return tuple(slice(a, b) for a, b in pairwise(ends))
+
+
+def _flatten_pose(pose: Expression) -> Expression:
+    return array([*pose[:3, :3].reshape(9), *pose[:3, 3]])
+
+
+def build_layout(
+    tangent_space: TangentSpace,
+    observations: tuple[MeasurementModel, ...],
+    limits: tuple[Constraint, ...],
+    inputs: Sequence[Symbol],
+) -> Layout:
+    """Arrange observations and limits in independent groups."""
+    speeds = {x: frozenset(tangent_space.rate_row(x)) for x in tangent_space.coordinates}
+    observed: list[frozenset[Symbol]] = []
+    for one in observations:
+        symbols = [s for s in tangent_space.resolve(one.value).symbols if s in speeds]
+        if not symbols:
+            raise InvalidValueError(
+                f"'{one.label}' does not move with any coordinate that is estimated: nothing can be learnt "
+                "from observing it."
+            )
+        observed.append(frozenset().union(*(speeds[s] for s in symbols)))
+    limited = [frozenset[Symbol]().union(*(speeds[s] for s in c.symbols if s in speeds)) for c in limits]
+    # A rate couples the coordinates it depends on with those it moves.
+    rated = [
+        frozenset().union(
+            speeds[x], *(speeds[s] for e in tangent_space.rates[x].values() for s in e.symbols if s in speeds)
+        )
+        for x in tangent_space.coordinates
+        if x in tangent_space.rates
+    ]
+    groups = []
+    for union in connected_components([*observed, *limited, *rated]):
+        tangent = tuple(v for v in tangent_space.tangent if v in union)
+        coordinates = tuple(x for x in tangent_space.coordinates if speeds[x] & union)
+        own = {x.derivative() for x in coordinates if x not in tangent_space.by_speeds}
+        groups.append(
+            CoordinateGroup(
+                coordinates,
+                tangent,
+                np.array([tangent_space.coordinates.index(x) for x in coordinates]),
+                np.array([tangent_space.tangent.index(v) for v in tangent]),
+                tuple(i for i, w in enumerate(observed) if w & union),
+                tuple(i for i, w in enumerate(limited) if w & union),
+                np.array([k for k, v in enumerate(tangent) if v not in own], dtype=np.int64),
+            )
+        )
+    return Layout(tangent_space, observations, limits, tuple(inputs), tuple(groups))

@@ -1,0 +1,101 @@
+"""Sampling of mobile bases: random places in front of a point to reach, and collision-free start states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.geometry import Rule, Scene
+from kineverse.lie import Array
+from kineverse.model.frame import is_of_robot
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+_NEAREST, _FARTHEST = 0.3, 1.1
+"""Distance of a base from the point that the hand has to reach [m]."""
+_SIDE, _TURN = math.radians(110.0), math.radians(60.0)
+"""Largest angles between base and coming hand, and between the front of the base and the point [rad]."""
+
+
+class BaseSampler:
+    """Random places of a mobile base at which it touches nothing, as far as there are some."""
+
+    def __init__(
+        self, scene: Scene, base: Sequence[Symbol], own: Sequence[str], others: Sequence[str], margin: float
+    ) -> None:
+        self.base = tuple(base)
+        self._scene = scene
+        carried = [b for b in own if {*scene.model.symbols_of(b)} <= {*base}]
+        self._watch = scene.watch(carried, others, margin) if base and carried else None
+
+    def draw(
+        self,
+        random: np.random.Generator,
+        states: Sequence[State],
+        points: Array,
+        directions: Array,
+        tries: int = 5,
+    ) -> Array:
+        """Return places (B, 3) of the base: x [m], y [m] and angle [rad]."""
+        places = self._draw(random, points, directions)
+        for _ in range(tries - 1):
+            hits = self.find_touching(states, places)
+            if not hits.any():
+                break
+            places[hits] = self._draw(random, points[hits], directions[hits])
+        return places
+
+    def find_touching(self, states: Sequence[State], places: Array) -> npt.NDArray[np.bool_]:
+        """Return flags (B,) of places (B, 3) at which the base is too near to something in a state."""
+        return np.array([any(self._touches(state, place) for state in states) for place in places.tolist()])
+
+    def _touches(self, state: State, place: Sequence[float]) -> bool:
+        if self._watch is None:
+            return False
+        self._scene.update(state.updated(dict(zip(self.base, place, strict=True))))
+        return len(self._watch()) > 0
+
+    def _draw(self, random: np.random.Generator, points: Array, directions: Array) -> Array:
+        count = len(points)
+        angle = np.arctan2(directions[:, 1], directions[:, 0]) + random.uniform(-_SIDE, _SIDE, count)
+        from_above = np.hypot(*directions.T) <= 0.02
+        angle = np.where(from_above, random.uniform(-math.pi, math.pi, count), angle)
+        distance = random.uniform(_NEAREST, _FARTHEST, count)
+        turn = random.uniform(-_TURN, _TURN, count)
+        at = points + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return np.column_stack([at, angle + math.pi + turn])
+
+
+def find_planar_base(model: ModelView, symbols: Sequence[Symbol]) -> tuple[Symbol, ...]:
+    """Return the coordinates x, y and angle of a mobile base among some; empty without one."""
+    for joint in model.articulations.values():
+        names = tuple(s.path.rpartition("/")[2] for s in joint.coordinates)
+        if names == ("x", "y", "angle") and {*joint.coordinates} <= {*symbols}:
+            return tuple(joint.coordinates)
+    return ()
+
+
+def find_free_state(
+    model: ModelView, robot: str, states: Iterable[State], margin: float = 0.0, rules: Iterable[Rule] = ()
+) -> tuple[State | None, str]:
+    """Return the first of some states in which a robot touches nothing, and its contact in the first."""
+    scene = Scene(model)
+    own = [body for body in scene.bodies if is_of_robot(body, robot)]
+    others = [body for body in scene.bodies if not is_of_robot(body, robot)]
+    near = scene.watch(own, others, radius=max(margin, 0.0), rules=rules) if own and others else None
+    contact = None
+    for state in states:
+        if near is None:
+            return state, ""
+        scene.update(state)
+        pair = next(iter(near()), None)
+        touches = pair is not None and pair.distance < margin
+        if contact is None:
+            contact = f"{pair.a} and {pair.b}" if touches and pair is not None else ""
+        if not touches:
+            return state, contact
+    return None, contact or ""

@@ -1,0 +1,248 @@
+"""Sweep of an object: what is in its way from one value of its coordinate to another one.
+
+The bodies that a coordinate moves are placed along the way so densely that no point of them goes further than
+:data:`STEP` at a time. There they are measured against everything that is not the robot's and that they move
+relative to: fixed furniture, furniture that other coordinates move, and what carries the object itself. Which
+overlaps mean nothing is said by :class:`.FurnitureOverlaps`, as it is for worlds and for their judge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from kineverse.errors import NoSolutionError
+from kineverse.geometry import Rule, Scene
+from kineverse.geometry.distance_queries import PreparedQuery
+from kineverse.geometry.objects import Exclusion
+from kineverse.lie import Array
+from kineverse.model.frame import is_of_robot
+from kineverse.model.frame_dependence import FrameDependence
+from kineverse.model.model_view import ModelView
+from kineverse.model.symbolic_view import cached_for_version
+from kineverse.state import State
+from kineverse.symbols import Symbol
+from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
+
+from .outcome import SkillError
+
+STEP = 5e-4
+"""Longest way of a point of the object between two places where it is looked at [m]."""
+
+_COARSE = 32
+"""Number of parts of a way whose lengths are measured."""
+_MOST_PLACES = 100_000
+_TURNED = 1e-6
+"""Change of an entry of a rotation from which on a body has turned."""
+_CLEAR = 3e-3
+"""Distance before the first contact up to which a way is said to be free [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle:
+    """First thing in the way of an object."""
+
+    coordinate: Symbol  # coordinate of the object, and the value that it was to reach [m], [rad]
+    target: float
+    body: str  # body of the object
+    other: str  # the one that is in its way
+    value: float  # value of the coordinate from which on they overlap [m], [rad]
+    depth: float  # largest depth of the two on the way to the target [m]
+    free: float  # value up to which the way is free, a little before the contact [m], [rad]
+    unit: str = ""  # "rad" if the object turns, "m" if it slides
+    carrier: Symbol | None = None  # coordinate that moves the other body; None if none does
+    aside: float | None = None  # [m], [rad]
+
+    @property
+    def measures(self) -> dict[str, Any]:
+        """Measures of a skill that is not begun: the failure, the pair, and the value that can be reached."""
+        return {"failure": "collision", "in_the_way": (self.body, self.other), "free": self.free}
+
+    def __str__(self) -> str:
+        value, target, free = (f"{v:.3f} {self.unit}".rstrip() for v in (self.value, self.target, self.free))
+        text = (
+            f"'{self.body}' meets '{self.other}' at {value} of '{self.coordinate}': on the way to {target} "
+            f"they would overlap by {1e3 * self.depth:.3g} mm. The way is free up to {free}."
+        )
+        if self.aside is not None:
+            return f"{text} Move '{self.carrier}' to {self.aside:.3f} first."
+        if self.carrier is not None:
+            return f"{text} '{self.carrier}' moves what is in the way; none of its ends leaves the way free."
+        return text
+
+
+class BlockedError(SkillError):
+    """End of a skill before something in the way of an object."""
+
+    def __init__(self, obstacle: Obstacle) -> None:
+        super().__init__("collision", str(obstacle))
+        self.obstacle = obstacle
+
+
+def find_obstacle(
+    model: ModelView,
+    coordinate: Symbol,
+    state: State,
+    target: float,
+    *,
+    robot: str = "",
+    rules: Iterable[Rule] = (),
+    leave_out: Iterable[Exclusion] = (),
+    start: State | None = None,
+    least: float = OVERLAP,
+) -> Obstacle | None:
+    """Return the first thing in the way of an object from its value to a target; None if the way is free.
+
+    What overlaps at the begin counts as far as it gets deeper than :class:`.FurnitureOverlaps` allows. The
+    robot counts nowhere: it moves.
+    """
+    own = tuple(rules), tuple(leave_out)
+
+    def make() -> _Sweep:
+        return _Sweep(model, robot, *own)
+
+    sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot), make)
+    sweep.start = start
+    found = sweep.find(coordinate, state, target, least)
+    return None if found is None else sweep.find_aside(found, state)
+
+
+class _Sweep:
+    """Scene in which objects are swept."""
+
+    def __init__(
+        self, model: ModelView, robot: str, rules: tuple[Rule, ...], leave_out: tuple[Exclusion, ...]
+    ) -> None:
+        self._model, self._robot = model, robot
+        self._scene = Scene(model, rules=rules, leave_out=leave_out)
+        self._overlaps = FurnitureOverlaps(self._scene, robot)
+        self._queries: dict[tuple[Symbol, bytes], tuple[PreparedQuery, FrameDependence]] = {}
+        self.start: State | None = None
+
+    def find(
+        self, coordinate: Symbol, state: State, target: float, least: float = OVERLAP
+    ) -> Obstacle | None:
+        """Return the first obstacle of a coordinate on its way to a target; None without."""
+        scene, start = self._scene, float(state[coordinate])
+        if start == target or coordinate not in scene.inputs:
+            return None
+        scene.update(state)
+        self._overlaps.begin(*(() if self.start is None else (self.start,)))
+        query, motion = self._query(coordinate)
+        if not len(query.pairs):
+            return None
+        values = self._divide(coordinate, state, start, target)
+        for k in self._find_near(query, coordinate, values):
+            found = query(0.0)
+            excess = -found.distances - self._overlaps.allowances(found)
+            worst = int(np.argmax(excess)) if len(excess) else 0
+            if not len(excess) or excess[worst] <= least:
+                continue
+            pair = found[worst]
+            one, other = (pair.a, pair.b) if motion.moves(pair.a) else (pair.b, pair.a)
+            deepest = self._find_deepest(query, coordinate, values[k:], one, other)
+            first = values[max(0, k - math.ceil(_CLEAR / STEP))]
+            unit = "rad" if self._turns(one, coordinate, state, target) else "m"
+            return Obstacle(coordinate, target, one, other, float(values[k]), deepest, float(first), unit)
+        return None
+
+    def find_aside(self, found: Obstacle, state: State) -> Obstacle:
+        """Return an obstacle with the coordinate that moves it, and where it leaves the way free."""
+        model = self._model
+        free = [s for s in model.degrees_of_freedom if not (self._robot and is_of_robot(s.path, self._robot))]
+        moving = [
+            s
+            for s in free
+            if s != found.coordinate and FrameDependence(model, [s]).moves_between(found.body, found.other)
+        ]
+        carriers = [s for s in moving if FrameDependence(model, [s]).moves(found.other)]
+        for carrier in carriers:
+            ends = {*map(float, model.limits(carrier, state)), model.default_state()[carrier]}
+            here = float(state[carrier])
+            for end in sorted((v for v in ends if math.isfinite(v)), key=lambda v: -abs(v - here)):
+                if end == here or self.find(carrier, state, end) is not None:
+                    continue
+                if self.find(found.coordinate, state.updated({carrier: end}), found.target) is None:
+                    return replace(found, carrier=carrier, aside=end)
+        return replace(found, carrier=carriers[0]) if carriers else found
+
+    def _query(self, coordinate: Symbol) -> tuple[PreparedQuery, FrameDependence]:
+        """Return the query for what a coordinate moves and counts since the begin, and its motion."""
+        key = coordinate, self._overlaps.counting.tobytes()
+        if key not in self._queries:
+            motion = FrameDependence(self._model, [coordinate])
+            self._queries[key] = self._overlaps.watch([coordinate]), motion
+        return self._queries[key]
+
+    def _find_near(self, query: PreparedQuery, coordinate: Symbol, values: Array) -> Iterator[int]:
+        """Place the scene at the values at which anything of the object touches, and yield their indices."""
+        rows, k = values[:, None], 0
+        at = self._scene.inputs.index(coordinate)
+        while True:
+            first = query.first_within([coordinate], rows[k:], 0.0)
+            if first is None:
+                return
+            k += first
+            # What rests on something touches on a long way.
+            inputs = self._scene.collision_world.values
+            while True:
+                yield k
+                k += 1
+                if k == len(values):
+                    return
+                inputs[at] = values[k]
+                try:
+                    touching = query.at(inputs, 0.0)
+                except NoSolutionError:
+                    return
+                if not len(touching):
+                    break
+
+    def _divide(self, coordinate: Symbol, state: State, start: float, target: float) -> Array:
+        """Return values from the first to the last one between which no point goes further than the step.
+
+        They end where a loop does not close any more.
+        """
+        scene = self._scene
+        table = scene.collision_world.table
+        coarse, places = np.linspace(start, target, _COARSE + 1), []
+        for value in coarse.tolist():
+            try:
+                scene.update(state.updated({coordinate: value}))
+            except NoSolutionError:
+                break
+            moving = slice(None, table.moving)
+            places.append((table.position[moving].copy(), table.poses[moving, :, :3].copy()))
+        scene.update(state)
+        radius = np.where(np.isfinite(table.radius), table.radius, 0.0)[: table.moving]
+        parts = [np.array([start])]
+        for k, ((p, R), (p_next, R_next)) in enumerate(pairwise(places)):
+            turn = np.linalg.norm((R_next - R).reshape(len(R), -1), axis=1) / math.sqrt(2.0)
+            way = float((np.linalg.norm(p_next - p, axis=1) + turn * radius).max(initial=0.0))
+            count = min(max(1, math.ceil(way / STEP)), _MOST_PLACES // _COARSE)
+            parts.append(np.linspace(coarse[k], coarse[k + 1], count + 1)[1:])
+        return np.concatenate(parts)
+
+    def _turns(self, body: str, coordinate: Symbol, state: State, value: float) -> bool:
+        """Return True if a body is turned when a coordinate changes to a value."""
+        scene = self._scene
+        scene.update(state)
+        before = scene.pose(body)[:3, :3]
+        middle = (float(state[coordinate]) + value) / 2
+        scene.update(state.updated({coordinate: middle}))
+        return bool(np.abs(scene.pose(body)[:3, :3] - before).max() > _TURNED)
+
+    def _find_deepest(
+        self, query: PreparedQuery, coordinate: Symbol, values: Array, one: str, other: str
+    ) -> float:
+        """Return the largest depth of two bodies at some values [m]."""
+        pair, deepest = {one, other}, 0.0
+        for _ in self._find_near(query, coordinate, values):
+            depths = (-found.distance for found in query(0.0) if {found.a, found.b} == pair)
+            deepest = max(deepest, *depths, 0.0)
+        return deepest

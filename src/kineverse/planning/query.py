@@ -1,0 +1,197 @@
+"""Planning queries: search, shortcuts and certificate, in the whole space or on a manifold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.compilation.build_queue import working_seconds
+from kineverse.lie import Array
+
+from .bindings import TIME_IS_UP, TOO_LONG
+from .collision_checker import RESOLUTION, CollisionChecker
+from .collision_geometry import Floats32
+from .manifold import Manifold
+from .sampling_planners import MOST_EDGES, PATH_ROOM, Roadmap, RrtConnect, SearchResult
+
+PATIENCE, MORE_PATIENCE = 40, 160
+"""Numbers of shortcuts in a row that may bring nothing: for the first path, and where paths are optimized."""
+_REPAIRS = 12
+_FINER = 8.0
+"""Factor of the resolution where an edge collides between its samples."""
+_FINEST = 4000.0
+_ATTEMPTS, _NEXT_SEED = 16, 7919
+_LEAST_CHECK = 1.0
+"""Time for the checks of what is found [s]; or as long as the search may take, if that is longer."""
+_TELLING = 100
+"""Number of samples after which a small tree says that its root cannot be left."""
+_WIDER, _WIDE_EDGES = 1e-3, 10_000
+"""Margin beyond the one asked for: edges of a search are mostly free between their samples then [m]. A way,
+as of a door, may be too narrow for it: after that many edges, or half of the time, searches go on without."""
+
+
+@dataclass(frozen=True, slots=True)
+class Connected:
+    """Outcome of a connection."""
+
+    points: Array  # configurations (N, n) of the path, or of the best partial one
+    problem: str  # why it does not lead to a goal; empty if it does
+    iterations: int  # number of samples
+
+
+def connect(
+    checker: CollisionChecker,
+    starts: Floats32,
+    goals: Floats32,
+    seconds: float,
+    seed: int,
+    edges: int = MOST_EDGES,
+    roadmap: Roadmap | None = None,
+    patience: int = PATIENCE,
+    asked: float | None = None,
+) -> Connected:
+    """Return a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
+
+    Edges of the search that collide between samples are planned anew, with more samples.
+    """
+    begin = working_seconds()
+    search = RrtConnect(checker)
+    iterations, points = 0, starts
+    for attempt in range(_ATTEMPTS):
+        left = seconds - (working_seconds() - begin)
+        if attempt and left <= 0.0:
+            break
+        for by in (_WIDER, 0.0):
+            left = seconds - (working_seconds() - begin)
+            with checker.widened(by, np.vstack([starts, goals])) as wider:
+                share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
+                if roadmap is None:
+                    found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, edges=most)
+                else:
+                    found = roadmap.solve(checker, starts, goals, share, seed + _NEXT_SEED * attempt)
+            iterations += found.iterations
+            if found.found or not wider:
+                break
+        if not found.found:
+            return Connected(
+                found.points.astype(float),
+                explain_failure(found, seconds if asked is None else asked),
+                iterations,
+            )
+        # Parts of a shortcut that just passes would not be certain by themselves.
+        with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
+            points = search.shorten(found.points, seconds - (working_seconds() - begin), seed, patience)
+        certain = _repair(search, checker, points, begin + seconds, checked_by(begin, seconds), seed, edges)
+        if certain is not None:
+            return Connected(certain.astype(float), "", iterations)
+    problem = (
+        "A path was found whose samples are free, but something thin lies between two of them, and no way "
+        "around it was found in the time given. More seconds=, or another seed=, may find one."
+    )
+    return Connected(points.astype(float), problem, iterations)
+
+
+def _repair(
+    search: RrtConnect,
+    checker: CollisionChecker,
+    points: Floats32,
+    end: float,
+    checked: float,
+    seed: int,
+    edges: int,
+) -> Floats32 | None:
+    """Return a path that is certainly free: edges that are not are planned anew, with more samples."""
+    resolution = RESOLUTION
+    for _ in range(_REPAIRS):
+        collision = checker.find_collision(points, checked - working_seconds())
+        if collision is None:
+            return points
+        k, _fraction = collision
+        resolution = min(_FINER * resolution, _FINEST)
+        left = end - working_seconds()
+        detour = search.solve(points[k : k + 1], points[k + 1 : k + 2], left, seed, resolution, edges)
+        if not detour.found:
+            return None
+        points = np.ascontiguousarray(np.vstack([points[:k], detour.points, points[k + 2 :]]))
+    return None
+
+
+def connect_on_manifold(
+    checker: CollisionChecker,
+    manifold: Manifold,
+    starts: Floats32,
+    goals: Floats32,
+    seconds: float,
+    seed: int,
+    edges: int = MOST_EDGES,
+    asked: float | None = None,
+) -> Connected:
+    """Return a path on a manifold from any of some starts (S, n) to any of some goals (G, n).
+
+    Its points are in double precision on the manifold, and lines between them keep to it; see
+    :meth:`.Manifold.refine`. A path that collides between samples is searched again, with another seed and
+    more samples.
+    """
+    begin = working_seconds()
+    search = RrtConnect(checker, manifold)
+    iterations, resolution, problem = 0, RESOLUTION, ""
+    points = starts
+    for attempt in range(_ATTEMPTS):
+        left = seconds - (working_seconds() - begin)
+        if attempt and left <= 0.0:
+            break
+        for by in (_WIDER, 0.0):
+            left = seconds - (working_seconds() - begin)
+            with checker.widened(by, np.vstack([starts, goals])) as wider:
+                share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
+                found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)
+                iterations += found.iterations
+                points = search.contract(found.points, left) if found.found else found.points
+            if found.found or not wider:
+                break
+        if not found.found:
+            problem = problem or explain_failure(found, seconds if asked is None else asked)
+            return Connected(points.astype(float), problem, iterations)
+        exact = manifold.refine(points)
+        if exact is None:
+            problem = "A path was found, but within limits its holds cannot be met exactly all along it."
+            continue
+        left = checked_by(begin, seconds) - working_seconds()
+        if checker.find_collision(np.ascontiguousarray(exact, dtype=np.float32), left) is None:
+            return Connected(exact, "", iterations)
+        problem = "A path was found whose samples are free, but something thin lies between two of them."
+        resolution *= 2.0
+    return Connected(points.astype(float), problem, iterations)
+
+
+def checked_by(begin: float, seconds: float) -> float:
+    """Return when what a search has found is checked, which began and may last some seconds."""
+    return begin + seconds + max(seconds, _LEAST_CHECK)
+
+
+def explain_failure(found: SearchResult, seconds: float) -> str:
+    """Return why a search has found no path, and how far it has come."""
+    own, other = found.nodes
+    if found.status == TOO_LONG:
+        return f"A way was found, but it has more than the {PATH_ROOM} points of a path: choose nearer goals."
+    reached = f"{own} configurations were reached from the start and {other} from the goals"
+    names = ("the start", "the goal") if found.iterations >= _TELLING else ()
+    enclosed = [name for name, count in zip(names, found.nodes, strict=False) if count < 8]
+    hint = f" It seems that {' and '.join(enclosed)} cannot be left." if enclosed else ""
+    if math.isfinite(found.gap):
+        reached += f", and the nearest pair is {found.gap:.3g} apart"
+    if found.status == TIME_IS_UP:
+        return f"The time of {seconds:g} s is up: {reached}.{hint} Give more seconds=, or other goals."
+    return f"The search ended: {reached}.{hint}"
+
+
+def unique_rows(Q: Array, apart: float) -> Sequence[int]:
+    """Return the indices of rows (N, n) none of which is nearer to an earlier one than a distance."""
+    kept: list[int] = []
+    for k, q in enumerate(Q):
+        if not kept or np.linalg.norm(Q[kept] - q, axis=1).min() > apart:
+            kept.append(k)
+    return kept

@@ -1,0 +1,115 @@
+"""HTML of the page.
+
+Elements with escaped text, the only place in which names and messages become HTML, and reports of violated
+constraints and failures.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+
+class Html(str):
+    """Text that is HTML already."""
+
+    __slots__ = ()
+
+
+def element(tag: str, *content: str, style: str = "", **attributes: object) -> Html:
+    """Return an HTML element; its content is escaped, unless it is :class:`Html`."""
+    named = {name.rstrip("_").replace("_", "-"): value for name, value in attributes.items()}
+    shown = {**({"style": style} if style else {}), **named}
+    opened = "".join(f' {name}="{html.escape(str(value))}"' for name, value in shown.items())
+    inside = "".join(text if isinstance(text, Html) else html.escape(text) for text in content)
+    return Html(f"<{tag}{opened}>{inside}</{tag}>")
+
+
+def join_html(*content: str) -> Html:
+    """Concatenate content; text that is not :class:`Html` is escaped."""
+    return Html("".join(text if isinstance(text, Html) else html.escape(text) for text in content))
+
+
+class HtmlBox:
+    """Exchangeable HTML on a page."""
+
+    def __init__(self, gui: Any, content: Html) -> None:
+        self._handle = gui.add_html(str(content))
+
+    @property
+    def content(self) -> str:
+        """The present content."""
+        return str(self._handle.content)
+
+    def show(self, content: Html) -> None:
+        """Replace the content; it is sent only if it differs."""
+        if self._handle.content != content:
+            self._handle.content = str(content)
+
+
+BREAK = Html("<br>")
+
+FONT = "font-size:0.8em;line-height:1.35;overflow-wrap:anywhere;"
+"""The font of the panel."""
+
+
+def colored_box(color: str, background: str, *content: str) -> Html:
+    """Return a coloured box in the font of the panel."""
+    colors = f"color:{color};background:{background}"
+    return element(
+        "div", *content, style=f"{FONT}padding:6px 9px;margin:2px 8px 10px;border-radius:4px;{colors}"
+    )
+
+
+MOST_LINES = 12
+"""Lines of the panel; further constraints are counted, not listed."""
+
+_RED, _LIGHT_RED = "#c92a2a", "#fff5f5"
+
+
+def format_violations(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
+    """Return HTML: each violated constraint with its value, bounds and excess, or that there is none."""
+    found = sorted(violations, key=lambda v: -abs(v.excess))
+    rest = len(list(unchecked))
+    aside = [element("span", f" · {rest} on speeds not checked", style="color:#868e96")] if rest else []
+    if not found:
+        return colored_box("#2b8a3e", "#ebfbee", element("b", "All constraints hold."), *aside)
+    noun = "constraint" if len(found) == 1 else "constraints"
+    lines = [element("b", f"{len(found)} {noun} violated"), *aside]
+    lines += [
+        element(
+            "div",
+            element("b", v.name),
+            BREAK,
+            "{} is not in [{}, {}], by {}".format(
+                *map(format_significant, (v.value, v.lower, v.upper, v.excess))
+            ),
+            class_="kineverse-violation",
+            style="margin-top:3px",
+        )
+        for v in found[:MOST_LINES]
+    ]
+    if len(found) > MOST_LINES:
+        lines.append(element("div", f"and {len(found) - MOST_LINES} more"))
+    return colored_box(_RED, _LIGHT_RED, *lines)
+
+
+def format_failure(message: str) -> Html:
+    """Return HTML: the reason why the state on the page cannot be shown."""
+    return colored_box(_RED, _LIGHT_RED, element("b", "This state cannot be shown."), BREAK, message)
+
+
+def format_missing_meshes(problems: Sequence[str]) -> Html:
+    """Return HTML: the meshes that could not be loaded."""
+    lines = [element("div", line, style="margin-top:3px") for line in problems[:MOST_LINES]]
+    if len(problems) > MOST_LINES:
+        lines.append(element("div", f"and {len(problems) - MOST_LINES} more"))
+    noun = "mesh" if len(problems) == 1 else "meshes"
+    return colored_box(_RED, _LIGHT_RED, element("b", f"{len(problems)} {noun} could not be loaded"), *lines)
+
+
+def format_significant(value: float) -> str:
+    """Format a number with at most 4 significant digits and a legible minus sign."""
+    text = f"{value:.4g}"
+    return text.replace("-", "−").replace("inf", "∞")
