@@ -24,12 +24,12 @@ _LONGEST = 200
 
 
 GALLERY = "articulations"
-"""First part of the names of the models that the package builds, one for each articulation."""
+"""First part of the names of the scenes that ship, one for each articulation."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """File of a model, with its name if it ships; or a model of a collection, without a file.
+    """File of a model, with its name if it ships; or a model that a collection builds, without a file.
 
     ``shipped`` is its prefix by default.
     """
@@ -79,7 +79,9 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     group, _, member = text.partition("/")
     collection = registry.find_collection(group)
     if collection is not None and collection.has(member):
-        return Source(Path(text), collection.prefix or member, group)
+        document = collection.document(member)
+        prefix = collection.prefix or member
+        return Source(Path(text), prefix, group) if document is None else Source(document, prefix)
     if text.lstrip().startswith("<"):
         raise UnknownNameError(
             "This looks like the text of a description, where the name or path of a model is expected. "

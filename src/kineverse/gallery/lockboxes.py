@@ -20,6 +20,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from kineverse.articulations.mechanisms.mechanism import STEEL, box_shape
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.expressions.expression import Expression
 from kineverse.logic import less
@@ -31,8 +32,6 @@ from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 from kineverse.spatial import translation
 from kineverse.symbols import position
-
-from .shapes import box as box_shape
 
 Join: TypeAlias = Callable[[Expression, Expression], Expression]
 
@@ -193,7 +192,7 @@ def make_operations(box: Lockbox, prefix: str | None = None, join: Join = and_) 
     for k, (name, part) in enumerate(box.parts.items()):
         path, here = full[name], q[name]
         at = translation(0.1 * k, here, 0.0)
-        body = Body(visuals=box_shape((0.08, 0.2, 0.04)))
+        body = Body((box_shape((0.08, 0.2, 0.04), (0.0, 0.0, 0.0), STEEL),))
         yield AddFrame(path, Frame.from_transform(WORLD, at), body)
         limits = Constraint.from_expressions(0.0, here, part.upper)
         yield Constrain(f"{path}/position", limits)

@@ -79,11 +79,12 @@ class FileFormat:
 
 @dataclass(frozen=True, slots=True)
 class ModelCollection:
-    """Models that functions build, loaded as ``collection/name``."""
+    """Models that functions build, or documents that ship, loaded as ``collection/name``."""
 
     list_names: str  # function that returns all names
-    build: str  # function from a name and a prefix to an iterable of operations
     summary: str  # number of its models, for errors: "one for each ..."
+    build: str = ""  # function from a name and a prefix to an iterable of operations; empty for documents
+    find_document: str = ""  # function from a name to the path of its document; empty if models are built
     accept: str = ""  # predicate of names, if list_names has examples alone; empty if it has all names
     prefix: str = ""  # prefix of a model by default; that of an empty text is the name of the model
 
@@ -95,8 +96,12 @@ class ModelCollection:
         """Return the names of the models, or examples of them."""
         return tuple(import_entry(self.list_names)())
 
+    def document(self, name: str) -> Path | None:
+        """Return the path of the document of a model; None for a model that is built."""
+        return import_entry(self.find_document)(name) if self.find_document else None
+
     def operations(self, name: str, prefix: str | None) -> Iterator[Operation]:
-        """Yield the operations of a model."""
+        """Yield the operations of a model that is built."""
         yield from import_entry(self.build)(name, prefix)
 
 

@@ -7,7 +7,7 @@ import math
 from kineverse.articulations import Continuous, Cylindrical, Fixed, Limits, Prismatic, Revolute, Screw
 from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL, WOOD
 
-from .scene import SceneBuilder
+from .scene_builder import SceneBuilder
 from .shapes import GREEN, ORANGE, RED, WHITE, X, Y, Z, box, disc, rod, sphere, wheel
 
 

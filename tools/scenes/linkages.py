@@ -14,7 +14,7 @@ from kineverse.expressions.expression import Expression
 from kineverse.model.body import Rgba
 from kineverse.spatial import rotation_x, rotation_z, translation
 
-from .scene import SceneBuilder
+from .scene_builder import SceneBuilder
 from .shapes import GREEN, ORANGE, RED, Point, Shapes, X, Y, Z, box, disc, link, rod, sphere
 
 

@@ -11,7 +11,7 @@ from kineverse.articulations import Cam, Continuous, Gearbox, RackAndPinion, Rev
 from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL
 from kineverse.spatial import rotation_y, translation
 
-from .scene import SceneBuilder
+from .scene_builder import SceneBuilder
 from .shapes import GREEN, ORANGE, RED, WHITE, Shapes, Y, Z, bone, box, disc, gear, perpendicular, rod
 
 

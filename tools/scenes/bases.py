@@ -9,7 +9,7 @@ import numpy as np
 from kineverse.articulations import Ackermann, Continuous, DifferentialDrive, Mecanum, OmniBase, Revolute
 from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL
 
-from .scene import SceneBuilder
+from .scene_builder import SceneBuilder
 from .shapes import GREEN, ORANGE, RED, WHITE, Shapes, Y, Z, arrow, bone, box, disc, rod, sphere, wheel
 
 

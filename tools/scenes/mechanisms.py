@@ -18,7 +18,7 @@ from kineverse.articulations.mechanisms import (
 )
 from kineverse.articulations.mechanisms.mechanism import STEEL
 
-from .scene import SceneBuilder
+from .scene_builder import SceneBuilder
 from .shapes import RED, box, rod, sphere
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from kineverse.articulations import Ball, Floating, Limits, Planar, Universal
 from kineverse.articulations.mechanisms.mechanism import BLUE, DARK, STEEL, WOOD
 
-from .scene import SceneBuilder
+from .scene_builder import SceneBuilder
 from .shapes import GREEN, ORANGE, RED, WHITE, X, Y, arrow, bone, box, disc, rod, sphere
 
 
