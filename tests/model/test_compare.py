@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 import kineverse as kv
 from kineverse.model.body import Mesh
+from kineverse.model.changes import find_moved_tags
 from kineverse.model.comparison import measure_deltas
-from kineverse.model.diff import find_moved_tags
 from kineverse.model.sampling import StateSamples
 
 

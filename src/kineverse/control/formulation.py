@@ -20,8 +20,8 @@ from kineverse.expressions.gradient import stack_columns
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
-from kineverse.model.speed_limits import is_infinite, raw_max
-from kineverse.model.velocity_rows import VelocityRows, velocity_rows
+from kineverse.model.velocity_constraints.speed_limits import is_infinite, raw_max
+from kineverse.model.velocity_constraints.velocity_rows import VelocityRows, velocity_rows
 from kineverse.symbols import Symbol
 
 from .tasks import Goal, Hold, Keep, Task

@@ -34,8 +34,8 @@ from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import TOLERANCE, is_equality
 from kineverse.model.rates import Rates, to_plain
-from kineverse.model.speed_limits import INFINITE, ZERO, raw_max, raw_min
-from kineverse.model.velocity_rows import velocity_rows
+from kineverse.model.velocity_constraints.speed_limits import INFINITE, ZERO, raw_max, raw_min
+from kineverse.model.velocity_constraints.velocity_rows import velocity_rows
 from kineverse.symbols import Symbol, parameter
 
 from .configuration_space import ConfigurationSpace, find_coordinates

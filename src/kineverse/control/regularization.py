@@ -16,7 +16,7 @@ from kineverse.expressions.graph import dense_column
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import count_moved_bodies
 from kineverse.model.model_view import ModelView
-from kineverse.model.speed_limits import is_infinite, raw_min
+from kineverse.model.velocity_constraints.speed_limits import is_infinite, raw_min
 from kineverse.symbols import Symbol
 
 from .formulation import Formulation, GoalRows, HoldRows, find_speeds

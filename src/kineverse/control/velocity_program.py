@@ -31,7 +31,7 @@ from kineverse.compilation.function import WantedTier
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
 from kineverse.expressions.functions import norm
 from kineverse.lie import Array
-from kineverse.model.speed_limits import INFINITE, ZERO, is_infinite, raw_max
+from kineverse.model.velocity_constraints.speed_limits import INFINITE, ZERO, is_infinite, raw_max
 from kineverse.symbols import Symbol, parameter
 
 from .formulation import Formulation, GoalRows, HoldRows

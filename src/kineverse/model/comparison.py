@@ -18,7 +18,7 @@ from kineverse.symbols import Symbol
 
 from .articulation import Articulation
 from .body import Mesh, Pose
-from .diff import Change, Diff, find_moved_tags
+from .changes import Change, Diff, find_moved_tags
 from .frame import Frame
 from .history import History, HistoryEntry
 from .model import Model, Snapshot

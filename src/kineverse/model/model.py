@@ -11,10 +11,9 @@ from kineverse._runtime import no_collection
 from kineverse.errors import EditError, ExpressionError, UnknownAttributeError
 from kineverse.symbols import Symbol
 
-from .diff import Change, Diff
+from .changes import Change, Diff, Listener, Listeners
 from .edit import Edit
 from .history import History, HistoryEntry
-from .listeners import Listener, Listeners
 from .model_view import ModelView
 from .read_recorder import ABSENT
 from .registry import LoopTreatment

@@ -29,7 +29,7 @@ from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, EqualityConstraints, project
 from .registry import SaveResult
 from .symbolic_view import SymbolicView, cached_for_version
-from .velocity_rows import Recovery, VelocityRows, velocity_rows
+from .velocity_constraints.velocity_rows import Recovery, VelocityRows, velocity_rows
 from .violations import ConstraintChecker, Violations, find_violations
 
 
@@ -278,7 +278,7 @@ class ModelView(SymbolicView):
 
         With a subject, these are the constraints relevant for it and the speed limits of all coordinates that
         they involve; without one, all constraints. See :meth:`constraints_for` and
-        :mod:`kineverse.model.velocity_rows`, for ``gain`` and ``recovery`` as well.
+        :mod:`kineverse.model.velocity_constraints.velocity_rows`, for ``gain`` and ``recovery`` as well.
         """
         with self._lock:
             every = dict(self.constraints)

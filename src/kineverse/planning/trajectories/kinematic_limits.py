@@ -14,7 +14,7 @@ from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
-from kineverse.model.speed_limits import SpeedLimits
+from kineverse.model.velocity_constraints.speed_limits import SpeedLimits
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 

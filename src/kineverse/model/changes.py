@@ -1,19 +1,133 @@
-"""Notification of listeners about committed changes, once for each commit."""
+"""Changes of a model by a commit, and listeners that get them."""
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from kineverse.errors import ExpressionError
 from kineverse.symbols import Symbol, check_symbols
 
-from .diff import Change, Diff
+from .constraint import Constraint, coordinates
 from .operation import CONSTRAINTS, KINDS
 from .read_recorder import unknown_path_error
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Structural change of one value; ``before`` is None for an added value, ``after`` for a removed one."""
+
+    kind: str
+    name: str
+    before: Any
+    after: Any
+
+    @property
+    def path(self) -> str:
+        """Kind and name, such as ``frames/kitchen/door``."""
+        return f"{self.kind}/{self.name}"
+
+    @property
+    def coordinates(self) -> frozenset[str]:
+        """Coordinates of a constraint before and after the change; empty for other kinds of data."""
+        sides = [v for v in (self.before, self.after) if isinstance(v, Constraint)]
+        return frozenset().union(*(coordinates(c.lower, c.expression, c.upper) for c in sides))
+
+
+@dataclass(frozen=True, slots=True)
+class Diff:
+    """Difference between two versions of a model.
+
+    Attributes
+    ----------
+    version
+        Version after the change. A commit starts from ``version - 1``.
+    changes
+        Values that changed, in no particular order.
+    added, removed, replaced
+        Tags of operations, in the order of the edit.
+    reruns
+        Number of times that an operation was applied.
+    moved
+        Tags of operations with a new position relative to the others. In a commit, these were removed and
+        added again elsewhere, and are in ``replaced`` as well.
+    rerun
+        Tags of operations that were applied again because a value that they read had changed, in order.
+        ``changes`` shows if their writes changed. Empty in comparisons of models.
+    """
+
+    version: int
+    changes: tuple[Change, ...]
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    replaced: tuple[str, ...] = ()
+    reruns: int = 0
+    moved: tuple[str, ...] = ()
+    rerun: tuple[str, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        """True if there are no differences."""
+        return not (self.changes or self.tags)
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The paths of all changes, sorted."""
+        return tuple(sorted(c.path for c in self.changes))
+
+    @property
+    def tags(self) -> frozenset[str]:
+        """Tags that were added, removed, replaced, moved or run again."""
+        return frozenset((*self.added, *self.removed, *self.replaced, *self.moved, *self.rerun))
+
+
+def find_moved_tags(before: Sequence[str], after: Sequence[str], among: Container[str]) -> tuple[str, ...]:
+    """Return a smallest set of tags whose removal makes both orders equal, in the new order."""
+    present = set(after)
+    place = {tag: i for i, tag in enumerate(tag for tag in before if tag in present)}
+    common = [tag for tag in after if tag in place]
+    kept = _longest_in_order([place[tag] for tag in common], [tag not in among for tag in common])
+    return tuple(tag for i, tag in enumerate(common) if i not in kept)
+
+
+def _longest_in_order(places: Sequence[int], wanted: Sequence[bool]) -> set[int]:
+    """Return the indices of a longest increasing part that has all that are wanted, which increase."""
+    # What stands still leaves room for the others only in between.
+    kept: set[int] = set()
+    low, start = -1, 0
+    for end in (*(i for i, is_wanted in enumerate(wanted) if is_wanted), len(places)):
+        high = places[end] if end < len(places) else max(places, default=0) + 1
+        inside = [i for i in range(start, end) if low < places[i] < high]
+        kept.update(inside[k] for k in _longest([places[i] for i in inside]))
+        if end < len(places):
+            kept.add(end)
+            low, start = high, end + 1
+    return kept
+
+
+def _longest(places: Sequence[int]) -> set[int]:
+    """Return the indices of a longest increasing part."""
+    # ends[k]: the least end of an increasing part of k + 1 places.
+    ends: list[int] = []
+    lengths: list[int] = []
+    for place in places:
+        length = bisect_left(ends, place)
+        lengths.append(length)
+        ends[length : length + 1] = [place]
+    kept: set[int] = set()
+    length, last = len(ends) - 1, math.inf
+    for i in range(len(places) - 1, -1, -1):
+        if lengths[i] == length and places[i] < last:
+            kept.add(i)
+            length, last = length - 1, places[i]
+    return kept
+
 
 _LOG = logging.getLogger(__name__)
 

@@ -33,11 +33,11 @@ from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, ExpressionLike, array
 from kineverse.expressions.functions import sqrt
 from kineverse.expressions.implicit import clamp_to_domains
+from kineverse.model.constraint import Constraint
+from kineverse.model.rates import Rates
 from kineverse.symbols import Symbol, check_symbols
 
-from .constraint import Constraint
 from .feasibility import RecoveryBound, RecoveryBounds, limit_recovery
-from .rates import Rates
 from .speed_limits import (
     INFINITE,
     ZERO,

@@ -14,10 +14,9 @@ from kineverse.expressions.functions import norm
 from kineverse.expressions.gradient import partial
 from kineverse.expressions.implicit import clamp_to_domains
 from kineverse.expressions.nonsmooth import Norm
+from kineverse.model.constraint import Constraint
+from kineverse.model.rates import Rates
 from kineverse.symbols import Symbol
-
-from .constraint import Constraint
-from .rates import Rates
 
 SIDES = 16
 
