@@ -139,7 +139,7 @@ def __getattr__(name: str) -> object:
     if name in _LAZY:
         return importlib.import_module(f"kineverse.{name}")
     if name == "show":
-        return importlib.import_module("kineverse.view.show").show
+        return importlib.import_module("kineverse.view.page").show
     from kineverse._synonyms import MODULE_SYNONYMS
     from kineverse.errors import unknown_attribute_error
 

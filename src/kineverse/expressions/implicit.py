@@ -49,7 +49,7 @@ class ImplicitFunction:
     """A definition of unknowns as a function of inputs."""
 
     name: str  # name in error messages
-    unknowns: tuple[Symbol, ...]  # (n,), (k,)
+    unknowns: tuple[Symbol, ...]  # x, shape (n,)
     inputs: tuple[Symbol, ...]
     residual: Expression  # r(x, u), of shape (m,) with m at least n; all of it is zero at a solution
     rows: tuple[int, ...]  # n rows of the residual for Newton's method

@@ -58,7 +58,7 @@ class Slider:
 
     upper: float = 1.0  # upper limit [m]
     groups: tuple[tuple[Condition, ...], ...] = ()  # conditions of the lock
-    speed: float = 0.4  # limits of the speed forward and backward [m/s]
+    speed: float = 0.4  # largest, in either direction [m/s]
     back: float = 0.4
     blocks: Literal["forward", "both"] = "forward"
 

@@ -32,10 +32,10 @@ class Delta:
     """Difference in one part of a value."""
 
     what: str  # path of the part within the value
-    before: Any  # old
-    after: Any  # new content of the part; None if there is none
-    distance: float = inf  # [m]
-    angle: float = 0.0  # angle of the rotation from one transform to the other [rad]; 0 for other parts
+    before: Any  # content of the part; None if there is none
+    after: Any
+    distance: float = inf  # of origins [m]; of numbers relative to the larger one above one; inf for texts
+    angle: float = 0.0  # of the rotation from one transform to the other [rad]
     at_default: tuple[float, float] = (inf, 0.0)  # distance and angle at the default state
 
     def is_within(self, tolerance: float) -> bool:

@@ -61,9 +61,9 @@ class FileFormat:
     suffixes: tuple[str, ...]  # endings of the file names that it reads
     read: str  # function from a FileContent to an iterable of (tag, operation)
     written: tuple[str, ...] = ()  # endings of the file names that it writes
-    write: str = ""  # (model, path, leave_out, tolerance, strict)
-    recognize: Callable[[str, bytes], bool] | None = None  # (name, content)
-    exact: bool = False  # (model, path)
+    write: str = ""  # function of (model, path, leave_out, tolerance, strict) to the content of files
+    recognize: Callable[[str, bytes], bool] | None = None  # of (name, content), where formats share a suffix
+    exact: bool = False  # True if files hold all of a model; then write is a function of (model, path)
     loop_element: str = ""  # element of the format that closes a loop; empty if the format has none
     reference: bytes = b""  # text in every file that refers to further files; empty if files never do
 
@@ -126,7 +126,7 @@ class SaveResult:
 
     path: Path  # path of the file
     remarks: tuple[str, ...] = ()  # differences between the file and the model that are no errors
-    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)  # [m], [rad]
+    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)  # bounds, where a tolerance allows any
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property

@@ -313,7 +313,13 @@ class SymbolicView:
     # -- kinematics ----------------------------------------------------------------------------------------
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
-        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates."""
+        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates.
+
+        Raises
+        ------
+        UnknownNameError
+            If a frame does not exist, with similar names.
+        """
         with self._lock:
             self._settle()
             known = self._poses.get((frame, relative_to))
@@ -333,7 +339,21 @@ class SymbolicView:
         symbols: Sequence[Symbol] | None = None,
         heuristic: bool = False,
     ) -> Expression:
-        """Return the geometric Jacobian of a frame, 6×n: linear rows [m] first, then angular rows [rad]."""
+        """Return the geometric Jacobian of a frame, 6×n: linear rows [m] first, then angular rows [rad].
+
+        Parameters
+        ----------
+        frame, relative_to
+            Moving frame and reference frame.
+        form
+            ``world_aligned``: velocity of the frame's origin in axes of ``relative_to``; ``world``: the
+            spatial twist there; ``body``: in the frame itself.
+        symbols
+            Positions or velocities, one for each column. By default the speeds that move the frame, sorted
+            (:meth:`speeds_of`).
+        heuristic
+            True to include heuristic gradient entries. The default is the exact Jacobian.
+        """
         if form not in ("world_aligned", "world", "body"):
             raise UnknownNameError(
                 f"There is no form {form!r}; forms are 'world_aligned', 'world' and 'body'."
@@ -400,6 +420,18 @@ class SymbolicView:
         """Return the centre of mass, (3,) [m] in the world; coordinates are carried by their rates.
 
         Bodies without mass do not count.
+
+        Parameters
+        ----------
+        frame
+            Frame whose bodies count, with those of all frames below it; by default all bodies.
+
+        Raises
+        ------
+        UnknownNameError
+            If the frame does not exist, with similar names.
+        ModelError
+            If none of the bodies has a mass, with their names.
         """
         with self._lock:
             self._settle()
@@ -438,6 +470,11 @@ class SymbolicView:
         coordinates of a joint in its own order. A dependent coordinate, as of a mimic joint or a closed loop,
         is replaced by those that determine it. Pass them to :func:`kineverse.compile` for input vectors in
         this order instead of sorted by name.
+
+        Raises
+        ------
+        UnknownNameError
+            If a frame does not exist, with similar names.
         """
         with self._lock:
             self._settle()

@@ -261,7 +261,7 @@ MAX_ATTACH_DEPTH = 20
 class PreprocessedMjcf:
     """Input of MuJoCo's parser."""
 
-    text: str = ""  # text of the document
+    text: str = ""
     models: dict[str, bytes] = field(default_factory=dict)
     passive_text: str = ""  # same without actuators and keys, with all elements on the same lines
     passive_models: dict[str, bytes] = field(default_factory=dict)

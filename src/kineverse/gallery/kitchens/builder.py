@@ -129,11 +129,11 @@ class Style:
     counter_material: Material
     bar: Material  # material of the handles
     round_bar: bool  # True for round bars, False for square ones
-    thickness: float  # thickness of a bar, and the free space between bar and front [m]
-    clearance: float
+    thickness: float  # of a bar [m]
+    clearance: float  # between bar and front [m]
     length: float  # largest length of a bar [m]; fronts that are narrower have shorter ones
     travel: float  # travel of the drawers [m]
-    plinth: float  # [m]
+    plinth: float  # height [m]
     counter: float
     worktop: float
     top: float

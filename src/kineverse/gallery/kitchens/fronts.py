@@ -47,7 +47,7 @@ _BEHIND = 0.03
 class Area:
     """Part of a unit's face that one front covers, up to half a gap on each side."""
 
-    y: Span  # ends across and in height [m]
+    y: Span  # ends across [m]
     z: Span
 
     @property

@@ -71,8 +71,8 @@ class SpeedRow:
 
     name: str  # name of the constraint
     weights: Weights  # coefficients by speed
-    lower: Expression  # bounds
-    upper: Expression  # scalars
+    lower: Expression  # scalar bounds
+    upper: Expression
     violation: Expression = ZERO  # signed excess of a position constraint
 
     @property
