@@ -4,35 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-RENAMED: Mapping[str, str] = {
-    "Edge": "kv.estimation.KinematicEdge",
-    "Effects": "kv.model.Writes",
-    "Graph": "kv.estimation.KinematicGraph",
-    "Hypotheses": "kv.estimation.HypothesisBank",
-    "MissingExtraError": "kv.errors.MissingDependencyError",
-    "NameTakenError": "kv.errors.DuplicateNameError",
-    "Rating": "kv.estimation.JointVerdict",
-    "Reader": "kv.model.ReadRecorder",
-    "Unknown": "kv.estimation.FamilyParameter",
-    "UnsolvedError": "kv.errors.NoSolutionError",
-    "ValueRejectedError": "kv.errors.InvalidValueError",
-    "Write": "kv.model.SetData",
-    "blocked_unless": "kv.articulations.position_lock",
-    "difference": "kv.model.compare_models",
-    "exponential": "kv.spatial.exp_so3",
-    "limit_table": "kv.articulations.tabulated_limit",
-    "normalised": "kv.spatial.normalize",
-    "plausibility": "kv.estimation.check_plausibility",
-    "quaternion_of": "kv.spatial.to_quaternion",
-    "rotation_vector": "kv.spatial.log_so3",
-    "rpy_of": "kv.spatial.to_rpy",
-    "transform_like": "kv.spatial.as_transform",
-    "twist_exponential": "kv.spatial.exp_se3",
-    "twist_logarithm": "kv.spatial.log_se3",
-    "unlocked_while": "kv.articulations.speed_lock",
-}
-"""Earlier public names of this library."""
-
 MODULE_SYNONYMS: Mapping[str, str] = {
     "Hinge": "kv.Revolute",
     "HingeJoint": "kv.Revolute",
@@ -73,7 +44,6 @@ MODULE_SYNONYMS: Mapping[str, str] = {
     "JointState": "kv.State",
     "Joint": "kv.Revolute, kv.Prismatic and the others of kv.articulations",
     "Link": "kv.model.Frame, by edit.add_frame",
-    **RENAMED,
 }
 
 MODEL_SYNONYMS: Mapping[str, str] = {

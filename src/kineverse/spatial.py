@@ -32,6 +32,39 @@ from kineverse.expressions.functions import arctan2, cos, norm, sin, sqrt, where
 from kineverse.expressions.layout import SX
 from kineverse.lie import normalize
 
+__all__ = [
+    "Direction",
+    "OneAxisTransform",
+    "VectorLike",
+    "adjoint",
+    "as_one_axis_transform",
+    "as_transform",
+    "axis_angle",
+    "exp_se3",
+    "exp_so3",
+    "inverse",
+    "log_se3",
+    "log_so3",
+    "point",
+    "position_of",
+    "quaternion",
+    "rotation_about",
+    "rotation_angle",
+    "rotation_of",
+    "rotation_x",
+    "rotation_y",
+    "rotation_z",
+    "rpy",
+    "skew",
+    "to_quaternion",
+    "to_rpy",
+    "transform",
+    "translation",
+    "translation_along",
+    "unit_vector",
+    "vector",
+]
+
 Direction = tuple[float, float, float]
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)

@@ -151,7 +151,7 @@ class _Solver:
         return [tuple(u) for u in unknowns]
 
     def _find_box(self, inputs: list[RealInterval]) -> _Box | None:
-        """Return a box with one solution for each input, Y, and β/(1 - β) with β = |1 - Y ∂r/∂x|.
+        """Return a box with one solution for each input, Y, and β/(1 - β) with ``β = |1 - Y ∂r/∂x|``.
 
         The box is centred on the tangent D at the middle m, which is far closer to the solution than x is.
         The residual along it is r(x, m) + (∂r/∂u + ∂r/∂x D)(u - m).
@@ -286,7 +286,7 @@ def _step(term: Term, args: list[TaylorSeries]) -> TaylorSeries:
 
 
 def _enclose_truth(excess: RealInterval, contrast: float) -> RealInterval:
-    """Return the range of (1 + tanh(x·R))/2, which is 0 or 1 to the last bit from |x|·R = 20 on."""
+    """Return the range of (1 + tanh(x·R))/2, which is 0 or 1 to the last bit from ``|x|·R = 20`` on."""
     low, high = interval_unary(ca.OP_TANH, (excess[0] * contrast, excess[1] * contrast))
     return (
         1.0 if excess[0] * contrast >= SATURATED else max(0.0, math.nextafter((1 + low) / 2, -math.inf)),

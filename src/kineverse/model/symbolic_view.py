@@ -339,20 +339,34 @@ class SymbolicView:
         symbols: Sequence[Symbol] | None = None,
         heuristic: bool = False,
     ) -> Expression:
-        """Return the geometric Jacobian of a frame, 6×n: linear rows [m] first, then angular rows [rad].
+        r"""Return the geometric Jacobian a_J_b of a frame, 6×n: linear rows [m], then angular rows [rad].
+
+        It maps the speeds to the twist of the frame b in the frame a, where a_p_b and a_R_b are its position
+        and its rotation in :meth:`fk`:
+
+        .. math::
+
+            \begin{pmatrix} v \\ \omega \end{pmatrix} = {}_aJ_b(q)\, \dot q, \qquad
+            v = \frac{d}{dt}\, {}_ap_b, \qquad
+            [\omega]_\times = \frac{d}{dt} \left( {}_aR_b \right) {}_aR_b^\top
 
         Parameters
         ----------
         frame, relative_to
-            Moving frame and reference frame.
+            Moving frame b and reference frame a.
         form
-            ``world_aligned``: velocity of the frame's origin in axes of ``relative_to``; ``world``: the
-            spatial twist there; ``body``: in the frame itself.
+            ``world_aligned``: v and ω as above, at the origin of b in axes of a; ``world``: the spatial twist
+            v + p × ω and ω; ``body``: Rᵀv and Rᵀω, in axes of b.
         symbols
             Positions or velocities, one for each column. By default the speeds that move the frame, sorted
             (:meth:`speeds_of`).
         heuristic
             True to include heuristic gradient entries. The default is the exact Jacobian.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such frame or form, with similar names.
         """
         if form not in ("world_aligned", "world", "body"):
             raise UnknownNameError(

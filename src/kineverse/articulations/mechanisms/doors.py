@@ -36,7 +36,7 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
 
         B = A + (e1, e2)·panel_hinge,      C = B + (f1, f2)·arm_end,      |C - D| = arm
 
-    C is the intersection of two circles, about B and about D. With c = |arm_end|, d = |D - B| and
+    C is the intersection of two circles, about B and about D. With ``c = |arm_end|``, ``d = |D - B|`` and
     w = (D - B)/d:
 
         C - B = m w + h (w_z, -w_x),       m = (c² + d² - arm²)/2d,       h = √(c² - m²)
@@ -253,7 +253,7 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
     play
         Largest distance of a from l at which the bolt still catches [m].
     speed
-        Limit of |q̇| while it is unlocked [rad/s], or as published [m/s].
+        Limit of ``|q̇|`` while it is unlocked [rad/s], or as published [m/s].
 
     Raises
     ------

@@ -249,7 +249,7 @@ def bound_error(
     sampled: float,
     negligible: float,
 ) -> float:
-    """Return an upper bound of |curve - polynomial| over an interval, close to the least one."""
+    """Return an upper bound of ``|curve - polynomial|`` over an interval, close to the least one."""
 
     def difference(where: RealInterval) -> TaylorSeries:
         return taylor_subtract(curve(where), taylor_polynomial(polynomial, taylor_variable(where)))

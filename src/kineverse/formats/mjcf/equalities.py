@@ -114,9 +114,9 @@ LENGTH_KEY = "length"
 class Tendon(Operation, document_kind="Tendon"):
     """Tendon with a length over joints or along a path through frames.
 
-    L = Σ coef · q [m], where q are positions of articulations; or L = Σ |pₖ₊₁ - pₖ| / divisor [m] over the
-    origins p of frames, summed over the branches of pulleys. The length is the datum ``name/length``, and its
-    range the constraint of the same name.
+    L = Σ coef · q [m], where q are positions of articulations; or ``L = Σ |pₖ₊₁ - pₖ| / divisor`` [m] over
+    the origins p of frames, summed over the branches of pulleys. The length is the datum ``name/length``, and
+    its range the constraint of the same name.
     """
 
     name: str

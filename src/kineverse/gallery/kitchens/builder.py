@@ -92,7 +92,7 @@ def furniture_body(solids: Iterable[MaterialShape], decoration: Iterable[Materia
 
 
 def compute_inertia(solids: Iterable[MaterialShape]) -> Inertia:
-    """Return mass and inertia of boxes and cylinders: the parallel axis theorem, Σ I + m (|d|² E - d dᵀ)."""
+    """Return mass and inertia of solids by the parallel axis theorem, ``Σ I + m (|d|² E - d dᵀ)``."""
     parts = [(*_mass_and_tensor(s), s.shape.origin.matrix) for s in solids]
     mass = sum(m for m, _, _ in parts)
     center: npt.NDArray[np.float64] = np.sum([m * pose[:3, 3] for m, _, pose in parts], axis=0) / mass
