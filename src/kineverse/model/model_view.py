@@ -331,7 +331,7 @@ class ModelView(SymbolicView):
 
         With a subject, these are the constraints relevant for it and the speed limits of all coordinates that
         they involve; without one, all constraints. See :meth:`constraints_for` and
-        :mod:`kineverse.model.velocity_rows`, for ``gain`` and ``recovery`` as well.
+        :mod:`kineverse.model.velocity_constraints.velocity_rows`, for ``gain`` and ``recovery`` as well.
 
         Parameters
         ----------
@@ -390,7 +390,7 @@ class ModelView(SymbolicView):
         }
 
     def integrate(self, state: StateLike, speeds: StateLike, dt: float, *, clip: bool = False) -> State:
-        """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integrator`.
+        """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integration`.
 
         **Limits and other constraints are ignored.** At 100 rad/s, a door with a limit of 1.57 rad is at 100
         rad after one second, and :meth:`violations` reports it.
