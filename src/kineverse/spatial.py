@@ -371,8 +371,8 @@ def quaternion(
     q = array(list(_components("A quaternion", ("x", "y", "z", "w"), (x, y, z, w))))
     listener = access_listener(q)
     if listener is not None:
-        anew: Expression = listener.ask("quaternion", q)
-        return anew
+        result: Expression = listener.ask("quaternion", q)
+        return result
     if not q.symbols:
         largest = float(np.abs(q()).max())
         if not 0 < largest < math.inf:
@@ -560,8 +560,8 @@ def unit_vector(v: VectorLike, what: str = "The vector") -> Expression:
     expression = _as_vector3(v, what)
     listener = access_listener(expression)
     if listener is not None:
-        anew: Expression = listener.ask("unit", expression)
-        return anew
+        result: Expression = listener.ask("unit", expression)
+        return result
     if not expression.symbols:
         number = normalize(expression())
         if number is None:

@@ -116,7 +116,7 @@ def test_planted_libraries_are_removed_and_not_loaded(
     plant(folder / f"{KEY}.so", elsewhere)
     with caplog.at_level(logging.WARNING, "kineverse.compile"):
         assert found.load(KEY, content_of) is None
-    assert f"{folder / KEY}.so {PLANTED[plant]} and will be made anew." in caplog.text
+    assert f"{folder / KEY}.so {PLANTED[plant]} and will be compiled again." in caplog.text
     assert not os.path.lexists(folder / f"{KEY}.so")
     assert elsewhere.read_bytes() == whole(b"evil")
     assert found.find(KEY) is None
@@ -135,7 +135,7 @@ def test_a_file_of_another_user_is_not_loaded(
     with caplog.at_level(logging.WARNING, "kineverse.compile"):
         assert library_cache().folder == folder
         assert library_cache().load(KEY, content_of) is None
-    assert "belongs to another user and will be made anew" in caplog.text
+    assert "belongs to another user and will be compiled again" in caplog.text
 
 
 @as_root

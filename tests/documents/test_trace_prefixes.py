@@ -86,7 +86,7 @@ def test_an_open_loop_is_refused_and_closed_anew() -> None:
         kv.model.Frame.from_transform("world", kv.translation(0, 0, 0.01) @ model.fk("board")),
     )
     before = read.snapshot()
-    advice = r"'loop four_bar'.*CloseLoop\(\.\.\.\) made anew"
+    advice = r"'loop four_bar'.*new CloseLoop\(\.\.\.\)"
     with pytest.raises(kv.errors.EditError, match=advice), read.edit() as edit:
         edit.replace("frame board", longer)
     assert read.snapshot() == before

@@ -48,7 +48,7 @@ def speed_lock(
     max_speed
         Limit of the speed while the lock is open [m/s] or [rad/s].
     blocks
-        The directions that are locked. With ``"forward"``, the way back is free:
+        The directions that are locked. With ``"forward"``, the opposite direction is free:
         -max_speed <= q̇ <= c·max_speed.
 
     Raises

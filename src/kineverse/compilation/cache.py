@@ -180,7 +180,7 @@ class LibraryCache:
     def __init__(self, folder: Path, made: bool = False) -> None:
         self.folder = folder
         self._inside = inside = PrivateFolder(folder, made)
-        complaint = "The compiled library %s %s and will be made anew."
+        complaint = "The compiled library %s %s and will be compiled again."
         self._files = ContentCache(lambda: inside, ".so", MAXIMUM_BYTES, logger, complaint, _MARK)
 
     @property

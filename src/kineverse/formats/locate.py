@@ -101,7 +101,7 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
             f"{_shown(text)} is no regular file, but a pipe, a device, or a link that leads nowhere."
         )
     if path.is_absolute() or text.startswith("."):
-        raise UnknownNameError(f"There is no file {_shown(text)}.{_beside(path)}")
+        raise UnknownNameError(f"There is no file {_shown(text)}.{_path_hint(path)}")
     searched: list[str] = []
     seen: list[str] = []
     for place, folder in model_folders():
@@ -114,7 +114,7 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     if collection is not None:
         raise UnknownNameError(_no_member(group, collection, member))
     raise UnknownNameError(
-        f"There is no model {_shown(text)}.{_beside(path) if text else ''} {_similar(text, seen)} "
+        f"There is no model {_shown(text)}.{_path_hint(path) if text else ''} {_similar(text, seen)} "
         f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}.{_missing_places()} "
         f"Give the path of a file, or add its folder to the environment variable {MODEL_PATH}"
         f"{_more_robots(searched)}."
@@ -152,7 +152,7 @@ def _files(folder: Path, depth: int = _DEPTH) -> Iterator[Path]:
             folders.clear()
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for file in sorted(files):
-            # A template beside the file that it expands to does not make its name ambiguous.
+            # A template next to the file that it expands to does not make its name ambiguous.
             if file.endswith(suffixes) and not file.endswith(".xacro"):
                 yield Path(root, file)
 
@@ -226,8 +226,8 @@ def _more_robots(searched: list[str]) -> str:
     return "".join(f", or {way}" for way in left)
 
 
-def _beside(path: Path) -> str:
-    """Return a hint about a path that is no file: the models in that folder, or similar files beside it."""
+def _path_hint(path: Path) -> str:
+    """Return a hint about a path that is no file: the models in that folder, or similar files next to it."""
     if _is(path, Path.is_dir):
         inside = [p.relative_to(path).as_posix() for p in islice(_files(path, 2), _LISTED)]
         return f" It is a folder; models in it: {', '.join(inside) or 'none'}."
@@ -236,7 +236,7 @@ def _beside(path: Path) -> str:
     if not _is(path.parent, Path.is_dir):
         return f" The folder {_shown(str(path.parent))} does not exist."
     beside = [p.name for p in _files(path.parent, 0)]
-    return f" {suggest(path.name, beside, 'model file in its folder')}"
+    return f" {suggest(path.name, neighbours, 'model file in its folder')}"
 
 
 def _expanded(text: str) -> Path:

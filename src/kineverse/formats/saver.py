@@ -32,7 +32,7 @@ def save(
 
     The file is replaced atomically; after an error, the old file is unchanged. URDF and MJCF are read again
     before that, MJCF by MuJoCo if it is installed. Meshes that MuJoCo cannot read are converted, into a
-    folder beside the file.
+    folder next to the file.
     """
     target = _target(path)
     file_format = _check(target)

@@ -135,7 +135,7 @@ def read_or_default(
     try:
         return read()
     except ElementError as mistake:
-        remarks.mend(mistake, taken, owner)
+        remarks.repair(mistake, taken, owner)
         return default
 
 
@@ -165,7 +165,7 @@ def read_origin(
         quaternion = None
     if quaternion is not None and "rpy" in origin[1]:
         mistake = ElementError(origin, "has both rpy and quat_xyzw; keep one of them.")
-        remarks.mend(mistake, "rpy is what counts", owner)
+        remarks.repair(mistake, "rpy is what counts", owner)
         quaternion = None
     if quaternion is None:
         return poses.pose_from_rpy(xyz, _read_origin_vector(origin, "rpy", owner, remarks))
@@ -173,13 +173,13 @@ def read_origin(
         xyzw = scale_to_bounds(parse_directions(quaternion, 4))
     except ValueError as error:
         mistake = ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.')
-        remarks.mend(mistake, "nothing is turned", owner)
+        remarks.repair(mistake, "nothing is turned", owner)
         return poses.pose_from_rpy(xyz, _ZERO)
     if not poses.is_valid_quaternion(xyzw):
         mistake = ElementError(
             origin, f'quat_xyzw="{abbreviate(quaternion)}" has length zero, and so is no rotation.'
         )
-        remarks.mend(mistake, "nothing is turned", owner)
+        remarks.repair(mistake, "nothing is turned", owner)
     return poses.pose_from_quaternion(xyz, xyzw)
 
 
@@ -295,7 +295,7 @@ def read_element_pose(element: Element, remarks: ReaderWarnings) -> Pose:
         if not poses.is_valid_quaternion(tuple(xyzw)):
             said = abbreviate(read_text(element))
             mistake = ElementError(element, f"says {said}: it has length zero, and so is no rotation.")
-            remarks.mend(mistake, "nothing is turned")
+            remarks.repair(mistake, "nothing is turned")
         return poses.pose_from_quaternion((x, y, z), tuple(xyzw))
     x, y, z, *angles = read_numbers(element, 6)
     return poses.pose_from_rpy((x, y, z), tuple(math.radians(a) if degrees else a for a in angles))

@@ -377,8 +377,8 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
 
     @property
     def _title(self) -> str:
-        beside = f" and {len(self.dependent)} dependent coordinates" if self.dependent else ""
-        return f"{len(self)} rates{beside}"
+        dependent = f" and {len(self.dependent)} dependent coordinates" if self.dependent else ""
+        return f"{len(self)} rates{dependent}"
 
     def __eq__(self, other: object) -> bool:
         return self.key == other.key if isinstance(other, Rates) else NotImplemented

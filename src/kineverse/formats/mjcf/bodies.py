@@ -164,7 +164,7 @@ class MjcfBodies:
         shapes: MjcfShapes,
         source: str,
         remark: ElementRemark,
-        mend: NameFaultHandler,
+        on_recoverable_error: NameFaultHandler,
     ) -> None:
         self._model, self._source, self._shapes = compiled.model, source, shapes
         self._efforts, self._home = compiled.efforts, compiled.home
@@ -180,8 +180,8 @@ class MjcfBodies:
             for number, node in compiled.nodes(spec.joints).items()
         }
         self._site_nodes = compiled.nodes(spec.sites)
-        self._unique_frames = UniqueNames(mend, WORLD)
-        self._unique_joints = UniqueNames(mend)
+        self._unique_frames = UniqueNames(on_recoverable_error, WORLD)
+        self._unique_joints = UniqueNames(on_recoverable_error)
         self.body_names = self._name_bodies()
         self.joint_names = self._name_joints()
         joints: dict[int, list[MjcfJoint]] = {}

@@ -65,13 +65,18 @@ def read_tree(
     source: str,
     folder: str,
     root: str,
-    mend: Callable[[str, int, str], None] | None = None,
+    on_recoverable_error: Callable[[str, int, str], None] | None = None,
 ) -> MjcfElement:
     """Return the root element of a document, with includes replaced by the content of their files."""
 
     def parsed(data: str | bytes, source: str) -> Element:
         return parse_xml(
-            data, source, depth=MAX_ELEMENT_DEPTH, mend=None if mend is None else partial(mend, source)
+            data,
+            source,
+            depth=MAX_ELEMENT_DEPTH,
+            on_recoverable_error=None
+            if on_recoverable_error is None
+            else partial(on_recoverable_error, source),
         )
 
     top = parsed(data, source)

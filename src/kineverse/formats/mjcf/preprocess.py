@@ -292,10 +292,10 @@ class MjcfPreprocessor:
         top: str,
         root: str,
         remark: Callable[[MjcfElement | None, str], None],
-        mend: Callable[[str, int, str], None] | None,
+        on_recoverable_error: Callable[[str, int, str], None] | None,
     ) -> None:
         self._top, self._root = top, root
-        self._remark, self._mend = remark, mend
+        self._remark, self._on_recoverable_error = remark, on_recoverable_error
         self._models: dict[Path, _AttachedModel] = {}
         self._open_files: list[Path] = []
         self.prepared = PreprocessedMjcf()
@@ -329,7 +329,7 @@ class MjcfPreprocessor:
 
     def _read(self, data: str | bytes, source: str, folder: str) -> MjcfElement:
         """Return the element tree of a document."""
-        return read_tree(data, source, folder, self._root, self._mend)
+        return read_tree(data, source, folder, self._root, self._on_recoverable_error)
 
     def _attached_model(self, node: MjcfElement, folder: str) -> _AttachedModel:
         """Return the model that an element attaches, preprocessed once."""

@@ -96,7 +96,7 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
             mistake = ElementError(
                 element, f"is {kind} but has no <{tag}>; by default both axes are z, which is no such joint."
             )
-            remarks.mend(mistake, "it is z")
+            remarks.repair(mistake, "it is z")
             return SdfAxis(suffix=suffix)
         remarks.add(element, f"has no <{tag}>; it is z, the specification's default.")
         return SdfAxis(suffix=suffix)
@@ -112,7 +112,7 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         mistake = ElementError(
             limit, f"has lower {lower!r} above upper {upper!r}: no position would be valid."
         )
-        remarks.mend(mistake, "the joint is not limited", element)
+        remarks.repair(mistake, "the joint is not limited", element)
         lower = upper = None
     values = [] if effort is None or effort < 0.0 else [("effort", effort)]
     if dynamics is not None:
@@ -137,7 +137,7 @@ def _magnitude(limit: Element, key: str, node: PoseNode) -> float | None:
     try:
         return read_child_limit(limit, key)
     except ElementError as mistake:
-        node.document.remarks.mend(mistake, "it bounds nothing", node.element)
+        node.document.remarks.repair(mistake, "it bounds nothing", node.element)
         return None
 
 
@@ -146,7 +146,7 @@ def _dynamics_value(dynamics: Element, key: str, node: PoseNode) -> float:
     try:
         return read_child_number(dynamics, key, 0.0)
     except ElementError as mistake:
-        node.document.remarks.mend(mistake, "0 is taken", node.element)
+        node.document.remarks.repair(mistake, "0 is taken", node.element)
         return 0.0
 
 
@@ -240,7 +240,7 @@ def resolve_gearboxes(
                 mistake = ElementError(
                     node.element, "has no <gearbox_reference_body>: nothing says what it turns against."
                 )
-                node.document.remarks.mend(mistake, "it is left out")
+                node.document.remarks.repair(mistake, "it is left out")
             result[index] = None
             continue
         body = find_reference_body(node, attachments)

@@ -214,7 +214,7 @@ def find_early(name: str, element: Element, scope: SdfScope, owner: Element) -> 
     if document.version < (1, 7) and not scope.has(name):
         with document.locate_errors(owner):
             mistake = ElementError(element, f"refers to {quote(name)}, which does not exist in this scope.")
-            document.remarks.mend(mistake, "it is passed over", owner)
+            document.remarks.repair(mistake, "it is passed over", owner)
         return None
     return scope.find(name, element, owner)
 

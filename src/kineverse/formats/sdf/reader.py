@@ -75,7 +75,9 @@ def open_document(
     """Return a document and its root element."""
     reader_warnings = ReaderWarnings(source, remarks, strict)
     try:
-        root = parse_xml(data, source, texts=True, mend=None if strict else reader_warnings.fault)
+        root = parse_xml(
+            data, source, texts=True, on_recoverable_error=None if strict else reader_warnings.fault
+        )
     except FormatError as error:
         raise FormatError(f"{error}{_template_hint(data)}") from None
     document = SdfDocument(source, folder, _LATEST, reader_warnings, root_folder)
@@ -277,7 +279,7 @@ class SdfModelReader:
         if merge and scope.model.kind == "world" and any(part[0] == "link" for part in models[0][2]):
             with document.locate_errors(include):
                 mistake = ElementError(include, "has merge, and a world has no links as that model has.")
-                document.remarks.mend(mistake, "it is a model of its own")
+                document.remarks.repair(mistake, "it is a model of its own")
             merge = False
         if merge:
             proxy = self._add("frame", models[0], scope, f"_merged__{name}__model__")

@@ -58,7 +58,7 @@ class UrdfMaterials:
                 f"is {_format_appearance(appearance)} here and {_format_appearance(earlier)} before; "
                 "give the two different names.",
             )
-            self._remarks.mend(mistake, "the first is taken")
+            self._remarks.repair(mistake, "the first is taken")
 
     def appearance(self, material: Element, link: Element) -> Appearance | None:
         """Return the appearance of a visual's ``<material>``; None if it is not defined yet."""
@@ -98,9 +98,9 @@ class UrdfMaterials:
         try:
             red, green, blue, alpha = parse_numbers(" ".join(text.split()[:4]), 4)
         except ValueError:
-            self._remarks.mend(mistake, "it is no colour", owner)
+            self._remarks.repair(mistake, "it is no colour", owner)
             return (None, file)
-        self._remarks.mend(mistake, "the first four are taken", owner)
+        self._remarks.repair(mistake, "the first four are taken", owner)
         return ((red, green, blue, alpha), file)
 
 

@@ -35,7 +35,7 @@ _ISLAND_BACK = 0.75
 _BASIN_X, _BASIN_DEPTH = (-0.47, -0.11), 0.17
 _WHEEL_ROOM = 0.01
 """Depth of what the floor collides with below what is seen [m]: wheels at height 0 do not touch it."""
-_CEILING, _PARAPET, _BESIDE = 2.45, 1.1, 0.3
+_CEILING, _PARAPET, _SIDE_WALKWAY = 2.45, 1.1, 0.3
 
 
 def add_room(kitchen: KitchenBuilder, layout: KitchenLayout) -> list[str]:
@@ -44,7 +44,7 @@ def add_room(kitchen: KitchenBuilder, layout: KitchenLayout) -> list[str]:
     The frame of a row is on the floor in the plane of its fronts: x into the aisle, z up.
     """
     half = layout.aisle / 2
-    reach = max(max(map(abs, row.length)) for row in layout.rows) + _BESIDE
+    reach = max(max(map(abs, row.length)) for row in layout.rows) + _SIDE_WALKWAY
     y: Span = (-reach, reach)
     far = {"row": half + BACK, "island": half + 1.6, "wall": half}[layout.opposite]
     kitchen.fixed(ROOM, WORLD, shift())
