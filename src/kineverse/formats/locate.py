@@ -235,7 +235,7 @@ def _path_hint(path: Path) -> str:
         return ""
     if not _is(path.parent, Path.is_dir):
         return f" The folder {_shown(str(path.parent))} does not exist."
-    beside = [p.name for p in _files(path.parent, 0)]
+    neighbours = [p.name for p in _files(path.parent, 0)]
     return f" {suggest(path.name, neighbours, 'model file in its folder')}"
 
 
