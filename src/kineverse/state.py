@@ -130,7 +130,7 @@ class State(Mapping[Symbol, float]):
             return self._values[self._known(key)]
         except KeyError:
             raise UnknownNameError(
-                f"The state says nothing about '{key}'. {suggest(str(key), self._by_name, 'symbol')}"
+                f"The state has no value of '{key}'. {suggest(str(key), self._by_name, 'symbol')}"
             ) from None
 
     def _known(self, key: object) -> Symbol:
@@ -248,7 +248,7 @@ class State(Mapping[Symbol, float]):
 
     def _unknown(self, key: object) -> KineverseError:
         symbol = _symbol(key)
-        about = f"The state says nothing about '{symbol}', so there is nothing to update."
+        about = f"The state has no value of '{symbol}', so there is nothing to update."
         if str(symbol) in self._by_name:
             return UnknownNameError(
                 f"{about} It knows another symbol of that name, of another role or value; "

@@ -66,7 +66,7 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
     for symbol, value in values.items():
         if not isinstance(symbol, Symbol):
             raise ExpressionError(
-                f"Only symbols can be replaced, and {symbol!r} is none; write {{kv.position('path'): value}}."
+                f"Only symbols can be replaced, not {symbol!r}; write {{kv.position('path'): value}}."
             )
         replacement = as_expression(value)
         if replacement.shape:

@@ -78,7 +78,7 @@ class LoopClosures:
         gaps = self._gaps(loop)
         name = _shown(loop.name)
         if len(gaps) and gaps.max() <= CLOSED:
-            self._tell(loop, "is left out: it says nothing new, what it ties coincides whatever moves")
+            self._tell(loop, "is left out: it adds nothing, since what it connects coincides in every state")
             return
         if error is not None and self.loops == "refuse":
             raise FormatError(
@@ -89,7 +89,7 @@ class LoopClosures:
         if not any(row.symbols for rows in self._rows(loop) for row in rows.values()):
             self._tell(
                 loop,
-                f"is left out, and never holds: nothing moves what it ties, and {gaps.max():.3g} is left "
+                f"is left out, and never holds: nothing moves what it connects, and {gaps.max():.3g} is left "
                 "between its ends",
             )
             return

@@ -39,7 +39,7 @@ def save(
     if file_format.exact:
         if tuple(leave_out) or tolerance is not None:
             what = "nothing can be left out" if tolerance is None else "it has no tolerance"
-            raise FormatError(f"{target.name}: a document says all of a model exactly, so {what}.")
+            raise FormatError(f"{target.name}: a document holds all of a model exactly, so {what}.")
         registry.import_entry(file_format.write)(model, target)
         return SaveResult(target)
     try:

@@ -230,7 +230,7 @@ def as_entry(coordinate: Symbol, value: Mapping[Symbol, ExpressionLike] | Expres
 
 def _check_coordinate(coordinate: Symbol) -> None:
     if not isinstance(coordinate, Symbol) or coordinate.order or not coordinate.has_derivative:
-        raise ModelError(f"Only positions have a rate, and '{coordinate}' is none.")
+        raise ModelError(f"Only positions have a rate, not '{coordinate}'.")
 
 
 def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> RateRow:

@@ -64,7 +64,7 @@ class MjcfConstraints:
             elif kind == kinds.mjEQ_WELD:
                 closures += self._closure(number, "weld")
             else:
-                remark(self._nodes.get(number), "is left out: no constraint here says it.")
+                remark(self._nodes.get(number), "is left out: no constraint here expresses it.")
         self.couplings = tuple(couplings)
         loops = compiled.prepared.custom.loops
         self.closures = merge_loop_closures(tuple(closures), bodies.links, loops, remark)

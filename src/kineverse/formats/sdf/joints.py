@@ -178,9 +178,9 @@ def _mimic(node: PoseNode, axis: Element) -> MimicRelation[str] | None:
         return None
     name, which = mimic[1].get("joint", ""), mimic[1].get("axis", "axis")
     if not name:
-        raise ElementError(mimic, "does not say which joint.")
+        raise ElementError(mimic, "does not name a joint.")
     if which not in ("axis", "axis2"):
-        raise ElementError(mimic, f"says axis={quote(which)}; axis and axis2 are the ones there are.")
+        raise ElementError(mimic, f"says axis={quote(which)}; it has to be axis or axis2.")
     leader = node.scope.find(name, mimic, node.element)
     if leader.kind != "joint":
         raise ElementError(mimic, f"names {quote(name)}, which is a {leader.kind} and no joint.")
@@ -238,7 +238,7 @@ def resolve_gearboxes(
         if not read_child_text(node.element, "gearbox_reference_body"):
             with node.document.locate_errors(node.element):
                 mistake = ElementError(
-                    node.element, "has no <gearbox_reference_body>: nothing says what it turns against."
+                    node.element, "has no <gearbox_reference_body>: it is undefined what it turns against."
                 )
                 node.document.remarks.repair(mistake, "it is left out")
             result[index] = None

@@ -89,7 +89,7 @@ def open_document(
     version = root[1].get("version", "")
     match = re.fullmatch(r"(\d{1,3})\.(\d{1,3})(\.\d{1,3})?", version.strip())
     if match is None:
-        document.refuse(root, 'does not say its version, as <sdf version="1.10"> does.')
+        document.refuse(root, 'has no version, such as <sdf version="1.10"> does.')
     document.version = int(match[1]), int(match[2])
     if not _OLDEST <= document.version <= _LATEST:
         document.refuse(root, f"version={quote(version)} is not one that is read; 1.2 to 1.12 are.")

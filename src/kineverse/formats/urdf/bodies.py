@@ -194,7 +194,7 @@ class UrdfLinkReader:
     def _geometry(self, geometry: Element | None, shape: Element, link: Element) -> Geometry | None:
         """Return the geometry of a shape; None, with a remark, if it is missing or unknown."""
         if geometry is None or not geometry[2]:
-            self._remarks.add(geometry or shape, "says no shape and is left out.", link)
+            self._remarks.add(geometry or shape, "has no shape and is left out.", link)
             return None
         form = geometry[2][0]
         tag = form[0]

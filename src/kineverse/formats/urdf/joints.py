@@ -141,7 +141,7 @@ def _link(element: Element, parts: dict[str, Element], role: str) -> str:
         raise ElementError(element, f'has no <{role} link="..."/>; the specification requires it.')
     link = part[1].get("link")
     if not link:
-        raise ElementError(part, "does not say which link.")
+        raise ElementError(part, "does not name a link.")
     return link
 
 
@@ -314,7 +314,7 @@ def _mimic(mimic: Element) -> UrdfMimic:
     """Return the joint that is followed, by its name in the file, and the factors."""
     joint = mimic[1].get("joint")
     if not joint:
-        raise ElementError(mimic, "does not say which joint.")
+        raise ElementError(mimic, "does not name a joint.")
     return UrdfMimic(
         joint, read_attribute_number(mimic, "multiplier", 1.0), read_attribute_number(mimic, "offset", 0.0)
     )
