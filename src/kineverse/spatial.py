@@ -85,8 +85,7 @@ _TRANSFORM_SPARSITIES = {
 }
 _TRANSLATION_SPARSITY = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 3, 3])
 _UNIT_ENTRY = ca.SX(1)
-_UNIT_TOLERANCE = 1e-9
-"""Largest difference of the length of a direction from 1."""
+_UNIT_TOLERANCE = 1e-9  # largest difference of the length of a direction from 1
 
 
 class OneAxisTransform(Expression):

@@ -19,8 +19,7 @@ from kineverse.errors import FormatError
 
 from .private_folder import NotPrivateError, PrivateFolder
 
-UNFINISHED = ".making-"
-"""Beginning of the names of files and folders that are not finished."""
+UNFINISHED = ".making-"  # beginning of the names of files and folders that are not finished
 
 _STALE_SECONDS = 3600.0
 _LAST_USE_RESOLUTION = 3600.0

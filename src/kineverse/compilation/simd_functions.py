@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-Scalar: TypeAlias = Literal["float", "double"]
-"""The type of the numbers in a vector."""
+Scalar: TypeAlias = Literal["float", "double"]  # the type of the numbers in a vector
 
 TRIGONOMETRIC = r"""
 /* The nearest multiple of pi/2 is `turns` quarter turns, and x is r beyond it.

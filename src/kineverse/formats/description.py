@@ -16,8 +16,7 @@ from kineverse.model.registry import FrameDeviation
 from kineverse.symbols import Symbol
 
 Matrix: TypeAlias = npt.NDArray[np.float64]
-Coefficients: TypeAlias = tuple[float, ...]
-"""Coefficients of the powers of a coordinate, constant first."""
+Coefficients: TypeAlias = tuple[float, ...]  # coefficients of the powers of a coordinate, constant first
 
 IDENTITY_COEFFICIENTS: Coefficients = (0.0, 1.0)
 NO_BODY = Body()

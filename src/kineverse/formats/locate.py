@@ -23,8 +23,7 @@ _LISTED = 6
 _LONGEST = 200
 
 
-GALLERY = "articulations"
-"""First part of the names of the scenes that ship, one for each articulation."""
+GALLERY = "articulations"  # first part of the names of the scenes that ship, one for each articulation
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,7 @@ from kineverse.symbols import Symbol
 
 from .reader_warnings import warn
 
-CLOSED = 1e-6
-"""Largest gap of a loop that counts as closed [m], [rad]: files have six digits."""
+CLOSED = 1e-6  # largest gap of a loop that counts as closed [m], [rad]: files have six digits
 
 _LOOKED_AT = 12
 _MOVED = 1e-6

@@ -33,11 +33,8 @@ from .root_folder import (
 )
 from .xml_reader import quote
 
-MAX_DEPTH = 4
-"""Depth of the search for packages below a folder of a workspace variable."""
-
-MAX_FOLDERS = 20_000
-"""Most folders to visit below one such folder."""
+MAX_DEPTH = 4  # depth of the search for packages below a folder of a workspace variable
+MAX_FOLDERS = 20_000  # most folders to visit below one such folder
 
 _WORKSPACES = ("KINEVERSE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
 _PREFIXES = ("AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH", "CMAKE_PREFIX_PATH")

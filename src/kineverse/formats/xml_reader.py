@@ -17,16 +17,12 @@ from kineverse.errors import FormatError
 
 from .files import MAX_BYTES
 
-MAX_DEPTH = 200
-"""Deepest nesting of elements. A URDF needs 5, however long its kinematic chains are."""
-
-Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"
-"""Tag, attributes, children, line."""
+MAX_DEPTH = 200  # deepest nesting of elements. A URDF needs 5, however long its kinematic chains are
+Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"  # tag, attributes, children, line
 
 _CHUNK_BYTES = 1 << 12
 
-TEXT = ""
-"""Key of the text of an element among its attributes; no attribute of XML has an empty name."""
+TEXT = ""  # key of the text of an element among its attributes; no attribute of XML has an empty name
 
 Visit: TypeAlias = Callable[[Element], None]
 Begin: TypeAlias = Callable[[Element], Visit]

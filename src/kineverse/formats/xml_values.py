@@ -23,8 +23,7 @@ from . import poses
 from .reader_warnings import ReaderWarnings
 from .xml_reader import TEXT, Element, ElementError, abbreviate, find_child, quote
 
-LARGEST = 1e50
-"""Largest magnitude of coordinates, positions, and factors between positions."""
+LARGEST = 1e50  # largest magnitude of coordinates, positions, and factors between positions
 
 SMALLEST = 1e-50
 """Smallest factor between positions except 0: with a smaller one, limits of a follower are out of reach."""
@@ -194,8 +193,7 @@ def _read_origin_vector(origin: Element, key: str, owner: Element, remarks: Read
 
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 _INFINITE = {"inf": math.inf, "+inf": math.inf, "-inf": -math.inf}
-_UNBOUNDED = 1e16
-"""Magnitude from which a limit counts as none, as in older versions of SDF."""
+_UNBOUNDED = 1e16  # magnitude from which a limit counts as none, as in older versions of SDF
 
 
 def read_text(element: Element) -> str:

@@ -35,13 +35,10 @@ from kineverse.symbols import position
 
 Join: TypeAlias = Callable[[Expression, Expression], Expression]
 
-_LARGEST_SEED = 18
-"""Largest number of digits of a seed in a name."""
+_LARGEST_SEED = 18  # largest number of digits of a seed in a name
 _MOST_RINGS = 99
-_PARTS = (5, 41)
-"""Range of the number of parts of a box that is given by its seed alone."""
-_NEGATED = 0.25
-"""Share of negated conditions in such a box."""
+_PARTS = (5, 41)  # range of the number of parts of a box that is given by its seed alone
+_NEGATED = 0.25  # share of negated conditions in such a box
 
 
 class Condition(NamedTuple):

@@ -20,8 +20,7 @@ from .mechanism import DARK, PALE, STEEL, WOOD, Mechanism, MechanismPart, box_sh
 
 Point: TypeAlias = tuple[float, float]
 
-_CLEARANCE = 0.007
-"""Distance of the front edges of the walls behind those of the cupboard [m]."""
+_CLEARANCE = 0.007  # distance of the front edges of the walls behind those of the cupboard [m]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,8 +50,7 @@ from .node_graph import NodeGraph
 Ref: TypeAlias = Callable[[Expression], int]
 Rename: TypeAlias = Callable[[str], str]
 
-MAX_BITS = 10_000
-"""Length of the longest integer: Python reads no more than 4300 digits."""
+MAX_BITS = 10_000  # length of the longest integer: Python reads no more than 4300 digits
 PLAIN_BITS = 63
 """Length of the longest integer that is written as a number; other languages and msgpack end there."""
 DATUM_TAGS = ("expression", "float", "integer")

@@ -34,8 +34,7 @@ from kineverse.symbols import Symbol
 from .joint_axes import JointMotion, MotionChain, QuaternionMotion
 
 _ROUNDING = 1e-12
-_UP = 1 + 1e-12
-"""Factor by which sums of a few errors are rounded up."""
+_UP = 1 + 1e-12  # factor by which sums of a few errors are rounded up
 
 
 class CurveApproximation:
@@ -196,10 +195,8 @@ SeriesCurve = Callable[[RealInterval], TaylorSeries]
 """Function that returns the Taylor series of a curve over an interval."""
 
 SAMPLE_COUNT = 257
-_CLOSE = 1.05
-"""Ratio of the error bound to the largest sampled error at which the bound is close enough."""
-_NEGLIGIBLE = 1e-3
-"""Part of the tolerance within which the bound is close enough."""
+_CLOSE = 1.05  # ratio of the error bound to the largest sampled error at which the bound is close enough
+_NEGLIGIBLE = 1e-3  # part of the tolerance within which the bound is close enough
 _MAX_INTERVALS = 1000
 _MAX_HALVINGS = 4
 _MAX_EXCHANGES = 40

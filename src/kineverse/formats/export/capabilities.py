@@ -18,8 +18,7 @@ class FormatCapabilities:
     polynomial_degree: int = 1  # highest degree of the polynomials by which a joint may follow another
 
 
-_SHOWN = 6
-"""Number of unsupported features that an error message lists."""
+_SHOWN = 6  # number of unsupported features that an error message lists
 
 
 class UnsupportedError(FormatError):

@@ -93,8 +93,7 @@ def as_vector3(numbers: Matrix) -> Vector3:
     return x, y, z
 
 
-_SKEW_TOLERANCE = 1e-12
-"""Tolerance for the skew symmetry of an angular velocity matrix Ṙ Rᵀ."""
+_SKEW_TOLERANCE = 1e-12  # tolerance for the skew symmetry of an angular velocity matrix Ṙ Rᵀ
 
 
 def decompose_transform(

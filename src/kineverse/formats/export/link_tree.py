@@ -92,8 +92,7 @@ def check_rotation(link: LinkDescription, unsupported: UnsupportedFeatures) -> N
         )
 
 
-_STILL_TOLERANCE = 1e-9
-"""Largest distance [m] of a point from a plane in which it stays."""
+_STILL_TOLERANCE = 1e-9  # largest distance [m] of a point from a plane in which it stays
 
 
 def find_loop_joints(model: ModelView) -> Iterator[LoopJoint]:

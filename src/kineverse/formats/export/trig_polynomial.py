@@ -19,8 +19,7 @@ from kineverse.intervals.graph import Term
 Exponents: TypeAlias = tuple[tuple[int, float], ...]
 """Pairs of a variable and its exponent: a power n, or a frequency w; sorted."""
 
-NOISE = 1e-14
-"""Largest rounding error of a coefficient, in motions in [m] and [rad]."""
+NOISE = 1e-14  # largest rounding error of a coefficient, in motions in [m] and [rad]
 _MAX_TERMS = 300
 
 

@@ -42,8 +42,7 @@ from .elements import ElementRemark, MjcfElement
 from .meshes import place_mesh
 from .mujoco_api import mujoco
 
-_VISIBLE_GROUPS = range(3)
-"""Geom groups that MuJoCo's viewers show by default."""
+_VISIBLE_GROUPS = range(3)  # geom groups that MuJoCo's viewers show by default
 
 _DEFAULT_COLOR = [0.5, 0.5, 0.5, 1.0]
 """Colour of a geom without one, which has the colour of its material instead."""
@@ -151,8 +150,7 @@ def mujoco_pose(position: Any, wxyz: Any) -> Pose:
     return poses.pose_from_quaternion((x, y, z), (a, b, c, w))
 
 
-FREE_JOINT = "free"
-"""Last part of the name of a mocap body's free joint, after the name of the body."""
+FREE_JOINT = "free"  # last part of the name of a mocap body's free joint, after the name of the body
 
 
 class MjcfBodies:

@@ -32,8 +32,7 @@ from kineverse.model.body import (
 from kineverse.model.registry import find_service
 
 _HEADER, _TRIANGLE = 84, 50
-MAX_STL_FACES = 200_000
-"""Largest number of faces of an STL file in MuJoCo."""
+MAX_STL_FACES = 200_000  # largest number of faces of an STL file in MuJoCo
 
 
 class MeshFiles:

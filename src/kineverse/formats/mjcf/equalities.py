@@ -19,8 +19,7 @@ from kineverse.symbols import position
 
 from .description import MjcfCoupling, MjcfJoint, Quartic
 
-_FIXED = "\0"
-"""Leader of joints that an equality fixes; not a valid name."""
+_FIXED = "\0"  # leader of joints that an equality fixes; not a valid name
 
 _HOME_TOLERANCE = 1e-6
 

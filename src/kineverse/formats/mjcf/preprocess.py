@@ -21,8 +21,7 @@ from kineverse.formats.xml_values import LARGEST
 from .custom_elements import CustomElements, read_custom_elements
 from .elements import MjcfElement, find_below_root, read_tree, serialize_elements
 
-MAX_ELEMENTS = 30_000
-"""Largest number of elements of a document after <replicate> and <attach>."""
+MAX_ELEMENTS = 30_000  # largest number of elements of a document after <replicate> and <attach>
 
 BOX_MESH = {
     "vertex": "-1 -2 -3  1 -2 -3  -1 2 -3  1 2 -3  -1 -2 3  1 -2 3  -1 2 3  1 2 3",
@@ -253,8 +252,7 @@ def _count(node: MjcfElement) -> int:
     return product
 
 
-MAX_ATTACH_DEPTH = 20
-"""Deepest nesting of attached models."""
+MAX_ATTACH_DEPTH = 20  # deepest nesting of attached models
 
 
 @dataclass(slots=True)

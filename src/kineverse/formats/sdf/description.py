@@ -37,8 +37,7 @@ AXIS_COUNT: dict[SdfJointType, int] = {
 }
 """Number of axes of a joint of each type."""
 
-WORLD = "world"
-"""Name of the world in place of a link; reserved in SDF."""
+WORLD = "world"  # name of the world in place of a link; reserved in SDF
 
 _IDENTITY = Pose()
 _EMPTY_BODY = Body()

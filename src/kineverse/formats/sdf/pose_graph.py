@@ -363,8 +363,7 @@ def pose_in_model(model: PoseNode, frame: PoseNode) -> Pose:
     return pose
 
 
-_MAX_PATH = 64
-"""Steps of the path between two nodes up to which their relative pose is composed along it."""
+_MAX_PATH = 64  # steps of the path between two nodes up to which their relative pose is composed along it
 
 
 def pose_between(a: PoseNode, b: PoseNode) -> Pose:

@@ -38,8 +38,7 @@ from .pose_graph import (
 )
 
 _MAX_DEPTH = 100
-MAX_INCLUDED = 100_000
-"""Largest number of links, joints, frames and models with those of included files."""
+MAX_INCLUDED = 100_000  # largest number of links, joints, frames and models with those of included files
 
 _OLDEST, _LATEST = (1, 2), (1, 12)
 _IGNORED = ("actor", "population", "road", "plugin")

@@ -156,8 +156,7 @@ def _add_inertia(link: Tag, inertia: Inertia) -> None:
 
 
 URDF_CAPABILITIES = FormatCapabilities("URDF")
-LARGEST_FLOAT = sys.float_info.max
-"""Number written in place of no limit, where URDF requires a number."""
+LARGEST_FLOAT = sys.float_info.max  # number written in place of no limit, where URDF requires a number
 
 _NEWER = ("acceleration", "deceleration", "jerk")
 _KNOWN = frozenset(("effort", "damping", "friction", "k_position", "k_velocity", *_NEWER))

@@ -17,8 +17,7 @@ from kineverse.model.body import Body, Box, Cylinder, Inertia, Pose, Rgba, Shape
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import Operation
 
-Span: TypeAlias = tuple[float, float]
-"""Ends of a range along an axis [m]."""
+Span: TypeAlias = tuple[float, float]  # ends of a range along an axis [m]
 
 
 @dataclass(frozen=True, slots=True)

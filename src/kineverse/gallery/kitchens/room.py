@@ -26,11 +26,8 @@ from .builder import (
 from .layout import KitchenLayout, Opposite, Row, Unit
 from .units import BACK, DEPTH
 
-ROOM = "room"
-"""Frame on the floor, in the middle of the aisle; y along the rows."""
-
-_OVERHANG = 0.035
-"""End of a countertop before the fronts' plane [m]."""
+ROOM = "room"  # frame on the floor, in the middle of the aisle; y along the rows
+_OVERHANG = 0.035  # end of a countertop before the fronts' plane [m]
 _ISLAND_BACK = 0.75
 _BASIN_X, _BASIN_DEPTH = (-0.47, -0.11), 0.17
 _WHEEL_ROOM = 0.01
