@@ -223,7 +223,6 @@ def _as_translation(transform: Expression) -> Expression:
 
 
 def _split_factor(part: SX) -> tuple[float, SX]:
-    """Return a scalar as a constant factor and the rest."""
     if part.op() == ca.OP_NEG:
         factor, rest = _split_factor(part.dep(0))
         return -factor, rest

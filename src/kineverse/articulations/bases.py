@@ -340,6 +340,5 @@ _CORNERS = ("front_left", "front_right", "rear_left", "rear_right")
 
 
 def _total(row: Mapping[Symbol, float]) -> Expression:
-    """Return the linear combination of speeds with the factors of a row."""
     terms = [factor * wheel for wheel, factor in row.items()]
     return sum(terms[1:], terms[0])

@@ -239,7 +239,6 @@ class _Statements:
         return self._dialect.conditions[step.op].format(**operands)
 
     def _define_circle(self, value: int, angle: str) -> str:
-        """Define the sine and cosine of an angle together."""
         pair = [self._circle[op].get(self._steps[value].arguments[0]) for op in _CIRCLE]
         self._defined.update(v for v in pair if v is not None)
         sine, cosine = (f"v{v}" if v is not None else f"unused{value}" for v in pair)

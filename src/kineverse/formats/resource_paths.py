@@ -196,7 +196,6 @@ def _may_open(path: Folder, root: str, package: Path | None = None, folder: Fold
 
 
 def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterator[str]:
-    """Yield the real paths of the folders in which files may be opened."""
     # Most meshes lie below the root, and each further real path costs system calls.
     yield root
     if package is not None:
@@ -284,7 +283,6 @@ def _lines(places: Sequence[str]) -> str:
 def _folders_of(
     name: str, folder: Path, search: Sequence[Folder], log: _SearchLog, root: str | None
 ) -> Iterator[Path]:
-    """Yield the folders of a package by priority."""
     log.places.append(f"{folder.absolute()} and the folders above it")
     for place in search:
         log.places.append(str(place))

@@ -202,7 +202,6 @@ def _declared(data: str | bytes, on_recoverable_error: XmlFaultHandler) -> tuple
 
 
 def _commented(data: str | bytes, on_recoverable_error: XmlFaultHandler) -> str | bytes:
-    """Return a document with blanks for comments that have two hyphens inside."""
     content = _bytes(data)
     pieces: list[bytes] = []
     start, at, literal = 0, 0, content.find(b"<![CDATA[")

@@ -112,7 +112,6 @@ def _longest_in_order(places: Sequence[int], wanted: Sequence[bool]) -> set[int]
 
 
 def _longest(places: Sequence[int]) -> set[int]:
-    """Return the indices of a longest increasing part."""
     # ends[k]: the least end of an increasing part of k + 1 places.
     ends: list[int] = []
     lengths: list[int] = []

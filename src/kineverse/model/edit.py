@@ -238,7 +238,6 @@ class Edit:
         return operation.default_tag()
 
     def _diff(self, version: int, changes: Iterable[Change], reruns: int) -> Diff:
-        """Return the difference that the edit made."""
         moved: tuple[str, ...] = ()
         if self._again:
             old = [entry.tag for entry in self._order if entry.tag not in self._added]

@@ -292,7 +292,6 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             self._rows[x] = self._combine(rows[x])
 
     def _expand(self, row: RateRow) -> RateRow:
-        """Return a row in terms of independent coordinates."""
         if not self.dependent:
             return row
         result: dict[Symbol, Expression] = {}

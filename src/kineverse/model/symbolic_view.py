@@ -137,7 +137,6 @@ class SymbolicView:
         self._derived: dict[Hashable, Any] = {}
 
     def _invalidate(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
-        """Invalidate the caches that changes affect."""
         kinds = {cell[0] for cell, _, _ in changes}
         if self._is_indexed:
             self._pending += changes
@@ -253,7 +252,6 @@ class SymbolicView:
         return known
 
     def _eliminate_dependent(self, constraint: Constraint) -> Constraint:
-        """Return a constraint in terms of independent coordinates and free speeds."""
         rates = self.rates
         if not any(s.position in rates.dependent for s in constraint.symbols):
             return constraint

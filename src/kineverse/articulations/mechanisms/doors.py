@@ -166,7 +166,6 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
         }
 
     def _arm_end_from(self, bx: Expression, bz: Expression) -> tuple[Expression, Expression]:
-        """Return C - B."""
         c = math.hypot(*self.arm_end)
         to_x, to_z = self.arm_pivot[0] - bx, self.arm_pivot[1] - bz
         square = to_x**2 + to_z**2

@@ -99,7 +99,6 @@ class CurveApproximation:
         return taylor_polynomial(motion.coefficients, inner)
 
     def _sample(self, motion: JointMotion, symbol: Symbol, lower: float, upper: float) -> np.ndarray:
-        """Return a motion's positions at the Chebyshev points of an interval."""
         x = chebyshev_points(lower, upper)
         if motion.curve is not None:
             function = ca.Function("curve", [symbol.sx], [expand_nodes(motion.curve)])

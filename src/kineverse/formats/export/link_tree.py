@@ -444,7 +444,6 @@ class LinkTreeBuilder:
             )
 
     def _add_remarks(self) -> None:
-        """Add remarks on data and on names that are left out on request."""
         if self.model.data:
             names = list(self.model.data)
             more = f" and {len(names) - 4} more" if len(names) > 4 else ""
@@ -454,14 +453,12 @@ class LinkTreeBuilder:
 
 
 def _non_loop_articulations(model: ModelView) -> Iterator[tuple[str, Articulation]]:
-    """Yield the names and records of all articulations but loops."""
     for name, record in model.articulations.items():
         if record.kind not in LOOP_KINDS:
             yield name, record
 
 
 def _quaternion_coordinates(found: MotionChain) -> Iterator[Symbol]:
-    """Yield the coordinates of all quaternions in a motion chain."""
     for motion in found.motions:
         if isinstance(motion, QuaternionMotion):
             yield from motion.factor.symbols

@@ -168,7 +168,6 @@ class TrigPolynomialConverter:
         return self._converted[term.index]
 
     def _variable(self, term: Term) -> TrigPolynomial:
-        """Return the polynomial of a term that becomes a variable."""
         self.variables[term.index] = term
         return TrigPolynomial.variable(term.index)
 
@@ -224,7 +223,6 @@ def _multiply_exponents(a: Exponents, b: Exponents) -> Exponents:
 
 
 def _drop_noise(terms: Mapping[tuple[Exponents, Exponents], complex]) -> TrigPolynomial:
-    """Return a polynomial without the coefficients that are rounding errors."""
     if len(terms) > _MAX_TERMS:
         raise TooManyTermsError
     return TrigPolynomial({key: c for key, c in terms.items() if abs(c) > NOISE})

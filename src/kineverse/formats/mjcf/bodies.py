@@ -199,7 +199,6 @@ class MjcfBodies:
         return drop_empty_parts(m.site(site).name) in self._custom.ends and is_identity(pose)
 
     def _where(self, node: MjcfElement | None) -> str:
-        """Return the place of an element for messages."""
         return self._source if node is None else node.where
 
     def _name_bodies(self) -> list[str]:
@@ -326,7 +325,6 @@ class MjcfBodies:
         )
 
     def _home_position(self, number: int, kind: MjcfJointType, address: int) -> tuple[float, ...]:
-        """Return the coordinates of a joint at its home position."""
         m, engine = self._model, mujoco()
         qpos = m.qpos0 if self._home is None else self._home
         if kind in ("hinge", "slide"):
@@ -371,6 +369,5 @@ class MjcfBodies:
 
 
 def _vector(numbers: Any) -> Vector3:
-    """Return three numbers as a tuple."""
     x, y, z = map(float, numbers)
     return x, y, z

@@ -165,5 +165,4 @@ def _limited(flag: Any, limits: Any) -> bool:
 
 
 def _largest(limits: Any) -> float:
-    """Return the largest magnitude in a range."""
     return max(abs(float(limits[0])), abs(float(limits[1])))

@@ -89,7 +89,6 @@ class MjcfConstraints:
         return result
 
     def _where(self, node: MjcfElement | None) -> str:
-        """Return the place of an element for messages."""
         return "" if node is None else node.where
 
     def _joint_coupling(self, number: int) -> MjcfCoupling:
@@ -119,7 +118,6 @@ class MjcfConstraints:
         )
 
     def _quartic(self, number: int) -> Quartic:
-        """Return the coefficients of the polynomial of an equality."""
         a, b, c, d, e = self._model.eq_data[number][:5].tolist()
         return a, b, c, d, e
 

@@ -123,7 +123,6 @@ def find_below_root(node: MjcfElement, name: str, root: str, *places: str) -> Pa
 
 
 def _check_root(root: Element, source: str) -> None:
-    """Check that the root element is that of an MJCF."""
     tag, _, _, line = root
     if tag == "mujoco":
         return

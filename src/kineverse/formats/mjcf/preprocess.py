@@ -178,7 +178,6 @@ def _plugin_instances(root: MjcfElement) -> dict[str, MeshReference]:
 
 
 def _plugin_reference(plugin: str, owner: MjcfElement) -> MeshReference:
-    """Return a plugin with the settings in an element."""
     settings = [(c.attributes.get("key", ""), c.attributes.get("value", "")) for c in owner.children]
     return MeshReference("", plugin, tuple(settings))
 
@@ -326,7 +325,6 @@ class MjcfPreprocessor:
         return text, passive_text, _AttachedModel("", root.attributes.get("model", ""), size)
 
     def _read(self, data: str | bytes, source: str, folder: str) -> MjcfElement:
-        """Return the element tree of a document."""
         return read_tree(data, source, folder, self._root, self._on_recoverable_error)
 
     def _attached_model(self, node: MjcfElement, folder: str) -> _AttachedModel:

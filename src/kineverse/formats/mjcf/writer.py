@@ -277,7 +277,6 @@ class MjcfWriter:
         return float(np.polynomial.polynomial.polyval(x, joint.coefficients))
 
     def _equalities(self) -> Tag:
-        """Return the equalities of dependent joints and of loops."""
         equality, names = Tag("equality"), TakenNames()
         for joint in self._description.joints:
             if not joint.is_independent:
@@ -304,7 +303,6 @@ class MjcfWriter:
         return equality
 
     def _tendons(self) -> Tag:
-        """Return the limits of sums as fixed tendons."""
         tendon = Tag("tendon")
         for item in self._description.sum_limits:
             fixed = tendon.add("fixed", name=item.name)

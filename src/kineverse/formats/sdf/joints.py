@@ -151,7 +151,6 @@ def _dynamics_value(dynamics: Element, key: str, node: PoseNode) -> float:
 
 
 def _direction(node: PoseNode, axis: Element) -> Vector3:
-    """Return the direction of an axis in the joint's frame."""
     xyz, document = read_axis_direction(axis), node.document
     part = find_child(axis, "xyz")
     reference = None
@@ -376,6 +375,5 @@ def reverse_joint(joint: SdfJoint) -> SdfJoint:
 
 
 def _negate_axis(axis: SdfAxis) -> SdfAxis:
-    """Return an axis of the opposite direction."""
     x, y, z = axis.xyz
     return replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z))

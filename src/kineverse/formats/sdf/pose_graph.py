@@ -271,7 +271,6 @@ def find_joint_end(joint: PoseNode, role: str) -> PoseNode:
 
 
 def _attach(node: PoseNode) -> None:
-    """Set the node to which a joint or a frame is attached."""
     if node.kind == "joint":
         node.attached_to = find_joint_end(node, "child")
     elif node.kind == "frame" and node.is_named_frame:

@@ -391,7 +391,6 @@ def _scene(
     document: SdfDocument,
     remarks: list[str],
 ) -> SdfScene:
-    """Return the description of a resolved pose graph."""
     links = tuple(_link(node) for node in graph.by_kind("link"))
     resolved = [read_sdf_joint(node, attachments) for node in graph.by_kind("joint")]
     resolved = resolve_gearboxes(resolved, attachments)

@@ -105,7 +105,6 @@ class UrdfMaterials:
 
 
 def _format_appearance(appearance: Appearance) -> str:
-    """Return an appearance as text for messages."""
     color, texture = appearance
     words = [] if color is None else ["rgba " + " ".join(f"{part:g}" for part in color)]
     return " with ".join([*words, f"texture {quote(texture)}"] if texture else words)

@@ -135,7 +135,6 @@ class _Document:
         return hint
 
     def _read_element(self, element: Element) -> None:
-        """Read a child of the root element."""
         tag = element[0]
         try:
             if tag in ("link", "joint"):
@@ -168,7 +167,6 @@ class _Document:
         self.joints[fixed] = replace(joint, name=fixed)
 
     def _error(self, mistake: ElementError, owner: Element) -> FormatError:
-        """Return a mistake as an error that names the enclosing link or joint."""
         part = "" if mistake.element is owner else f"{label(mistake.element)} "
         where = f"{self.remarks.source}, line {mistake.element[3]}, {label(owner)}"
         return FormatError(f"{where}: {part}{mistake.message}")
@@ -234,7 +232,6 @@ def _warn_unknown_elements(
 
 
 def _check_expanded(element: Element, xacro: str, remarks: ReaderWarnings) -> None:
-    """Warn of xacro inside of an element."""
     if "${" in element[1].get("name", ""):
         mistake = ElementError(element, f"has a name that xacro was to expand. {XACRO_HINT}")
         remarks.repair(mistake, "it is taken as it is")

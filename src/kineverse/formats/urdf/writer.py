@@ -133,7 +133,6 @@ class UrdfBodyWriter:
         return shape.texture
 
     def _remark(self, text: str) -> None:
-        """Add a remark once."""
         if text not in self._remarks:
             self._remarks.append(text)
 
@@ -244,7 +243,6 @@ class UrdfWriter:
         return roots[0]
 
     def _link(self, link: LinkDescription, is_root: bool) -> None:
-        """Add a link with its joints and the intermediate links between them."""
         check_rotation(link, self._unsupported)
         if is_root:
             self._bodies.write(self._root.add("link", name=link.name), link.body)
@@ -390,7 +388,6 @@ class UrdfWriter:
         pose: Matrix,
         axis: Iterable[float] | None = None,
     ) -> Tag:
-        """Add a joint and return its element."""
         element = self._root.add("joint", name=name, type=kind)
         xyz, rpy = pose[:3, 3].tolist(), rpy_angles(pose)
         if any(xyz) or any(rpy):

@@ -164,7 +164,6 @@ def _limit_motion(
 
 
 def _subtract_motion(motion: Mapping[Symbol, Expression], limits: AdmissibleSpeeds) -> AdmissibleSpeeds:
-    """Return the limits on speeds that are added to a motion."""
     box = dict(limits.box)
     for speed, done in motion.items():
         if speed in box:
