@@ -26,10 +26,7 @@ from kineverse.expressions.printing import html_table
 from kineverse.lie import Array
 from kineverse.symbols import Symbol, parse_symbol_name
 
-__all__ = [
-    "State",
-    "StateLike",
-]
+__all__ = ["State", "StateLike"]
 
 StateLike: TypeAlias = "State | Mapping[Symbol, float] | Mapping[str, float] | Mapping[Symbol | str, float]"
 """A state, or a plain mapping from symbols or their names to numbers."""

@@ -46,7 +46,7 @@ class Base(Joint):
         return {
             self.child: Frame.from_transform(
                 self.parent, (self.origin, translation(x, y, 0), rotation_z(angle))
-            ),
+            )
         }
 
     def check_wheels(self, paths: object, count: int) -> None:

@@ -134,10 +134,7 @@ def position_lock(
 
 
 def tabulated_limit(
-    driver: Expression,
-    points: Mapping[float, float] | Iterable[tuple[float, float]],
-    *,
-    smooth: bool = False,
+    driver: Expression, points: Mapping[float, float] | Iterable[tuple[float, float]], *, smooth: bool = False
 ) -> Expression:
     """Return a bound interpolated in a table of the driver, for ``lower=`` or ``upper=`` of any constraint.
 

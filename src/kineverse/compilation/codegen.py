@@ -71,12 +71,7 @@ _BINARY = {
     ca.OP_REMAINDER: "remainder",
     ca.OP_HYPOT: "hypot",
 }
-_COMPARISONS = {
-    ca.OP_LT: "{a} < {b}",
-    ca.OP_LE: "{a} <= {b}",
-    ca.OP_EQ: "{a} == {b}",
-    ca.OP_NE: "{a} != {b}",
-}
+_COMPARISONS = {ca.OP_LT: "{a} < {b}", ca.OP_LE: "{a} <= {b}", ca.OP_EQ: "{a} == {b}", ca.OP_NE: "{a} != {b}"}
 _CIRCLE = (ca.OP_SIN, ca.OP_COS)
 
 VECTOR = Dialect(

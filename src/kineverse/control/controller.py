@@ -13,12 +13,7 @@ import numpy.typing as npt
 from kineverse._runtime import CallLock, no_collection, one_at_a_time
 from kineverse.compilation import CompiledFunction
 from kineverse.compilation.function import WantedTier
-from kineverse.errors import (
-    InvalidValueError,
-    ShapeError,
-    UnknownNameError,
-    suggest,
-)
+from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResults

@@ -287,9 +287,7 @@ def rint(x: ExpressionLike) -> Expression:
     above_half = operand - below
     odd = binary(ca.OP_LT, 2 * floor(below / 2), below)
     up = binary(
-        ca.OP_OR,
-        binary(ca.OP_LT, 0.5, above_half),
-        binary(ca.OP_AND, binary(ca.OP_EQ, above_half, 0.5), odd),
+        ca.OP_OR, binary(ca.OP_LT, 0.5, above_half), binary(ca.OP_AND, binary(ca.OP_EQ, above_half, 0.5), odd)
     )
     return copysign(below + up, operand)
 

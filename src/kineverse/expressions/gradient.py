@@ -146,11 +146,7 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
 
 
 def _collect(
-    expression: Expression,
-    by_key: layout.SX,
-    columns: list[int],
-    keys: list[Symbol],
-    nodes: frozenset[Node],
+    expression: Expression, by_key: layout.SX, columns: list[int], keys: list[Symbol], nodes: frozenset[Node]
 ) -> dict[Symbol, Expression]:
     shape = expression._shape
     result = {}

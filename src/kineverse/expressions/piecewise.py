@@ -205,12 +205,7 @@ def _check_knots(t: list[float]) -> None:
             raise InvalidValueError(f"Knots increase: knot {i + 1} is {after:g}, and knot {i} is {before:g}.")
 
 
-def _slopes(
-    h: Array,
-    d: Array,
-    first: float,
-    last: float,
-) -> Array:
+def _slopes(h: Array, d: Array, first: float, last: float) -> Array:
     """Return the slopes at all knots for which the second derivative is continuous at the inner ones."""
     n = len(h)
     system, right = np.eye(n + 1), np.array([first, *np.zeros(n - 1), last])

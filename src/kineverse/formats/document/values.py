@@ -273,11 +273,7 @@ def _encode_geometry(geometry: Geometry) -> dict[str, Any]:
     if type(geometry) is Mesh:
         scale = encode_numbers(geometry.scale)
         return {
-            "mesh": {
-                "uri": encode_text(geometry.uri),
-                "scale": scale,
-                "folder": encode_text(geometry.folder),
-            }
+            "mesh": {"uri": encode_text(geometry.uri), "scale": scale, "folder": encode_text(geometry.folder)}
         }
     raise FormatError(f"a {type(geometry).__name__} is no geometry that a document knows")
 

@@ -300,8 +300,7 @@ def _evaluate_series(here: TaylorSeries, around: TaylorSeries, low: float, high:
     for k in range(count):
         coefficient = around[k] if k == count - 1 else here[k]
         total = interval_add(
-            total,
-            interval_multiply(coefficient, interval_power(away, (k, k)) if k else (1.0, 1.0)),
+            total, interval_multiply(coefficient, interval_power(away, (k, k)) if k else (1.0, 1.0))
         )
     return max(total[0], value[0]), min(total[1], value[1])
 

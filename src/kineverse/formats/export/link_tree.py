@@ -398,10 +398,7 @@ class LinkTreeBuilder:
         return {k.removeprefix(start): v for k, v in record.dynamics if k.startswith(start)}
 
     def _carrier_links(
-        self,
-        chains: Mapping[str, MotionChain],
-        independent: set[Symbol],
-        links: list[LinkDescription],
+        self, chains: Mapping[str, MotionChain], independent: set[Symbol], links: list[LinkDescription]
     ) -> Iterator[LinkDescription]:
         """Yield links without body, for coordinates that are the position of no joint yet."""
         frames = TakenNames([*self.model.frames, WORLD])

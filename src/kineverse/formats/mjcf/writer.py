@@ -34,14 +34,7 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 
 from .body_writer import MjcfBodyWriter, add_pose
-from .custom_elements import (
-    ENDS,
-    MASSLESS,
-    add_loop,
-    add_names,
-    add_speeds,
-    format_range,
-)
+from .custom_elements import ENDS, MASSLESS, add_loop, add_names, add_speeds, format_range
 from .mujoco_api import find_blamed_mesh, find_load_error
 
 MJCF_CAPABILITIES = FormatCapabilities(

@@ -13,15 +13,7 @@ from kineverse.formats.mimic import MimicRelation
 from kineverse.model.body import Body, Pose, Vector3
 
 SdfJointType: TypeAlias = Literal[
-    "fixed",
-    "revolute",
-    "continuous",
-    "prismatic",
-    "screw",
-    "universal",
-    "revolute2",
-    "ball",
-    "gearbox",
+    "fixed", "revolute", "continuous", "prismatic", "screw", "universal", "revolute2", "ball", "gearbox"
 ]
 
 AXIS_COUNT: dict[SdfJointType, int] = {

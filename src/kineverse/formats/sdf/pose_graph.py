@@ -14,18 +14,8 @@ from kineverse.errors import FormatError, suggest
 from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import NOWHERE
-from kineverse.formats.xml_reader import (
-    TEXT,
-    Element,
-    ElementError,
-    find_child,
-    label,
-    quote,
-)
-from kineverse.formats.xml_values import (
-    read_element_pose,
-    read_text,
-)
+from kineverse.formats.xml_reader import TEXT, Element, ElementError, find_child, label, quote
+from kineverse.formats.xml_values import read_element_pose, read_text
 from kineverse.model.body import Pose
 
 NodeKind: TypeAlias = Literal["world", "model", "link", "joint", "frame"]

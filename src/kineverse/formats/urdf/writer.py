@@ -337,11 +337,7 @@ class UrdfWriter:
         self._dynamics(element, joint.name, joint.dynamics, soft)
 
     def _dynamics(
-        self,
-        element: Tag,
-        name: str,
-        known: Mapping[str, Any],
-        soft: tuple[float, float] | None = None,
+        self, element: Tag, name: str, known: Mapping[str, Any], soft: tuple[float, float] | None = None
     ) -> None:
         """Add the ``<dynamics>`` and the ``<safety_controller>`` of a joint."""
         if known.get("damping") or known.get("friction"):
@@ -380,13 +376,7 @@ class UrdfWriter:
             limit.give(key, value)
 
     def _joint(
-        self,
-        name: str,
-        kind: str,
-        parent: str,
-        child: str,
-        pose: Matrix,
-        axis: Iterable[float] | None = None,
+        self, name: str, kind: str, parent: str, child: str, pose: Matrix, axis: Iterable[float] | None = None
     ) -> Tag:
         element = self._root.add("joint", name=name, type=kind)
         xyz, rpy = pose[:3, 3].tolist(), rpy_angles(pose)

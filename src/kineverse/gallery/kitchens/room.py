@@ -53,10 +53,7 @@ def add_room(kitchen: KitchenBuilder, layout: KitchenLayout) -> list[str]:
         _add_wall(kitchen, "room_wall_2", (-far - 0.1, -far), y, _PARAPET, PLASTER)
     elif layout.opposite == "wall":
         _add_wall(kitchen, "room_wall_2", (-far - 0.1, -far), y, _CEILING, CLEAR)
-    facing = (
-        Pose((-1.0, 0.0, 0.0, half, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)),
-        shift(-half, 0.0, 0.0),
-    )
+    facing = (Pose((-1.0, 0.0, 0.0, half, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)), shift(-half, 0.0, 0.0))
     names = []
     for number, (row, pose) in enumerate(zip(layout.rows, facing, strict=False), 1):
         low, high = row.length
