@@ -101,8 +101,8 @@ def _wordings(before: Any, after: Any) -> Iterator[bool]:
 def _equal(a: Any, b: Any) -> bool:
     if isinstance(a, list) and isinstance(b, list):
         return len(a) == len(b) and all(map(_equal, a, b))
-    numbers = all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in (a, b))
-    if numbers and math.isfinite(a) and math.isfinite(b):
+    numbers = all(isinstance(x, (int, float)) for x in (a, b))
+    if numbers and float in (type(a), type(b)) and math.isfinite(a) and math.isfinite(b):
         return abs(a - b) <= TOLERANCE * max(1.0, abs(a), abs(b))
     return bool(a == b) or (numbers and math.isnan(a) and math.isnan(b))
 
