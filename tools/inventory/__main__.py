@@ -40,7 +40,7 @@ def write(file: Path, sections: list[str], data: Path | None) -> None:
         sys.stdout.write(f"{name:10} {said}, {time.monotonic() - begin:.0f} s\n")
         sys.stdout.flush()
         ordered = {name: made[name] for name in SECTIONS if name in made}
-        file.write_text(json.dumps(ordered, indent=1, sort_keys=True, ensure_ascii=False) + "\n", "utf-8")
+        file.write_text(json.dumps(made, indent=1, ensure_ascii=False) + "\n", "utf-8")
 
 
 def main() -> int:
