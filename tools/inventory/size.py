@@ -43,8 +43,8 @@ def size(data: Path | None) -> dict[str, Any]:
             found |= {f"{folder}: {key}": value for key, value in _rooms(ROOT / folder).items()}
     with tempfile.TemporaryDirectory() as place:
         for name, program in _PROGRAMS.items():
-            _, _, err = run([sys.executable, "-c", _COUNT + program], 300, Path(place))
-            found[f"modules imported by {name}"] = json.loads(err.strip().splitlines()[-1])
+            ended = run([sys.executable, "-c", _COUNT + program], 300, Path(place))
+            found[f"modules imported by {name}"] = json.loads(ended.err.strip().splitlines()[-1])
     return found
 
 

@@ -41,20 +41,19 @@ def _skills() -> Iterator[tuple[str, Any]]:
 
 
 def _outcome(words: list[str], folder: Path) -> dict[str, Any]:
-    begin = time.monotonic()
-    status, out, err = run([sys.executable, "-m", "kineverse", *words], 240, folder)
-    seconds = round(time.monotonic() - begin, 1)
-    if status not in (0, 1):
-        return {"status": status, "reason": (err.strip().splitlines() or [""])[-1], "seconds": seconds}
-    said = json.loads(out)
+    ended = run([sys.executable, "-m", "kineverse", *words], 240, folder)
+    if ended.status not in (0, 1):
+        reason = (ended.err.strip().splitlines() or [""])[-1]
+        return {"status": ended.status, "reason": reason, "seconds": ended.seconds}
+    said = json.loads(ended.out)
     return {
-        "status": status,
+        "status": ended.status,
         "done": said["done"],
         "value": round(said["value"], 3),
         "reason": said["reason"],
         "keys": sorted(said),
         "measures": sorted(said["measures"]),
-        "seconds": seconds,
+        "seconds": ended.seconds,
     }
 
 

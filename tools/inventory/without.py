@@ -8,14 +8,13 @@ import re
 import sys
 import sysconfig
 import tempfile
-import time
 import tomllib
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from inventory.bounded import ROOT, import_path, neutral, run
+from inventory.bounded import ROOT, Ended, import_path, neutral, run
 from inventory.programs import COMMANDS, PROGRAMS
 
 _USUAL = "all extras"
@@ -49,18 +48,16 @@ def _outcomes(place: Path) -> Iterator[tuple[str, Any]]:
     for circumstance, (python, changes) in circumstances.items():
         for name, words in programs.items():
             with tempfile.TemporaryDirectory(dir=place) as here:
-                begin = time.monotonic()
-                status, out, err = run([*python, *words], 120, Path(here), changes)
-                entry = _entry(status, neutral(out, Path(here), place), neutral(err, Path(here), place))
+                ended = run([*python, *words], 120, Path(here), changes)
                 key = neutral(f"{circumstance} | {name}").replace(":", "")
-                yield key, {**entry, "seconds": round(time.monotonic() - begin, 1)}
+                yield key, {**_entry(ended, Path(here), place), "seconds": ended.seconds}
 
 
-def _entry(status: int, out: str, err: str) -> dict[str, Any]:
-    lines = (err.strip() or out.strip()).splitlines() or [""]
-    entry: dict[str, Any] = {"outcome": "ok" if status == 0 else f"{status} {_last(lines)}"}
-    if out.startswith("{"):
-        entry["keys"] = sorted(json.loads(out))
+def _entry(ended: Ended, *folders: Path) -> dict[str, Any]:
+    lines = neutral(ended.err.strip() or ended.out.strip(), *folders).splitlines() or [""]
+    entry: dict[str, Any] = {"outcome": "ok" if ended.status == 0 else f"{ended.status} {_last(lines)}"}
+    if ended.out.startswith("{"):
+        entry["keys"] = sorted(json.loads(ended.out))
     return entry
 
 
