@@ -17,6 +17,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 TOO_LONG = 124
+CACHE = "KINEVERSE_CACHE_DIR"
+"""Variable with the folder of compiled functions."""
 _MODEL_VARIABLES = ("KINEVERSE_MODEL_PATH", "KINEVERSE_PACKAGE_PATH", "KINEVERSE_ROOT", "ROS_PACKAGE_PATH")
 
 

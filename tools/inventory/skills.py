@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from inventory.bounded import each, run
+from inventory.bounded import CACHE, each, run
 
 KITCHENS, ROBOTS, SKILLS = range(6), ("fetch", "hsr", "pr2"), ("close", "open", "push")
 OUT_OF_REACH = ("wall", "upper", "top")
@@ -41,7 +41,8 @@ def _skills() -> Iterator[tuple[str, Any]]:
 
 
 def _outcome(words: list[str], folder: Path) -> dict[str, Any]:
-    ended = run([sys.executable, "-m", "kineverse", *words], 240, folder)
+    changes = {CACHE: str(folder / "cache")}
+    ended = run([sys.executable, "-m", "kineverse", *words], 240, folder, changes)
     if ended.status not in (0, 1):
         reason = (ended.err.strip().splitlines() or [""])[-1]
         return {"status": ended.status, "reason": reason, "seconds": ended.seconds}
