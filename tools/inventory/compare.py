@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -34,6 +35,8 @@ def compare(before: Mapping[str, Entries], after: Mapping[str, Entries], most: i
         sys.stdout.write(f"{section}: {len(equal)} equal{counts}{pace}\n")
         for kind, texts in kinds.items():
             listed = [text for key, text in texts.items() if key.rpartition(".")[0] not in texts]
+            if kind == "moved":
+                listed = [f"{place}: {count}" for place, count in Counter(listed).items()]
             for text in listed[:most]:
                 cut = text if most is None or len(text) < _WIDTH else f"{text[:_WIDTH]} …"
                 sys.stdout.write(f"  {kind} {cut}\n")
@@ -65,7 +68,7 @@ def compare_entries(before: Entries, after: Entries) -> dict[str, dict[str, str]
         new.discard(there)
         found = [*changes(before[key], after[there])]
         if there != key:
-            kinds["moved"][key] = f"{key} -> {there.partition(':')[0]}"
+            kinds["moved"][key] = f"{key.partition(':')[0]} -> {there.partition(':')[0]}"
         if found:
             kinds["changed"][key] = f"{key}  {'; '.join(found)}"
         elif there == key:

@@ -48,7 +48,7 @@ def size(data: Path | None) -> dict[str, Any]:
     return found
 
 
-def _rooms(folder: Path) -> Iterator[tuple[str, Any]] | dict[str, Any]:
+def _rooms(folder: Path) -> dict[str, Any]:
     """Return modules that are small and imported by one other alone, large ones, and crowded folders."""
     files = {_module(f): f for f in sorted(folder.rglob("*.py"))}
     importers: dict[str, set[str]] = {name: set() for name in files}

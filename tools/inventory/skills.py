@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import tempfile
 import time
@@ -51,7 +52,7 @@ def _outcome(words: list[str], folder: Path) -> dict[str, Any]:
         "status": ended.status,
         "done": said["done"],
         "value": round(said["value"], 3),
-        "reason": said["reason"],
+        "reason": re.sub(r"\b\d+\.\d+\b", "#", said["reason"]),
         "keys": sorted(said),
         "measures": sorted(said["measures"]),
         "seconds": ended.seconds,
