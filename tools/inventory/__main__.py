@@ -26,11 +26,11 @@ MINUTES = 180
 
 def write(file: Path, sections: list[str], data: Path | None) -> None:
     """Add sections to a file; each is made by a process of its own."""
-    made = json.loads(file.read_text("utf-8")) if file.is_file() else {}
     for name in sections:
         begin = time.monotonic()
         words = [sys.executable, __file__, "--section", name, *(["--data", str(data)] if data else [])]
         ended = run(words, 60 * MINUTES, ROOT)
+        made = json.loads(file.read_text("utf-8")) if file.is_file() else {}
         if ended.status == 0:
             made[name] = json.loads(ended.out)
             said = f"{len(made[name])} entries"
