@@ -9,6 +9,7 @@ import resource
 import signal
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -75,7 +76,8 @@ def run(words: Sequence[str], seconds: int, cwd: Path, changes: Mapping[str, str
 def neutral(text: str, *folders: Path) -> str:
     """Return a text without the places of this checkout, of Python, and of some folders."""
     places = {str(folder): "TMP" for folder in folders}
-    places |= {str(Path(sys.executable).parent): "BIN", str(ROOT): "ROOT"}
+    places |= {sysconfig.get_path("purelib"): "SITE", str(Path(sys.executable).parent): "BIN"}
+    places |= {str(ROOT): "ROOT"}
     for place, name in places.items():
         text = text.replace(place, name)
     return re.sub(r" at 0x[0-9a-f]+", "", text)

@@ -51,7 +51,7 @@ def _outcome(words: list[str], folder: Path) -> dict[str, Any]:
     return {
         "status": ended.status,
         "done": said["done"],
-        "value": round(said["value"], 3),
+        "value": None if said["value"] is None else round(said["value"], 3),
         "reason": re.sub(r"\b\d+\.\d+\b", "#", said["reason"]),
         "keys": sorted(said),
         "measures": sorted(said["measures"]),
