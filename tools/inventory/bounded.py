@@ -99,17 +99,20 @@ def each(function: Callable[[Any], Any], items: Iterable[Any], seconds: float) -
             here.recv()  # it has imported what it needs
         here.send(item)
         try:
-            result = here.recv() if here.poll(seconds) else None
+            yield here.recv() if here.poll(seconds) else _end(worker, "too long")
         except EOFError:
-            result = "the process ended"
-        if result is None or not worker.is_alive():
-            worker.kill()
-            worker = None
-        yield "too long" if result is None else result
+            yield _end(worker, "the process ended")
+        worker = worker if worker.is_alive() else None
     if worker is not None:
         here.close()
         worker.join(5)
         worker.kill()
+
+
+def _end(worker: Any, reason: str) -> str:
+    worker.kill()
+    worker.join()
+    return reason
 
 
 def _serve(pipe: Connection, function: Callable[[Any], Any]) -> None:
