@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -265,7 +266,7 @@ class State(Mapping[Symbol, float]):
         return hash((frozenset(self._values.items()), self.stamp, self.source))
 
     def __reduce__(self) -> Any:
-        return _restore, (self._values, self.stamp, self.source)
+        return partial(State, stamp=self.stamp, source=self.source), (self._values,)
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{s}: {v:g}" for s, v in list(self._values.items())[:8])
@@ -321,10 +322,6 @@ def _is_number(value: object) -> bool:
         return not math.isnan(real_number(value))
     except (TypeError, ValueError, OverflowError):
         return False
-
-
-def _restore(values: dict[Symbol, float], stamp: float | None, source: str) -> State:
-    return State(values, stamp=stamp, source=source)
 
 
 def as_state(values: StateLike, known: Iterable[Symbol]) -> State:

@@ -80,7 +80,7 @@ def position_lock(
 ) -> BoundedExpression:
     """Return the lock of a position: q stays within [lower, upper] unless the lock is open.
 
-    Surprise first: a position that is *outside* already is free, and free to return. A bolt that springs out
+    Note that a position that is *outside* already is free, and free to return. A bolt that springs out
     while the door stands open holds nothing; it holds the door once that is shut. With c = open_if, the
     bounds are
 

@@ -8,6 +8,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, overload
 from weakref import WeakSet
@@ -353,7 +354,8 @@ class CompiledFunction(Generic[Results]):
         return self
 
     def __reduce__(self) -> Any:
-        return _restore, (self._outputs, self.inputs, self._single, self._wanted)
+        restore = partial(CompiledFunction, single=self._single, tier=self._wanted)
+        return restore, (self._outputs, self.inputs)
 
     def __repr__(self) -> str:
         inputs = ", ".join(self.names[:4]) + (", ..." if len(self.names) > 4 else "")
@@ -374,12 +376,6 @@ def _load(path: str) -> _Code:
     library = open_library(path)
     address = ctypes.cast(library[FUNCTION_NAME], ctypes.c_void_p).value
     return _Code(ca.external(FUNCTION_NAME, path), address or 0, library)
-
-
-def _restore(
-    outputs: tuple[Expression, ...], inputs: tuple[Symbol, ...], single: bool, tier: WantedTier
-) -> CompiledFunction:
-    return CompiledFunction(outputs, inputs, single=single, tier=tier)
 
 
 def compile_columns(

@@ -198,7 +198,7 @@ class Model(ModelView):
         return self.copy()
 
     def __reduce__(self) -> Any:
-        return _restore, (self.snapshot(),)
+        return Snapshot.model, (self.snapshot(),)
 
 
 class Snapshot(ModelView):
@@ -233,14 +233,4 @@ class Snapshot(ModelView):
         return hash(tuple(self.tags))
 
     def __reduce__(self) -> Any:
-        return _restore_snapshot, (self._head, self._entries, self._version)
-
-
-def _restore(snapshot: Snapshot) -> Model:
-    return snapshot.model()
-
-
-def _restore_snapshot(
-    head: dict[str, dict[str, Any]], entries: tuple[HistoryEntry, ...], version: int
-) -> Snapshot:
-    return Snapshot(head, entries, version)
+        return Snapshot, (self._head, self._entries, self._version)

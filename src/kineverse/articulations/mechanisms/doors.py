@@ -225,7 +225,7 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
 
         base_T_door = translation(0, 0, l (1 - cos α)) · rotation_y(α)
 
-    Surprise first: the coordinate is α, and not the papers' position a = l cos α, which is l when closed and
+    Note that the coordinate is α, and not the papers' position a = l cos α, which is l when closed and
     0 when open. There α = arccos(a/l) has an infinite slope at a = l, exactly where the door is locked. With
     ``form="published"`` the coordinate is a, and the height is l - a, because the a that Eq. 12 prints is not
     0 at the floor when closed.
