@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,10 @@ def hand_made() -> kv.Model:
     return model
 
 
-MODELS = (hand_made, *(lambda name=name: build_scene(name) for name in SCENES))
+LARGE = ("delta_robot", "jansen_leg", "parallel_gripper", "scissor_linkage", "spatial_four_bar")
+"""Scenes that take long, of the same kinds of operations as ``four_bar``."""
+
+MODELS = (hand_made, *(partial(build_scene, name) for name in SCENES if name not in LARGE))
 
 
 def made_anew() -> dict[str, int]:
