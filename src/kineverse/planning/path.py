@@ -17,7 +17,6 @@ from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .path_checks import PathChecks
 from .path_rounding import (
     PathSection,
     TimedSection,
@@ -25,6 +24,7 @@ from .path_rounding import (
     parameterize_sections,
     section_times,
 )
+from .state_validity import PathChecks
 from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.kinematic_limits import RAMP
 
@@ -232,37 +232,3 @@ def _as_numbers(name: str, given: Any) -> Array:
         return np.asarray(given, dtype=float)
     except (TypeError, ValueError):
         raise InvalidValueError(f"{name} is a number or an array of numbers, not {given!r:.80}.") from None
-
-
-def densify(points: Array, step: float) -> Array:
-    """Return the points of a polyline (N, n) with others between them, at most a step apart."""
-    if len(points) < 2:
-        return points
-    counts = np.maximum(np.ceil(_segment_lengths(points) / step), 1).astype(int)
-    ends = np.cumsum(counts)
-    shares = (np.arange(ends[-1]) - np.repeat(ends - counts, counts)) / np.repeat(counts, counts)
-    at = np.append(np.repeat(np.arange(len(counts)), counts) + shares, len(counts))
-    return _interpolate(points, np.arange(float(len(points))), at)
-
-
-def sample_path(points: Array, step: float) -> Array:
-    """Return samples of a polyline (N, n), at most a step apart: its points and others, or some of many."""
-    lengths = _segment_lengths(points)
-    count = int(np.ceil(lengths.sum() / step)) + 1
-    if len(points) <= 4 * count:
-        return densify(points, step)
-    along = np.concatenate([[0.0], np.cumsum(lengths)])
-    return _interpolate(points, along, np.linspace(0.0, along[-1], count))
-
-
-def _segment_lengths(points: Array) -> Array:
-    return np.asarray(np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)))
-
-
-def _interpolate(points: Array, along: Array, at: Array) -> Array:
-    """Return rows of a polyline (N, n) with knots at (N,), at places (M,) from the first to the last."""
-    lengths = along[1:] - along[:-1]
-    slopes = np.zeros(points.shape)
-    slopes[:-1] = (points[1:] - points[:-1]) / np.where(lengths > 0.0, lengths, 1.0)[:, None]
-    k = np.searchsorted(along, at, side="right") - 1
-    return np.asarray(slopes[k] * (at - along[k])[:, None] + points[k])

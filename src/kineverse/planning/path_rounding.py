@@ -14,7 +14,7 @@ from kineverse.errors import ShapeError
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .path_checks import PathChecks
+from .state_validity import PathChecks
 from .trajectories import BlendedPath, Trajectory, round_corners, time_parameterize
 from .trajectories.kinematic_limits import MotionLimits
 

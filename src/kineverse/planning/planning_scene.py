@@ -29,12 +29,11 @@ from kineverse.symbols import Symbol
 from .collision_checker import BodyPairs, CollisionChecker, LateCheckError
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
 from .path import Path
-from .path_checks import PathChecks
 from .planning_space import BEYOND, FULL_TURN, HALF_TURN, PlanningSpace
 from .query import MORE_PATIENCE, PATIENCE, checked_by, connect, connect_on_manifold
 from .sampling_planners import MOST_EDGES, Roadmap
 from .start_goal import MOST_BATCHES, Endpoints, find_solutions
-from .state_validity import SceneJudge, describe_contacts
+from .state_validity import PathChecks, SceneJudge, describe_contacts
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 

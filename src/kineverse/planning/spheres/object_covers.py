@@ -144,7 +144,7 @@ def find_cover(key: str) -> SphereCover | None:
 def keep_cover(key: str, name: str, cover: SphereCover) -> None:
     """Keep a cover in memory, and atomically on the disk, with the name of what it covers."""
     _remember(key, cover)
-    head = {"name": name, "protrusion": cover.protrusion, "excess": cover.excess, "sizes": [len(cover)]}
+    head = {"name": name, "protrusion": cover.protrusion, "sizes": [len(cover)]}
     COVERS.write(key, _pack(head, cover.centres, cover.radii))
 
 
@@ -225,7 +225,7 @@ def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]
 
 def _parse_cover(content: bytes) -> tuple[str, SphereCover]:
     head, ((centres, radii),) = _unpack(content)
-    return head["name"], SphereCover(centres, radii, head["protrusion"], head["excess"])
+    return head["name"], SphereCover(centres, radii, head["protrusion"])
 
 
 def _parse_tree(content: bytes) -> SphereTree:

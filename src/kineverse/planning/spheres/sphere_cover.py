@@ -15,7 +15,6 @@ from kineverse.model.body import Capsule, Sphere
 
 from .cover_fit import FittedSpheres, fit_spheres
 from .polytope import CoverPolytope, CoverRegion, bound_solid, solid_volume
-from .union_volume import union_volume
 
 MOST = 48
 """Default largest number of spheres of a cover."""
@@ -41,14 +40,11 @@ class SphereCover:
         (N, 3) and (N,) in the frame of the solids' poses [m]; read-only.
     protrusion
         Upper bound of the distance of any point of a sphere from the solids [m].
-    excess
-        Volume of the union of the spheres over that of the union of the solids, minus 1.
     """
 
     centres: Floats
     radii: Floats
     protrusion: float
-    excess: float
 
     def __len__(self) -> int:
         """Return the number of spheres."""
@@ -97,7 +93,7 @@ def cover_solids(
     if len(spheres) == len(solids) <= most:
         places = np.array([pose[:3, 3] for pose, _ in spheres])
         sizes = np.array([sphere.radius for _, sphere in spheres], dtype=float)
-        return _make_cover(places, sizes, 0.0, _volume(solids))
+        return _make_cover(places, sizes, 0.0)
     if protrusion is None:
         protrusion = default_protrusion(solids)
     # Solids may be longer than any sensible protrusion, and one ball is then enough.
@@ -105,10 +101,10 @@ def cover_solids(
     (first, pose), *others = solids
     if isinstance(first.surface, Capsule) and not others:
         centres, radii, reached = _capsule_chain(first.surface, protrusion, most)
-        return _make_cover(centres, radii, reached, _volume(solids)).move(pose)
+        return _make_cover(centres, radii, reached).move(pose)
     if _is_needle(first) and not others:
         centres, reached = _needle_chain(first, protrusion, most)
-        return _make_cover(centres, np.full(len(centres), reached), reached, _volume(solids)).move(pose)
+        return _make_cover(centres, np.full(len(centres), reached), reached).move(pose)
     parts, growth = _bound_solids(solids, protrusion)
     corners = np.concatenate([part.corners for part in parts])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -117,9 +113,8 @@ def cover_solids(
     shift[:3, 3] = -origin
     region = CoverRegion([part.move(shift, 1.0 / unit) for part in parts])
     fitted: FittedSpheres = fit_spheres(region, protrusion / unit, most)
-    volume = solid_volume(first) if not others else region.measure_volume() * unit**3
     reached = fitted.protrusion * unit + growth
-    return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, reached, volume)
+    return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, reached)
 
 
 def default_protrusion(solids: Sequence[tuple[Solid, Floats]]) -> float:
@@ -189,10 +184,9 @@ def _needle_chain(solid: Solid, protrusion: float, most: int) -> tuple[Floats, f
     return solid.centre + centres, math.hypot(half / count, aside) * (1.0 + 1e-9)
 
 
-def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float) -> SphereCover:
+def _make_cover(centres: Floats, radii: Floats, protrusion: float) -> SphereCover:
     centres.flags.writeable = radii.flags.writeable = False
-    excess = max(union_volume(centres, radii) / volume - 1.0, 0.0)
-    return SphereCover(centres, radii, protrusion, excess)
+    return SphereCover(centres, radii, protrusion)
 
 
 def _capsule_chain(capsule: Capsule, protrusion: float, most: int) -> tuple[Floats, Floats, float]:
