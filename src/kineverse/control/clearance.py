@@ -17,7 +17,7 @@ from kineverse.symbols import Symbol
 
 from .contact_constraints import ContactSlots
 from .position_program import PositionProgram
-from .quadratic_program import make_solver
+from .qp import QpSolver
 
 _SLOTS, _RADIUS = 24, 0.1
 _LONGEST = 0.2
@@ -66,7 +66,7 @@ class Clearance:
         self._lower, self._upper = np.zeros((2, n + rows + _SLOTS))
         self._H, self._f = np.zeros((n, n)), np.zeros(n)
         self._contacts.bind(self._H, self._f, self._A[rows:], self._lower[n + rows :])
-        self._solver = make_solver("daqp", n, rows + _SLOTS)
+        self._solver = QpSolver(n, rows + _SLOTS)
 
     def load(self, values: Mapping[Symbol, float]) -> None:
         """Set the values of all inputs."""

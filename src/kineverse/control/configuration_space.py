@@ -92,7 +92,7 @@ class ConfigurationSpace:
 
 
 def find_coordinates(
-    model: ModelView, names: Iterable[Symbol | str], argument: str = "still"
+    model: ModelView, names: Iterable[Symbol | str], argument: str = "fixed"
 ) -> frozenset[Symbol]:
     """Return independent coordinates of a model, given as symbols or names.
 

@@ -66,14 +66,14 @@ class Formulation:
         tasks: Iterable[Task],
         *,
         dt: ExpressionLike,
-        still: Iterable[Symbol | str] = (),
+        fixed: Iterable[Symbol | str] = (),
         accelerations: Mapping[Symbol, ExpressionLike] | None = None,
     ) -> None:
         self.model = model
         self.tasks = check_tasks(tasks)
         self._names = name_tasks(self.tasks)
         self._most_gain = 1.0 / as_expression(dt)
-        self._still = find_speeds(model, still, "still")
+        fixed_speeds = find_speeds(model, fixed, "fixed")
         rates = model.rates
         every = dict(model.constraints)
         errors = {task: rates.carry(task.error) for task in self.tasks if isinstance(task, Goal | Hold)}
@@ -115,7 +115,7 @@ class Formulation:
         }
         self._limits = every | brakes
         found = self._rows(ranges, dt, None)
-        columns = (first | set(found.speeds)) - self._still
+        columns = (first | set(found.speeds)) - fixed_speeds
         self.speeds: tuple[Symbol, ...] = tuple(sorted(columns, key=lambda s: s.sort_key))
         unknown = [s for s in self.speeds if s not in model.speeds]
         if unknown:
@@ -239,7 +239,7 @@ class Formulation:
         if not any(s in gradient for s in self.speeds):
             named = ", ".join(f"'{s}'" for s in sorted(gradient, key=lambda s: s.sort_key))
             raise InvalidValueError(
-                f"{task!r} is moved by {named or 'no speed'} only, and all of that is to stay still."
+                f"{task!r} is moved by {named or 'no speed'} only, which fixed= keeps in place."
             )
         return self._stack(gradient, task.error.size)
 

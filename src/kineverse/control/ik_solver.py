@@ -13,23 +13,27 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kineverse._checks import as_count, as_tolerance
 from kineverse.errors import NotFiniteError
-from kineverse.geometry import Scene
-from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import TOLERANCE
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-from .clearance import Clearance
 from .configuration_search import PROGRESS, STEPS, ConfigurationSearch, SearchEnd
 from .position_program import PositionProgram
 from .tasks import Task
+
+if TYPE_CHECKING:
+    from kineverse.geometry import Scene
+    from kineverse.geometry.results import DistanceResult
+
+    from .clearance import Clearance
 
 _DIFFERENT = 1e-3
 """Least difference of a coordinate of two solutions [m], [rad]."""
@@ -57,8 +61,8 @@ class InverseKinematics:
         Collision scene of the model; None to ignore collisions. Only pairs that the tasks move relatively
         to each other count, without those that its rules except and those that always overlap. The scene
         stays at the last configuration that was tried.
-    still
-        Coordinates that stay still, as symbols or names; a name of an articulation stands for its
+    fixed
+        Coordinates that do not move, as symbols or names; a name of an articulation stands for its
         coordinates.
     margin
         Least distance of pairs of bodies [m].
@@ -82,7 +86,7 @@ class InverseKinematics:
     InvalidValueError
         If there is no goal or hold, for a task about speeds, or one that nothing moves.
     UnknownNameError
-        For a task about a symbol that the model does not have, an unknown name in ``still``, or a scene of
+        For a task about a symbol that the model does not have, an unknown name in ``fixed``, or a scene of
         another model.
     DuplicateNameError
         For two tasks of one name.
@@ -96,16 +100,19 @@ class InverseKinematics:
         tasks: Iterable[Task],
         *,
         scene: Scene | None = None,
-        still: Iterable[Symbol | str] = (),
+        fixed: Iterable[Symbol | str] = (),
         margin: float = 0.0,
         tolerance: float = 1e-5,
     ) -> None:
         self.model = model
-        self._program = program = PositionProgram(model, tasks, still, as_tolerance(tolerance))
+        self._program = program = PositionProgram(model, tasks, fixed, as_tolerance(tolerance))
         self.tasks, self.coordinates = program.tasks, program.coordinates
-        self._clearance = (
-            None if scene is None else Clearance(scene, program, as_tolerance(margin, "The margin"))
-        )
+        self._clearance: Clearance | None = None
+        if scene is not None:
+            # For start-up time: a solver without a scene imports no geometry.
+            from .clearance import Clearance
+
+            self._clearance = Clearance(scene, program, as_tolerance(margin, "The margin"))
         self._search = ConfigurationSearch(program, self._clearance)
         others = () if self._clearance is None else self._clearance.inputs
         extra = sorted({*others} - {*program.inputs}, key=lambda s: s.sort_key)
@@ -360,7 +367,7 @@ def inverse_kinematics(
     solutions: int = 1,
     seed: int = 0,
     scene: Scene | None = None,
-    still: Iterable[Symbol | str] = (),
+    fixed: Iterable[Symbol | str] = (),
     margin: float = 0.0,
     tolerance: float = 1e-5,
 ) -> IkResult:
@@ -368,12 +375,12 @@ def inverse_kinematics(
 
     Parameters
     ----------
-    model, tasks, scene, still, margin, tolerance
+    model, tasks, scene, fixed, margin, tolerance
         As for :class:`InverseKinematics`.
     values, starts, solutions, seed
         As for :meth:`InverseKinematics.solve`.
     """
-    solver = InverseKinematics(model, tasks, scene=scene, still=still, margin=margin, tolerance=tolerance)
+    solver = InverseKinematics(model, tasks, scene=scene, fixed=fixed, margin=margin, tolerance=tolerance)
     return solver.solve(values, starts=starts, solutions=solutions, seed=seed)
 
 

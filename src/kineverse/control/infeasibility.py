@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,35 +14,44 @@ from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError,
 from kineverse.model.model_view import ModelView
 
 from .command import Command, name_contact
-from .contact_constraints import ContactSlots
 from .formulation import Formulation
-from .qp import Vector
-from .quadratic_program import make_solver
+from .qp import QpSolver, Vector
 from .velocity_program import VelocityProgram
+
+if TYPE_CHECKING:
+    from .contact_constraints import ContactSlots
+
+_WEIGHT = 1e6
+"""Weight of squared violations, relative to the squared distance from the point to be near to."""
+_HARD_WEIGHT = 1e4
+_SHORTEST = 1e-12
 
 
 class Conflict(NamedTuple):
-    """One member of a set of contradictory constraints."""
+    """Member of a set of contradictory constraints."""
 
-    name: str  # name of the constraint
-    operations: tuple[str, ...]  # operations of the model that wrote it
+    name: str
+    operations: tuple[str, ...]  # of the model, which wrote the constraint
     lower: float  # bounds that take part; infinite where that side does not
     upper: float
 
 
 class ConflictingBound(NamedTuple):
-    """One bound of a conflict of rows."""
+    """Bound in a conflict of rows."""
 
     row: int  # index of the row in [x; A x]
     side: int  # -1 for its lower bound, 1 for its upper one
 
 
 class LeastViolation(NamedTuple):
-    """The point that violates the soft rows least."""
+    """Point that violates the soft rows least.
 
-    x: Vector  # point, of shape (n,)
-    violations: Vector  # violations of [x
-    hard_rows_hold: bool  # whether the hard rows are satisfied
+    If the hard rows contradict each other, they are violated little, and the soft ones count for nothing.
+    """
+
+    x: Vector  # (n,)
+    violations: Vector  # (n + m,), of [x; A x]: negative below the lower bound, positive above the upper one
+    hard_rows_hold: bool
 
 
 def find_irreducible_conflict(
@@ -97,7 +106,10 @@ def find_least_violation(
     hard: ArrayLike | None = None,
     near: ArrayLike | None = None,
 ) -> LeastViolation:
-    """Find the point whose violations have the smallest sum of squares, within the hard rows."""
+    """Find the point whose violations have the smallest sum of squares, within the hard rows.
+
+    ``hard`` is a mask (n + m,); of the points that violate equally, the nearest to ``near`` (n,) is taken.
+    """
     rows, low, high = _stacked(A, lower, upper)
     n = rows.shape[1]
     held = np.zeros(len(rows), bool) if hard is None else np.asarray(hard, bool)
@@ -124,12 +136,6 @@ def find_least_violation(
     values = rows @ x
     under, over = np.maximum(low - values, 0.0), np.maximum(values - high, 0.0)
     return LeastViolation(x, np.where(over >= under, over, -under), holds)
-
-
-_WEIGHT = 1e6
-"""The weight of squared violations beside the squared distance from the point to be near to."""
-_HARD_WEIGHT = 1e4
-_SHORTEST = 1e-12
 
 
 def _stacked(A: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Vector, Vector, Vector]:
@@ -196,21 +202,12 @@ def _least_squares(
     """Return the point closest to another one, subject to rows, some of them soft."""
     count, n = g.shape
     free = np.zeros(n, bool)
-    solver = make_solver(
-        "daqp",
-        n,
-        count,
-        soft=np.concatenate([free, soft]),
-        soft_weight=np.concatenate([np.ones(n), weight]),
+    solver = QpSolver(
+        n, count, soft=np.concatenate([free, soft]), soft_weight=np.concatenate([np.ones(n), weight])
     )
     no_bound = np.full(n, np.inf)
-    solution = solver.solve(
-        np.eye(n),
-        -near,
-        np.ascontiguousarray(g),
-        np.concatenate([-no_bound, lower]),
-        np.concatenate([no_bound, upper]),
-    )
+    low, high = np.concatenate([-no_bound, lower]), np.concatenate([no_bound, upper])
+    solution = solver.solve(np.eye(n), -near, np.ascontiguousarray(g), low, high)
     return solution.x if solution.status == "solved" else None
 
 

@@ -64,17 +64,17 @@ class PositionProgram:
     """Compiled quadratic program of a Gauss-Newton step."""
 
     def __init__(
-        self, model: ModelView, tasks: Iterable[Task], still: Iterable[Symbol | str], tolerance: float
+        self, model: ModelView, tasks: Iterable[Task], fixed: Iterable[Symbol | str], tolerance: float
     ) -> None:
         self.model = model
         self.tasks = check_tasks(tasks)
-        fixed = find_coordinates(model, still)
+        still = find_coordinates(model, fixed)
         parts, ranges = self._collect(tolerance)
         self.parts, ranges = self._close(parts, ranges)
         errors = as_expression(np.concatenate([part.error for part in self.parts]))
         subjects = [errors, *(e for c in ranges.values() for e in (c.lower, c.expression, c.upper))]
-        moving = {s.position for e in subjects for s in e.gradient(heuristic=False)} - fixed
-        self._check_moved(fixed)
+        moving = {s.position for e in subjects for s in e.gradient(heuristic=False)} - still
+        self._check_moved(still)
         self.coordinates = tuple(sorted(moving, key=lambda s: s.sort_key))
         self.space = ConfigurationSpace(model, self.coordinates, ranges)
         self._compile(errors, ranges)
@@ -144,13 +144,13 @@ class PositionProgram:
             raise InvalidValueError("There is no goal and no hold, so there is nothing to reach.")
         return tuple(parts), ranges
 
-    def _check_moved(self, fixed: frozenset[Symbol]) -> None:
+    def _check_moved(self, still: frozenset[Symbol]) -> None:
         for part in self.parts:
             moved = {s.position for s in part.error.gradient(heuristic=False)}
-            if part.name not in self.model.constraints and moved and moved <= fixed:
+            if part.name not in self.model.constraints and moved and moved <= still:
                 named = ", ".join(f"'{s}'" for s in sorted(moved, key=lambda s: s.sort_key))
                 raise InvalidValueError(
-                    f"'{part.name}' is moved by {named} only, and all of that is to stay still."
+                    f"'{part.name}' is moved by {named} only, which fixed= keeps in place."
                 )
 
     def _check_symbols(self, task: Task, expression: Expression) -> None:
