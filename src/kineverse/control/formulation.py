@@ -198,11 +198,7 @@ class Formulation:
         return gradients, constants
 
     def _goal_rows(
-        self,
-        goal: Goal,
-        error: Expression,
-        gradient: dict[Symbol, Expression],
-        constant: Expression | None,
+        self, goal: Goal, error: Expression, gradient: dict[Symbol, Expression], constant: Expression | None
     ) -> GoalRows:
         jacobian = self._matrix(goal, gradient)
         given = as_expression(goal.weight).ravel()

@@ -22,11 +22,7 @@ import casadi as ca
 import numpy as np
 
 from kineverse.compilation import compile
-from kineverse.errors import (
-    DuplicateNameError,
-    InvalidValueError,
-    NoSolutionError,
-)
+from kineverse.errors import DuplicateNameError, InvalidValueError, NoSolutionError
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
 from kineverse.expressions.gradient import stack_columns
 from kineverse.lie import Array

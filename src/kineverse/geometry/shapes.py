@@ -286,12 +286,7 @@ def _drop_degenerate(vertices: Floats, faces: Integers) -> Integers:
 
 
 def _solid_around(
-    engine: Any,
-    surface: Hull | Faces,
-    centre: Floats,
-    half: Floats,
-    points: Floats,
-    core: Core | None = None,
+    engine: Any, surface: Hull | Faces, centre: Floats, half: Floats, points: Floats, core: Core | None = None
 ) -> Solid:
     engine.computeLocalAABB()
     radius = float(np.linalg.norm(points - centre, axis=1).max())

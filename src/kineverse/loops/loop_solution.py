@@ -175,12 +175,7 @@ def _rank(equations: Equations, x: Array, given: Array) -> int:
 
 
 def _choose_dependent(
-    name: str,
-    equations: Equations,
-    x: Array,
-    given: Array,
-    rank: int,
-    dependent: Sequence[Symbol] | None,
+    name: str, equations: Equations, x: Array, given: Array, rank: int, dependent: Sequence[Symbol] | None
 ) -> tuple[Symbol, ...]:
     """Return the dependent coordinates: the given ones, or the last possible ones."""
     by_q = equations(x, given)[1]

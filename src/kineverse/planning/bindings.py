@@ -84,8 +84,7 @@ class ProjectionStruct(ctypes.Structure):
     """Projection onto a manifold as C reads it."""
 
     _fields_ = _fields(
-        "ppidippid",
-        "step kept stored tolerance steps exact exact_kept exact_stored exact_tolerance",
+        "ppidippid", "step kept stored tolerance steps exact exact_kept exact_stored exact_tolerance"
     )
 
 

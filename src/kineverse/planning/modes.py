@@ -260,11 +260,7 @@ class ModeSearch:
         return False
 
     def _solve(
-        self,
-        holds: Sequence[Hold],
-        near: Array,
-        touching: BodyPairs,
-        still: npt.NDArray[np.bool_],
+        self, holds: Sequence[Hold], near: Array, touching: BodyPairs, still: npt.NDArray[np.bool_]
     ) -> Array:
         self._searches += 1
         self._compile(holds)

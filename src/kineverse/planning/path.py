@@ -17,13 +17,7 @@ from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .path_rounding import (
-    PathSection,
-    TimedSection,
-    join_sections,
-    parameterize_sections,
-    section_times,
-)
+from .path_rounding import PathSection, TimedSection, join_sections, parameterize_sections, section_times
 from .state_validity import PathChecks
 from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.kinematic_limits import RAMP

@@ -217,10 +217,7 @@ class Trajectory:
     def reversed(self) -> Trajectory:
         """Return the motion backwards in time."""
         return Trajectory(
-            self.symbols,
-            self.duration - self.times[::-1],
-            self.positions[::-1],
-            -self.velocities[::-1],
+            self.symbols, self.duration - self.times[::-1], self.positions[::-1], -self.velocities[::-1]
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
