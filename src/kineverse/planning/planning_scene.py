@@ -40,7 +40,7 @@ Flags: TypeAlias = npt.NDArray[np.bool_]
 _JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _TOO_FAR = (
-    "A way was found to a goal that is {:.4g} away, but to check it takes longer than the time given. Give "
+    "A path was found to a goal that is {:.4g} away, but to check it takes longer than the time given. Give "
     "more seconds=, or nearer goals."
 )
 _MOST_MANIFOLDS = 16
