@@ -31,12 +31,12 @@ class StepTimes(NamedTuple):
 class TaskErrors(NamedTuple):
     """Errors of tasks at a state."""
 
-    names: tuple[str, ...]  # names (k,) of the tasks, and norms (k,) of their errors at the state
-    values: Array
+    names: tuple[str, ...]
+    values: Array  # (k,) norms of the errors at the state
     speed_goals: npt.NDArray[np.intp]  # places of goals about speeds among these
-    first_rows: npt.NDArray[np.intp]  # of their first rows in jacobian
-    jacobian: Array | None  # (m, n), (m,)
-    rate: Array | None
+    first_rows: npt.NDArray[np.intp]  # of these in the Jacobian
+    jacobian: Array | None  # (m, n), of all goals about speeds; None without any
+    rate: Array | None  # (m,), wanted
 
     def norms(self, speeds: Array) -> dict[str, float]:
         """Return the norm of the error of each task at speeds (n,), by name."""

@@ -57,15 +57,15 @@ class DurationSummary(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LoopReport:
-    """The outcome of a control loop."""
+    """Outcome of a control loop."""
 
-    cycles: int  # number of commands that the sink got
-    missed_deadlines: int  # number of periods at whose end no command had been given
+    cycles: int  # commands that the sink got
+    missed_deadlines: int  # periods that ended without a command
     worst_lateness: float  # longest time from a deadline to the end of its cycle [s]; 0 if none was missed
-    stale_cycles: int  # number of cycles without a state, or with one that was too old
-    errors: int  # number of cycles in which the controller raised an error, or had a speed that is not finite
-    last_error: KineverseError | None  # last of these errors
-    step_times: DurationSummary  # durations of the controller's steps [s], by the clock of the loop
+    stale_cycles: int  # cycles without a state, or with one that was too old
+    errors: int  # cycles in which the controller raised an error, or a speed was not finite
+    last_error: KineverseError | None
+    step_times: DurationSummary  # of the controller, by the clock of the loop
     interrupted: bool  # whether a KeyboardInterrupt ended the loop
 
 

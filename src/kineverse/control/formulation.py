@@ -37,10 +37,10 @@ class GoalRows:
     name: str
     error: Expression  # (k,) expression minus target; of a goal about speeds, minus the target alone
     jacobian: Expression  # (k, n) over the columns
-    correction: Expression  # (k,) wanted rates by the error alone, and with those of the target
-    rate: Expression
-    weight: Expression  # (k,) weights of the squared differences
-    about_speeds: bool = False  # True for a goal about speeds
+    correction: Expression  # (k,) wanted rates by the error alone
+    rate: Expression  # (k,) wanted rates, those of the target included
+    weight: Expression  # (k,)
+    about_speeds: bool = False
 
 
 @dataclass(frozen=True)

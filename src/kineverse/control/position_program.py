@@ -49,10 +49,10 @@ _SAME = 1e-9
 class ErrorRows:
     """Rows of one task, or of an equality of the model."""
 
-    name: str  # name of the task or constraint
-    error: Expression  # (k,) errors, in plain independent coordinates
-    weights: Expression  # (k,) weights of their squares
-    tolerance: float  # largest entry where the task is done
+    name: str
+    error: Expression  # (k,), in plain independent coordinates
+    weights: Expression  # (k,), of the squares
+    tolerance: float  # largest error of a task that is done
     exact: bool  # True for holds and equalities, which are kept where goals are out of reach
 
 

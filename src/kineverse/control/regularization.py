@@ -35,20 +35,26 @@ _LEAST_SHARE = 0.01
 class Costs:
     """Weights of the terms that no task states."""
 
-    damping: float = 1e-4  # weight of squared speeds
-    smooth: float = 1e-2  # weights of the first
-    jerk: float = 0.0  # second differences of commands
-    progress: float = 10.0  # weight of the progress of holds, as a multiple of the largest one of goals
+    damping: float = 1e-4  # of squared speeds
+    smooth: float = 1e-2  # of first differences of commands
+    jerk: float = 0.0  # of second differences
+    progress: float = 10.0  # of the progress of holds, as a multiple of the largest weight of goals
     recovery: float = 5.0  # rate at which violations of limits decay [1/s]
 
 
 @dataclass(frozen=True)
 class JointWeights:
-    """Factors of the speeds in the terms that no task states."""
+    """Factors of the speeds in the terms that no task states.
 
-    shares: tuple[Expression, ...]  # (n,) factors c_i of damping, smoothness and posture
-    curvatures: Mapping[str, tuple[Expression, ...]]  # (n,)
-    immovable: frozenset[str]
+    The shares c_i are mean squares of the columns of the Jacobians of goals and holds over random states, so
+    that units do not matter, times the share of bodies that a speed moves. By the name of a goal about
+    positions, ``Σ κ_i v_i²`` bounds the second derivative of its errors: ``Σ_j |∂²e/∂q_i∂q_j| l_i/l_j``, with
+    l the root mean squares of the columns, times the same share.
+    """
+
+    shares: tuple[Expression, ...]  # (n,), c_i
+    curvatures: Mapping[str, tuple[Expression, ...]]  # (n,) each, κ_i
+    immovable: frozenset[str]  # equalities of the model whose gradient is nothing but rounding
 
 
 def joint_weights(

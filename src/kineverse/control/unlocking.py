@@ -48,11 +48,11 @@ _SWEEPS = 3
 class LockSide:
     """Direction in which a constraint holds a coordinate, and the trend of the condition that frees it."""
 
-    name: str  # name of the constraint, with the side
+    name: str  # of the constraint, with the side
     coordinate: Symbol
-    way: Way  # the direction that is held
+    way: Way  # direction that is held
     room: Expression  # speed or distance that is left in this direction, positive if the lock is open
-    trend: Mapping[Symbol, Expression]
+    trend: Mapping[Symbol, Expression]  # gradient of the room by key, trends of logic included
 
     def behind(self, margins: Mapping[Symbol, float]) -> LockSide:
         """Return the side at a state in which each key is a margin back along the trend.

@@ -44,13 +44,13 @@ def parse_exclusions(entries: Any) -> tuple[Exclusion, ...]:
 class CollisionObject:
     """Shape of a body, or one of the convex hulls that a mesh is decomposed into."""
 
-    body: str  # frame of the body
-    number: int  # index of the shape among the shapes of the body
-    shape: Shape  # geometry and its pose in the frame
+    body: str
+    number: int  # of the shape, among the shapes of the body
+    shape: Shape
     triangles: bool  # True if a mesh stays a triangle mesh rather than its convex hull
-    body_pose: Expression  # pose of the body, world_T_body: a (4, 4) expression
-    moves: bool  # True if it depends on any symbol
-    hull: Floats | None = None  # (n, 3), [m]
+    body_pose: Expression  # world_T_body, (4, 4)
+    moves: bool  # True if the pose depends on any symbol
+    hull: Floats | None = None  # (n, 3) corners in the frame of the shape [m]; None for the shape itself
 
     def make_solid(self) -> Solid:
         """Make the solid of the object, for distance computation."""

@@ -100,7 +100,7 @@ Primitive: TypeAlias = Box | Sphere | Cylinder | Capsule | Cone | Ellipsoid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hull:
-    """A convex polytope: the points x with ``normals @ x <= offsets``; (F, 3) and (F,) [m]."""
+    """Convex polytope: the points x with ``normals @ x <= offsets``; (F, 3) and (F,) [m]."""
 
     normals: Floats
     offsets: Floats
@@ -115,10 +115,13 @@ class Core:
     """
 
     half: Floats  # (3,) half edges of the box [m]
-    radius: float = 0.0  # radius of the ball [m]
-    radii: Floats = field(default_factory=lambda: np.zeros(3))  # (3,), [m]
-    corners: Floats = field(default_factory=lambda: np.empty((3, 0)))  # (3, n), [m]
-    tip: float = 0.0  # [m], (0, 0, tip)
+    radius: float = 0.0  # of the ball [m]
+    radii: Floats = field(
+        default_factory=lambda: np.zeros(3)
+    )  # of the ellipsoid; a disc if the last is 0 [m]
+    # (3, n) corners; the first is repeated until n is a multiple of 8. n = 0 for a core that is no hull [m].
+    corners: Floats = field(default_factory=lambda: np.empty((3, 0)))
+    tip: float = 0.0  # half the height of a cone between (0, 0, tip) and a disc at (0, 0, -tip) [m]
 
     @staticmethod
     def from_corners(points: Floats) -> Core:
@@ -132,13 +135,13 @@ class Core:
 class Solid:
     """Immutable shape for distance computation; equal geometries share one solid."""
 
-    engine: Any  # geometry of coal
-    surface: Primitive | Hull | Faces  # surface for ray casts: a primitive, a hull, or triangles
-    centre: Floats  # bounding box in the frame of the solid: (3,) centre and (3,) half edges [m]
+    engine: Any  # geometry of coal, which keeps pointers only: the solid outlives all functors made of it
+    surface: Primitive | Hull | Faces
+    centre: Floats  # (3,) centre and half edges of the bounding box [m]
     half: Floats
-    radius: float  # radius of the bounding sphere about centre [m]
-    stand_in: Any = None  # geometry of coal for pairs with a cylinder; None if that is engine
-    core: Core | None = None  # support description for our own GJK; None for triangles
+    radius: float  # of the bounding sphere about the centre [m]
+    stand_in: Any = None  # geometry of coal for pairs with a cylinder; None if that is the engine
+    core: Core | None = None  # None for triangles
 
     @property
     def is_convex(self) -> bool:

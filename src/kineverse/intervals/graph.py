@@ -44,9 +44,9 @@ _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """An operation (by CasADi's number, or a name) on other terms."""
+    """Operation (by CasADi's number, or a name) on other terms."""
 
-    index: int  # number of the term; arguments have smaller ones
+    index: int  # arguments have smaller ones
     op: int | str
     args: tuple[Term, ...]
     data: Any = None  # number of a constant, a symbol, a contrast, or a node

@@ -36,7 +36,7 @@ Estimates and controllers overstep limits."""
 class InputDomain:
     """Domain of one input: limits, or a full revolution."""
 
-    lower: float  # limits [m] or [rad]
+    lower: float  # [m] or [rad]
     upper: float
     whole: bool = False  # True for an angle without limits
 
@@ -100,10 +100,10 @@ class InputDomain:
 class BranchGuess:
     """Fitted guess: Σ coefficient · product of basis functions, plus a linear term in periodic inputs."""
 
-    intervals: tuple[InputDomain, ...]  # domain of each input, shape (k,)
-    degree: int  # degree of the basis functions in each input
-    coefficients: Array  # one column for each unknown, shape (P, n)
-    winding: Array  # slopes of the unknowns over periodic inputs, shape (k, n)
+    intervals: tuple[InputDomain, ...]  # (k,), of the inputs
+    degree: int  # of the basis functions in each input
+    coefficients: Array  # (P, n), a column for each unknown
+    winding: Array  # (k, n) slopes of the unknowns over periodic inputs
 
     @staticmethod
     def fit(

@@ -99,7 +99,7 @@ class ContinuationResult:
     """Result of a continuation."""
 
     solution: Array  # unknowns at the last point
-    part: float  # completed fraction of the path, 1 for all of it
+    part: float  # completed fraction of the path
 
 
 def continue_solution(

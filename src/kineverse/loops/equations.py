@@ -82,7 +82,7 @@ MOST_EFFORT = 150_000.0
 class WorkBudget:
     """Budget of work for the analysis of a loop, independent of machine and process."""
 
-    name: str  # name of the loop
+    name: str  # of the loop
     left: float = MOST_EFFORT  # remaining work; an evaluation of a few equations is 1
 
     def spend(self, amount: float) -> None:

@@ -23,9 +23,9 @@ class LoopRecord:
 
     name: str
     ends: tuple[tuple[str, str], ...]  # pairs of frames (frame, to) that coincide in the axes of the mask
-    mask: tuple[str, ...]  # names out of x y z rx ry rz
-    free: tuple[str, ...]  # names of the free
-    dependent: tuple[str, ...]  # of the dependent coordinates
+    mask: tuple[str, ...]  # some of x y z rx ry rz
+    free: tuple[str, ...]  # coordinates
+    dependent: tuple[str, ...]
     constraints: tuple[str, ...] = ()
 
 

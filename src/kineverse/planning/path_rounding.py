@@ -32,9 +32,9 @@ _STEP = 0.02
 class PathSection(NamedTuple):
     """Part of a path with holds of its own, from one of its points to another; the motion rests at both."""
 
-    first: int  # indices of the points
+    first: int  # index of its first and last point
     last: int
-    checks: PathChecks  # checks of configurations between them
+    checks: PathChecks
 
 
 class TimedSection(NamedTuple):

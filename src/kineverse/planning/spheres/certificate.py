@@ -26,8 +26,8 @@ _NEAR, _SMALL = 10, 0.7
 class Uncovered:
     """Cells that lie in none of the spheres after subdivision."""
 
-    growth: Floats  # (N,) by how much the radii have to grow, so that the spheres cover everything [m]
-    points: Floats  # (n, 3) points outside of all spheres, one of a cell that has one [m]
+    growth: Floats  # (N,) growth of the radii with which the spheres cover everything [m]
+    points: Floats  # (n, 3) points outside of all spheres, one for each cell that has one [m]
 
 
 def find_uncovered(region: CoverRegion, centres: Floats, radii: Floats, tolerance: float) -> Uncovered:

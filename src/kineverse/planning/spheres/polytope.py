@@ -46,11 +46,11 @@ class RoundSide:
     the origin. A sphere has the reach 0; cylinders and cones have an infinite one, and a cone has a slope.
     """
 
-    origin: Floats  # (3,) origin of the axis [m], and its direction
-    axis: Floats
-    reach: float  # lengths of the formula [m]
-    offset: float
-    slope: float = 0.0  # its factors
+    origin: Floats  # (3,), of the axis [m]
+    axis: Floats  # (3,), its direction
+    reach: float  # [m]
+    offset: float  # [m]
+    slope: float = 0.0
     width: float = 1.0
 
 
@@ -62,12 +62,12 @@ _NO_SIDE = RoundSide(np.zeros(3), _Z, 0.0, _FAR, width=0.0)
 class CoverPolytope:
     """Convex solid, with a polytope that contains it."""
 
-    corners: Floats  # (V, 3), [m], (T, 3)
-    faces: Integers
-    normals: Floats  # (F, 3), (F,), [m]
+    corners: Floats  # (V, 3), of the polytope [m]
+    faces: Integers  # (T, 3), its triangles
+    normals: Floats  # (F, 3) and (F,), flat sides of the solid: normals @ x <= offsets [m]
     offsets: Floats
-    volume: float  # volume of the solid itself [m³]
-    side: RoundSide = _NO_SIDE  # its round side
+    volume: float  # of the solid [m³]
+    side: RoundSide = _NO_SIDE
     is_hull: bool = False  # True if the polytope is the solid
 
     def simplify(self) -> CoverPolytope:

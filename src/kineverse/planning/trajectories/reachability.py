@@ -17,13 +17,13 @@ from .blends import BlendedPath
 class PathGrid:
     """Cells of a path: straight segments, and parts of blends."""
 
-    lengths: Array  # lengths in s (K,)
-    first: Array  # derivatives q' at the ends (K, n)
-    last: Array
-    curvature: Array  # derivatives q'' (K, n)
-    start: Array  # configurations at the beginning (K, n)
-    straight: npt.NDArray[np.bool_]  # flags of the cells that are straight segments (K,)
-    stops: npt.NDArray[np.bool_]  # flags of the nodes where the motion is at rest (K+1,)
+    lengths: Array  # (K,), in the path parameter s
+    first: Array  # (K, n), q' at the beginning
+    last: Array  # (K, n), q' at the end
+    curvature: Array  # (K, n), q''
+    start: Array  # (K, n), q at the beginning
+    straight: npt.NDArray[np.bool_]  # (K,), True for straight segments
+    stops: npt.NDArray[np.bool_]  # (K+1,), True for nodes where the motion is at rest
 
 
 def divide_path(path: BlendedPath, cells: int) -> PathGrid:

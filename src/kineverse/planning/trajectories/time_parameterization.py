@@ -131,9 +131,9 @@ def _limits(
 class _Phases(NamedTuple):
     """Parts of cells in which the path speed is linear in time, (P,) each."""
 
-    cells: npt.NDArray[np.intp]  # indices of the cells
-    durations: Array  # durations [s]
-    begins: Array  # beginning in the cell and length, in s
+    cells: npt.NDArray[np.intp]
+    durations: Array  # [s]
+    begins: Array  # beginning within the cell, in the path parameter
     lengths: Array
     before: Array  # path speeds ṡ at both ends
     after: Array
