@@ -82,10 +82,10 @@ class Clearance:
     @property
     def near(self) -> tuple[DistanceResult, ...]:
         """Pairs of the last measurement that are nearer than the margin, each once, nearest first."""
-        found = self._contacts.found
+        result = self._contacts.found
         near: dict[tuple[str, str], DistanceResult] = {}
-        for k in range(int(np.count_nonzero(found.distances < self.margin))):
-            near.setdefault((found[k].a, found[k].b), found[k])
+        for k in range(int(np.count_nonzero(result.distances < self.margin))):
+            near.setdefault((result[k].a, result[k].b), result[k])
         return tuple(near.values())
 
     def find_step(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> Array | None:
@@ -98,8 +98,8 @@ class Clearance:
         self._upper[:n] = np.minimum(upper[:n], _LONGEST)
         self._H[:], self._f[:] = H, f
         self._contacts.write(1.0)
-        found = self._solver.solve(self._H, self._f, self._A, self._lower, self._upper)
-        return found.x if found.status == "solved" else None
+        result = self._solver.solve(self._H, self._f, self._A, self._lower, self._upper)
+        return result.x if result.status == "solved" else None
 
     def _twist(self, body: str) -> Expression:
         """Return the spatial twist of a body over the coordinates, (6, n)."""

@@ -104,11 +104,11 @@ class ConfigurationSearch:
             if not total <= ratio * recent[k % _PATIENCE]:
                 break
             recent[k % _PATIENCE] = total
-            found = solve(H, f, A, lower, upper)
-            if found.status != "solved":
+            result = solve(H, f, A, lower, upper)
+            if result.status != "solved":
                 break
             before[:] = x
-            step = found.x
+            step = result.x
             x += step
             if quaternions:
                 normalize(x)
@@ -175,10 +175,10 @@ class ConfigurationSearch:
             if least == math.inf:
                 return
             H.reshape(-1)[:: len(x) + 1] += damping
-            found = self._solver.solve(H, f, A, lower, upper)
-            if found.status != "solved":
+            result = self._solver.solve(H, f, A, lower, upper)
+            if result.status != "solved":
                 return
-            x += found.x
+            x += result.x
             self.space.normalize(x)
             total = self.evaluate()
             if total < least:
@@ -187,7 +187,7 @@ class ConfigurationSearch:
                 if settled:
                     return
             else:
-                if np.abs(found.x).max() < _SHORTEST:
+                if np.abs(result.x).max() < _SHORTEST:
                     break
                 x[:], damping = best, max(4 * damping, 0.01 * least)
                 self.evaluate()
@@ -226,19 +226,19 @@ class ConfigurationSearch:
         self.evaluate()
         values = self.outputs[5]
         # Unlike numpy's norm, hypot does not overflow.
-        found = {name: math.hypot(*values[rows].tolist()) for name, rows in self.rows.items()}
+        result = {name: math.hypot(*values[rows].tolist()) for name, rows in self.rows.items()}
         violations = values[self.first_violation :]
         for keep in self.program.keeps:
             rows = [k for k, names in enumerate(self.program.names) if keep in names]
-            found[keep] = max((abs(float(violations[k])) for k in rows), default=0.0)
-        return found
+            result[keep] = max((abs(float(violations[k])) for k in rows), default=0.0)
+        return result
 
     def active(self) -> tuple[str, ...]:
         """Return the names of the constraints whose multipliers are not 0 at the present coordinates."""
         self.weights[:] = np.where(self.exact, _EXACT_WEIGHT, 1.0)
         if self.evaluate() == math.inf:
             return ()
-        found = self._solver.solve(*self.outputs[:5])
-        sizes = np.abs(found.multipliers)
+        result = self._solver.solve(*self.outputs[:5])
+        sizes = np.abs(result.multipliers)
         order = sorted(np.flatnonzero(sizes > SATURATED).tolist(), key=lambda k: -float(sizes[k]))
         return tuple(dict.fromkeys(name for k in order for name in self.program.names[k]))

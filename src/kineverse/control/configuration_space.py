@@ -99,7 +99,7 @@ def find_coordinates(
     A dependent coordinate stands for those that determine it, an articulation for all of its coordinates, and
     a speed for the coordinates that it drives.
     """
-    found: set[Symbol] = set()
+    result: set[Symbol] = set()
     known = {*model.symbols, *model.rates.dependent, *model.speeds}
     for symbol in find_symbols(model, names, argument):
         if symbol not in known and symbol.position not in known:
@@ -108,9 +108,9 @@ def find_coordinates(
             )
         dependent = model.rates.dependent.get(symbol.position)
         if dependent is not None:
-            found |= {s for s in dependent.symbols if s.has_derivative}
+            result |= {s for s in dependent.symbols if s.has_derivative}
         else:
-            found.add(symbol.position)
+            result.add(symbol.position)
         if symbol.order == 1:
-            found |= {x for x, row in model.rates.items() if symbol in row}
-    return frozenset(found)
+            result |= {x for x, row in model.rates.items() if symbol in row}
+    return frozenset(result)

@@ -258,7 +258,7 @@ def _accelerations(
     if not isinstance(acceleration, Mapping):
         acceleration = dict.fromkeys(speeds, acceleration)
     known = {str(name): s for s in speeds for name in (s, s.position)}
-    found = dict.fromkeys(speeds, DEFAULT_ACCELERATION)
+    result = dict.fromkeys(speeds, DEFAULT_ACCELERATION)
     for key, value in acceleration.items():
         if str(key) not in known:
             raise UnknownNameError(
@@ -266,5 +266,5 @@ def _accelerations(
             )
         if not (isinstance(value, int | float) and 0 < value < math.inf):
             raise InvalidValueError(f"The acceleration of '{key}' is a positive number, not {value!r}.")
-        found[known[str(key)]] = float(value)
-    return found
+        result[known[str(key)]] = float(value)
+    return result

@@ -351,18 +351,18 @@ class Controller:
         if not math.isfinite(self._check.item()):
             raise self._diagnosis.not_finite()
         evaluated = perf_counter()
-        found = self._solver.solve(*self._quadratic_program)
-        if found.status != "solved" and self._relaxed is not self._solver:
-            found = self._relaxed.solve(*self._quadratic_program)
+        result = self._solver.solve(*self._quadratic_program)
+        if result.status != "solved" and self._relaxed is not self._solver:
+            result = self._relaxed.solve(*self._quadratic_program)
         solved = perf_counter()
         times = StepTimes(read - start, evaluated - read, solved - evaluated, solved - start)
-        if found.status != "solved":
+        if result.status != "solved":
             least = self._diagnosis.least_violation()
-            command = self._command(least.x, np.zeros(len(found.multipliers)), 0, times)
+            command = self._command(least.x, np.zeros(len(result.multipliers)), 0, times)
             if np.abs(least.violations).max() < _FEASIBLE:
                 return command  # the solver failed, not the problem
             raise self._diagnosis.infeasible(command)
-        return self._command(found.x, found.multipliers, found.iterations, times)
+        return self._command(result.x, result.multipliers, result.iterations, times)
 
     def _command(self, x: Array, multipliers: Array, iterations: int, times: StepTimes) -> Command:
         """Return the command of a solution, and remember it as the last one."""

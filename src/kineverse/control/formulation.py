@@ -114,8 +114,8 @@ class Formulation:
             for speed, limit in (accelerations or {}).items()
         }
         self._limits = every | brakes
-        found = self._rows(ranges, dt, None)
-        columns = (first | set(found.speeds)) - fixed_speeds
+        result = self._rows(ranges, dt, None)
+        columns = (first | set(result.speeds)) - fixed_speeds
         self.speeds: tuple[Symbol, ...] = tuple(sorted(columns, key=lambda s: s.sort_key))
         unknown = [s for s in self.speeds if s not in model.speeds]
         if unknown:
@@ -123,7 +123,7 @@ class Formulation:
                 f"The tasks are about '{unknown[0]}', and nothing in the model moves with it. "
                 f"{suggest(str(unknown[0]), map(str, model.speeds), 'speed')}"
             )
-        self.rows = found if found.speeds == self.speeds else self._rows(ranges, dt, self.speeds)
+        self.rows = result if result.speeds == self.speeds else self._rows(ranges, dt, self.speeds)
         self._check_keeps({name: c for name, c in keeps.items() if name in ranges})
         self.keeps = tuple(name for name in keeps if name not in equalities)
         self.goals = tuple(
@@ -150,15 +150,15 @@ class Formulation:
     @property
     def parts(self) -> dict[str, Expression]:
         """All values and derivatives in the rows of each task and constraint, by name, flat."""
-        found: dict[str, list[Expression]] = {}
+        result: dict[str, list[Expression]] = {}
         tasks: tuple[GoalRows | HoldRows, ...] = (*self.goals, *self.holds)
         for row in tasks:
-            found[row.name] = [row.error, row.jacobian.ravel()]
+            result[row.name] = [row.error, row.jacobian.ravel()]
         rows = self.rows
         for k, name in enumerate(rows.names):
             ends = [e for e in (rows.lower[k], rows.upper[k], rows.violation[k]) if e.symbols]
-            found.setdefault(name, []).extend([rows.matrix[k], *(e.ravel() for e in ends)])
-        return {name: as_expression(np.concatenate(part)) for name, part in found.items()}
+            result.setdefault(name, []).extend([rows.matrix[k], *(e.ravel() for e in ends)])
+        return {name: as_expression(np.concatenate(part)) for name, part in result.items()}
 
     def _rows(
         self, constraints: dict[str, Constraint], dt: ExpressionLike, speeds: Sequence[Symbol] | None
@@ -266,14 +266,14 @@ def _relevant_constraints(model: ModelView, subject: Sequence[Expression]) -> di
     Coordinates in bounds of positions count: what bounds another coordinate moves it, and the other way
     round. Those in bounds of speeds, such as the bolt of a lock, do not.
     """
-    found = model.constraints_for(subject, closure=True)
+    result = model.constraints_for(subject, closure=True)
     while True:
-        shared = [*subject, *(part for c in found.values() for part in _parts(c))]
+        shared = [*subject, *(part for c in result.values() for part in _parts(c))]
         every = model.constraints_for(shared, bounds=True)
-        more = [c for name, c in every.items() if name not in found and c.order == 0]
+        more = [c for name, c in every.items() if name not in result and c.order == 0]
         if not more:
-            return found
-        found = model.constraints_for([*shared, *(part for c in more for part in _parts(c))], closure=True)
+            return result
+        result = model.constraints_for([*shared, *(part for c in more for part in _parts(c))], closure=True)
 
 
 def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) -> frozenset[Symbol]:
@@ -282,7 +282,7 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
     A driven or dependent coordinate stands for all speeds in its row, an articulation for all of its
     coordinates.
     """
-    found: set[Symbol] = set()
+    result: set[Symbol] = set()
     for symbol in find_symbols(model, names, argument):
         row = model.rates.row(symbol.position) if symbol.order <= 1 else None
         speeds = {symbol.derivative() if symbol.order == 0 else symbol} if row is None else set(row)
@@ -292,8 +292,8 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
                 f"{argument}=: nothing in the model moves with '{unknown[0]}'. "
                 f"{suggest(str(unknown[0]), map(str, model.speeds), 'speed')}"
             )
-        found |= speeds
-    return frozenset(found)
+        result |= speeds
+    return frozenset(result)
 
 
 def find_symbols(model: ModelView, names: Iterable[Symbol | str], argument: str) -> Iterator[Symbol]:

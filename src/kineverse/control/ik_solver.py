@@ -166,7 +166,7 @@ class InverseKinematics:
         home = x.copy()
         search.iterations = 0
         search.weights[:] = self._program.weights
-        found: list[Array] = []
+        result: list[Array] = []
         obstacles: Counter[str] = Counter()
         best = blocked = SearchEnd(home, math.inf)
         generator: np.random.Generator | None = None
@@ -194,13 +194,13 @@ class InverseKinematics:
                     if error < blocked.error:
                         blocked = SearchEnd(x.copy(), error)
                     continue
-            if all(np.abs(x - other).max() > _DIFFERENT for other in found):
-                found.append(x.copy())
-            if len(found) == solutions:
+            if all(np.abs(x - other).max() > _DIFFERENT for other in result):
+                result.append(x.copy())
+            if len(result) == solutions:
                 break
-        found.sort(key=lambda q: float(np.linalg.norm(q - home)))
-        if found:
-            x[:] = found[0]
+        result.sort(key=lambda q: float(np.linalg.norm(q - home)))
+        if result:
+            x[:] = result[0]
         elif blocked.error < math.inf:
             x[:] = blocked.coordinates
         else:
@@ -208,8 +208,8 @@ class InverseKinematics:
             space.bring_back(x, home)
             # Monotone steps converge where full steps were given up, such as on the way to a distant target.
             if search.is_done() and (clearance is None or clearance.measure(x) == 0.0):
-                found.append(x.copy())
-        return self._result(given, found, obstacles, used, begin)
+                result.append(x.copy())
+        return self._result(given, result, obstacles, used, begin)
 
     def batch(self, values: Iterable[StateLike], *, starts: int = 16, seed: int = 0) -> list[IkResult]:
         """Return the results of many targets, each as of :meth:`solve`.

@@ -233,8 +233,8 @@ class Diagnosis:
             return NotFiniteError(f"The state has no finite value for {', '.join(map(repr, wrong[:6]))}.")
         parts = self._formulation.parts
         symbols = self._program.function.inputs
-        found = compile(list(parts.values()), symbols, tier="interpreter")(values)
-        names = [name for name, part in zip(parts, found, strict=True) if not np.isfinite(part).all()]
+        result = compile(list(parts.values()), symbols, tier="interpreter")(values)
+        names = [name for name, part in zip(parts, result, strict=True) if not np.isfinite(part).all()]
         where = ", ".join(map(repr, names[:6])) or "the sum of the terms, which is too large"
         return NotFiniteError(
             f"A value or derivative is not finite at this state, in {where}: the state is a singularity of "
@@ -279,14 +279,14 @@ class Diagnosis:
         rows = self._formulation.rows
         column = {s: k for k, s in enumerate(self._program.speeds)}
         ends = compile([rows.lower, rows.upper], self._program.function.inputs, tier="interpreter")
-        found = []
+        result = []
         for row, low, high in zip(rows.rows, *ends(self._evaluator.input), strict=True):
             if len(row.weights) == 1:
                 ((speed, weight),) = row.weights.items()
                 if not weight.symbols:
                     below, above = sorted((low / float(weight), high / float(weight)))
-                    found.append((row.name, column[speed], float(below), float(above)))
-        return found
+                    result.append((row.name, column[speed], float(below), float(above)))
+        return result
 
     def _find_conflict(self) -> tuple[Conflict, ...]:
         """Return an irreducible set of contradictory constraints; rows of one name are one member."""
@@ -295,7 +295,7 @@ class Diagnosis:
         soft = self._program.soft
         lower, upper = np.where(soft, -math.inf, lower), np.where(soft, math.inf, upper)
         simple = self._simple_rows()
-        found: dict[str, tuple[float, float]] = {}
+        result: dict[str, tuple[float, float]] = {}
         for k, side in find_irreducible_conflict(A, lower, upper):
             if k < len(self._program.speeds):
                 # Bounds of several constraints are merged: those count that are as tight.
@@ -304,9 +304,9 @@ class Diagnosis:
             else:
                 names = list(self._names_of_row(k))
             for name in names:
-                low, high = found.get(name, (-math.inf, math.inf))
-                found[name] = (max(low, lower[k]), high) if side < 0 else (low, min(high, upper[k]))
-        return tuple(Conflict(name, self._operations(name), *map(float, e)) for name, e in found.items())
+                low, high = result.get(name, (-math.inf, math.inf))
+                result[name] = (max(low, lower[k]), high) if side < 0 else (low, min(high, upper[k]))
+        return tuple(Conflict(name, self._operations(name), *map(float, e)) for name, e in result.items())
 
     def _names_of_row(self, index: int) -> tuple[str, ...]:
         names = self._program.names

@@ -125,12 +125,12 @@ class PositionProgram:
                     else Constraint(*map(self.make_plain, (c.lower, c.expression, c.upper)))
                 )
         symbols = {name: {s for s in c.symbols if s.has_derivative} for name, c in waiting.items()}
-        found = {s for part in parts for s in part.error.symbols}
-        found |= {s for c in ranges.values() for s in c.symbols}
-        while named := [name for name in waiting if not found.isdisjoint(symbols[name])]:
+        result = {s for part in parts for s in part.error.symbols}
+        result |= {s for c in ranges.values() for s in c.symbols}
+        while named := [name for name in waiting if not result.isdisjoint(symbols[name])]:
             for name in named:
                 c = waiting.pop(name)
-                found |= symbols[name]
+                result |= symbols[name]
                 if is_equality(c):
                     error = (c.expression - c.lower).ravel()
                     parts.append(ErrorRows(name, error, as_expression(np.ones(error.size)), TOLERANCE, True))
@@ -237,8 +237,8 @@ class PositionProgram:
                 function()
             except NoSolutionError:
                 return None
-            found: Array = function.outputs[0].copy()
-            return found if np.isfinite(found).all() else None
+            result: Array = function.outputs[0].copy()
+            return result if np.isfinite(result).all() else None
 
         squares: list[Array] = []
         generator = np.random.default_rng(0)

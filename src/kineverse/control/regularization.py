@@ -197,14 +197,14 @@ def find_posture(
             if isinstance(task, Goal) and isinstance(task.expression, Symbol)
         }
         weights = {s: posture for s in formulation.speeds if s.position not in asked}
-    found = {}
+    result = {}
     for speed, weight in weights.items():
         coordinate = speed.position
         if weight and coordinate in model.degrees_of_freedom and coordinate not in model.rates:
             lower, upper = model.limits(coordinate)
             if math.isfinite(lower) and math.isfinite(upper):
-                found[speed] = weight, (lower + upper) / 2
-    return found
+                result[speed] = weight, (lower + upper) / 2
+    return result
 
 
 def acceleration_limits(

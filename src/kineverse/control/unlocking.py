@@ -68,7 +68,7 @@ class LockSide:
 
 def find_lock_sides(model: ModelView, goals: Iterable[Symbol]) -> list[LockSide]:
     """Return the sides of all locks on the way to goals: those on the goals, on their keys, and so on."""
-    found: list[LockSide] = []
+    result: list[LockSide] = []
     waiting = list(dict.fromkeys(goals))
     seen = set(waiting)
     while waiting:
@@ -76,11 +76,11 @@ def find_lock_sides(model: ModelView, goals: Iterable[Symbol]) -> list[LockSide]
         for name, constraint in model.constraints_for([coordinate]).items():
             held = constraint.expression
             if isinstance(held, Symbol) and constraint.order <= 1 and held.position == coordinate:
-                found += _sides(name, constraint, held)
-        keys = [key for side in found for key in side.trend if key not in seen]
+                result += _sides(name, constraint, held)
+        keys = [key for side in result for key in side.trend if key not in seen]
         waiting += dict.fromkeys(keys)
         seen.update(keys)
-    return found
+    return result
 
 
 def _sides(name: str, constraint: Constraint, held: Symbol) -> Iterator[LockSide]:
@@ -99,8 +99,8 @@ def _sides(name: str, constraint: Constraint, held: Symbol) -> Iterator[LockSide
         }
         if trend:
             room, *slopes = _values_of([way * (bound - offset), *trend.values()])
-            found = dict(zip(trend, slopes, strict=True))
-            yield LockSide(f"{name} {side}", coordinate, way, room, found)
+            result = dict(zip(trend, slopes, strict=True))
+            yield LockSide(f"{name} {side}", coordinate, way, room, result)
 
 
 def _values_of(expressions: list[Expression]) -> list[Expression]:
@@ -154,9 +154,9 @@ def unlock(
         if not (finite_number(number) or 0.0) > 0:
             raise InvalidValueError(f"The {what} of unlocking is a positive number, not {number!r}.")
     goals = _check_goals(model, goal)
-    found = _sort_sides(find_lock_sides(model, goals), goals)
-    margins = {key: _margin(model, key, margin) for side in found for key in side.trend}
-    order = [side.behind(margins) for side in found]
+    result = _sort_sides(find_lock_sides(model, goals), goals)
+    margins = {key: _margin(model, key, margin) for side in result for key in side.trend}
+    order = [side.behind(margins) for side in result]
     tasks = [Goal(q, value, name=f"reach {q}", gain=2.0, weight=10.0) for q, value in goals.items()]
     wanted: Claims = {}
     for q, value in goals.items():
@@ -165,8 +165,8 @@ def unlock(
     shut = [_is_less(side.room, _SHUT) for side in order]
     needs = _pass_demand(order, shut, wanted) if demand else [as_expression(1.0)] * len(order)
     states = list(zip(order, shut, needs, strict=True))
-    scores = [_score(*pair, number) for number, pair in enumerate(zip(found, order, needs, strict=True))]
-    claims = _collect_claims(found, order, scores)
+    scores = [_score(*pair, number) for number, pair in enumerate(zip(result, order, needs, strict=True))]
+    claims = _collect_claims(result, order, scores)
     for (side, is_shut, need), score in zip(states, scores, strict=True):
         trend = {q: slope * _wins(q, slope, score, claims) for q, slope in side.trend.items()}
         length = sqrt(sum((s * s for s in trend.values()), as_expression(_TINY**2)))
@@ -283,10 +283,10 @@ def _larger(a: Expression, b: Expression) -> Expression:
 def _check_goals(model: ModelView, goal: Mapping[Symbol, float] | Mapping[str, float]) -> dict[Symbol, float]:
     if not goal:
         raise InvalidValueError("Unlocking has a goal, such as {'garage/door': 1.5}.")
-    found: dict[Symbol, float] = {}
+    result: dict[Symbol, float] = {}
     for name, value in goal.items():
         symbol, number = model.degree_of_freedom(name), finite_number(value)
         if number is None:
             raise InvalidValueError(f"The goal of '{name}' is a finite number, not {value!r}.")
-        found[symbol] = number
-    return found
+        result[symbol] = number
+    return result

@@ -147,10 +147,10 @@ class CollisionLibrary(SourceLibrary):
             return broadphase.find_near_pairs(table, reach)
         binding = _bind_table(table)
         while True:
-            found = self._code.near(binding.address, reach, *binding.results)
-            if found <= len(binding.lows):
-                return binding.pairs[:found], binding.lows[:found]
-            binding.reserve(2 * found)
+            result = self._code.near(binding.address, reach, *binding.results)
+            if result <= len(binding.lows):
+                return binding.pairs[:result], binding.lows[:result]
+            binding.reserve(2 * result)
 
     def measure(self, table: ObjectTable, pairs: Indices, limit: float) -> tuple[Floats, Floats]:
         """Measure pairs of objects, (K, 2) with the smaller index first, as far as C can."""
@@ -174,12 +174,12 @@ class CollisionLibrary(SourceLibrary):
 
     def _extend(self, binding: _TableBinding, facing: FacingPoints) -> bool:
         """Add facing points to the results of a query; False, with larger buffers, if they were too short."""
-        found = self._code.extend(binding.address, binding.query_address, facing.address)
-        if found < 0:
+        result = self._code.extend(binding.address, binding.query_address, facing.address)
+        if result < 0:
             raise MemoryError("There is no memory for the facing points of near bodies.")
-        if found <= binding.query.room:
+        if result <= binding.query.room:
             return True
-        binding.reserve(2 * found)
+        binding.reserve(2 * result)
         return False
 
     def rank(
@@ -189,9 +189,9 @@ class CollisionLibrary(SourceLibrary):
         if self._code is not None:
             order = np.empty(len(pairs), dtype=np.int64)
             where = pairs.ctypes.data, len(pairs), distances.ctypes.data, radius, per_shape, order.ctypes.data
-            found = self._code.rank(_bind_table(table).address, *where)
-            if found >= 0:
-                return order[:found]
+            result = self._code.rank(_bind_table(table).address, *where)
+            if result >= 0:
+                return order[:result]
         return broadphase.rank_pairs(table, pairs, distances, radius, per_shape)
 
     def gather(
@@ -235,16 +235,16 @@ class CollisionLibrary(SourceLibrary):
         query = binding.query
         known = binding.ask(table, reach, radius, selection, per_shape)
         while True:
-            found = self._code.search(binding.address, binding.query_address)
-            if found < 0 and known is not None:
-                known.reserve(-2 * found)
-            elif found > query.room:
-                binding.reserve(2 * found)
+            result = self._code.search(binding.address, binding.query_address)
+            if result < 0 and known is not None:
+                known.reserve(-2 * result)
+            elif result > query.room:
+                binding.reserve(2 * result)
             elif query.kept <= 0 or facing is None or self._extend(binding, facing):
                 break
         if query.kept < 0:
-            pairs, lows = binding.pairs[:found], binding.lows[:found]
-            return (pairs, lows, binding.distances[:found], binding.witnesses[:found]), None
+            pairs, lows = binding.pairs[:result], binding.lows[:result]
+            return (pairs, lows, binding.distances[:result], binding.witnesses[:result]), None
         return None, binding.copy_ranked()
 
     def search_at(

@@ -74,12 +74,12 @@ def parse_known_rules(entries: Any, model: ModelView) -> tuple[Rule, ...]:
 
 def read_rules(model: ModelView) -> tuple[Rule, ...]:
     """Return rules that a model keeps: first those of included models, below their prefix, then its own."""
-    found: list[Rule] = []
+    result: list[Rule] = []
     for name, entries in model.data.items():
         if name.endswith(f"/{RULES}"):
             prefix = name.removesuffix(RULES)
-            found += [rule._replace(a=prefix + rule.a, b=prefix + rule.b) for rule in parse_rules(entries)]
-    return (*found, *parse_rules(model.data.get(RULES, ())))
+            result += [rule._replace(a=prefix + rule.a, b=prefix + rule.b) for rule in parse_rules(entries)]
+    return (*result, *parse_rules(model.data.get(RULES, ())))
 
 
 def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ...]:

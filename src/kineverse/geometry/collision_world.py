@@ -201,13 +201,13 @@ class CollisionWorld:
             return None
         self._evaluator.input[:] = values
         kinematics = address, *self._addresses
-        found = collision_library.search_at(
+        result = collision_library.search_at(
             self.table, kinematics, radius + ACCURACY, radius, selection, per_shape, facing
         )
-        if found is not None:
+        if result is not None:
             self._placed_at, self._missing_state = (self.inputs, values.copy()), ""
             self.narrowphase.invalidate_poses(self.table.moving)
-        return found
+        return result
 
     @property
     def values(self) -> Floats:

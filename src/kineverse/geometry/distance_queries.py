@@ -42,8 +42,8 @@ def find_distance(world: CollisionWorld, a: str, b: str) -> DistanceResult:
         radius = _least_distance(world, pairs[[np.argmin(lows)]]) + ACCURACY
         near = lows <= radius
         pairs, lows = pairs[near], lows[near]
-    (found,) = _nearest_pairs(world, pairs, lows, radius)
-    return found if found.a == a else found.swap()
+    (result,) = _nearest_pairs(world, pairs, lows, radius)
+    return result if result.a == a else result.swap()
 
 
 def find_pairs_within(
@@ -104,7 +104,7 @@ def find_distances_to(world: CollisionWorld, body: str, radius: float) -> list[D
     lows = table.lower_bounds(pairs[:, 0], pairs[:, 1])
     near = lows <= radius + ACCURACY
     nearest = _nearest_pairs(world, pairs[near], lows[near], radius)
-    return [found if found.a == body else found.swap() for found in nearest]
+    return [result if result.a == body else result.swap() for result in nearest]
 
 
 def _pair_product(members: list[int], others: list[int]) -> Indices:
@@ -198,9 +198,9 @@ class PreparedQuery:
         within = self.radius if radius is None else radius
         check_radius(within)
         with self._lock:
-            found = self._world.search_at(values, within, self._select(), self.per_shape, facing)
-            if found is not None:
-                return DistanceResults(self._world, *found)
+            result = self._world.search_at(values, within, self._select(), self.per_shape, facing)
+            if result is not None:
+                return DistanceResults(self._world, *result)
             self._world.update(values)
             return self(within, facing)
 
@@ -251,13 +251,13 @@ class PreparedQuery:
         within = self.radius if radius is None else radius
         check_radius(within)
         motion = self._move(coordinates)
-        found = motion.struct
+        result = motion.struct
         for _ in motion.find_rows(_as_rows(Q, len(coordinates)), within, first=False):
-            near = self(found.limit)
+            near = self(result.limit)
             if len(near):
-                found.least = min(found.least, float(near.distances[0]))
-                found.limit = max(found.least, 0.0)
-        return float(found.least)
+                result.least = min(result.least, float(near.distances[0]))
+                result.limit = max(result.least, 0.0)
+        return float(result.least)
 
     @one_at_a_time
     def prepare(self) -> None:
@@ -336,15 +336,15 @@ def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:
 
 def flag_matching(bodies: Sequence[str], patterns: str | Iterable[str]) -> npt.NDArray[np.bool_]:
     """Return (B,) flags of the bodies that match one of some names or patterns."""
-    found = np.zeros(len(bodies), dtype=bool)
+    result = np.zeros(len(bodies), dtype=bool)
     for pattern in (patterns,) if isinstance(patterns, str) else tuple(patterns):
         matching = np.array([matches_pattern(body, (pattern,)) for body in bodies], dtype=bool)
         if not matching.any():
             raise UnknownNameError(
                 f"No body of the scene is named or matched by '{pattern}'. {suggest(pattern, bodies, 'body')}"
             )
-        found |= matching
-    return found
+        result |= matching
+    return result
 
 
 def flag_subtree(model: ModelView, bodies: Sequence[str], frame: str) -> npt.NDArray[np.bool_]:

@@ -40,8 +40,8 @@ def find_widest_gap(a: PlacedSolid, b: PlacedSolid, directions: Floats) -> tuple
         [directions, _DIRECTIONS, *(sign * rotation.T for _, rotation, _ in (a, b) for sign in (1.0, -1.0))]
     )
     values = directional_gaps(a, b, tried)
-    found = [_ascend(a, b, tried[k], float(values[k])) for k in np.argsort(-values, kind="stable")[:_STARTS]]
-    return max(found, key=lambda one: one[0])
+    result = [_ascend(a, b, tried[k], float(values[k])) for k in np.argsort(-values, kind="stable")[:_STARTS]]
+    return max(result, key=lambda one: one[0])
 
 
 def smoothed_support(placed: PlacedSolid, direction: Floats) -> Floats:
@@ -148,11 +148,11 @@ def gjk_distance(a: PlacedSolid, b: PlacedSolid) -> tuple[float, Floats, Floats]
         nearest = _nearest_to_origin([*points, corner])
         if nearest is None:
             return None
-        kept, some, found = nearest
-        if not (nearer := float(np.linalg.norm(found))) < high:
+        kept, some, result = nearest
+        if not (nearer := float(np.linalg.norm(result))) < high:
             break
         points, origins = [[*points, corner][k] for k in kept], [[*origins, point][k] for k in kept]
-        direction, high, weights = found, nearer, some
+        direction, high, weights = result, nearer, some
     if not (high > 0.0 and high - low <= _ACCEPTED * size):
         return None
     return high, weights @ np.array(origins), direction / high
@@ -177,11 +177,11 @@ def gjk_distance_to_faces(
         triangle = Solid(
             None, faces, np.zeros(3), np.zeros(3), radius, core=Core.from_corners(corners[k] - middle)
         )
-        found = gjk_distance(a, (triangle, np.eye(3), middle))
-        if found is None:
+        result = gjk_distance(a, (triangle, np.eye(3), middle))
+        if result is None:
             return None
-        if best is None or found[0] < best[0]:
-            best = found
+        if best is None or result[0] < best[0]:
+            best = result
     return best
 
 
@@ -201,7 +201,7 @@ def _nearest_to_origin(points: list[Floats]) -> tuple[tuple[int, ...], Floats, F
                 continue
             if count == 4:
                 return None
-            found = weights @ corners
-            if best is None or found @ found < best[2] @ best[2]:
-                best = kept, weights, found
+            result = weights @ corners
+            if best is None or result @ result < best[2] @ best[2]:
+                best = kept, weights, result
     return best

@@ -30,14 +30,14 @@ def parse_exclusions(entries: Any) -> tuple[Exclusion, ...]:
     """Return the entries of ``leave_out=``: bodies, patterns, and single shapes (body, number)."""
     if isinstance(entries, str):
         return (entries,)
-    found = tuple(entries) if isinstance(entries, Iterable) else (entries,)
-    for entry in found:
+    result = tuple(entries) if isinstance(entries, Iterable) else (entries,)
+    for entry in result:
         body, number = entry if isinstance(entry, tuple) and len(entry) == 2 else (entry, 0)
         if not isinstance(body, str) or not hasattr(number, "__index__"):
             raise InvalidValueError(
                 f"leave_out= takes bodies, patterns, or shapes (body, number), not {entry!r:.80}."
             )
-    return found
+    return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +109,7 @@ class CollisionObjects:
         """
         frames, bodies, rates = dict(model.frames), dict(model.bodies), model.rates.key
         same = _UnchangedPoses(self._frames, frames) if rates == self._rates else None
-        found: dict[str, tuple[CollisionObject, ...]] = {}
+        result: dict[str, tuple[CollisionObject, ...]] = {}
         for name, body in bodies.items():
             if matches_pattern(name, self._excluded_bodies) or not collision_shapes(body):
                 continue
@@ -117,9 +117,9 @@ class CollisionObjects:
             if kept is None or self._bodies[name] is not body or same is None or not same.contains(name):
                 kept = tuple(self._make_objects(model, name, body))
             if kept:
-                found[name] = kept
-        changed = list(found.items()) != list(self.by_body.items())
-        self._frames, self._bodies, self._rates, self.by_body = frames, bodies, rates, found
+                result[name] = kept
+        changed = list(result.items()) != list(self.by_body.items())
+        self._frames, self._bodies, self._rates, self.by_body = frames, bodies, rates, result
         return changed
 
     def _make_objects(self, model: ModelView, name: str, body: Body) -> Iterator[CollisionObject]:

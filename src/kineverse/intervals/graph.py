@@ -198,11 +198,11 @@ def _formula(node: Node) -> Expression:
 
 def reachable_terms(roots: tuple[Term, ...]) -> list[Term]:
     """Return the arguments and deciders of terms, theirs, and so on, arguments first."""
-    found: dict[int, Term] = {}
+    result: dict[int, Term] = {}
     stack = list(roots)
     while stack:
         term = stack.pop()
-        if term.index not in found:
-            found[term.index] = term
+        if term.index not in result:
+            result[term.index] = term
             stack += [*term.args, *term.deciders]
-    return [found[index] for index in sorted(found)]
+    return [result[index] for index in sorted(result)]

@@ -158,16 +158,16 @@ def _evaluate_products(inputs: Array, intervals: Sequence[InputDomain], degree: 
 def list_products(intervals: Sequence[InputDomain], degree: int) -> list[tuple[int, ...]]:
     """Return the index of the basis function of each input for each product."""
     most = degree if len(intervals) > FEW else degree * len(intervals)
-    found: list[tuple[tuple[int, ...], int]] = [((), 0)]
+    result: list[tuple[tuple[int, ...], int]] = [((), 0)]
     for interval in intervals:
         orders = interval.orders(degree)
-        found = [
+        result = [
             ((*which, i), total + order)
-            for which, total in found
+            for which, total in result
             for i, order in enumerate(orders)
             if total + order <= most
         ]
-    return [which for which, _ in found]
+    return [which for which, _ in result]
 
 
 _SAMPLES = {1: 65, 2: 17, 3: 9}

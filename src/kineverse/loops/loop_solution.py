@@ -136,28 +136,28 @@ def solve_loop(
     spans = np.array([max(map(abs, limits.get(s, (np.pi,)))) for s in followers])
     reach = np.where(angles, np.pi, np.where(np.isfinite(spans), spans, np.pi) + 1.0)
     stands = None if upright is None else compile(upright, [*followers, *inputs], tier="interpreter")
-    found, gap = find_branches(equations, x, u, angles, reach, stands)
+    result, gap = find_branches(equations, x, u, angles, reach, stands)
     where = format_point(free, u[: len(free)]) or "all configurations"
-    if not found:
+    if not result:
         raise NoSolutionError(
             f"Loop '{name}' does not close at {where}: {gap:.6g} is left between its ends. "
             "Begin where it does, with home={...}."
         )
-    if not 0 <= branch < len(found):
+    if not 0 <= branch < len(result):
         raise NoSolutionError(
-            f"Loop '{name}' has {len(found)} branches at {where}, numbered from 0, and none is {branch}."
+            f"Loop '{name}' has {len(result)} branches at {where}, numbered from 0, and none is {branch}."
         )
     intervals = [
         _interval(name, s, limits.get(s), bool(turns)) for s, turns in zip(free, goes_round, strict=False)
     ]
-    sampled, seed, steps, rows = _fit_guess(name, equations, intervals, found[branch], u, angles)
+    sampled, seed, steps, rows = _fit_guess(name, equations, intervals, result[branch], u, angles)
     if parameters:
         # The guess is fitted for one value of the parameters only, so others need more steps.
         steps += _MORE_STEPS
     domain = (*map(_domain, seed.intervals), *((-np.inf, np.inf) for _ in parameters))
     function = ImplicitFunction(name, followers, inputs, residual, rows, seed.expression(free), steps, domain)
     return SolvedLoop(
-        function, free, followers, len(coordinates) - rank, len(found), branch,
+        function, free, followers, len(coordinates) - rank, len(result), branch,
         sampled.condition, tuple(sampled.worst.tolist()),
     )  # fmt: skip
 

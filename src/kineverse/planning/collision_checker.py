@@ -100,8 +100,8 @@ class CollisionChecker:
         if any(e.nodes for e in outputs):
             outputs.append(as_expression(sum((p.sum() for p in poses), as_expression(0.0)) * 0.0))
         moving = {*self.coordinates}
-        found = {s for e in outputs for s in e.symbols} - moving
-        self.parameters = tuple(sorted(found, key=lambda s: s.sort_key))
+        result = {s for e in outputs for s in e.symbols} - moving
+        self.parameters = tuple(sorted(result, key=lambda s: s.sort_key))
         self.conditions = len(outputs) - len(poses)
         return VectorProgram(outputs, self.coordinates, self.parameters, scalar="float")
 
@@ -142,9 +142,9 @@ class CollisionChecker:
         for k, items in enumerate(members):
             solids = [solid for _, solid, _ in items]
             bodies, places = np.zeros(len(solids), dtype=np.int32), np.array([T[:3] for _, _, T in items])
-            found = ObstacleSet(solids, bodies, places, self._planes, lanes, poses[k], k)
-            self._sets.append(found)
-            self._costs.append(found.cost)
+            result = ObstacleSet(solids, bodies, places, self._planes, lanes, poses[k], k)
+            self._sets.append(result)
+            self._costs.append(result.cost)
 
     def _choose_pairs(self, dependence: FrameDependence) -> None:
         """Choose for each pair of moving bodies whether shapes or spheres stand for the second one.
@@ -297,24 +297,24 @@ class CollisionChecker:
 
     def valid(self, Q: Floats32) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of the configurations (N, n) that are within limits, allowed and free."""
-        found = np.zeros(len(Q), dtype=np.uint8)
-        self._code.kineverse_valid(self.address, Q.ctypes.data, len(Q), found.ctypes.data)
-        return found.astype(bool)
+        result = np.zeros(len(Q), dtype=np.uint8)
+        self._code.kineverse_valid(self.address, Q.ctypes.data, len(Q), result.ctypes.data)
+        return result.astype(bool)
 
     def edges(
         self, A: Floats32, B: Floats32, resolution: float = RESOLUTION, least: float = 0.0
     ) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of the straight edges between configurations (N, n) that are free."""
-        found = np.zeros(len(A), dtype=np.uint8)
+        result = np.zeros(len(A), dtype=np.uint8)
         self._code.kineverse_edges(
-            self.address, A.ctypes.data, B.ctypes.data, len(A), resolution, least, found.ctypes.data
+            self.address, A.ctypes.data, B.ctypes.data, len(A), resolution, least, result.ctypes.data
         )
-        return found.astype(bool)
+        return result.astype(bool)
 
     def find_collision(self, points: Floats32, seconds: float = math.inf) -> tuple[int, float] | None:
         """Return the first edge of a polyline (N, n) that is not certainly free, and a fraction of it."""
         where = ctypes.c_double()
-        found = self._code.kineverse_certify(
+        result = self._code.kineverse_certify(
             self.address,
             points.ctypes.data,
             len(points),
@@ -323,39 +323,39 @@ class CollisionChecker:
             seconds,
             ctypes.addressof(where),
         )
-        if found == -3:
+        if result == -3:
             raise LateCheckError
-        if found < -1:
+        if result < -1:
             raise MemoryError("There is no memory for the check of a path.")
-        return None if found < 0 else (int(found), where.value)
+        return None if result < 0 else (int(result), where.value)
 
     def outputs(self, q: Floats32) -> tuple[Floats32, Floats32]:
         """Return the poses (K, 3, 4) of the rigid groups and the conditions at a configuration (n,)."""
         count = 12 * len(self.groups)
-        found = np.zeros(count + self.conditions, dtype=np.float32)
-        self._code.kineverse_poses(self.address, q.ctypes.data, found.ctypes.data)
-        return found[:count].reshape(-1, 3, 4), found[count:]
+        result = np.zeros(count + self.conditions, dtype=np.float32)
+        self._code.kineverse_poses(self.address, q.ctypes.data, result.ctypes.data)
+        return result[:count].reshape(-1, 3, 4), result[count:]
 
     def _find_turns(self) -> Array:
         """Return by which angle a unit of each coordinate turns a body, the largest one found (n,) [rad].
 
         Threads and gears turn bodies so fast that two poses do not tell how far they are apart.
         """
-        generator, found = np.random.default_rng(0), np.zeros(len(self.coordinates))
-        for q in generator.uniform(-1.0, 1.0, (2, len(found))).astype(np.float32):
+        generator, result = np.random.default_rng(0), np.zeros(len(self.coordinates))
+        for q in generator.uniform(-1.0, 1.0, (2, len(result))).astype(np.float32):
             before = self.outputs(q)[0][:, :, :3]
-            for i in range(len(found)):
+            for i in range(len(result)):
                 near = q.copy()
                 near[i] += _SAME
                 change = np.linalg.norm(self.outputs(near)[0][:, :, :3] - before, axis=(1, 2))
                 turns = np.nan_to_num(change / math.sqrt(2.0) / float(near[i] - q[i]), nan=0.0)
-                found[i] = max(found[i], turns.max(initial=0.0))
-        return found
+                result[i] = max(result[i], turns.max(initial=0.0))
+        return result
 
     def find_periodic(self, candidates: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
         """Return flags (n,) of those coordinates whose full turns change no pose and no condition."""
         generator = np.random.default_rng(0)
-        found = candidates.copy()
+        result = candidates.copy()
         # At other places too: a screw whose pitch happens to be 0 is not periodic.
         elsewhere = self.program.prepare(generator.uniform(-1.0, 1.0, len(self.parameters)))
         self.struct.kept = elsewhere.ctypes.data
@@ -364,9 +364,9 @@ class CollisionChecker:
                 turned = q.copy()
                 turned[i] += math.tau
                 pairs = zip(self.outputs(q), self.outputs(turned), strict=True)
-                found[i] &= all(np.allclose(a, b, atol=_SAME, equal_nan=True) for a, b in pairs)
+                result[i] &= all(np.allclose(a, b, atol=_SAME, equal_nan=True) for a, b in pairs)
         self.struct.kept = self._kept.ctypes.data
-        return found
+        return result
 
 
 def is_switching(expression: Expression) -> bool:

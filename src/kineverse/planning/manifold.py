@@ -102,8 +102,8 @@ class Manifold:
         # A coordinate that stands still, or stays at its limit, has no column.
         free = [parameter(f"planning/free/{i}", 1.0) for i in range(len(symbols))]
         outputs = [newton_step(self.rows, jacobian * array(free)), largest(self.rows)]
-        found = {s for e in outputs for s in e.symbols} - {*symbols, *free, *self._targets}
-        self._others = tuple(sorted(found, key=lambda s: s.sort_key))
+        result = {s for e in outputs for s in e.symbols} - {*symbols, *free, *self._targets}
+        self._others = tuple(sorted(result, key=lambda s: s.sort_key))
         self.parameters = (*self._others, *self._targets)
         self._program = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="float")
         self._exact = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="double")
@@ -195,12 +195,12 @@ class Manifold:
 
 def hold_targets(holds: Sequence[Hold]) -> Array:
     """Return the numbers that holds have as targets, of all holds one after the other."""
-    found = [np.zeros(0)]
+    result = [np.zeros(0)]
     for hold in holds:
         if _is_number(hold):
             value = hold.target if isinstance(hold.target, int | float) else as_expression(hold.target)({})
-            found.append(np.full(hold.expression.shape, value, dtype=float).ravel())
-    return np.concatenate(found)
+            result.append(np.full(hold.expression.shape, value, dtype=float).ravel())
+    return np.concatenate(result)
 
 
 def _is_number(hold: Hold) -> bool:
@@ -238,7 +238,7 @@ def newton_step(rows: Expression, jacobian: Expression) -> Expression:
 
 def largest(rows: Expression) -> Expression:
     """Return the largest magnitude of some rows (k,)."""
-    found = abs(rows[0])
+    result = abs(rows[0])
     for k in range(1, rows.size):
-        found = as_expression(maximum(found, abs(rows[k])))
-    return found
+        result = as_expression(maximum(result, abs(rows[k])))
+    return result

@@ -137,9 +137,9 @@ class Path:
 
     @cached_property
     def _times(self) -> Array:
-        found = section_times(self.points, self._parameterize(DEVIATION, RAMP, None, None))
-        found.flags.writeable = False
-        return found
+        result = section_times(self.points, self._parameterize(DEVIATION, RAMP, None, None))
+        result.flags.writeable = False
+        return result
 
     def _parameterize(
         self,

@@ -59,14 +59,14 @@ def parameterize_sections(
             f"deviation= is a number or an array of one for each of the {len(points)} points, not of shape "
             f"{given.shape}."
         )
-    found = []
+    result = []
     for section in sections:
         part = slice(section.first, section.last + 1)
         allowed = given if given.ndim == 0 else given[part]
-        found.append(
+        result.append(
             TimedSection(section, *parameterize_path(points[part], symbols, limits, allowed, section.checks))
         )
-    return found
+    return result
 
 
 def join_sections(sections: Sequence[TimedSection]) -> Trajectory:
@@ -122,9 +122,9 @@ def passing_times(points: Array, path: BlendedPath, trajectory: Trajectory) -> A
     way = np.concatenate([[0.0], np.cumsum(path.lengths - cut[:-1] - cut[1:])])
     at_corners = np.interp(way * (travelled[-1] / max(way[-1], 1e-300)), travelled, times)
     corners = np.concatenate([[0.0], np.cumsum(path.lengths)])
-    found: Array = np.interp(_lengths(points), corners, at_corners)
-    found[-1] = trajectory.duration
-    return found
+    result: Array = np.interp(_lengths(points), corners, at_corners)
+    result[-1] = trajectory.duration
+    return result
 
 
 def _drop_near(points: Array, deviation: npt.ArrayLike) -> tuple[Array, npt.ArrayLike]:
@@ -194,15 +194,15 @@ def _fine_times(trajectory: Trajectory) -> Array:
     counts = np.maximum(np.ceil(steps / _STEP), 1).astype(int)
     parts = [k + np.arange(count) / count for k, count in enumerate(counts.tolist())]
     at = np.concatenate([*parts, [float(len(counts))]])
-    found: Array = np.interp(at, np.arange(len(trajectory)), trajectory.times)
-    return found
+    result: Array = np.interp(at, np.arange(len(trajectory)), trajectory.times)
+    return result
 
 
 def _deviations(path: BlendedPath) -> Array:
     """Return the distances between the points of a path (N,) and its blends."""
-    found: Array = np.zeros(len(path.points))
-    found[1:-1] = path.deviation
-    return found
+    result: Array = np.zeros(len(path.points))
+    result[1:-1] = path.deviation
+    return result
 
 
 def _chords(path: BlendedPath, corner: int) -> Array:
@@ -212,5 +212,5 @@ def _chords(path: BlendedPath, corner: int) -> Array:
 
 def _lengths(points: Array) -> Array:
     """Return the lengths of a polyline (N, n) from its first point to each (N,)."""
-    found: Array = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    return found
+    result: Array = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return result

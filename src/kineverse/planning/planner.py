@@ -125,9 +125,9 @@ class Planner:
 
     def _check_separate_pairs(self, Q: Array) -> PlanningScene:
         """Return the scene in which pairs are checked that are apart at some of the configurations (N, n)."""
-        found = self.planning_scene.find_separate_pairs(Q)
-        if found:
-            self._separate |= found
+        result = self.planning_scene.find_separate_pairs(Q)
+        if result:
+            self._separate |= result
             self.planning_scene = self._build(self.planning_scene.state)
         return self.planning_scene
 
@@ -225,12 +225,12 @@ class Planner:
 
     def _start(self, start: Any) -> Array:
         """Return a start (n,) from a vector or a state."""
-        found = self._configurations(start, "start")
-        if len(found) != 1:
+        result = self._configurations(start, "start")
+        if len(result) != 1:
             raise ShapeError(
-                f"start has {len(found)} configurations; there is one start. Goals may be several."
+                f"start has {len(result)} configurations; there is one start. Goals may be several."
             )
-        return np.asarray(found[0])
+        return np.asarray(result[0])
 
     def _configurations(self, Q: Any, name: str) -> Array:
         """Return configurations (N, n) from one or several vectors or states."""
@@ -368,20 +368,20 @@ class Planner:
 
     def _plan_modes(self, search: ModeSearch, q: Array, begin: float) -> Path:
         """Return the path through modes that a search finds."""
-        scene, found = self.planning_scene, search.run(q)
+        scene, result = self.planning_scene, search.run(q)
         parts, modes, sections, first = [q[None]], [], [], 0
-        for segment in found.segments:
+        for segment in result.segments:
             parts.append(segment.points[1:])
             last = first + len(segment.points) - 1
             modes.append((segment.mode.name, first, last))
             checks = scene.checks(segment.touching, scene.manifold(segment.mode.along))
             sections.append(PathSection(first, last, checks))
             first = last
-        touching = frozenset(pair for segment in found.segments for pair in segment.touching)
+        touching = frozenset(pair for segment in result.segments for pair in segment.touching)
         whole = np.vstack(parts)
-        why = found.problem or f"Found through {len(modes)} modes, after {found.iterations} searches."
+        why = result.problem or f"Found through {len(modes)} modes, after {result.iterations} searches."
         path = scene.path(
-            not found.problem, whole, why, begin, perf_counter() - begin, found.iterations, touching
+            not result.problem, whole, why, begin, perf_counter() - begin, result.iterations, touching
         )
         return replace(path, modes=tuple(modes), sections=tuple(sections))
 
@@ -418,8 +418,8 @@ class Planner:
                 why += f" Without limits, so searched within 32 m or rad of the start: {named}."
             return why
         judge = scene.judge(touching)
-        found = [judge.contacts(row.astype(float), checker.struct.margin) for row in rows[:_TASK_GOALS]]
-        least = max((c for c in found if len(c)), key=lambda c: float(c[0].distance), default=None)
+        result = [judge.contacts(row.astype(float), checker.struct.margin) for row in rows[:_TASK_GOALS]]
+        least = max((c for c in result if len(c)), key=lambda c: float(c[0].distance), default=None)
         example = "" if least is None else f", at least of {describe_contacts(least)}"
         return (
             f"No configuration without collision was found that meets {names}. In reach, but with contacts "

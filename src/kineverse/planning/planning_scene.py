@@ -141,10 +141,10 @@ class PlanningScene:
             for beyond in reaches:
                 self.set_bounds(near, near[None], still, beyond)
                 share = seconds / len(reaches)
-                found = find_solutions(self.checker, manifold, near, count, share, seed, batches)
-                if len(found):
+                result = find_solutions(self.checker, manifold, near, count, share, seed, batches)
+                if len(result):
                     break
-        return found
+        return result
 
     def manifold(self, holds: Sequence[Hold]) -> Manifold | None:
         """Return the manifold of holds and equalities of the model, at the present place."""
@@ -248,15 +248,15 @@ class PlanningScene:
         by the long way round. A roadmap is on a circle and needs one search.
         """
         short = [v for goal in goals for v in self.space.equivalents(goal, q)]
-        found: list[tuple[float | Array, list[Array]]] = [(HALF_TURN, short)]
+        result: list[tuple[float | Array, list[Array]]] = [(HALF_TURN, short)]
         if not around or not self.space.turning.any():
-            return found
+            return result
         wound = [int(np.argmin(np.abs(ends - goal).max(axis=1))) for goal in goals]
         far = [goal + given[k] - ends[k] for goal, k in zip(goals, wound, strict=True)]
         if any(np.abs(a - b).max() > _SAME for a, b in zip(far, goals, strict=True)):
-            found.insert(0, (np.maximum(np.abs(np.array(far) - q).max(axis=0) + _SAME, HALF_TURN), far))
+            result.insert(0, (np.maximum(np.abs(np.array(far) - q).max(axis=0) + _SAME, HALF_TURN), far))
         long = [v for goal in goals for v in self.space.equivalents(goal, q, turn=FULL_TURN)]
-        return [*found, (FULL_TURN, long)]
+        return [*result, (FULL_TURN, long)]
 
     def _connect(
         self,
@@ -278,13 +278,13 @@ class PlanningScene:
         searched, until = perf_counter(), checked_by(working_seconds(), seconds)
         if manifold is None:
             patience = MORE_PATIENCE if optimize else PATIENCE
-            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience, asked)
+            result = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience, asked)
         else:
-            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges, asked)
+            result = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges, asked)
         spent = perf_counter() - searched
-        if found.problem:
-            return self.no_path(found.points, found.problem, begin, spent, found.iterations)
-        points = found.points
+        if result.problem:
+            return self.no_path(result.points, result.problem, begin, spent, result.iterations)
+        points = result.points
         # A roadmap may wind further than the variants do.
         turns = np.where(self.space.turning, np.round((points[-1] - targets) / math.tau), 0.0) * math.tau
         k = int(np.argmin(np.abs(targets + turns - points[-1]).max(axis=1)))
@@ -292,9 +292,9 @@ class PlanningScene:
         contact = self.judge(touching).first_contact(points, _JUDGED, until)
         if contact is not None:
             problem = f"The scene finds a contact on the path: {describe_contacts([contact[1]])}."
-            return self.no_path(points, problem, begin, spent, found.iterations)
-        why = f"Found after {found.iterations} samples{'' if roadmap is None else roadmap.describe()}."
-        return self.path(True, points, why, begin, spent, found.iterations, touching, manifold)
+            return self.no_path(points, problem, begin, spent, result.iterations)
+        why = f"Found after {result.iterations} samples{'' if roadmap is None else roadmap.describe()}."
+        return self.path(True, points, why, begin, spent, result.iterations, touching, manifold)
 
     def judge(self, touching: BodyPairs = frozenset()) -> SceneJudge:
         """Return the judge of the scene in which some pairs may touch, at the present place."""
@@ -374,8 +374,8 @@ def find_overlapping_pairs(scene: Scene, space: PlanningSpace) -> tuple[Rule, ..
     columns = {s: samples.values_of(s).tolist() for s in home if s.has_derivative and not s.order}
     states = [home.updated({s: values[k] for s, values in columns.items()}) for k in range(samples.size)]
     pairs = {frozenset(pair) for pair in scene.pairs_affected_by(space.symbols)}
-    found = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
-    return tuple(rule for rule in found if frozenset((rule.a, rule.b)) in pairs)
+    result = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
+    return tuple(rule for rule in result if frozenset((rule.a, rule.b)) in pairs)
 
 
 def find_separate_pairs(
@@ -385,12 +385,12 @@ def find_separate_pairs(
 
     Samples miss a small gap, in which a start may be.
     """
-    found = set()
+    result = set()
     for q in Q if rules else ():
         if _has_poses(scene, state.updated(dict(zip(space.symbols, q.tolist(), strict=True)))):
             results = scene.distances((rule.a, rule.b) for rule in rules)
-            found |= {frozenset((r.a, r.b)) for r in results if r.distance > margin + _APART}
-    return frozenset(found)
+            result |= {frozenset((r.a, r.b)) for r in results if r.distance > margin + _APART}
+    return frozenset(result)
 
 
 def _has_poses(scene: Scene, state: State) -> bool:

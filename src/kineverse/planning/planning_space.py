@@ -130,16 +130,16 @@ class PlanningSpace:
         if not self.turning.any():
             return q[None]
         low, high = self.bounds(start, q[None], turn=turn)
-        found = q[None].copy()
+        result = q[None].copy()
         for i in np.flatnonzero(self.turning).tolist():
             first = math.ceil((low[i] - q[i]) / math.tau - 1e-9)
             last = math.floor((high[i] - q[i]) / math.tau + 1e-9)
             turned = [float(q[i]) + k * math.tau for k in range(first, last + 1)] or [float(q[i])]
-            found = np.repeat(found, len(turned), axis=0)
-            found[:, i] = turned * (len(found) // len(turned))
+            result = np.repeat(result, len(turned), axis=0)
+            result[:, i] = turned * (len(result) // len(turned))
             if len(turned) > 1:
-                found = found[np.argsort(np.linalg.norm(found - start, axis=1), kind="stable")[:most]]
-        return found
+                result = result[np.argsort(np.linalg.norm(result - start, axis=1), kind="stable")[:most]]
+        return result
 
 
 def _fold(e: Expression) -> Expression | float:
@@ -162,7 +162,7 @@ def _rolling_coordinates(model: ModelView) -> set[Symbol]:
     driven: dict[Symbol, set[Symbol]] = {
         x: {*row} for x, row in model.rates.items() if x not in model.rates.dependent
     }
-    found: set[Symbol] = set()
+    result: set[Symbol] = set()
     groups: list[tuple[set[Symbol], set[Symbol]]] = []
     for x, speeds in driven.items():
         joined = [g for g in groups if g[1] & speeds]
@@ -170,8 +170,8 @@ def _rolling_coordinates(model: ModelView) -> set[Symbol]:
         groups.append(({x}.union(*(g[0] for g in joined)), speeds.union(*(g[1] for g in joined))))
     for coordinates, speeds in groups:
         if len(speeds) < len(coordinates):
-            found |= coordinates
-    return found
+            result |= coordinates
+    return result
 
 
 def read_configurations(space: PlanningSpace, placed: State, Q: Any, name: str) -> Array:
@@ -224,7 +224,7 @@ def read_state(model: ModelView, given: Any) -> State:
 def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) -> tuple[Symbol, ...]:
     given = (move,) if isinstance(move, Symbol | str) else tuple(move)
     names = {str(s): s for s in model.degrees_of_freedom}
-    found: dict[Symbol, None] = {}
+    result: dict[Symbol, None] = {}
     for item in given:
         if isinstance(item, str) and any(sign in item for sign in _WILDCARDS):
             matching = [s for name, s in names.items() if fnmatchcase(name, item)]
@@ -232,15 +232,15 @@ def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) 
                 raise UnknownNameError(
                     f"move=: no coordinate matches '{item}'. {suggest(item, names, 'coordinate')}"
                 )
-            found.update(dict.fromkeys(matching))
+            result.update(dict.fromkeys(matching))
         else:
             chosen = find_coordinates(model, [item], "move")
-            found.update(dict.fromkeys(sorted(chosen, key=lambda s: s.sort_key)))
-    rolling = [s for s in found if s in _rolling_coordinates(model)]
+            result.update(dict.fromkeys(sorted(chosen, key=lambda s: s.sort_key)))
+    rolling = [s for s in result if s in _rolling_coordinates(model)]
     if rolling:
         raise InvalidValueError(
             f"move=: {', '.join(map(repr, map(str, rolling[:6])))} cannot move independently: wheels that "
             "roll drive them, and a straight way between two configurations would slip. Leave them out and "
             "place the base with place(), or give it a base that moves freely."
         )
-    return tuple(found)
+    return tuple(result)

@@ -69,18 +69,18 @@ def connect(
             with checker.widened(by, np.vstack([starts, goals])) as wider:
                 share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
                 if roadmap is None:
-                    found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, edges=most)
+                    result = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, edges=most)
                 else:
-                    found = roadmap.solve(checker, starts, goals, share, seed + _NEXT_SEED * attempt)
-            iterations += found.iterations
-            if found.found or not wider:
+                    result = roadmap.solve(checker, starts, goals, share, seed + _NEXT_SEED * attempt)
+            iterations += result.iterations
+            if result.found or not wider:
                 break
-        if not found.found:
-            problem = explain_failure(found, seconds if asked is None else asked)
-            return Connected(found.points.astype(float), problem, iterations)
+        if not result.found:
+            problem = explain_failure(result, seconds if asked is None else asked)
+            return Connected(result.points.astype(float), problem, iterations)
         # Parts of a shortcut that just passes would not be certain by themselves.
         with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
-            points = search.shorten(found.points, seconds - (working_seconds() - begin), seed, patience)
+            points = search.shorten(result.points, seconds - (working_seconds() - begin), seed, patience)
         certain = _repair(search, checker, points, begin + seconds, checked_by(begin, seconds), seed, edges)
         if certain is not None:
             return Connected(certain.astype(float), "", iterations)
@@ -143,13 +143,13 @@ def connect_on_manifold(
             left = seconds - (working_seconds() - begin)
             with checker.widened(by, np.vstack([starts, goals])) as wider:
                 share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
-                found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)
-                iterations += found.iterations
-                points = search.contract(found.points, left) if found.found else found.points
-            if found.found or not wider:
+                result = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)
+                iterations += result.iterations
+                points = search.contract(result.points, left) if result.found else result.points
+            if result.found or not wider:
                 break
-        if not found.found:
-            problem = problem or explain_failure(found, seconds if asked is None else asked)
+        if not result.found:
+            problem = problem or explain_failure(result, seconds if asked is None else asked)
             return Connected(points.astype(float), problem, iterations)
         exact = manifold.refine(points)
         if exact is None:

@@ -79,11 +79,11 @@ class RrtConnect:
         count = self._code.kineverse_shortcut(
             ctypes.addressof(s), work.ctypes.data, len(points), room, patience, LEAST_INFLATION
         )
-        found = work[:count]
-        apart = np.abs(np.diff(found, axis=0)).max(axis=1, initial=0.0) > 1e-6
+        result = work[:count]
+        apart = np.abs(np.diff(result, axis=0)).max(axis=1, initial=0.0) > 1e-6
         keep = np.concatenate([[True], apart])
         keep[-1] = True  # the ends stay exact
-        return np.ascontiguousarray(found[keep])
+        return np.ascontiguousarray(result[keep])
 
     def contract(self, points: Floats32, seconds: float) -> Floats32:
         """Contract a path on the manifold like a rubber band, while its samples are free."""

@@ -82,8 +82,8 @@ class Endpoints:
             if inside.any():
                 return [Endpoint(end) for end in ends[inside]]
         names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
-        found = [self.check(name, end) for name, end in zip(names, ends, strict=True)]
-        return [end for end in found if not end.reason] or " ".join(end.reason for end in found[:3])
+        result = [self.check(name, end) for name, end in zip(names, ends, strict=True)]
+        return [end for end in result if not end.reason] or " ".join(end.reason for end in result[:3])
 
     def _beyond_limits(self, q: Array) -> str:
         lower, upper = self._space.lower, self._space.upper
@@ -149,7 +149,7 @@ def find_solutions(
     generator = np.random.default_rng(seed)
     begin = working_seconds()
     lower, upper = checker.lower.astype(float), checker.upper.astype(float)
-    found, idle = np.zeros((0, len(near))), 0
+    result, idle = np.zeros((0, len(near))), 0
     for k in range(batches):
         if k == 0:
             tries = near + generator.standard_normal((_BATCH, len(near))) * (upper - lower) / 8
@@ -158,16 +158,16 @@ def find_solutions(
             tries = generator.uniform(lower, upper, (_BATCH, len(near)))
         rows = np.ascontiguousarray(np.clip(tries, lower, upper), dtype=np.float32)
         rows = np.ascontiguousarray(rows[manifold.project(rows)])
-        rows, before = rows[checker.valid(rows)], len(found)
+        rows, before = rows[checker.valid(rows)], len(result)
         if len(rows):
             exact, residuals = manifold.polish(rows[: 4 * count].astype(float))
             inside = (exact >= lower - 1e-9).all(axis=1) & (exact <= upper + 1e-9).all(axis=1)
             exact = exact[inside & (residuals <= EXACT)]
             # Polishing moves them a little.
             free = checker.valid(np.ascontiguousarray(np.clip(exact, lower, upper), dtype=np.float32))
-            found = np.vstack([found, exact[free]])
-            found = found[unique_rows(found, _APART)]
-        idle = 0 if len(found) > before else idle + 1
-        if len(found) >= count or (len(found) and idle >= _IDLE) or working_seconds() - begin > seconds:
+            result = np.vstack([result, exact[free]])
+            result = result[unique_rows(result, _APART)]
+        idle = 0 if len(result) > before else idle + 1
+        if len(result) >= count or (len(result) and idle >= _IDLE) or working_seconds() - begin > seconds:
             break
-    return found[np.argsort(np.linalg.norm(found - near, axis=1), kind="stable")][:count]
+    return result[np.argsort(np.linalg.norm(result - near, axis=1), kind="stable")][:count]

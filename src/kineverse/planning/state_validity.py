@@ -142,8 +142,8 @@ class PathChecks:
 
     def find_collision(self, points: Array) -> int | None:
         """Return the first edge of a polyline (N, n) that is not certainly free; None if all are."""
-        found = self._checker.find_collision(np.ascontiguousarray(points, dtype=np.float32))
-        return None if found is None else found[0]
+        result = self._checker.find_collision(np.ascontiguousarray(points, dtype=np.float32))
+        return None if result is None else result[0]
 
 
 def describe_contacts(contacts: Sequence[DistanceResult], limit: int = 3) -> str:

@@ -165,8 +165,8 @@ def find_entry(mesh: str, settings: str | None = None) -> Decomposition | None:
     if settings is not None:
         return DECOMPOSITIONS.read(_key(mesh, settings), Decomposition.from_bytes)
     keys = [key for key in DECOMPOSITIONS.list_keys() if key.startswith(_key(mesh, ""))]
-    found = [DECOMPOSITIONS.read(key, Decomposition.from_bytes) for key in keys]
-    return max((some for some in found if some), key=lambda some: some.made, default=None)
+    result = [DECOMPOSITIONS.read(key, Decomposition.from_bytes) for key in keys]
+    return max((some for some in result if some), key=lambda some: some.made, default=None)
 
 
 def add_entry(mesh: str, settings: str, decomposition: Decomposition) -> None:

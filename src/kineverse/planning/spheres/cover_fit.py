@@ -148,18 +148,18 @@ def _search_start(
         if not len(centres) or len(centres) in tried:
             break
         tried.add(len(centres))
-        found = descend(problem, centres, aim, _FEW_ROUNDS)
-        best = found if found.is_better(best, aim) else best
+        result = descend(problem, centres, aim, _FEW_ROUNDS)
+        best = result if result.is_better(best, aim) else best
         # The protrusion after the descent is about proportional to that of the start.
-        wanted = max(wanted * aim / found.protrusion, least)
+        wanted = max(wanted * aim / result.protrusion, least)
     for factor in (1.3, 1.1):
         centres = start.lattice(factor * aim, most)
         reached = best.protrusion <= aim
         if not len(centres) or len(centres) in tried or len(centres) > (len(best.radii) if reached else most):
             continue
         tried.add(len(centres))
-        found = descend(problem, centres, aim, _FEW_ROUNDS)
-        best = found if found.is_better(best, aim) else best
+        result = descend(problem, centres, aim, _FEW_ROUNDS)
+        best = result if result.is_better(best, aim) else best
     return best
 
 
@@ -246,7 +246,7 @@ def _relax(
     moving = owners[first]
     solids = solids[moving]
     group = np.cumsum(np.diff(owners, prepend=-1) > 0) - 1
-    found = centres.copy()
+    result = centres.copy()
     centres, speed = centres[moving], np.zeros((len(moving), 3))
     slack, normals = region.nearest_sides(centres, solids, _SIDES)
     offsets = slack + np.einsum("nfj,nj->nf", normals, centres)
@@ -261,8 +261,8 @@ def _relax(
         gradient += np.einsum("nf,nfj->nj", near, normals) / near.sum(axis=1, keepdims=True)
         speed = _MOMENTUM * speed - temperature * gradient
         centres = centres + speed
-    found[moving] = centres
-    return found
+    result[moving] = centres
+    return result
 
 
 def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSpheres:
@@ -275,9 +275,9 @@ def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSphere
             break
         count = max(count >> failures, 1)
         dropped = np.argsort(_removal_losses(problem, cover), kind="stable")[:count]
-        found = descend(problem, np.delete(cover.centres, dropped, axis=0), aim)
-        if found.protrusion <= aim:
-            cover = found
+        result = descend(problem, np.delete(cover.centres, dropped, axis=0), aim)
+        if result.protrusion <= aim:
+            cover = result
         elif count == 1:
             break
         else:

@@ -184,13 +184,13 @@ class CoverStarts:
         """
         region = self._region
         centres = [_box_centres(part.corners, protrusion, most) for part in region.parts]
-        owners = np.repeat(np.arange(len(centres)), [len(found) for found in centres])
+        owners = np.repeat(np.arange(len(centres)), [len(result) for result in centres])
         points = np.concatenate(centres)
         depths = region.part_depths(points)
         # What lies deeper in another solid is left to that one.
         kept = (depths.max(axis=1) > -protrusion) & (depths.argmax(axis=1) == owners)
-        found: Floats = points[kept]
-        return found if len(found) else region.middles[:1]
+        result: Floats = points[kept]
+        return result if len(result) else region.middles[:1]
 
 
 def _box_centres(corners: Floats, protrusion: float, most: int) -> Floats:

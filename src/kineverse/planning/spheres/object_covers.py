@@ -47,17 +47,17 @@ def cover_objects(
         If a shape cannot be used, or is a triangle mesh; the message names the body.
     """
     solids, key = _request(items, protrusion, most)
-    found = None if force else find_cover(key)
-    if found is None:
+    result = None if force else find_cover(key)
+    if result is None:
         try:
-            found = cover_solids(solids, protrusion, most)
+            result = cover_solids(solids, protrusion, most)
         except InvalidValueError as error:
             raise InvalidValueError(
                 f"No spheres cover the shapes of body '{items[0].body}' ({_name(items)}): {error} Make them "
                 "thicker, or leave the body out: Planner(model, leave_out=[...])."
             ) from None
-        keep_cover(key, _name(items), found)
-    return found
+        keep_cover(key, _name(items), result)
+    return result
 
 
 def are_covered(items: Sequence[CollisionObject], protrusion: float | None = None, most: int = MOST) -> bool:
@@ -189,10 +189,10 @@ def _find(cache: ContentCache, key: str, parse: Callable[[bytes], Kept]) -> Kept
         if key in _in_memory:
             _in_memory.move_to_end(key)
             return _in_memory[key]  # type: ignore[return-value]
-    found = cache.read(key, parse)
-    if found is not None:
-        _remember(key, found)
-    return found
+    result = cache.read(key, parse)
+    if result is not None:
+        _remember(key, result)
+    return result
 
 
 def _remember(key: str, content: SphereCover | SphereTree) -> None:

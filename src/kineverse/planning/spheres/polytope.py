@@ -205,11 +205,11 @@ def scalar_products(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> npt.N
 
     It is computed in blocks: libraries share a large product among threads, which may have other work.
     """
-    found = np.empty((len(points), len(others)), dtype=points.dtype)
+    result = np.empty((len(points), len(others)), dtype=points.dtype)
     rows = max(_BLOCK // max(len(others), 1), 1)
     for k in range(0, len(points), rows):
-        np.matmul(points[k : k + rows], others.T, out=found[k : k + rows])
-    return found
+        np.matmul(points[k : k + rows], others.T, out=result[k : k + rows])
+    return result
 
 
 def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:

@@ -67,16 +67,16 @@ class BlendedPath:
     @property
     def deviation(self) -> Array:
         """Distances between the inner corners and their blends (N-2,)."""
-        found: Array = self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4
-        return found
+        result: Array = self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4
+        return result
 
     @property
     def curvature(self) -> Array:
         """Second derivatives q'' of the blends (N-2, n); 0 where there is none."""
         change: Array = np.diff(self.directions, axis=0)
         reach = self.reach[:, None]
-        found: Array = np.where(reach > 0, change / np.where(reach > 0, 2 * reach, 1.0), 0.0)
-        return found
+        result: Array = np.where(reach > 0, change / np.where(reach > 0, 2 * reach, 1.0), 0.0)
+        return result
 
     def blend(self, corner: int, count: int) -> Array:
         """Return ``count`` configurations on the blend of an inner corner, both ends included."""

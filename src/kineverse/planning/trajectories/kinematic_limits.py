@@ -83,8 +83,8 @@ def motion_limits(
     velocity = np.array([bounds.get(s, math.inf) for s in speeds])
     velocity[np.isinf(velocity)] = speed
     stated, _ = acceleration_limits(model, None)
-    found = [_evaluate(stated[s], values) if s in stated else math.inf for s in speeds]
-    acceleration = np.array(found, dtype=float)
+    result = [_evaluate(stated[s], values) if s in stated else math.inf for s in speeds]
+    acceleration = np.array(result, dtype=float)
     return MotionLimits(velocity, np.where(np.isfinite(acceleration), acceleration, velocity / ramp))
 
 

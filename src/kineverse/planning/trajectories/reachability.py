@@ -183,12 +183,12 @@ class CellPrograms:
         for _ in range(_ITERATIONS):
             meet = np.divide(c - a, slope - other, out=left.copy(), where=rising)
             up, e, between = _extreme(self._x0, meet, np.argmin)
-            found = up >= (a + slope * meet) * (1 - _ROUNDING)
-            ahead = rising & (found | (between > 0))
+            result = up >= (a + slope * meet) * (1 - _ROUNDING)
+            ahead = rising & (result | (between > 0))
             left, a, slope = (
                 np.where(ahead, new, old) for new, old in ((meet, left), (e, a), (between, slope))
             )
-            rising &= ~found
+            rising &= ~result
             if not rising.any():
                 break
             c, other = np.where(ahead, c, e), np.where(ahead, other, between)

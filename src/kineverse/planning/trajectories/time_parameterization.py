@@ -109,7 +109,7 @@ def _limits(
     """Return the limits of the coordinates (n,), checked; infinite speeds become those that none reaches."""
     n = path.points.shape[1]
     travel = np.abs(np.diff(path.points, axis=0)).sum(axis=0)
-    found = []
+    result = []
     for noun, given in (("speed", velocity), ("acceleration", acceleration)):
         limits = np.array(given, dtype=float)
         if limits.shape not in ((), (n,)):
@@ -122,8 +122,8 @@ def _limits(
                 f"The {noun} limit of '{symbols[int(k)]}', which moves, is {wanted}, not {limits[k]:g}."
             )
         limits[~good] = 1.0
-        found.append(limits)
-    speeds, accelerations = found
+        result.append(limits)
+    speeds, accelerations = result
     # With the acceleration a over the travel S the speed stays below √(2·a·S).
     return np.minimum(speeds, 2 * np.sqrt(accelerations * travel) + np.finfo(float).tiny), accelerations
 

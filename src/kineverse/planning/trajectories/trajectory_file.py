@@ -90,7 +90,7 @@ def read_trajectory_file(path: str | os.PathLike[str]) -> TrajectoryData:
 
 def parse_coordinates(names: list[str], source: str) -> tuple[Symbol, ...]:
     """Return the symbols of names in a file."""
-    found = []
+    result = []
     for name in names:
         try:
             path, order = parse_symbol_name(name)
@@ -99,8 +99,8 @@ def parse_coordinates(names: list[str], source: str) -> tuple[Symbol, ...]:
             raise FormatError(f"{source}: {name!r:.80} is no name of a coordinate: {error}") from None
         if order:
             raise FormatError(f"{source}: {name!r:.80} is a derivative; the columns are positions.")
-        found.append(symbol)
-    return tuple(found)
+        result.append(symbol)
+    return tuple(result)
 
 
 def _numbers(values: Any, key: str, source: str) -> Array:
