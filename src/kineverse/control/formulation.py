@@ -189,10 +189,10 @@ class Formulation:
         slopes, constant = every.partial(speeds), every.substitute(dict.fromkeys(speeds, 0.0))
         first = 0
         for task, error in eliminated.items():
-            own, rows = set(error.symbols), slice(first, first + error.size)
-            if any(s.order for s in slopes[rows].symbols) or any(s.order > 1 for s in own):
+            symbols, rows = set(error.symbols), slice(first, first + error.size)
+            if any(s.order for s in slopes[rows].symbols) or any(s.order > 1 for s in symbols):
                 raise InvalidValueError(f"{task!r} is not linear in speeds, so no goal can be made of it.")
-            gradients[task] = {s: slopes[rows, i] for i, s in enumerate(speeds) if s in own}
+            gradients[task] = {s: slopes[rows, i] for i, s in enumerate(speeds) if s in symbols}
             constants[task] = constant[rows]
             first = rows.stop
         return gradients, constants
@@ -201,8 +201,8 @@ class Formulation:
         self, goal: Goal, error: Expression, gradient: dict[Symbol, Expression], constant: Expression | None
     ) -> GoalRows:
         jacobian = self._matrix(goal, gradient)
-        given = as_expression(goal.weight).ravel()
-        weight = array([given[k if given.size > 1 else 0] for k in range(goal.error.size)])
+        weights = as_expression(goal.weight).ravel()
+        weight = array([weights[k if weights.size > 1 else 0] for k in range(goal.error.size)])
         if constant is not None:
             none = as_expression(np.zeros(goal.error.size))
             return GoalRows(self._names[goal], constant, jacobian, none, -constant, weight, True)
@@ -313,22 +313,22 @@ def check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
     """Return the tasks as a tuple, after a check of their kinds and number."""
     if isinstance(tasks, Goal | Hold | Keep):
         tasks = (tasks,)
-    given = tuple(tasks)
-    for task in given:
+    checked = tuple(tasks)
+    for task in checked:
         if not isinstance(task, Goal | Hold | Keep):
             raise ExpressionError(f"A task is a Goal, a Hold or a Keep, not {task!r}.")
-    if not given:
+    if not checked:
         raise InvalidValueError("Without a task there is nothing to do; give a Goal, Hold or Keep.")
-    return given
+    return checked
 
 
 def name_tasks(tasks: Sequence[Task]) -> dict[Task, str]:
     """Return a name for each task: its own, that of its only symbol, or its kind and number."""
     named: dict[Task, str] = {}
     for k, task in enumerate(tasks):
-        own = str(task.expression) if isinstance(task.expression, Symbol) else ""
+        subject = str(task.expression) if isinstance(task.expression, Symbol) else ""
         kind = type(task).__name__.lower()
-        named[task] = task.name or (f"{kind} {own}" if own else f"{kind} {k + 1}")
+        named[task] = task.name or (f"{kind} {subject}" if subject else f"{kind} {k + 1}")
     twice = [name for name, count in Counter(named.values()).items() if count > 1]
     if twice:
         raise DuplicateNameError(f"Two tasks have the name {twice[0]!r}; give each a name=... of its own.")

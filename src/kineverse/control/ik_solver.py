@@ -160,7 +160,7 @@ class InverseKinematics:
         begin = perf_counter()
         starts, solutions = as_count("starts", starts, 1), as_count("solutions", solutions, 1)
         seed = as_count("seed", seed, 0)
-        given = self._load(values)
+        assigned = self._load(values)
         search, space, clearance = self._search, self._program.space, self._clearance
         x = search.x
         home = x.copy()
@@ -209,7 +209,7 @@ class InverseKinematics:
             # Monotone steps converge where full steps were given up, such as on the way to a distant target.
             if search.is_done() and (clearance is None or clearance.measure(x) == 0.0):
                 result.append(x.copy())
-        return self._result(given, result, obstacles, used, begin)
+        return self._result(assigned, result, obstacles, used, begin)
 
     def batch(self, values: Iterable[StateLike], *, starts: int = 16, seed: int = 0) -> list[IkResult]:
         """Return the results of many targets, each as of :meth:`solve`.
@@ -221,12 +221,12 @@ class InverseKinematics:
 
     def _load(self, values: StateLike | None) -> Mapping[Symbol, float]:
         """Write the values of all inputs, and return the given values by symbol."""
-        given = {} if values is None else self._given(values)
-        if isinstance(given, State):
-            vector = (self._home | given).vector(self.inputs)
+        assigned = {} if values is None else self._given(values)
+        if isinstance(assigned, State):
+            vector = (self._home | assigned).vector(self.inputs)
         else:
             vector = self._defaults.copy()
-            for symbol, value in given.items():
+            for symbol, value in assigned.items():
                 if symbol in self._place:
                     vector[self._place[symbol]] = value
         if not np.isfinite(vector).all():
@@ -236,7 +236,7 @@ class InverseKinematics:
         self._program.space.normalize(self._search.x)
         if self._clearance is not None:
             self._clearance.load(dict(zip(self.inputs, vector.tolist(), strict=True)))
-        return given
+        return assigned
 
     def _given(self, values: StateLike) -> Mapping[Symbol, float]:
         """Return values by symbol; a state if they are one, or contain anything unusual."""
@@ -244,16 +244,16 @@ class InverseKinematics:
             return values
         try:
             # A state takes ten times as long, most of the time of an easy target.
-            given = {self._lookup[key]: value for key, value in values.items()}
-            if len(given) == len(values) and all(map(math.isfinite, given.values())):
-                return given
+            assigned = {self._lookup[key]: value for key, value in values.items()}
+            if len(assigned) == len(values) and all(map(math.isfinite, assigned.values())):
+                return assigned
         except (KeyError, TypeError, AttributeError):
             pass
         return as_state(values, self._known)
 
     def _result(
         self,
-        given: Mapping[Symbol, float],
+        assigned: Mapping[Symbol, float],
         found: Sequence[Array],
         obstacles: Counter[str],
         starts: int,
@@ -272,7 +272,7 @@ class InverseKinematics:
                 contacts = self._clearance.near
 
         def make_states() -> tuple[State, ...]:
-            whole = self._home | State(given)
+            whole = self._home | State(assigned)
             return tuple(
                 whole | State(dict(zip(self.coordinates, end.tolist(), strict=True))) for end in ends
             )

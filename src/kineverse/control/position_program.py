@@ -186,8 +186,8 @@ class PositionProgram:
         size = errors.size + len(away)
         self.weights = np.concatenate([scales, np.ones(len(away))])
         numbers = [parameter(f"inverse kinematics/weight/{k}", 1.0) for k in range(size)]
-        own = [weight for part in self.parts for weight in part.weights]
-        w = [numbers[k] * own[k] for k in range(errors.size)]
+        factors = [weight for part in self.parts for weight in part.weights]
+        w = [numbers[k] * factors[k] for k in range(errors.size)]
         # A row within its bounds is no error; outside of them it is.
         w += [numbers[errors.size + k] * binary(ca.OP_NE, violation, 0) for k, violation in enumerate(away)]
         weighted = jacobian * array(w[: errors.size]).reshape(errors.size, 1)

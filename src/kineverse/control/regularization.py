@@ -71,10 +71,10 @@ def joint_weights(
         chosen = find_speeds(model, (key,), "weights")
         if any(s not in factors for s in chosen):
             raise InvalidValueError(f"weights=: no task moves '{key}', so it has no weight.")
-        given = as_expression(weight)
-        if not given.symbols and not 0 < float(given) < math.inf:
+        factor = as_expression(weight)
+        if not factor.symbols and not 0 < float(factor) < math.inf:
             raise InvalidValueError(f"weights=: the weight of '{key}' is positive, not {weight!r}.")
-        factors |= dict.fromkeys(chosen, given)
+        factors |= dict.fromkeys(chosen, factor)
     squares, curvatures = _sample_jacobians(formulation)
     sizes = squares[len(formulation.goals) :].sum(axis=1)
     immovable = frozenset(
@@ -221,14 +221,14 @@ def acceleration_limits(
     if chosen is None:
         return stated, {}
     if isinstance(chosen, Mapping):
-        given = {s: a for key, a in chosen.items() for s in find_speeds(model, (key,), "acceleration")}
+        limited = {s: a for key, a in chosen.items() for s in find_speeds(model, (key,), "acceleration")}
     else:
-        given = dict.fromkeys(model.speeds, chosen)
-    for speed, limit in given.items():
+        limited = dict.fromkeys(model.speeds, chosen)
+    for speed, limit in limited.items():
         if not (isinstance(limit, int | float) and 0 < limit < math.inf):
             raise InvalidValueError(
                 f"The acceleration of '{speed.position}' is a positive limit, not {limit!r}."
             )
-    limits = {s: as_expression(limit) for s, limit in given.items()}
+    limits = {s: as_expression(limit) for s, limit in limited.items()}
     limits |= {s: raw_min(stated[s], limit) for s, limit in limits.items() if s in stated}
     return stated, limits

@@ -206,8 +206,8 @@ def _collect_claims(sides: list[LockSide], behind: list[LockSide], scores: list[
         for q, slope in side.trend.items():
             wanted = back.trend[q] + is_open * slope
             for way in (1, -1):
-                own = score * _is_less(_TINY, way * wanted)
-                claims[q, way] = _larger(claims[q, way], own) if (q, way) in claims else own
+                claim = score * _is_less(_TINY, way * wanted)
+                claims[q, way] = _larger(claims[q, way], claim) if (q, way) in claims else claim
     return claims
 
 
@@ -228,8 +228,8 @@ def _pass_demand(sides: list[LockSide], shut: list[Expression], wanted: Claims) 
             passed = needs[k] * is_shut
             for q, slope in side.trend.items():
                 for way in (1, -1):
-                    own = passed * _is_less(_TINY, way * slope)
-                    known[q, way] = _larger(known[q, way], own) if (q, way) in known else own
+                    claim = passed * _is_less(_TINY, way * slope)
+                    known[q, way] = _larger(known[q, way], claim) if (q, way) in known else claim
     return needs
 
 

@@ -197,8 +197,8 @@ class VelocityProgram:
     def _keep_residual(self, name: str) -> Expression:
         """Return the violation of a keep; 0 for one on speeds, which a command satisfies."""
         rows = self.formulation.rows
-        own = [abs(rows.violation[k]) for k, row in enumerate(rows.names) if row == name]
-        return reduce(raw_max, own, ZERO)
+        violations = [abs(rows.violation[k]) for k, row in enumerate(rows.names) if row == name]
+        return reduce(raw_max, violations, ZERO)
 
 
 def arrange_inputs(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:

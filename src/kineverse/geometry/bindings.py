@@ -84,7 +84,7 @@ class _NeighbourStruct(ctypes.Structure):
 
 
 class FacingPoints:
-    """Further facing points of near pairs of a query: what of them counts.
+    """Settings of contact manifolds: which further contact points of near, parallel faces are reported.
 
     Parallel faces are nearest at every point, and a query finds one of them. Faces that are parallel, up to
     an angle, have up to four further pairs of points, with the distance along the normal of the pair, see
@@ -98,7 +98,7 @@ class FacingPoints:
 
 
 class ObjectPlacement:
-    """Objects of a table at poses of their own, for other compiled code; the solids are shared."""
+    """Objects of a table at other poses, for other compiled code; the solids are shared."""
 
     def __init__(self, table: ObjectTable) -> None:
         if not collision_library.prepare(wait=True):
@@ -163,7 +163,7 @@ class CollisionLibrary(SourceLibrary):
         return distances, witnesses
 
     def extend(self, table: ObjectTable, ranked: RankedPairs, facing: FacingPoints) -> RankedPairs:
-        """Return ranked pairs with further facing points of near ones, nearest first; without C, as given."""
+        """Add further facing points of near pairs to ranked pairs, nearest first; not without C."""
         if self._code is None or not len(ranked[2]):
             return ranked
         binding = _bind_table(table)
@@ -208,9 +208,9 @@ class CollisionLibrary(SourceLibrary):
         count = len(order)
         objects, bodies = np.empty((2, count, 2), dtype=np.int32)
         near, points = np.empty(count), np.empty((count, 9))
-        given = (array.ctypes.data for array in (pairs, distances, witnesses, order))
+        sources = (array.ctypes.data for array in (pairs, distances, witnesses, order))
         made = (array.ctypes.data for array in (objects, bodies, near, points))
-        self._code.gather(_bind_table(table).address, *given, count, *made)
+        self._code.gather(_bind_table(table).address, *sources, count, *made)
         return objects, bodies, near, points
 
     def search(
@@ -343,7 +343,6 @@ class _TableBinding:
         self.query.kept = kept
 
     def copy_ranked(self) -> RankedPairs:
-        """Return the results of the last query."""
         kept = self.query.kept
         objects, bodies, near, points = self.nearest
         return objects[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy()
@@ -371,7 +370,7 @@ class _NeighbourBinding:
         self.reserve(1024)
 
     def reserve(self, count: int) -> None:
-        """Allocate a list for a number of pairs, which are found anew."""
+        """Allocate a list for a number of pairs, which are searched again."""
         self._pairs = np.empty((count, 2), dtype=np.int32)
         self._struct.pairs, self._struct.room, self._struct.resets = self._pairs.ctypes.data, count, -1
 

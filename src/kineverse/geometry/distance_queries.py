@@ -108,7 +108,7 @@ def find_distances_to(world: CollisionWorld, body: str, radius: float) -> list[D
 
 
 def _pair_product(members: list[int], others: list[int]) -> Indices:
-    """Return all pairs of two lists, (K, 2), the smaller number first."""
+    """Return all pairs (K, 2) of two lists, the smaller index first."""
     left, right = np.repeat(members, len(others)), np.tile(others, len(members))
     return np.stack([np.minimum(left, right), np.maximum(left, right)], axis=1).astype(np.int32)
 
@@ -172,7 +172,7 @@ class PreparedQuery:
     def __call__(self, radius: float | None = None, facing: FacingPoints | None = None) -> DistanceResults:
         """Return the selected pairs within the radius [m], or within another one, nearest first.
 
-        With ``facing``, pairs with parallel faces are there with further facing points.
+        With ``facing``, near pairs of parallel faces have further points.
         """
         within = self.radius if radius is None else radius
         with self._lock:
@@ -273,7 +273,7 @@ class PreparedQuery:
             collision_library.bind(self._world.table)
 
     def _select(self) -> PairSelection:
-        """Return the selected pairs, whose objects have solids."""
+        """Select the pairs, and make the solids of their objects."""
         world = self._world
         if self._selection is None or self._version != world.model.version:
             flags = self._selected()
@@ -298,7 +298,6 @@ class PreparedQuery:
         return np.argwhere(np.triu(self._selected())).astype(np.int32)
 
     def _selected(self) -> Flags:
-        """Return the flags of the selected pairs at the model's present version."""
         self._world.synchronize()
         if self._version != self._world.model.version:
             self._selection = None

@@ -44,7 +44,7 @@ def find_unusable_shapes(model: ModelView) -> dict[tuple[str, int], str]:
 
 
 def label_unusable_shapes(model: ModelView, problems: Mapping[tuple[str, int], str]) -> dict[str, str]:
-    """Return labels of excluded shapes with the reasons; the body's name if all its shapes are excluded."""
+    """Label excluded shapes, with the reasons; by the body's name if all its shapes are excluded."""
     count = Counter(name for name, _ in problems)
     result: dict[str, str] = {}
     for (name, number), why in problems.items():

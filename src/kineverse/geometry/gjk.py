@@ -33,7 +33,7 @@ def directional_gaps(a: PlacedSolid, b: PlacedSolid, directions: Floats) -> Floa
 def find_widest_gap(a: PlacedSolid, b: PlacedSolid, directions: Floats) -> tuple[float, Floats]:
     """Search for the direction with the largest gap; return the gap [m] and the unit direction (3,).
 
-    Candidates are the axes of both solids, fixed directions all around, and the given ones, (n, 3). A pattern
+    Candidates are the axes of both solids, fixed directions all around, and some more (n, 3). A pattern
     search with a shrinking step refines the best of them.
     """
     tried = np.concatenate(
@@ -62,16 +62,16 @@ def smoothed_support(placed: PlacedSolid, direction: Floats) -> Floats:
 def support(placed: PlacedSolid, direction: Floats) -> Floats:
     """Return a support point (3,) of a solid in the world along a unit direction."""
     solid, rotation, position = placed
-    core, own = solid.core, direction @ rotation
+    core, local = solid.core, direction @ rotation
     assert core is not None
-    if core.tip and 2 * core.tip * own[2] >= core.radii[0] * np.hypot(own[0], own[1]):
+    if core.tip and 2 * core.tip * local[2] >= core.radii[0] * np.hypot(local[0], local[1]):
         return np.asarray(position + rotation @ np.array([0.0, 0.0, core.tip]))
-    point = np.where(own > 0.0, core.half, -core.half) + core.radius * own - [0.0, 0.0, core.tip]
+    point = np.where(local > 0.0, core.half, -core.half) + core.radius * local - [0.0, 0.0, core.tip]
     if core.corners.size:
-        point += core.corners[:, np.argmax(own @ core.corners)]
-    across = np.linalg.norm(core.radii * own)
+        point += core.corners[:, np.argmax(local @ core.corners)]
+    across = np.linalg.norm(core.radii * local)
     if across > 0.0:
-        point += core.radii**2 * own / across
+        point += core.radii**2 * local / across
     return np.asarray(position + rotation @ point)
 
 
@@ -109,7 +109,7 @@ def _support_values(solid: Solid, directions: Floats) -> Floats:
 
 
 def _spread_directions(count: int) -> Floats:
-    """Return a low-discrepancy sequence of unit directions, (count, 3): every prefix covers the sphere."""
+    """Return a low-discrepancy sequence of unit directions (count, 3)."""
     k = np.arange(1, count + 1)
     height, angle = 2.0 * (k * 0.7548776662466927 % 1.0) - 1.0, 2.0 * np.pi * (k * 0.5698402909980532 % 1.0)
     side = np.sqrt(1.0 - height**2)
@@ -165,8 +165,8 @@ def gjk_distance_to_faces(
     solid, rotation_a, position_a = a
     corners = (faces.vertices @ rotation.T + position)[faces.faces]
     # In the frame of the solid, the distance of both bounding boxes is a lower bound.
-    seen = (corners - position_a) @ rotation_a - solid.centre
-    apart = np.maximum(np.maximum(seen.min(axis=1) - solid.half, -solid.half - seen.max(axis=1)), 0.0)
+    local = (corners - position_a) @ rotation_a - solid.centre
+    apart = np.maximum(np.maximum(local.min(axis=1) - solid.half, -solid.half - local.max(axis=1)), 0.0)
     lows = np.linalg.norm(apart, axis=1)
     best: tuple[float, Floats, Floats] | None = None
     for k in np.argsort(lows, kind="stable").tolist():

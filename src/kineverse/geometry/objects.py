@@ -183,7 +183,7 @@ def load_solids(objects: Iterable[CollisionObject]) -> list[Solid]:
             errors.append(error)
     if not errors:
         return solids
-    advice = "Mend the model, or leave such bodies out: Scene(model, leave_out=[...])."
+    advice = "Correct the model, or leave such bodies out: Scene(model, leave_out=[...])."
     if len(errors) == 1:
         raise type(errors[0])(f"{errors[0]} {advice}") from errors[0]
     lines = "\n".join(f"  {summarize_error(error, advice=False)}" for error in errors[:_MAX_LISTED])

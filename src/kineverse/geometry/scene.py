@@ -207,12 +207,12 @@ class Scene:
         InvalidValueError
             If the radius is negative or NaN.
         """
-        names, own = (one, other), parse_known_rules(rules, self.model)
+        names, added = (one, other), parse_known_rules(rules, self.model)
         symbols = None if moving is None else _as_list(moving)
 
         def choose() -> PairFlags:
             bodies = self.bodies
-            wanted = apply_rules(self._world.table.allowed, bodies, own)
+            wanted = apply_rules(self._world.table.allowed, bodies, added)
             wanted *= flag_between(*(flag_matching(bodies, each) for each in names))
             return wanted if symbols is None else wanted * flag_relatively_moving(self.model, bodies, symbols)
 

@@ -369,10 +369,10 @@ def _sizes(geometry: Primitive) -> tuple[float, ...]:
 
 def solid_surface(solid: Solid) -> Faces | Primitive:
     """Return the surface of a solid: its primitive, or triangles that face outwards."""
-    return _hull_faces(solid.engine) if isinstance(solid.surface, Hull) else solid.surface
+    return hull_faces(solid.engine) if isinstance(solid.surface, Hull) else solid.surface
 
 
-def _hull_faces(convex: Any) -> Faces:
+def hull_faces(convex: Any) -> Faces:
     """Return the triangles of a ``coal.Convex``, counter-clockwise seen from outside."""
     vertices = np.array(convex.points())
     triangles = [convex.polygons(k) for k in range(convex.num_polygons)]

@@ -56,8 +56,8 @@ class Term:
 class TermGraph:
     """The terms of one or more expressions."""
 
-    def __init__(self, given: Mapping[Symbol, float]) -> None:
-        self._given = given
+    def __init__(self, constants: Mapping[Symbol, float]) -> None:
+        self._given = constants
         self._known: dict[Any, Term] = {}
         self._node_terms: dict[Node, list[Term]] = {}
 

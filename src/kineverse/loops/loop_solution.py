@@ -162,23 +162,23 @@ def solve_loop(
     )  # fmt: skip
 
 
-def _rank(equations: Equations, x: Array, given: Array) -> int:
+def _rank(equations: Equations, x: Array, inputs: Array) -> int:
     """Return the generic rank of ∂r/∂q: the largest near a closed configuration, which may be singular."""
     generator = np.random.default_rng(0)
     most = 0
     for scale in (0.0, 0.0, 1e-3, 1e-2, 0.05, 0.1, 0.2):
-        near, gap = equations.close(x + scale * generator.uniform(-1, 1, len(x)), given, 60)
+        near, gap = equations.close(x + scale * generator.uniform(-1, 1, len(x)), inputs, 60)
         if gap < CLOSURE_TOLERANCE:
-            values = np.linalg.svd(equations(near, given)[1], compute_uv=False)
+            values = np.linalg.svd(equations(near, inputs)[1], compute_uv=False)
             most = max(most, int((values > RANK * max(values.max(initial=0.0), _SMALL)).sum()))
     return most
 
 
 def _choose_dependent(
-    name: str, equations: Equations, x: Array, given: Array, rank: int, dependent: Sequence[Symbol] | None
+    name: str, equations: Equations, x: Array, inputs: Array, rank: int, dependent: Sequence[Symbol] | None
 ) -> tuple[Symbol, ...]:
     """Return the dependent coordinates: the given ones, or the last possible ones."""
-    by_q = equations(x, given)[1]
+    by_q = equations(x, inputs)[1]
     coordinates = equations.unknowns
     if dependent is not None:
         strange = [str(s) for s in dependent if s not in coordinates]

@@ -165,7 +165,7 @@ def _declare_signatures(code: Any) -> None:
 
 
 def _ensure_memory(failed: int, function: Any, arguments: tuple[Any, ...]) -> int:
-    """Raise MemoryError where a function of C says that it has failed, which is for lack of memory only."""
+    """Raise MemoryError where a function of C has failed, which only happens for lack of memory."""
     raise_signal()
     if failed:
         raise MemoryError("There is no memory for the check of configurations.")
@@ -173,6 +173,6 @@ def _ensure_memory(failed: int, function: Any, arguments: tuple[Any, ...]) -> in
 
 
 def _ensure_whole(result: int, function: Any, arguments: tuple[Any, ...]) -> int:
-    """Raise the exception for which a function of C has ended early, if there is one."""
+    """Raise the exception that ended a function of C early, if there is one."""
     raise_signal()
     return result

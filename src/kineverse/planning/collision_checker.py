@@ -50,11 +50,11 @@ LEAST_INFLATION = 2e-4
 
 
 class LateCheckError(NoSolutionError):
-    """The check of a path that was found takes longer than it may."""
+    """The check of a found path takes longer than it may."""
 
 
 class CollisionChecker:
-    """Collision check of many configurations of some coordinates; everything else stands still."""
+    """Collision check of many configurations of some coordinates; everything else is fixed."""
 
     def __init__(
         self,
@@ -106,14 +106,14 @@ class CollisionChecker:
         return VectorProgram(outputs, self.coordinates, self.parameters, scalar="float")
 
     def _in_group(self, body: str, group: str) -> list[tuple[CollisionObject, Solid, Array]]:
-        """Return the objects of a body with their solids and their poses in its rigid group, (4, 4)."""
+        """Return the objects of a body with their solids and their poses (4, 4) in its rigid group."""
         world = self.scene.collision_world
         offset = self.scene.model.fk(body, group)({})
         items = ((world.objects[k], world.solid(k)) for k in world.members[world.body_index(body)])
         return [(item, solid, offset @ item.shape.origin.matrix) for item, solid in items]
 
     def _place_static(self, dependence: FrameDependence) -> None:
-        """Collect the obstacles of the world: all objects that stand still."""
+        """Collect the obstacles of the world."""
         world = self.scene.collision_world
         self._static = np.array(
             [k for k, o in enumerate(world.objects) if not dependence.moves(o.body)], dtype=int
@@ -132,7 +132,7 @@ class CollisionChecker:
     def _place_moving(
         self, members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]], poses: Sequence[int]
     ) -> None:
-        """Collect the shapes of the bodies that move, each body in a set of its own."""
+        """Collect the shapes of the moving bodies, a set for each."""
         lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
         self._costs = []
@@ -147,7 +147,7 @@ class CollisionChecker:
             self._costs.append(result.cost)
 
     def _choose_pairs(self, dependence: FrameDependence) -> None:
-        """Choose for each pair of moving bodies whether shapes or spheres stand for the second one.
+        """Choose for each pair of moving bodies whether shapes or spheres represent the second one.
 
         Where spheres touch, the shapes of both are compared, unless these are spheres.
         """
@@ -181,37 +181,16 @@ class CollisionChecker:
         program, links = self.program, self.links
         self._kept = program.prepare(np.zeros(len(self.parameters)))
         self.struct = CheckerStruct(
-            n,
-            len(self.groups),
-            self.conditions,
-            program.stored,
-            program.compute_address,
-            self._kept.ctypes.data,
-            self.lower.ctypes.data,
-            self.upper.ctypes.data,
-            len(links.links),
-            len(self.standing),
-            links.links.ctypes.data,
-            links.coarse.ctypes.data,
-            links.fine.ctypes.data,
-            self._plane_table.ctypes.data,
-            self._allowed.ctypes.data,
-            ctypes.addressof(self._world.struct),
-            ctypes.addressof(self._set_structs),
-            self._fineness.ctypes.data,
-            self._turns.ctypes.data,
-            len(self.pairs),
-            len(self.moving_pairs),
-            self.pairs.ctypes.data,
-            self.moving_pairs.ctypes.data,
-            links.shapes.ctypes.data,
-            self._objects.address,
-            self._objects.poses.ctypes.data,
-            self._objects.positions.ctypes.data,
-            self.scene.collision_world.table.centre.ctypes.data,
-            self._objects.is_within,
-            margin,
-        )
+            n, len(self.groups), self.conditions, program.stored, program.compute_address,
+            self._kept.ctypes.data, self.lower.ctypes.data, self.upper.ctypes.data, len(links.links),
+            len(self.standing), links.links.ctypes.data, links.coarse.ctypes.data, links.fine.ctypes.data,
+            self._plane_table.ctypes.data, self._allowed.ctypes.data, ctypes.addressof(self._world.struct),
+            ctypes.addressof(self._set_structs), self._fineness.ctypes.data, self._turns.ctypes.data,
+            len(self.pairs), len(self.moving_pairs), self.pairs.ctypes.data, self.moving_pairs.ctypes.data,
+            links.shapes.ctypes.data, self._objects.address, self._objects.poses.ctypes.data,
+            self._objects.positions.ctypes.data, self.scene.collision_world.table.centre.ctypes.data,
+            self._objects.is_within, margin,
+        )  # fmt: skip
 
     @property
     def address(self) -> int:
@@ -219,7 +198,7 @@ class CollisionChecker:
         return ctypes.addressof(self.struct)
 
     def place(self, state: State) -> None:
-        """Place everything as at a state: obstacles, and what the poses depend on beside the coordinates."""
+        """Place the obstacles at a state, and set everything else that poses depend on."""
         self.scene.update(state)
         table, parameters = self.scene.collision_world.table, state.vector(self.parameters)
         poses = table.poses[self._static]
@@ -238,7 +217,7 @@ class CollisionChecker:
     def version(self) -> tuple[int, BodyPairs]:
         """Number of the placement, and the pairs that are left out.
 
-        While it stays, and the margin and the limits, so do the answers. Other checkers have other numbers.
+        Answers stay the same as long as these, the margin and the limits do.
         """
         return self._placed, self._excepted
 
@@ -252,7 +231,7 @@ class CollisionChecker:
             self._except(frozenset())
 
     def _except(self, pairs: BodyPairs) -> None:
-        """Make C use the tables without some pairs, which are kept: holds come again."""
+        """Switch C to tables without some pairs, which are kept for the next holds."""
         if pairs not in self._tables:
             self._tables[pairs] = self._without(pairs)
         self._excepted, s = pairs, self.struct
@@ -261,7 +240,6 @@ class CollisionChecker:
         s.pairs, s.moving_pairs = len(spheres), len(shapes)
 
     def _without(self, pairs: BodyPairs) -> PairTables:
-        """Return the tables of checked pairs without some of them."""
         standing = {body: k for k, body in enumerate(self.standing)}
         numbers = {body: k for k, body in enumerate(self.moving)}
         allowed = self._allowed.copy()
@@ -312,17 +290,12 @@ class CollisionChecker:
         return result.astype(bool)
 
     def find_collision(self, points: Floats32, seconds: float = math.inf) -> tuple[int, float] | None:
-        """Return the first edge of a polyline (N, n) that is not certainly free, and a fraction of it."""
+        """Find the first edge of a polyline (N, n) that is not certainly free, and a fraction of it."""
         where = ctypes.c_double()
         result = self._code.kineverse_certify(
-            self.address,
-            points.ctypes.data,
-            len(points),
-            RESOLUTION,
-            LEAST_INFLATION,
-            seconds,
+            self.address, points.ctypes.data, len(points), RESOLUTION, LEAST_INFLATION, seconds,
             ctypes.addressof(where),
-        )
+        )  # fmt: skip
         if result == -3:
             raise LateCheckError
         if result < -1:
@@ -337,9 +310,9 @@ class CollisionChecker:
         return result[:count].reshape(-1, 3, 4), result[count:]
 
     def _find_turns(self) -> Array:
-        """Return by which angle a unit of each coordinate turns a body, the largest one found (n,) [rad].
+        """Find the largest angle by which a unit of each coordinate turns a body (n,) [rad].
 
-        Threads and gears turn bodies so fast that two poses do not tell how far they are apart.
+        Threads and gears turn bodies so fast that two poses do not show how far they are apart.
         """
         generator, result = np.random.default_rng(0), np.zeros(len(self.coordinates))
         for q in generator.uniform(-1.0, 1.0, (2, len(result))).astype(np.float32):
@@ -353,7 +326,7 @@ class CollisionChecker:
         return result
 
     def find_periodic(self, candidates: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """Return flags (n,) of those coordinates whose full turns change no pose and no condition."""
+        """Return flags (n,) of the candidates whose full turns change no pose and no condition."""
         generator = np.random.default_rng(0)
         result = candidates.copy()
         # At other places too: a screw whose pitch happens to be 0 is not periodic.

@@ -136,5 +136,5 @@ def _explain_failure(status: int, said: bytes) -> str:
     elif "SIGKILL" in how:
         advice = "Systems without free memory do that: decompose fewer at a time, or simplify the mesh."
     else:
-        advice = "Simplify or mend the mesh, or allow more memory."
+        advice = "Simplify or repair the mesh, or allow more memory."
     return f"CoACD {how}{': ' if last else ''}{last.rstrip('.')}. {advice}"

@@ -25,7 +25,7 @@ _INSIDE = 1e-9
 
 
 def clean_hulls(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
-    """Return the hulls of sets of points, without degenerate hulls and hulls inside of another one.
+    """Make hulls of sets of points, without degenerate hulls and hulls inside of another one.
 
     Points outside of the hull of the whole mesh are projected onto it, because CoACD's wrapping of an open
     surface is a little larger all around.

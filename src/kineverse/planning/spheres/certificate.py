@@ -31,7 +31,7 @@ class Uncovered:
 
 
 def find_uncovered(region: CoverRegion, centres: Floats, radii: Floats, tolerance: float) -> Uncovered:
-    """Return the part of a region that spheres do not cover."""
+    """Find the part of a region that spheres do not cover."""
     growth = np.zeros(len(radii))
     points: list[Floats] = []
     cells = np.concatenate([region.middles[region.owners][:, None], region.corners[region.faces]], axis=1)
@@ -78,9 +78,9 @@ def _nearest_spheres(cells: Floats, centres: Floats, radii: Floats) -> Integers:
 def _measure_gaps(
     cells: Floats, near: Integers, centres: Floats, radii: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Return how far each cell is from lying in one of some spheres, and in which one.
+    """Measure how far each cell is from lying in a sphere, and in which one.
 
-    Further, how far its worst corner is from all of them, negative inside; and that corner.
+    Further, how far its worst corner is from all spheres, negative inside; and that corner.
     """
     beyond = np.empty((len(cells), 4, near.shape[1]))
     around, sizes = centres[near], radii[near]

@@ -26,7 +26,7 @@ from .sphere_cover import MOST, SphereCover, check_cover_settings, cover_solids
 from .sphere_tree import SphereTree
 
 _DIGITS = 12
-"""Digits to which poses in a body are told apart."""
+"""Digits in which poses in a body differ."""
 
 
 def cover_objects(
@@ -61,7 +61,7 @@ def cover_objects(
 
 
 def are_covered(items: Sequence[CollisionObject], protrusion: float | None = None, most: int = MOST) -> bool:
-    """Return True if the cover of collision objects is kept; for errors see :func:`cover_objects`."""
+    """Return True if the cover of collision objects is cached; for errors see :func:`cover_objects`."""
     return find_cover(_request(items, protrusion, most)[1]) is not None
 
 
@@ -204,12 +204,12 @@ def _remember(key: str, content: SphereCover | SphereTree) -> None:
 
 
 def _pack(head: dict[str, Any], *arrays: Floats) -> bytes:
-    """Return a line of JSON and the numbers of some arrays; an archive of numpy takes longer to read."""
+    """Write a line of JSON and the numbers of arrays; an archive of numpy takes longer to read."""
     return json.dumps(head).encode() + b"\n" + b"".join(array.astype("<f8").tobytes() for array in arrays)
 
 
 def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]]:
-    """Return the head that :func:`_pack` was given, and centres (N, 3) and radii (N,) for each size in it."""
+    """Read the head that :func:`_pack` wrote, and centres (N, 3) and radii (N,) for each size in it."""
     try:
         line, _, numbers = content.partition(b"\n")
         head = json.loads(line)

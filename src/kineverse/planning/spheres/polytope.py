@@ -71,9 +71,9 @@ class CoverPolytope:
     is_hull: bool = False  # True if the polytope is the solid
 
     def simplify(self) -> CoverPolytope:
-        """Return the hull of the corners that are extreme along some directions, if there are many corners.
+        """Return the hull of the corners of a hull that are extreme along some directions, if there are many.
 
-        It lies inside of the solid, and is returned for hulls only.
+        It lies inside of the solid.
         """
         if not self.is_hull or len(self.corners) <= _MANY_CORNERS:
             return self
@@ -225,7 +225,7 @@ def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
 
 
 def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
-    """Return a convex solid with a polytope, close enough for covers with a protrusion [m]."""
+    """Bound a convex solid by a polytope that is close enough for covers with a protrusion [m]."""
     surface = solid.surface
     if isinstance(surface, Faces):
         raise InvalidValueError(
@@ -295,7 +295,7 @@ def _bound_hull(solid: Solid) -> CoverPolytope:
 def _bound_round(
     corners: Floats, volume: float, side: RoundSide, below: float | None = None, above: float | None = None
 ) -> CoverPolytope:
-    """Return a solid with a round side, which may be cut flat below and above the origin [m]."""
+    """Bound a solid with a round side, which may be cut flat below and above the origin [m]."""
     around = _bound_hull(solid_from_points(corners))
     cuts = [(-_Z, below), (_Z, above)]
     normals = np.array([normal for normal, height in cuts if height is not None]).reshape(-1, 3)
@@ -304,7 +304,7 @@ def _bound_round(
 
 
 def _count_sides(radius: float, protrusion: float) -> int:
-    """Return the sides of a regular polygon whose sagitta is small beside a protrusion [m]."""
+    """Return the sides of a regular polygon whose sagitta is small compared with a protrusion [m]."""
     cosine = 1.0 - min(_ROUNDNESS * protrusion / radius, 0.5)
     return min(max(4 * math.ceil(math.pi / math.acos(cosine) / 4), _FEWEST_SIDES), _MOST_SIDES)
 

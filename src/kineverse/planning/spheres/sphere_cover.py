@@ -25,7 +25,7 @@ PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
 _MOST_OF_ALL = 1024
 
 _NEEDLE, _LEAST_RATIO = 1e-3, 1e-4
-"""Thickness of a needle beside its length, and the least one beside the largest size of what is fitted."""
+"""Thickness of a needle relative to its length, and least thickness relative to the largest size."""
 _SMALL, _LARGE = 1e-4, 1e4
 """Radii between which a solid is bounded as it is [m]."""
 
@@ -118,7 +118,7 @@ def cover_solids(
 
 
 def default_protrusion(solids: Sequence[tuple[Solid, Floats]]) -> float:
-    """Return the protrusion of covers where none is asked for: a tenth of the size, from 5 mm to 25 mm [m].
+    """Return the default protrusion of covers: a tenth of the size, from 5 mm to 25 mm [m].
 
     The size is the edge of a cube with the volume of the union.
     """
@@ -144,7 +144,7 @@ def _volume(solids: Sequence[tuple[Solid, Floats]]) -> float:
 def _bound_solids(
     solids: Sequence[tuple[Solid, Floats]], protrusion: float
 ) -> tuple[list[CoverPolytope], float]:
-    """Return polytopes around solids at poses, and by how much solids have grown at most [m].
+    """Bound solids at poses by polytopes; return these and the largest growth of a solid [m].
 
     Plates and needles are thickened, and what is very large or small is bounded at a size of 1 m, since hulls
     need a volume and a size.
@@ -163,13 +163,12 @@ def _bound_solids(
 
 
 def _is_needle(solid: Solid) -> bool:
-    """Return True for a primitive that is a thousand times as long as it is thick."""
     _, width, length = np.sort(solid.half).tolist()
     return not isinstance(solid.surface, Hull | Faces) and width <= _NEEDLE * length
 
 
 def _needle_chain(solid: Solid, protrusion: float, most: int) -> tuple[Floats, float]:
-    """Return the centres of equal spheres along the axis of a needle, and their radius [m].
+    """Cover a needle by equal spheres along its axis; return their centres and radius [m].
 
     The axis lies inside, so that none sticks out by more than its radius.
     """
@@ -190,7 +189,7 @@ def _make_cover(centres: Floats, radii: Floats, protrusion: float) -> SphereCove
 
 
 def _capsule_chain(capsule: Capsule, protrusion: float, most: int) -> tuple[Floats, Floats, float]:
-    """Return equal spheres along the axis of a capsule, and their protrusion [m].
+    """Cover a capsule by equal spheres along its axis; return them and their protrusion [m].
 
     With radius r + e they reach beyond both ends by e if the outermost are e inside of the ends of the axis,
     and cover the side as long as neighbours are no further than 2 √((r + e)² - r²) apart.

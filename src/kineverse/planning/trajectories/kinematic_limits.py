@@ -89,7 +89,7 @@ def motion_limits(
 
 
 def _speed_bounds(model: ModelView, speeds: Sequence[Symbol], values: State) -> dict[Symbol, float]:
-    """Return the largest magnitudes of speeds that may all be used at once."""
+    """Return largest magnitudes of speeds that may all be used at once."""
     moving = {s for s in speeds if s in model.speeds}
     limits = SpeedLimits(model.rates)
     for name, constraint in model.constraints_for(moving).items():

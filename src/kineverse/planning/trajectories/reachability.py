@@ -27,7 +27,7 @@ class PathGrid:
 
 
 def divide_path(path: BlendedPath, cells: int) -> PathGrid:
-    """Divide a path into cells."""
+    """Divide a path into its straight segments and some cells for each blend."""
     segments = len(path.lengths)
     reach = np.concatenate(([0.0], path.reach, [0.0]))
     straight = path.lengths - reach[:-1] - reach[1:]
@@ -85,7 +85,7 @@ _TINY = 1e-9
 
 
 def maximal_squared_speeds(grid: PathGrid, speeds: Array, accelerations: Array) -> Array:
-    """Return the largest squared path speeds at the nodes (K+1,): the backward and the forward pass."""
+    """Compute the largest squared path speeds at the nodes (K+1,) by a backward and a forward pass."""
     before, after = _speed_caps(grid, speeds)
     with np.errstate(divide="ignore", over="ignore"):
         path_accelerations = (accelerations / np.abs(grid.first)).min(axis=1)
@@ -107,7 +107,7 @@ def maximal_squared_speeds(grid: PathGrid, speeds: Array, accelerations: Array) 
 
 
 def _speed_caps(grid: PathGrid, speeds: Array) -> tuple[Array, Array]:
-    """Return bounds of x at both ends of each cell (K,) with which q'·√x keeps the speed limits between.
+    """Bound x at both ends of each cell (K,) so that q'·√x keeps the speed limits between them.
 
     In a cell x and q' are linear. x has to stay below (v/q')², which is convex, and below its tangent in the
     middle of the cell it does. Where q' changes much, it stays below the smallest value instead.
@@ -160,7 +160,7 @@ class CellPrograms:
         return float(np.minimum.reduce(self._row))
 
     def _find_best(self, lower: tuple[Array, Array], most: Array) -> Array:
-        """Return for each cell the x₁ of the largest x₀, or a little less, at most ``most``.
+        """Find for each cell the x₁ of the largest x₀, or a little less, at most ``most``.
 
         The upper bound of x₀ is concave in x₁, and the lower bound convex. Newton's method from the right
         finds where they meet, and secants of the upper bound find its maximum before that.

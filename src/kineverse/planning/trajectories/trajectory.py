@@ -126,7 +126,7 @@ class Trajectory:
         return np.array([np.stack(rows, axis=1) for rows in (begins, ends)])
 
     def _position_at(self, time: float) -> Array:
-        """Return the position (n,) at one time, for loops: as :meth:`positions_at`, ten times as fast."""
+        """Return the position (n,) at one time: as :meth:`positions_at`, ten times as fast."""
         last = len(self.times) - 1
         k = int(self.times.searchsorted(time, side="right")) - 1
         if k < 0 or k >= last:
@@ -290,7 +290,6 @@ class Trajectory:
 
     @property
     def _single(self) -> int:
-        """1 if there is a single knot, else 0."""
         return int(len(self.times) == 1)
 
     def _locate(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], Array, Array]:
@@ -307,8 +306,8 @@ class Trajectory:
         return Trajectory(self.symbols, times - times[0], self.positions_at(times), self.velocities_at(times))
 
 
-def _time(given: float) -> float:
-    number = finite_number(given)
+def _time(value: float) -> float:
+    number = finite_number(value)
     if number is None:
-        raise InvalidValueError(f"A time is a finite number of seconds, not {given!r}.")
+        raise InvalidValueError(f"A time is a finite number of seconds, not {value!r}.")
     return number
