@@ -73,7 +73,7 @@ class Clearance:
         self._values[:] = [values[s] for s in self.inputs]
 
     def measure(self, coordinates: Array) -> float:
-        """Find the near pairs, and return what the nearest lacks to the margin [m]; 0 if it lacks nothing."""
+        """Find the near pairs; return by how much the nearest falls short of the margin [m], or 0."""
         self._values[self._moved] = coordinates[self._source]
         self._contacts.update(self._values)
         distances = self._contacts.found.distances
@@ -89,7 +89,7 @@ class Clearance:
         return tuple(near.values())
 
     def find_step(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> Array | None:
-        """Return the step of the coordinates for the last near pairs, None if there is none."""
+        """Return the step of the coordinates that separates the last near pairs; None if there is none."""
         n, static = self._n, self._static
         self._A[: static - n], self._A[static - n :] = A, 0.0
         self._lower[:static], self._lower[static:] = lower, -np.inf
@@ -117,7 +117,6 @@ class Clearance:
         return stack_columns(columns, (6,))
 
     def _sample(self) -> Iterator[State]:
-        """Yield random states."""
         home, generator = self._scene.model.default_state(), np.random.default_rng(0)
         start = home.vector(self._program.coordinates)
         for _ in range(_SAMPLES):

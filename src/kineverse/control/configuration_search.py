@@ -24,9 +24,9 @@ PROGRESS = 0.9**2
 _SETTLED, _SHORTEST = 1 - 1e-9, 1e-7
 _HALVINGS, _APPROACHES = 8, 8
 _COLLIDING = 1e9
-"""Smallest penalty of an overlap, beside weighted sums of squares."""
+"""Smallest penalty of an overlap, above all weighted sums of squares."""
 _EXACT_WEIGHT = 1e4
-"""Weight of equalities and violated constraints beside goals that are out of reach."""
+"""Weight of equalities and violated constraints, relative to goals that are out of reach."""
 
 
 class SearchEnd(NamedTuple):
@@ -37,7 +37,7 @@ class SearchEnd(NamedTuple):
 
 
 class ConfigurationSearch:
-    """Present coordinates of a program, and ways to change them."""
+    """Present coordinates of a program, and steps that change them."""
 
     def __init__(self, program: PositionProgram, clearance: Clearance | None) -> None:
         self.program, self.clearance, self.space = program, clearance, program.space
@@ -127,8 +127,8 @@ class ConfigurationSearch:
     def approach(self, home: Array, end: Array, generator: np.random.Generator) -> None:
         """Search the best point: equalities and constraints first, then goals as far as these allow.
 
-        It starts at the given end of a search, at the given state and at random, until two points satisfy
-        the constraints. If none does, all of them have weights at the first start.
+        It starts at the end of a search, at a home state and at random, until two points satisfy the
+        constraints. If none does, all of them have weights at the first start.
         """
         x, exact_only = self.x, np.where(self.exact, 1.0, 0.0)
         best = SearchEnd(end, math.inf)
@@ -196,7 +196,7 @@ class ConfigurationSearch:
     def clear(self) -> float:
         """Leave collisions while the tasks are kept; return 0 if that succeeds.
 
-        Else the weighted sum of squares if the bodies are apart, and more than that if they are not.
+        Else return the weighted sum of squares if the bodies are apart, and more than that if they are not.
         """
         clearance, x = self.clearance, self.x
         assert clearance is not None

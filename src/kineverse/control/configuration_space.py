@@ -60,7 +60,7 @@ class ConfigurationSpace:
         return turning
 
     def draw(self, generator: np.random.Generator, start: Array) -> Array:
-        """Return random coordinates (n,): uniform within limits, around given ones where there are none."""
+        """Draw coordinates (n,): uniform within limits, or around others (n,) where there are no limits."""
         width = np.where(self.turning, math.pi, 1.0)
         low = np.where(np.isfinite(self.lower), self.lower, np.minimum(start, self.upper) - width)
         high = np.where(np.isfinite(self.upper), self.upper, np.maximum(start, self.lower) + width)
@@ -80,7 +80,7 @@ class ConfigurationSpace:
         np.copyto(q, np.minimum(np.maximum(q, self._least), self._largest), where=~self.turning)
 
     def bring_back(self, q: Array, start: Array) -> None:
-        """Bring coordinates with the period 2π within their limits, as near to given ones as possible."""
+        """Bring coordinates with the period 2π within their limits, as near to others (n,) as possible."""
         for i in np.flatnonzero(self.turning):
             value = q[i] - math.tau * round((q[i] - start[i]) / math.tau)
             if value > self.upper[i]:
@@ -94,7 +94,7 @@ class ConfigurationSpace:
 def find_coordinates(
     model: ModelView, names: Iterable[Symbol | str], argument: str = "fixed"
 ) -> frozenset[Symbol]:
-    """Return independent coordinates of a model, given as symbols or names.
+    """Find the independent coordinates of symbols or names.
 
     A dependent coordinate stands for those that determine it, an articulation for all of its coordinates, and
     a speed for the coordinates that it drives.

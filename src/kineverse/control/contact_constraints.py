@@ -251,7 +251,6 @@ class ContactSlots:
 
 
 def _contiguous(array: Array) -> Array:
-    """Return an array that C can write to."""
     if not array.flags.c_contiguous or array.dtype != np.float64:
         raise InvalidValueError("Rows of contacts are written in place, into contiguous arrays of doubles.")
     return array

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 
 class SpeedCommand(Protocol):
-    """A command of a controller."""
+    """Command of a controller."""
 
     @property
     def speeds(self) -> Mapping[Symbol, float]:
@@ -34,17 +34,17 @@ class SpeedCommand(Protocol):
 
 
 class SpeedController(Protocol):
-    """A controller that a loop can run."""
+    """Controller that a loop can run."""
 
     @property
     def speeds(self) -> Sequence[Symbol]:
-        """The speeds of its commands."""
+        """Speeds of its commands."""
 
     def step(self, state: State, /) -> SpeedCommand:
         """Return the command at a state."""
 
     def reset(self, speeds: Mapping[Symbol, float], /) -> None:
-        """Take given speeds as the last command."""
+        """Take speeds as the last command."""
 
 
 class DurationSummary(NamedTuple):
@@ -150,7 +150,7 @@ def run_control_loop(
 
 
 class _Loop:
-    """The state of a loop, and its commands."""
+    """State of a loop, and its commands."""
 
     def __init__(
         self,
@@ -193,7 +193,7 @@ class _Loop:
         return dict.fromkeys(self.last, 0.0)
 
     def step_times(self) -> DurationSummary:
-        """Return the summary of the durations of steps."""
+        """Summarize the durations of steps."""
         if not self._steps:
             return DurationSummary(0.0, 0.0, 0.0)
         p99 = float(np.percentile(self._durations, 99))

@@ -230,7 +230,7 @@ class Controller:
 
     @one_at_a_time
     def reset(self, speeds: StateLike | None = None) -> None:
-        """Forget the last commands and solutions: the next step starts from given speeds, or from rest."""
+        """Forget the last commands and solutions: the next step starts from some speeds, or from rest."""
         self._solver.reset()
         self._relaxed.reset()
         known = as_state(speeds or {}, self.speeds)
@@ -267,7 +267,6 @@ class Controller:
         self._values[place] = self._settings[place - len(self._coordinates)] = number
 
     def _set_target(self, target: Target, value: npt.ArrayLike) -> None:
-        """Set the parameters of a target that tasks depend on."""
         numbers = target.numbers(value)
         if target not in self._target_places:
             used = [k for k, s in enumerate(target.parameters) if s in self._parameters]
@@ -285,7 +284,7 @@ class Controller:
 
     @property
     def contact_slots(self) -> ContactSlots:
-        """The rows of contacts.
+        """Rows of contacts.
 
         Raises
         ------

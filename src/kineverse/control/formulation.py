@@ -217,7 +217,7 @@ class Formulation:
         return GoalRows(self._names[goal], error, jacobian, correction, rate, weight)
 
     def _limit_gain(self, gain: ExpressionLike) -> Expression:
-        """Return a gain of at most 1/dt; with a larger one a step goes beyond its target."""
+        """Limit a gain to 1/dt; with a larger one a step exceeds its target."""
         return minimum(as_expression(gain), self._most_gain)
 
     def _check_keeps(self, keeps: Mapping[str, Constraint]) -> None:
@@ -263,8 +263,8 @@ def _parts(constraint: Constraint) -> tuple[Expression, ...]:
 def _relevant_constraints(model: ModelView, subject: Sequence[Expression]) -> dict[str, Constraint]:
     """Return the constraints that share a coordinate with a subject, or with a constraint of the result.
 
-    Coordinates in bounds of positions count: what bounds another coordinate moves it, and the other way
-    round. Those in bounds of speeds, such as the bolt of a lock, do not.
+    Coordinates in bounds of positions count: each moves the others. Those in bounds of speeds, such as the
+    bolt of a lock, do not.
     """
     result = model.constraints_for(subject, closure=True)
     while True:
@@ -277,7 +277,7 @@ def _relevant_constraints(model: ModelView, subject: Sequence[Expression]) -> di
 
 
 def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) -> frozenset[Symbol]:
-    """Return the free speeds that stand for coordinates or speeds, given as symbols or names.
+    """Find the free speeds of coordinates, speeds or articulations, as symbols or names.
 
     A driven or dependent coordinate stands for all speeds in its row, an articulation for all of its
     coordinates.
@@ -297,7 +297,7 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
 
 
 def find_symbols(model: ModelView, names: Iterable[Symbol | str], argument: str) -> Iterator[Symbol]:
-    """Yield symbols that are given as symbols or names; an articulation stands for its coordinates."""
+    """Yield the symbols of names; an articulation stands for its coordinates."""
     coordinates = set(map(str, model.symbols))
     for item in (names,) if isinstance(names, str | Symbol) else names:
         if isinstance(item, str) and item in model.articulations and item not in coordinates:
@@ -310,7 +310,7 @@ def find_symbols(model: ModelView, names: Iterable[Symbol | str], argument: str)
 
 
 def check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
-    """Return the tasks as a tuple, after a check of their kinds and number."""
+    """Check the kinds and the number of tasks."""
     if isinstance(tasks, Goal | Hold | Keep):
         tasks = (tasks,)
     checked = tuple(tasks)
@@ -323,7 +323,7 @@ def check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
 
 
 def name_tasks(tasks: Sequence[Task]) -> dict[Task, str]:
-    """Return a name for each task: its own, that of its only symbol, or its kind and number."""
+    """Name each task: by its name, by its only symbol, or by its kind and number."""
     named: dict[Task, str] = {}
     for k, task in enumerate(tasks):
         subject = str(task.expression) if isinstance(task.expression, Symbol) else ""

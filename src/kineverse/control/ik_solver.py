@@ -206,7 +206,7 @@ class InverseKinematics:
         else:
             search.approach(home, best.coordinates, generator or np.random.default_rng(seed))
             space.bring_back(x, home)
-            # Monotone steps converge where full steps were given up, such as on the way to a distant target.
+            # Monotone steps converge where full steps were given up, such as towards a distant target.
             if search.is_done() and (clearance is None or clearance.measure(x) == 0.0):
                 result.append(x.copy())
         return self._result(assigned, result, obstacles, used, begin)
@@ -220,7 +220,7 @@ class InverseKinematics:
         return [self.solve(target, starts=starts, seed=seed) for target in values]
 
     def _load(self, values: StateLike | None) -> Mapping[Symbol, float]:
-        """Write the values of all inputs, and return the given values by symbol."""
+        """Write the values of all inputs, and return the assigned values by symbol."""
         assigned = {} if values is None else self._given(values)
         if isinstance(assigned, State):
             vector = (self._home | assigned).vector(self.inputs)
@@ -259,7 +259,6 @@ class InverseKinematics:
         starts: int,
         begin: float,
     ) -> IkResult:
-        """Return the result at the present coordinates."""
         search = self._search
         residuals = search.residuals()
         active: tuple[str, ...] = ()
@@ -291,7 +290,6 @@ class InverseKinematics:
         )
 
     def _explain(self, result: IkResult) -> str:
-        """Return the text of :attr:`.IkResult.why`."""
         if result.solved:
             return f"All tasks are done, after {result.starts} starts."
         self._load(result.best)
@@ -421,22 +419,22 @@ class IkResult:
 
     @cached_property
     def best(self) -> State:
-        """State of the solution that is nearest to the given state, else of the best point.
+        """State of the solution that is nearest to the first start, else of the best point.
 
-        That is the point of least weighted squared errors of goals found, where holds, keeps and constraints
-        are satisfied if that is possible. A state has values for everything in the model; what no task moves
-        has the given ones.
+        That is the point of least weighted squared errors of goals, where holds, keeps and constraints are
+        satisfied if that is possible. A state has values for everything in the model; what no task moves
+        keeps its values.
         """
         return self._states[0]
 
     @cached_property
     def solutions(self) -> tuple[State, ...]:
-        """Different solutions, the nearest to the given state first; empty if not solved."""
+        """Different solutions, the nearest to the first start first; empty if not solved."""
         return self._states if self.solved else ()
 
     @cached_property
     def why(self) -> str:
-        """Text that names what prevents a solution; computed on first use, by further searches."""
+        """Explanation of what prevents a solution; computed on first use, by further searches."""
         return self.explain(self)
 
     @cached_property

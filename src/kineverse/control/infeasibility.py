@@ -189,7 +189,6 @@ def _minimal_certificate(g: Vector, h: Vector, y: Vector) -> tuple[NDArray[np.in
 
 
 def _infeasible(g: Vector, h: Vector) -> bool:
-    """Return whether no x satisfies ``g x <= h``."""
     if not len(g):
         return False
     n, none = g.shape[1], np.full(len(g), -np.inf)
@@ -226,7 +225,7 @@ class Diagnosis:
         self._evaluator, self._contacts = evaluator, contacts
 
     def not_finite(self) -> NotFiniteError:
-        """Return the error that names the tasks and constraints with values that are not finite."""
+        """Name the tasks and constraints with values that are not finite."""
         values = self._evaluator.input
         wrong = [str(s) for s, v in zip(self._program.inputs, values, strict=False) if not math.isfinite(v)]
         if wrong:
@@ -243,7 +242,7 @@ class Diagnosis:
         )
 
     def least_violation(self) -> LeastViolation:
-        """Return the speeds that violate the rows least, within the model's limits of single speeds."""
+        """Find the speeds that violate the rows least, within the model's limits of single speeds."""
         _, _, A, lower, upper, *_ = self._evaluator.outputs
         n, width = len(self._program.speeds), A.shape[1]
         # Keeps on single speeds become rows, which may give way.
@@ -264,7 +263,7 @@ class Diagnosis:
         )
 
     def infeasible(self, command: Command) -> InfeasibleError:
-        """Return the error with an irreducible conflict, and with the least-violating command."""
+        """Name an irreducible conflict; the error has the least-violating command."""
         conflict = self._find_conflict()
         listed = "; ".join(map(_describe_conflict, conflict))
         return InfeasibleError(

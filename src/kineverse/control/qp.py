@@ -32,7 +32,7 @@ _REDUCED_SETTINGS = {"primal_tol": 1e-9, "eq_reduction": 1}
 _SOFT_SETTINGS = {"primal_tol": 1e-9, "sing_tol": 1e-13}
 """Pivots of soft rows are as small as the reciprocals of their weights."""
 _SCALED_SETTINGS = ({"primal_tol": 1e-9, "sing_tol": 1e-13}, {"primal_tol": 1e-6, "sing_tol": 1e-13})
-"""Rows that are nearly parallel are told apart; a larger tolerance prevents cycles."""
+"""Nearly parallel rows are distinguished; a larger tolerance prevents cycles."""
 
 
 class QpSolution(NamedTuple):

@@ -200,7 +200,6 @@ def _refuse_text(task: object, value: object) -> None:
 
 
 def _error_of(task: Goal | Hold, expression: Expression, target: ExpressionLike) -> Expression:
-    """Return expression minus target after checks."""
     _refuse_text(task, expression)
     _refuse_text(task, target)
     if not isinstance(expression, Expression):

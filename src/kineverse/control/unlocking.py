@@ -67,7 +67,7 @@ class LockSide:
 
 
 def find_lock_sides(model: ModelView, goals: Iterable[Symbol]) -> list[LockSide]:
-    """Return the sides of all locks on the way to goals: those on the goals, on their keys, and so on."""
+    """Find the sides of all locks that goals depend on: those on the goals, on their keys, and so on."""
     result: list[LockSide] = []
     waiting = list(dict.fromkeys(goals))
     seen = set(waiting)
@@ -104,7 +104,7 @@ def _sides(name: str, constraint: Constraint, held: Symbol) -> Iterator[LockSide
 
 
 def _values_of(expressions: list[Expression]) -> list[Expression]:
-    """Return expressions of the same values without gradients of their own, which weights have no use for."""
+    """Return expressions without gradients of their own, since weights have no use for them."""
     return [from_casadi(column[0], (), NO_NODES) for column in lower(expressions)]
 
 
@@ -271,12 +271,11 @@ def _has_circle(sides: list[LockSide]) -> bool:
 
 
 def _is_less(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return 1 or 0; unlike :func:`.less` without a trend, which a weight has no use for."""
+    """Return 1 where a < b, else 0; without a trend, for which weights have no use."""
     return binary(ca.OP_LT, as_expression(a), as_expression(b))
 
 
 def _larger(a: Expression, b: Expression) -> Expression:
-    """Return the larger of two weights."""
     return binary(ca.OP_FMAX, a, b)
 
 

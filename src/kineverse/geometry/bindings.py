@@ -338,8 +338,8 @@ class _TableBinding:
         if kept > self.query.room:
             self.reserve(2 * kept)
         buffers: tuple[npt.NDArray[Any], ...] = self.nearest
-        for own, given in zip(buffers, ranked, strict=True):
-            own[:kept] = given
+        for buffer, values in zip(buffers, ranked, strict=True):
+            buffer[:kept] = values
         self.query.kept = kept
 
     def copy_ranked(self) -> RankedPairs:

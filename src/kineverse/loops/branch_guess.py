@@ -241,7 +241,7 @@ class BranchSamples:
                 format_point(self.equations.inputs, end, named=False),
             )
             raise NoSolutionError(
-                f"Loop '{self.name}' does not close on the way to {to}: it ends, or is singular, at {at}. "
+                f"Loop '{self.name}' does not close between home and {to}: it ends, or is singular, at {at}. "
                 "Narrow the limits, or the loop's within={...}, so that it closes everywhere."
             )
         return reached.solution
@@ -298,7 +298,6 @@ def format_point(symbols: Sequence[Symbol], values: Array, named: bool = True) -
 
 
 def _corners(intervals: Sequence[InputDomain], generator: np.random.Generator) -> Array:
-    """Return the corners of a box, or a random selection of many."""
     ends = np.array([(i.lower, i.upper) for i in intervals]).reshape(-1, 2)
     if len(ends) <= _MOST_CORNERED:
         return _grid(list(ends))

@@ -177,7 +177,7 @@ def _rank(equations: Equations, x: Array, inputs: Array) -> int:
 def _choose_dependent(
     name: str, equations: Equations, x: Array, inputs: Array, rank: int, dependent: Sequence[Symbol] | None
 ) -> tuple[Symbol, ...]:
-    """Return the dependent coordinates: the given ones, or the last possible ones."""
+    """Choose the dependent coordinates: the wanted ones, or the last possible ones."""
     by_q = equations(x, inputs)[1]
     coordinates = equations.unknowns
     if dependent is not None:
