@@ -39,7 +39,8 @@ def find_distance(world: CollisionWorld, a: str, b: str) -> DistanceResult:
     if len(pairs) > 1:
         # The distance of the most promising pair bounds the answer from above.
         lows = world.table.lower_bounds(pairs[:, 0], pairs[:, 1])
-        radius = _least_distance(world, pairs[[np.argmin(lows)]]) + ACCURACY
+        (promising,), _ = world.measure(pairs[[np.argmin(lows)]], np.zeros(1), math.inf)
+        radius = float(promising) + ACCURACY
         near = lows <= radius
         pairs, lows = pairs[near], lows[near]
     (result,) = _nearest_pairs(world, pairs, lows, radius)
@@ -111,10 +112,6 @@ def _pair_product(members: list[int], others: list[int]) -> Indices:
     """Return all pairs (K, 2) of two lists, the smaller index first."""
     left, right = np.repeat(members, len(others)), np.tile(others, len(members))
     return np.stack([np.minimum(left, right), np.maximum(left, right)], axis=1).astype(np.int32)
-
-
-def _least_distance(world: CollisionWorld, pairs: Indices) -> float:
-    return float(world.measure(pairs, np.zeros(len(pairs)), math.inf)[0].min())
 
 
 def _nearest_pairs(world: CollisionWorld, pairs: Indices, lows: Floats, radius: float) -> DistanceResults:

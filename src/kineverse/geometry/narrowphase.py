@@ -101,7 +101,8 @@ class Narrowphase:
         distance: float = functor(pose_a, pose_b, self._request, result)
         if _TOUCH < distance < 1e300:
             if (i, j) in self._triangle_pairs:
-                self._witness = self._witness_from_points(distance)
+                point_a, point_b = result.getNearestPoint1(), result.getNearestPoint2()
+                self._witness = point_a, point_b, (point_b - point_a) / distance
                 return distance
             a, b = self._pair(i, j)
             if not (a.is_convex and b.is_convex):
@@ -134,10 +135,6 @@ class Narrowphase:
             return self._witness
         result = self._result
         return result.getNearestPoint1(), result.getNearestPoint2(), np.array(result.normal)
-
-    def _witness_from_points(self, distance: float) -> Witness:
-        point_a, point_b = self._result.getNearestPoint1(), self._result.getNearestPoint2()
-        return point_a, point_b, (point_b - point_a) / distance
 
     def _pair(self, i: int, j: int) -> tuple[Solid, Solid]:
         a, b = self._solids[i], self._solids[j]

@@ -187,7 +187,8 @@ def scale_solid(solid: Solid, factor: float) -> Solid:
         made = _hull_solid(factor * solid.core.corners.T)
     else:
         assert not isinstance(solid.surface, Faces)
-        made = _of_primitive(_scale_primitive(solid.surface, factor))
+        sizes = [factor * size for size in _sizes(solid.surface)]
+        made = _of_primitive(_resize_primitive(solid.surface, sizes))
     return replace(made, radius=factor * solid.radius)
 
 
@@ -340,10 +341,6 @@ def _of_primitive(geometry: Primitive) -> Solid:
 
 SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
 """Smallest and largest size of a primitive; beyond them a size is taken for a mistake [m]."""
-
-
-def _scale_primitive(geometry: Primitive, factor: float) -> Primitive:
-    return _resize_primitive(geometry, [factor * size for size in _sizes(geometry)])
 
 
 def _resize_primitive(geometry: Primitive, sizes: Sequence[float]) -> Primitive:

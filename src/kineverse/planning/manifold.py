@@ -94,7 +94,8 @@ class Manifold:
         self._targets: list[Symbol] = []
         errors = [e for hold in holds for e in self._rows_of(model, hold)]
         self.rows = as_expression(array([*errors, *equalities]))
-        jacobian = _jacobian(self.rows, symbols)
+        gradient = self.rows.gradient(heuristic=False)
+        jacobian = stack_columns([gradient.get(s.derivative()) for s in symbols], self.rows.shape)
         for hold in holds:
             moved = {s.position for s in model.rates.resolve(hold.error).gradient(heuristic=False)}
             if moved.isdisjoint(symbols):
@@ -204,11 +205,6 @@ def _is_number(hold: Hold) -> bool:
 def manifold_key(holds: Sequence[Hold]) -> tuple[object, ...]:
     """Return the key of a manifold's program, which holds with other numeric targets share."""
     return tuple((hold.expression, None if _is_number(hold) else hold.target) for hold in holds)
-
-
-def _jacobian(rows: Expression, symbols: Sequence[Symbol]) -> Expression:
-    gradient = rows.gradient(heuristic=False)
-    return stack_columns([gradient.get(s.derivative()) for s in symbols], rows.shape)
 
 
 def newton_step(rows: Expression, jacobian: Expression) -> Expression:

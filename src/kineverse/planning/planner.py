@@ -186,11 +186,9 @@ class Planner:
         UnknownNameError, InvalidValueError
             For unknown names and values that are not finite.
         """
-        self._synchronize().place(self._whole(state))
+        scene = self._synchronize()
+        scene.place(scene.state | read_state(self.model, state))
         self._check_separate_pairs(self.planning_scene.here[None])
-
-    def _whole(self, state: StateLike) -> State:
-        return self.planning_scene.state | read_state(self.model, state)
 
     # -- configurations ------------------------------------------------------------------------------------
 

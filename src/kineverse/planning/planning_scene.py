@@ -101,10 +101,6 @@ class PlanningScene:
         margin = self.checker.struct.margin
         return find_separate_pairs(self.scene, self.space, self.excluded, self.state, Q, margin)
 
-    def _replace(self) -> None:
-        """Place the checker again at the present state."""
-        self.checker.place(self.state)
-
     def set_bounds(
         self,
         start: Array,
@@ -328,10 +324,9 @@ class PlanningScene:
 
     def checks(self, touching: BodyPairs, manifold: Manifold | None) -> PathChecks:
         """Make the checks of a path at the present state."""
-        state, judge = self.state, self.judge(touching)
-        return PathChecks(
-            self.model, state, self.checker, judge, manifold, touching, self._replace, self._lock
-        )
+        judge, checker = self.judge(touching), self.checker
+        restore = lambda: checker.place(self.state)  # noqa: E731
+        return PathChecks(self.model, self.state, checker, judge, manifold, touching, restore, self._lock)
 
 
 def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
