@@ -1,4 +1,7 @@
-"""Reasons for steps without a command: conflicting constraints, values that are not finite."""
+"""Reasons for steps without a command: conflicting constraints, values that are not finite.
+
+The rows are those of a quadratic program, ``lower <= [x; A x] <= upper`` (:mod:`.qp`).
+"""
 
 from __future__ import annotations
 

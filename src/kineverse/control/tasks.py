@@ -1,4 +1,9 @@
-"""Tasks of controllers and inverse kinematics: goals, holds, keeps, their targets and task functions."""
+"""Tasks of controllers and inverse kinematics: goals, holds and keeps on any expression; targets.
+
+A task constrains an expression e of a model's symbols. It knows nothing of joints: the speeds that serve it
+are the keys of its gradient (task function approach: Samson, Le Borgne, Espiau 1991). Task functions, such as
+:func:`same_pose`, are expressions that are zero where a relation of frames holds.
+"""
 
 from __future__ import annotations
 

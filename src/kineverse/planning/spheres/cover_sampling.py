@@ -1,4 +1,11 @@
-"""First centres for sphere covers: a greedy set cover, and lattices."""
+"""Points of a region that are hardest to cover by spheres, and first centres for covers.
+
+The power of a point x for a sphere is |x - c|² - r². Spheres cover a solid if and only if each one covers the
+part where its own power is least. These parts are convex, so that their corners are hardest to cover: on the
+surface, points of equal power for three spheres; on an edge, for two. A triangle whose corners belong to
+different spheres is likely to have one (F. Aurenhammer, Power diagrams: properties, algorithms and
+applications, SIAM J. Comput. 16, 1987). First centres come from a greedy set cover, and from lattices.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Fastest speeds along a rounded path by reachability analysis, cell by cell (TOPP-RA)."""
+"""Reachability analysis of a rounded path: the largest squared path speeds within the limits.
+
+The two passes of TOPP-RA (Pham & Pham 2018, IEEE T-RO 34(3), algorithm 1), with x = ṡ² and u = s̈.
+"""
 
 from __future__ import annotations
 
