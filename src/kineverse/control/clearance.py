@@ -44,15 +44,9 @@ class Clearance:
             rules = scene.find_always_colliding(self._sample(), margin)
         except NoSolutionError:  # Some of the states are outside of the domain of a closed loop.
             rules = scene.find_always_colliding(margin=margin)
+        reach = margin + _RADIUS
         self._contacts = ContactSlots(
-            scene,
-            self._speeds,
-            _SLOTS,
-            margin=margin,
-            radius=margin + _RADIUS,
-            gain=1.0,
-            twist=self._twist,
-            rules=rules,
+            scene, self._speeds, _SLOTS, margin=margin, radius=reach, gain=1.0, twist=self._twist, rules=rules
         )
         self.inputs: Sequence[Symbol] = self._contacts.inputs
         place = {s: k for k, s in enumerate(program.coordinates)}

@@ -137,16 +137,8 @@ def run_control_loop(
             raise
     if loop.fatal is not None:
         raise loop.fatal
-    return LoopReport(
-        loop.cycles,
-        missed,
-        worst,
-        loop.stale_cycles,
-        loop.errors,
-        loop.last_error,
-        loop.step_times(),
-        interrupted,
-    )
+    problems = loop.stale_cycles, loop.errors, loop.last_error
+    return LoopReport(loop.cycles, missed, worst, *problems, loop.step_times(), interrupted)
 
 
 class _Loop:

@@ -152,14 +152,9 @@ class Controller:
             # For start-up time: a controller without a scene imports no geometry.
             from .contact_constraints import ContactSlots
 
+            reach, gain = _contact_radius(dt) if radius is None else radius, _contact_gain(dt)
             self._contacts = ContactSlots(
-                scene,
-                self.speeds,
-                contacts,
-                margin=margin,
-                radius=_contact_radius(dt) if radius is None else radius,
-                gain=_contact_gain(dt),
-                tier=tier,
+                scene, self.speeds, contacts, margin=margin, radius=reach, gain=gain, tier=tier
             )
             self.inputs = arrange_inputs({*self.inputs, *self._contacts.inputs})
             place = {s: k for k, s in enumerate(self.inputs)}
@@ -375,16 +370,10 @@ class Controller:
             program.residuals, self._residuals.copy(), program.speed_goals, program.speed_rows, jacobian, rate
         )
         values = x.tolist()
+        speeds, progress = dict(zip(self.speeds, values, strict=False)), min(values[n:], default=1.0)
+        contacts = () if self._contacts is None else self._contacts.found
         return Command(
-            dict(zip(self.speeds, values, strict=False)),
-            vector,
-            min(values[n:]) if len(values) > n else 1.0,
-            times,
-            iterations,
-            multipliers,
-            self._row_names,
-            () if self._contacts is None else self._contacts.found,
-            errors,
+            speeds, vector, progress, times, iterations, multipliers, self._row_names, contacts, errors
         )
 
     def _read(self, state: StateLike | npt.ArrayLike) -> None:

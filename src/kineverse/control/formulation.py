@@ -163,13 +163,9 @@ class Formulation:
     def _rows(
         self, constraints: dict[str, Constraint], dt: ExpressionLike, speeds: Sequence[Symbol] | None
     ) -> VelocityRows:
+        rates, limits = self.model.rates, self._limits
         return velocity_rows(
-            constraints,
-            dt,
-            rates=self.model.rates,
-            speeds=speeds,
-            speed_limits=self._limits,
-            recovery="allowed",
+            constraints, dt, rates=rates, speeds=speeds, speed_limits=limits, recovery="allowed"
         )
 
     def _split_speed_goals(

@@ -276,18 +276,8 @@ class InverseKinematics:
                 whole | State(dict(zip(self.coordinates, end.tolist(), strict=True))) for end in ends
             )
 
-        return IkResult(
-            bool(found),
-            residuals,
-            active,
-            contacts,
-            starts,
-            search.iterations,
-            perf_counter() - begin,
-            make_states,
-            self._explain,
-            obstacles,
-        )
+        effort, explain = (starts, search.iterations, perf_counter() - begin), self._explain
+        return IkResult(bool(found), residuals, active, contacts, *effort, make_states, explain, obstacles)
 
     def _explain(self, result: IkResult) -> str:
         if result.solved:

@@ -161,14 +161,9 @@ class PositionProgram:
     def _compile(self, errors: Expression, ranges: dict[str, Constraint]) -> None:
         n = len(self.coordinates)
         gradient = errors.gradient(heuristic=False)
-        jacobian = stack_columns([gradient.get(s.derivative()) for s in self.coordinates], errors.shape)
-        table = velocity_rows(
-            ranges,
-            1.0,
-            rates=Rates({}),
-            speeds=[s.derivative() for s in self.coordinates],
-            recovery="allowed",
-        )
+        speeds = [s.derivative() for s in self.coordinates]
+        jacobian = stack_columns([gradient.get(s) for s in speeds], errors.shape)
+        table = velocity_rows(ranges, 1.0, rates=Rates({}), speeds=speeds, recovery="allowed")
         bounds, general = table.bounds, table.general
         count = len(general.names)
         scales = self._sample(errors, jacobian, ranges)

@@ -277,13 +277,9 @@ class QpSolver:
 
     def _bind(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> None:
         n, m = self.n, self.m
-        for name, array, shape in (
-            ("H", H, (n, n)),
-            ("f", f, (n,)),
-            ("A", A, (m, n)),
-            ("lower", lower, (n + m,)),
-            ("upper", upper, (n + m,)),
-        ):
+        arrays = {"H": H, "f": f, "A": A, "lower": lower, "upper": upper}
+        shapes = (n, n), (n,), (m, n), (n + m,), (n + m,)
+        for (name, array), shape in zip(arrays.items(), shapes, strict=True):
             if not isinstance(array, np.ndarray) or array.dtype != np.float64 or not array.flags.c_contiguous:
                 raise InvalidValueError(
                     f"{name} is read in place, so it is a C-contiguous array of doubles: "

@@ -34,23 +34,16 @@ def make_loop_record(
 ) -> Articulation:
     """Return the record of a loop with dependent coordinates."""
     frame, to = ends[0]
-    return Articulation(
-        SOLVED_LOOP,
-        to,
-        frame,
-        dynamics=(
-            ("free", tuple(map(str, closed.free))),
-            ("dependent", tuple(map(str, closed.dependent))),
-            ("ends", ends),
-            ("mask", mask),
-            ("mobility", closed.mobility),
-            ("branches", closed.branches),
-            ("branch", closed.branch),
-            ("condition", closed.condition),
-            ("worst at", closed.worst),
-            ("domain", closed.function.domain),
-        ),
-    )
+    facts = {
+        "free": tuple(map(str, closed.free)),
+        "dependent": tuple(map(str, closed.dependent)),
+        "ends": ends,
+        "mask": mask,
+        **{name: getattr(closed, name) for name in ("mobility", "branches", "branch", "condition")},
+        "worst at": closed.worst,
+        "domain": closed.function.domain,
+    }
+    return Articulation(SOLVED_LOOP, to, frame, dynamics=tuple(facts.items()))
 
 
 def make_constrained_record(

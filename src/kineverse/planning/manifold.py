@@ -175,14 +175,9 @@ class Manifold:
         """
         work = np.empty((len(points) + _MOST_POINTS, points.shape[1]))
         work[: len(points)] = points
+        buffer = work.ctypes.data, len(points), len(work)
         count = self._code.kineverse_refine(
-            self._checker.address,
-            self.address,
-            work.ctypes.data,
-            len(points),
-            len(work),
-            _POLISHING,
-            DEVIATION,
+            self._checker.address, self.address, *buffer, _POLISHING, DEVIATION
         )
         return None if count < 0 else work[:count].copy()
 

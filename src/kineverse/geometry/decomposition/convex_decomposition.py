@@ -209,10 +209,9 @@ def _decompose_surface(
 ) -> Decomposition:
     start = time.perf_counter()
     error = settings.max_error(surface.size)
-    result = clean_hulls(
-        run_coacd(surface, error, limits, stop), Polytope.from_points(surface.faces.vertices)
-    )
-    hulls = reduce_hulls(result, settings.max_hulls)
+    whole = Polytope.from_points(surface.faces.vertices)
+    hulls = clean_hulls(run_coacd(surface, error, limits, stop), whole)
+    hulls = reduce_hulls(hulls, settings.max_hulls)
     if not hulls:
         raise DecompositionError("CoACD found no hull.")
     accuracy = measure_accuracy(surface.faces, hulls)
@@ -220,13 +219,7 @@ def _decompose_surface(
     for array in corners:
         array.flags.writeable = False
     seconds = time.perf_counter() - start
+    now = time.time()
     return Decomposition(
-        tuple(corners),
-        surface.name,
-        error,
-        settings.max_hulls,
-        accuracy,
-        seconds,
-        time.time(),
-        surface.remarks,
+        tuple(corners), surface.name, error, settings.max_hulls, accuracy, seconds, now, surface.remarks
     )

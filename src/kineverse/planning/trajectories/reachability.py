@@ -63,15 +63,8 @@ def divide_path(path: BlendedPath, cells: int) -> PathGrid:
     keep = ~kind | (lengths > 8 * np.finfo(float).eps * path.lengths.max())
     ends[-1] = True
     # A segment that its blends use up ends at no stop.
-    return PathGrid(
-        lengths[keep],
-        first[keep],
-        last[keep],
-        bend[keep],
-        start[keep],
-        kind[keep],
-        np.concatenate(([True], ends[keep][:-1], [True])),
-    )
+    stops = np.concatenate(([True], ends[keep][:-1], [True]))
+    return PathGrid(*(array[keep] for array in (lengths, first, last, bend, start, kind)), stops=stops)
 
 
 _ITERATIONS = 12

@@ -357,16 +357,10 @@ class TrajectoryFollower:
         self._trajectory = trajectory
         self._position = Target(f"{name}/position", trajectory.positions[0])
         self._speed = Target(f"{name}/speed", 0 * trajectory.positions[0])
+        targets, rates = self._position.expression, self._speed.expression
         self.tasks = tuple(
-            Goal(
-                symbol,
-                self._position.expression[k],
-                rate=self._speed.expression[k],
-                gain=gain,
-                weight=weight,
-                name=f"{name}/{symbol}",
-            )
-            for k, symbol in enumerate(trajectory.symbols)
+            Goal(s, targets[k], rate=rates[k], gain=gain, weight=weight, name=f"{name}/{s}")
+            for k, s in enumerate(trajectory.symbols)
         )
 
     @property

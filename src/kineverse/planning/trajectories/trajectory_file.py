@@ -80,12 +80,8 @@ def read_trajectory_file(path: str | os.PathLike[str]) -> TrajectoryData:
         raise FormatError(f"{source}: 'coordinates' is a list of names.")
     times = _numbers(document["times"], "times", source)
     shape = (times.size, len(names))
-    return TrajectoryData(
-        names,
-        times,
-        _table(document["positions"], "positions", shape, source),
-        _table(document["velocities"], "velocities", shape, source),
-    )
+    tables = (_table(document[key], key, shape, source) for key in ("positions", "velocities"))
+    return TrajectoryData(names, times, *tables)
 
 
 def parse_coordinates(names: list[str], source: str) -> tuple[Symbol, ...]:
