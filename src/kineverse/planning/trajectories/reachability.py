@@ -64,7 +64,7 @@ def divide_path(path: BlendedPath, cells: int) -> PathGrid:
     ends[-1] = True
     # A segment that its blends use up ends at no stop.
     stops = np.concatenate(([True], ends[keep][:-1], [True]))
-    return PathGrid(*(array[keep] for array in (lengths, first, last, bend, start, kind)), stops=stops)
+    return PathGrid(lengths[keep], first[keep], last[keep], bend[keep], start[keep], kind[keep], stops)
 
 
 _ITERATIONS = 12
