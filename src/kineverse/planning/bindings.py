@@ -19,34 +19,17 @@ from kineverse.geometry.bindings import collision_library
 
 SOURCES = ("collision.c", "edges.c", "rrt_connect.c", "manifold.c", "roadmap.c")
 
-OBSTACLE = np.dtype(
-    [
-        ("rotation", np.float32, 9),
-        ("translation", np.float32, 3),
-        ("size", np.float32, 3),
-        ("kind", np.int32),
-        ("body", np.int32),
-        ("first", np.int32),
-        ("planes", np.int32),
-        ("aligned", np.int32),
-        ("object", np.int32),
-    ]
-)
-LINK = np.dtype(
-    [
-        ("ball", np.float32, 4),
-        ("low", np.float32, 3),
-        ("high", np.float32, 3),
-        ("pose", np.int32),
-        ("first", np.int32),
-        ("coarse", np.int32),
-        ("first_shape", np.int32),
-        ("shapes", np.int32),
-        ("exact", np.int32),
-    ]
-)
+
+def _integers(names: str) -> list[tuple[str, type[np.int32]]]:
+    return [(name, np.int32) for name in names.split()]
+
+
+_VECTORS = ("rotation", np.float32, 9), ("translation", np.float32, 3), ("size", np.float32, 3)
+OBSTACLE = np.dtype([*_VECTORS, *_integers("kind body first planes aligned object")])
+_BOUNDS = ("ball", np.float32, 4), ("low", np.float32, 3), ("high", np.float32, 3)
+LINK = np.dtype([*_BOUNDS, *_integers("pose first coarse first_shape shapes exact")])
 SHAPE = np.dtype([("pose", np.float64, 12), ("object", np.int64)])
-COARSE = np.dtype([("sphere", np.float32, 4), ("first", np.int32), ("count", np.int32)])
+COARSE = np.dtype([("sphere", np.float32, 4), *_integers("first count")])
 
 MOST_COORDINATES = 64
 """Largest number of coordinates, as in ``edges.c``."""
