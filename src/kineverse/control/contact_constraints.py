@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation import compile
-from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.c_library import SourceLibrary, struct_fields
 from kineverse.compilation.function import WantedTier
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
@@ -74,11 +74,9 @@ __attribute__((visibility("default"))) void write_rows(const Rows *r) {
 
 
 class _Struct(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("n", "width", "bodies", "used")),
-        *((name, ctypes.c_void_p) for name in ("group", "twists", "margins", "H", "f", "A", "lower")),
-        *((name, ctypes.c_void_p) for name in ("distances", "witnesses", "owners")),
-        *((name, ctypes.c_double) for name in ("gain", "recovery", "weight", "inwards")),
+    _fields_ = struct_fields(
+        "i n width bodies used; p group twists margins H f A lower distances witnesses owners; "
+        "d gain recovery weight inwards"
     )
 
 

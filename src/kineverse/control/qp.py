@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kineverse._extras import install_command
-from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.c_library import SourceLibrary, struct_fields
 from kineverse.errors import InvalidValueError, MissingDependencyError, ShapeError
 
 Vector = NDArray[np.float64]
@@ -89,10 +89,7 @@ __attribute__((visibility("default"))) void bound(const Rows *r, double limit) {
 
 
 class _Rows(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("n", "m")),
-        *((name, ctypes.c_void_p) for name in ("A", "lower", "upper", "hard", "values", "low", "high")),
-    )
+    _fields_ = struct_fields("i n m; p A lower upper hard values low high")
 
 
 def _declare(code: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.c_library import SourceLibrary, struct_fields
 from kineverse.compilation.toolchain import NO_COMPILER
 from kineverse.errors import CompileError
 
@@ -46,40 +46,25 @@ MeasuredPairs: TypeAlias = tuple[Indices, Floats, Floats, Floats]
 
 
 class _Struct(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("count", "moving", "bodies", "axis")),
-        *((name, ctypes.c_void_p) for name in (*_ARRAYS, "boxes", "leaves")),
-        *((name, ctypes.c_int64) for name in ("node_count", "leaf_count", "resets")),
+    _fields_ = struct_fields(
+        f"i count moving bodies axis; p {' '.join(_ARRAYS)} boxes leaves; i node_count leaf_count resets"
     )
 
 
 class _QueryStruct(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_double) for name in ("reach", "radius")),
-        *((name, ctypes.c_int64) for name in ("all", "room")),
-        *((name, ctypes.c_void_p) for name in ("allowed", "active", "known")),
-        *((name, ctypes.c_void_p) for name in ("pairs", "lows", "distances", "witnesses", "order")),
-        ("kept", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("pieces", "bodies", "distance", "witness")),
+    _fields_ = struct_fields(
+        "d reach radius; i all room; p allowed active known pairs lows distances witnesses order; "
+        "i kept; p pieces bodies distance witness"
     )
 
 
 class _FacingStruct(ctypes.Structure):
-    _fields_ = (
-        ("margins", ctypes.c_void_p),
-        *((name, ctypes.c_double) for name in ("usual", "angle", "apart")),
-    )
+    _fields_ = struct_fields("p margins; d usual angle apart")
 
 
 class _NeighbourStruct(ctypes.Structure):
-    _fields_ = (
-        ("reach", ctypes.c_double),
-        ("travel", ctypes.c_void_p),
-        ("pairs", ctypes.c_void_p),
-        *((name, ctypes.c_int64) for name in ("found", "room", "resets")),
-        *((name, ctypes.c_void_p) for name in ("selected", "members", "first")),
-        ("count", ctypes.c_int64),
-        ("boxes", ctypes.c_void_p),
+    _fields_ = struct_fields(
+        "d reach; p travel pairs; i found room resets; p selected members first; i count; p boxes"
     )
 
 
@@ -115,12 +100,9 @@ class ObjectPlacement:
 class MotionStruct(ctypes.Structure):
     """Motion along samples as C reads it, see :class:`.SampledMotion`."""
 
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("moved", "still", "room")),
-        *((name, ctypes.c_void_p) for name in ("moving", "standing", "selected", "placed", "boxes")),
-        *((name, ctypes.c_void_p) for name in ("compute", "inputs", "outputs", "columns")),
-        *((name, ctypes.c_int64) for name in ("coordinates", "first")),
-        *((name, ctypes.c_double) for name in ("limit", "least")),
+    _fields_ = struct_fields(
+        "i moved still room; p moving standing selected placed boxes compute inputs outputs columns; "
+        "i coordinates first; d limit least"
     )
 
 

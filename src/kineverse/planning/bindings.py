@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.c_library import SourceLibrary, struct_fields
 from kineverse.compilation.interruption import WATCH, raise_signal
 from kineverse.compilation.toolchain import NO_COMPILER, NO_UNDEFINED_FLAGS
 from kineverse.compilation.vector_program import vector_header
@@ -41,55 +41,47 @@ FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY, TOO_LONG = range(5)
 """Outcomes of a search."""
 
 
-def _fields(kinds: str, names: str) -> list[tuple[str, Any]]:
-    types = {"p": ctypes.c_void_p, "i": ctypes.c_longlong, "d": ctypes.c_double}
-    return [(name, types[kind]) for kind, name in zip(kinds, names.split(), strict=True)]
-
-
 class ObstacleSetStruct(ctypes.Structure):
     """Set of obstacles as C reads it."""
 
-    _fields_ = _fields("pppiiiii", "items boxes chunks count padded padded_chunks pose link")
+    _fields_ = struct_fields("p items boxes chunks; i count padded padded_chunks pose link")
 
 
 class CheckerStruct(ctypes.Structure):
     """Tables of a collision checker as C reads them."""
 
-    _fields_ = _fields(
-        "iiiippppiipppppppppiippppppppd",
-        "coordinates poses conditions stored compute kept lower upper links bodies link coarse fine planes "
-        "allowed world moving fineness turns pairs moving_pairs pair moving_pair shape objects object_poses "
-        "object_positions object_centres is_within margin",
+    _fields_ = struct_fields(
+        "i coordinates poses conditions stored; p compute kept lower upper; i links bodies; p link coarse "
+        "fine planes allowed world moving fineness turns; i pairs moving_pairs; p pair moving_pair shape "
+        "objects object_poses object_positions object_centres is_within; d margin"
     )
 
 
 class ProjectionStruct(ctypes.Structure):
     """Projection onto a manifold as C reads it."""
 
-    _fields_ = _fields(
-        "ppidippid", "step kept stored tolerance steps exact exact_kept exact_stored exact_tolerance"
+    _fields_ = struct_fields(
+        "p step kept; i stored; d tolerance; i steps; p exact exact_kept; i exact_stored; d exact_tolerance"
     )
 
 
 class SearchStruct(ctypes.Structure):
     """Search and its results as C reads and writes them."""
 
-    _fields_ = _fields(
-        "ppdddiiiiiiiidd",
-        "checker projection range resolution seconds nodes most_edges seed "
-        "iterations edges count_start count_goal status elapsed gap",
+    _fields_ = struct_fields(
+        "p checker projection; d range resolution seconds; i nodes most_edges seed iterations edges "
+        "count_start count_goal status; d elapsed gap"
     )
 
 
 class RoadmapStruct(ctypes.Structure):
     """Roadmap, a query and its results as C reads and writes them."""
 
-    _fields_ = _fields(
-        "pddddiiiipppppppppppppiiiiiiiiiiidd",
-        "checker resolution least greed seconds seed degree room least_batch period columns lengths "
-        "targets incoming next node edge passing visits_start visits_goal order_start order_goal count "
-        "ends drawn round query samples nodes_checked edges_checked reached_start reached_goal status "
-        "elapsed gap",
+    _fields_ = struct_fields(
+        "p checker; d resolution least greed seconds; i seed degree room least_batch; p period columns "
+        "lengths targets incoming next node edge passing visits_start visits_goal order_start order_goal; "
+        "i count ends drawn round query samples nodes_checked edges_checked reached_start reached_goal "
+        "status; d elapsed gap"
     )
 
 
