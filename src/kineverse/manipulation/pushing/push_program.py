@@ -147,7 +147,7 @@ class PushProgram:
             model,
             tasks,
             dt=dt,
-            still=still,
+            fixed=still,
             scene=scene,
             margin=_MARGIN,
             radius=_RADIUS,
