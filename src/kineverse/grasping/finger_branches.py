@@ -13,8 +13,7 @@ from kineverse.symbols import Symbol
 
 from .hand_model import bodies_with_shapes
 
-MOST_JOINTS = 3
-"""Most free coordinates of one finger."""
+MOST_JOINTS = 3  # most free coordinates of one finger
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,21 +22,15 @@ from .finger_branches import Branch, path_to_root
 from .hand_model import HandModel
 
 _SAMPLES = 33
-_NEAR = 4e-3
-"""Opening at which fingers count as nearly closed: their pads face each other there [m]."""
-_FLAT = 2e-3
-"""Unevenness of a pad [m]."""
+_NEAR = 4e-3  # opening at which fingers count as nearly closed: their pads face each other there [m]
+_FLAT = 2e-3  # unevenness of a pad [m]
 _CELLS = 14
-_REACH = 0.3
-"""Length of the rays from the middle to the pads [m]."""
-_ALIGNED = 0.85
-"""Cosine of the angle below which an axis is taken for the approach direction."""
-_SLOWER = 0.4
-"""Least motion of one finger against the other's; fingers that mirror each other have 1."""
+_REACH = 0.3  # length of the rays from the middle to the pads [m]
+_ALIGNED = 0.85  # cosine of the angle below which an axis is taken for the approach direction
+_SLOWER = 0.4  # least motion of one finger against the other's; fingers that mirror each other have 1
 _STILL_OPEN, _WIDEST = 0.45, 0.4
 """Largest gap of closed fingers as a part of that of open ones, and the largest gap at all [m]."""
-_LEAST_STROKE = 5e-3
-"""Least change of the gap of a gripper [m]."""
+_LEAST_STROKE = 5e-3  # least change of the gap of a gripper [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

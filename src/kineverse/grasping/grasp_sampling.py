@@ -25,22 +25,16 @@ from .gripper_detection import Gripper
 from .hand_model import HandModel, bodies_with_shapes
 from .handles import Handle
 
-_RETREAT = 0.1
-"""Distance of the pose from which the hand approaches [m]."""
-_SLACK = 4e-3
-"""Gap of the pads minus the thickness of the bar, before the fingers touch [m]."""
-_MARGIN = 1e-3
-"""Least distance of the hand from the object before the fingers touch [m]."""
+_RETREAT = 0.1  # distance of the pose from which the hand approaches [m]
+_SLACK = 4e-3  # gap of the pads minus the thickness of the bar, before the fingers touch [m]
+_MARGIN = 1e-3  # least distance of the hand from the object before the fingers touch [m]
 _MOST_TILT, _MOST_TILT_OF_KNOB = math.radians(100), math.radians(20)
 """Largest angle about the bar: a hand that comes from the edge of a flap keeps its grasp while that opens."""
 _DEPTHS = (0.0, 0.5, 1.0, -0.5)
 """Parts of the depth of the pads at which a bar is tried first; 1 is at their tips."""
-_CANDIDATES = 6
-"""Candidates for each grasp that is asked for."""
-_NEAR = 0.6
-"""Distance from the bar up to which shapes are looked at [m]."""
-_REACH = 0.05
-"""Distance up to which the clearance of a grasp counts [m]."""
+_CANDIDATES = 6  # candidates for each grasp that is asked for
+_NEAR = 0.6  # distance from the bar up to which shapes are looked at [m]
+_REACH = 0.05  # distance up to which the clearance of a grasp counts [m]
 _CLOSING, _AWAY = 14, np.array([0.1, 0.25, 0.5, 1.0])
 """Number of gaps of fingers that close, and parts of the way to the pose before the approach."""
 _ADVANCES, _TOUCHING = 20, 1e-4

@@ -20,16 +20,12 @@ from kineverse.geometry.shapes import Solid, solid_from_geometry
 from kineverse.lie import Array, unit_vector
 from kineverse.model.body import Geometry, Mesh, Sphere
 
-MOST_THICK = 0.09
-"""Largest thickness of a bar [m]: hardly a gripper opens further."""
-_LONG = 1.5
-"""Length per width above which a part is a bar, and a knob below."""
+MOST_THICK = 0.09  # largest thickness of a bar [m]: hardly a gripper opens further
+_LONG = 1.5  # length per width above which a part is a bar, and a knob below
 _FLAT, _WIDE = 3.0, 2.0
 """Width per thickness from which on a part is a plate, and per width of what it carries, if it is a panel."""
-_STANDS_OUT = 3e-3
-"""Least length by which a bar stands out from what it is fixed to [m]."""
-_TOUCH = 2e-3
-"""Largest gap of parts that are fixed to each other [m]."""
+_STANDS_OUT = 3e-3  # least length by which a bar stands out from what it is fixed to [m]
+_TOUCH = 2e-3  # largest gap of parts that are fixed to each other [m]
 _STEPS = 144
 
 

@@ -20,8 +20,7 @@ from .finger_branches import Branch, Palm, find_palms, hand_frame, path_to_root
 from .fingertip_geometry import Pads, find_pads, reaches_pads
 from .hand_model import HandModel, bodies_with_shapes, usable_bodies
 
-_TYPICAL = 0.015
-"""Thickness of a bar for which the grasp pose is given [m]."""
+_TYPICAL = 0.015  # thickness of a bar for which the grasp pose is given [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,8 +215,7 @@ def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> 
 
 
 _MOST_LISTED = 6
-_LARGEST = 0.5
-"""Diagonal of the box around a finger that is too large for one [m]."""
+_LARGEST = 0.5  # diagonal of the box around a finger that is too large for one [m]
 
 _STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))
 """Ball at the origin of a frame, in place of shapes that cannot be read."""

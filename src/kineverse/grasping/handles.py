@@ -21,8 +21,7 @@ from kineverse.symbols import Symbol
 from .finger_branches import path_to_root
 from .graspable_features import Part, ProtrudingBar, find_bars, find_parts, free_length
 
-_FREE = 0.15
-"""Free space in front of a bar that a hand needs [m]."""
+_FREE = 0.15  # free space in front of a bar that a hand needs [m]
 _PART_OF_RANGE = 0.05
 _WITHIN = 0.5
 """Cosine above which a bar points along the opening motion, and below minus which it points inside."""

@@ -22,13 +22,10 @@ MotionKind: TypeAlias = Literal["door", "flap", "drawer", "knob", "linkage"]
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 
 _SAMPLES = 5
-_STILL = 1e-6
-"""Rotation below which a motion is a translation [rad]."""
-_SAME = 1e-3
-"""Largest difference of the axes of a motion about one axis, as direction and as point [m]."""
+_STILL = 1e-6  # rotation below which a motion is a translation [rad]
+_SAME = 1e-3  # largest difference of the axes of a motion about one axis, as direction and as point [m]
 _UPRIGHT = math.cos(math.pi / 4)
-_KNOB = 0.08
-"""Largest distance of a knob from its axis [m]."""
+_KNOB = 0.08  # largest distance of a knob from its axis [m]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,7 @@ from .opening.grasped_opening import open_object
 from .outcome import Outcome
 from .session import Session
 
-_PLANS = ("plan", "place")
-"""Computations that are no control steps."""
+_PLANS = ("plan", "place")  # computations that are no control steps
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,10 +61,8 @@ class HandReference:
 
 Speeds = Mapping[Symbol, float]
 
-STALE = 0.06
-"""Age of the latest readings from which on a skill ends [s]."""
-_MADE = 64
-"""Number of motions that are remembered."""
+STALE = 0.06  # age of the latest readings from which on a skill ends [s]
+_MADE = 64  # number of motions that are remembered
 
 
 class Session:

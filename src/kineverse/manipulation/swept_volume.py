@@ -31,16 +31,12 @@ from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 from .outcome import SkillError
 
-STEP = 5e-4
-"""Longest way of a point of the object between two places where it is looked at [m]."""
+STEP = 5e-4  # longest way of a point of the object between two places where it is looked at [m]
 
-_COARSE = 32
-"""Number of parts of a way whose lengths are measured."""
+_COARSE = 32  # number of parts of a way whose lengths are measured
 _MOST_PLACES = 100_000
-_TURNED = 1e-6
-"""Change of an entry of a rotation from which on a body has turned."""
-_CLEAR = 3e-3
-"""Distance before the first contact up to which a way is said to be free [m]."""
+_TURNED = 1e-6  # change of an entry of a rotation from which on a body has turned
+_CLEAR = 3e-3  # distance before the first contact up to which a way is said to be free [m]
 
 
 @dataclass(frozen=True, slots=True)

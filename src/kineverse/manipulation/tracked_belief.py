@@ -109,12 +109,10 @@ and .002 rad/√s and .0013 m/√s at rest."""
 _MOVED, _REFUTED = 1.0, 0.3
 """Times for which a part counts as moving after a command, and after a refuted prediction [s].
 In the latter all of the tracker's process noise counts."""
-_STILL = 1e-3
-"""Largest speed of a part that rests [m/s], [rad/s]."""
+_STILL = 1e-3  # largest speed of a part that rests [m/s], [rad/s]
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
 """Error of the motion of joints relative to the commanded one, and beside it [rad/√s], [m/√s]."""
-_HORIZON = 0.04
-"""Longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays."""
+_HORIZON = 0.04  # longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays
 
 
 class TrackedBelief:

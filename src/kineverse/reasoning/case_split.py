@@ -21,8 +21,7 @@ from .boxes import Interval, IntervalBox, Number
 from .domain import Domain
 from .polynomial import LinearForm, Polynomial, linear_form_expression
 
-NEGLIGIBLE = 1e-12
-"""Largest constant that is taken for 0 with a rounding error."""
+NEGLIGIBLE = 1e-12  # largest constant that is taken for 0 with a rounding error
 _SAME = 1e-12
 _CLOSE_ROOTS = 1e-9
 

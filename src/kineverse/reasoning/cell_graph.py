@@ -159,8 +159,7 @@ def _positions(expression: Expression) -> list[Symbol]:
     return list(dict.fromkeys(s for s in symbols if s.has_derivative))
 
 
-Move: TypeAlias = tuple[int, int]
-"""Number of a coordinate, and the cell to which it moves."""
+Move: TypeAlias = tuple[int, int]  # number of a coordinate, and the cell to which it moves
 
 
 class CellStep(NamedTuple):

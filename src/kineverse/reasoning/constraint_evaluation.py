@@ -26,10 +26,8 @@ from kineverse.symbols import Symbol
 
 from .boxes import IntervalBox
 
-SLOW = 1e-6
-"""Speed that constraints admit wherever a coordinate may move [m/s] or [rad/s]."""
-NOTHING = 1e-9
-"""Largest excess of a constraint that counts as satisfied; also a speed that is none."""
+SLOW = 1e-6  # speed that constraints admit wherever a coordinate may move [m/s] or [rad/s]
+NOTHING = 1e-9  # largest excess of a constraint that counts as satisfied; also a speed that is none
 BESIDE = SATURATED / SHARP_CONTRAST
 """Distance from a threshold within which a position counts as at it [m] or [rad]: its ramp is no wider."""
 _MOST_PIECES = 4096

@@ -22,8 +22,7 @@ from kineverse.symbols import Symbol, position
 from .boxes import Interval, IntervalBox, wrap_to_turn
 from .polynomial import Monomial, Polynomial
 
-UnitSphere = tuple[Symbol, ...]
-"""Coordinates whose squares have the sum 1, such as a unit quaternion."""
+UnitSphere = tuple[Symbol, ...]  # coordinates whose squares have the sum 1, such as a unit quaternion
 
 _WHOLE = Interval(-1.0, 1.0, True, True)
 _ROUNDING = 1e-12

@@ -17,11 +17,9 @@ Verdict: TypeAlias = Literal["found", "refuted", "undecided"]
 Edge: TypeAlias = tuple[int, int, int, CellStep]
 """Number of a coordinate, bits of a cell and of its neighbour, and the step between them."""
 
-_EXHAUSTED_AT_MOST = 50_000
-"""Largest number of states for which the shortest sequence is searched."""
+_EXHAUSTED_AT_MOST = 50_000  # largest number of states for which the shortest sequence is searched
 _PRUNED_AT_MOST = 300
-_CLOCK = 64
-"""Expansions between two looks at the clock."""
+_CLOCK = 64  # expansions between two looks at the clock
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 SAMPLES = 21
 """Number of positions along a move at which a constraint is evaluated that intervals do not decide."""
-_NARROWEST = 1e-7
-"""Width of an interval around a threshold that is not divided any further [m] or [rad]."""
+_NARROWEST = 1e-7  # width of an interval around a threshold that is not divided any further [m] or [rad]
 _MOST_INTERVALS = 400
 
 _Point = dict[Symbol, float]
@@ -161,8 +160,7 @@ def _excess(row: Constraint, point: _Point) -> float:
 
 
 CellRange: TypeAlias = tuple[int, int]
-Region: TypeAlias = tuple[CellRange, ...]
-"""First and last cell of each coordinate."""
+Region: TypeAlias = tuple[CellRange, ...]  # first and last cell of each coordinate
 _Box: TypeAlias = dict[Symbol, RealInterval]
 
 

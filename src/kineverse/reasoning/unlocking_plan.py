@@ -24,10 +24,8 @@ from .interlock_records import Interlock, Interlocks, Undecided
 from .move_search import MoveSearch, MoveSearchResult, Verdict, find_circle
 from .plan_verification import InvariantSet, Region, plan_violations, refutation_gaps
 
-BUDGET = 10.0
-"""Default budget of a plan [s]."""
-_BEYOND = 0.05
-"""Largest distance by which a move goes beyond a threshold [m] or [rad]."""
+BUDGET = 10.0  # default budget of a plan [s]
+_BEYOND = 0.05  # largest distance by which a move goes beyond a threshold [m] or [rad]
 
 
 @dataclass(frozen=True)

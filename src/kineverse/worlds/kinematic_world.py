@@ -39,8 +39,7 @@ from .world import Contact, Observation
 
 logger = logging.getLogger(__name__)
 
-_SUBSTEP = 0.002
-"""Longest way of a body between two checks of its gaps, while it is near an object [m]."""
+_SUBSTEP = 0.002  # longest way of a body between two checks of its gaps, while it is near an object [m]
 _HELD_SUBSTEP = 0.01
 """Longest way of a hand between two checks of what it holds [m]: thinner furniture is rare."""
 _MOST_SUBSTEPS = 10_000

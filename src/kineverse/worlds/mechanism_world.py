@@ -21,8 +21,7 @@ from kineverse.symbols import Symbol
 
 from .world import Contact, Observation
 
-_ALLOWED = 1e-7
-"""Violation of a constraint that counts as none, in its unit."""
+_ALLOWED = 1e-7  # violation of a constraint that counts as none, in its unit
 _NO_VALUE = 1e9
 _HALVINGS = 16
 

@@ -24,18 +24,15 @@ CURVE_TOLERANCE = 0.01
 """Largest error of a frame [m], [rad] where a joint follows a curve, which MuJoCo has as a polynomial."""
 _DRAWER = 3.0, 5.0
 _DOOR = 1.0, 1.0
-_KNOB = 0.02, 0.02
-"""Friction [N], [N m] and damping [N s/m], [N m s] of furniture that states neither."""
+_KNOB = 0.02, 0.02  # friction [N], [N m] and damping [N s/m], [N m s] of furniture that states neither
 _KNOB_MASS = 1.0
 _DENSITY, _MESH_MASS = 500.0, 0.5
 """Assumed density of bodies without inertia [kg/m³], and mass of a mesh [kg], whose volume is not known."""
 _CONDIM = 6
 _STIFF_SOLIMP = (0.99, 0.999, 0.001)
 """Impedance of limits, ties and friction in joints; MuJoCo's default gives way by some 10 %."""
-_RESTING = 1e-4
-"""Depth up to which shapes of furniture rest on each other, and collide [m]."""
-_SWEEP = 65
-"""Number of places between its limits where a joint is looked at."""
+_RESTING = 1e-4  # depth up to which shapes of furniture rest on each other, and collide [m]
+_SWEEP = 65  # number of places between its limits where a joint is looked at
 _FOLDER = Path("/")
 
 
@@ -329,8 +326,7 @@ def _solref(spec: Any) -> tuple[float, float]:
     return 2.0 * float(spec.option.timestep), 1.0
 
 
-_STANDS = -0.01, 0.005
-"""Gaps between the floor and bodies that stand or roll on it [m]."""
+_STANDS = -0.01, 0.005  # gaps between the floor and bodies that stand or roll on it [m]
 
 
 def add_floor(

@@ -37,12 +37,9 @@ from kineverse.symbols import Symbol
 
 from .mujoco_state import MujocoCoordinates
 
-BANDWIDTH = 80.0
-"""Bandwidth w [1/s]: a robot stands still some 50 ms after its speeds are zero."""
-_LEAD = 0.05
-"""Largest distance of a set point from its joint [m], [rad]; less for a servo of much inertia."""
-_ARMATURE = 0.1
-"""Part of the largest inertia that is added to a joint as that of its motor."""
+BANDWIDTH = 80.0  # bandwidth w [1/s]: a robot stands still some 50 ms after its speeds are zero
+_LEAD = 0.05  # largest distance of a set point from its joint [m], [rad]; less for a servo of much inertia
+_ARMATURE = 0.1  # part of the largest inertia that is added to a joint as that of its motor
 _ACCELERATION, _TRACTION = 20.0, 6.0
 """Acceleration that a servo without a stated effort can give to the largest inertia [m/s²], [rad/s²], and
 that of a base that slides along the floor: its wheels have some friction of 0.6."""

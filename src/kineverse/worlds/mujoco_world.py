@@ -30,8 +30,7 @@ from .sensors import Sensors
 from .world import Contact, Observation
 
 _MARGIN = 10.0
-_UNSTATED = 1.0
-"""Limit of a speed that states none [m/s], [rad/s]: walking pace."""
+_UNSTATED = 1.0  # limit of a speed that states none [m/s], [rad/s]: walking pace
 
 
 class SimulationBounds:

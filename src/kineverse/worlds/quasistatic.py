@@ -52,27 +52,18 @@ from .quasistatic_constraints import (
     project_twists,
 )
 
-SKIN = 1e-6
-"""Gap to which objects are pushed [m]: below, normals of nearest points are not determined."""
+SKIN = 1e-6  # gap to which objects are pushed [m]: below, normals of nearest points are not determined
 
-_REACH = 0.005
-"""Distance beyond the robot's motion up to which gaps are rows [m]."""
+_REACH = 0.005  # distance beyond the robot's motion up to which gaps are rows [m]
 _ROUNDS = 10
-_STEADY = 2e-7
-"""Change of displacements below which a solution is final [m]."""
-_SLACK = 1e-7
-"""Reciprocal ρ of the weight of slacks, beside weights near 1 kg of least motion."""
-_HARD = 1e-10
-"""Reciprocal weight of exceeded limits, where solutions of curved problems are compared."""
-_HELD = 1e-7
-"""Weight of least motion beside the error of a hold."""
+_STEADY = 2e-7  # change of displacements below which a solution is final [m]
+_SLACK = 1e-7  # reciprocal ρ of the weight of slacks, beside weights near 1 kg of least motion
+_HARD = 1e-10  # reciprocal weight of exceeded limits, where solutions of curved problems are compared
+_HELD = 1e-7  # weight of least motion beside the error of a hold
 _LIGHTEST = 1e-4
-_DEEP = 1e-4
-"""Penetration of what does not yield, from which on its side is remembered [m]."""
-_RELEASE = 0.1
-"""Largest speed out of a penetration that was there before a motion [m/s]."""
-_FIRM = 100.0
-"""Weight of gaps between furniture beside those to the robot: it is the robot that penetrates."""
+_DEEP = 1e-4  # penetration of what does not yield, from which on its side is remembered [m]
+_RELEASE = 0.1  # largest speed out of a penetration that was there before a motion [m/s]
+_FIRM = 100.0  # weight of gaps between furniture beside those to the robot: it is the robot that penetrates
 
 Residual: TypeAlias = Callable[[], tuple[Array, Array]]
 """Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""

@@ -22,11 +22,9 @@ from kineverse.symbols import Symbol
 
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps
 
-JAM = 0.5
-"""Cosine of the angle between a normal and the motion that it causes, below which a contact jams."""
+JAM = 0.5  # cosine of the angle between a normal and the motion that it causes, below which a contact jams
 
-_PARALLEL = 1e-3
-"""Least eigenvalue of directions of motion that are not parallel."""
+_PARALLEL = 1e-3  # least eigenvalue of directions of motion that are not parallel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,8 +64,7 @@ def project_twists(normals: Array, points: Array, twists: Array) -> Array:
     return np.asarray((wrench @ twists)[:, 0])
 
 
-_EXACT = 1e-6
-"""Excess of a limit that is a matter of rounding, and is taken back."""
+_EXACT = 1e-6  # excess of a limit that is a matter of rounding, and is taken back
 
 _HARMLESS = ("nothing that moves changes it", "it has no bounds")
 _STEP = Symbol("world/step", 0, "parameter", 0.01)
@@ -211,8 +208,7 @@ def _link_columns(count: int, patterns: Sequence[npt.NDArray[np.bool_]]) -> npt.
 RESTING = OVERLAP / 2
 """Depth beyond the allowance at which furniture stops [m]: shapes that rest on each other slide freely."""
 
-_REACH = 0.001
-"""Largest gap of pairs that have met [m]."""
+_REACH = 0.001  # largest gap of pairs that have met [m]
 
 Flags = npt.NDArray[np.bool_]
 

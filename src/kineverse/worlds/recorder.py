@@ -36,8 +36,7 @@ from kineverse.state import State, StateLike
 
 from .world import Contact, Observation, World
 
-PROFILE = "kineverse"
-"""Profile in the header of a recording."""
+PROFILE = "kineverse"  # profile in the header of a recording
 
 _NUMBER: dict[str, Any] = {"type": "number"}
 _TEXT: dict[str, Any] = {"type": "string"}
@@ -81,8 +80,7 @@ TOPICS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Topics, with the name of the schema and the properties of its messages."""
 
-_FLUSH = 0.5
-"""Longest time of the world that is lost if the process is killed [s]."""
+_FLUSH = 0.5  # longest time of the world that is lost if the process is killed [s]
 
 
 class RecordedStep(Protocol):

@@ -35,11 +35,9 @@ from kineverse.symbols import Symbol, parse_symbol_name
 from .recorder import TOPICS, import_mcap
 from .world import Contact, Observation
 
-MAX_CHUNK = 1 << 28
-"""Largest chunk [byte], uncompressed."""
+MAX_CHUNK = 1 << 28  # largest chunk [byte], uncompressed
 
-MAX_TOTAL = 1 << 30
-"""Largest content of a file [byte], uncompressed."""
+MAX_TOTAL = 1 << 30  # largest content of a file [byte], uncompressed
 
 _MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 1, 2, 3, 4, 5, 6, 12, 15
@@ -178,8 +176,7 @@ def _matches(data: bytes, checksum: int) -> bool:
     return not checksum or zlib.crc32(data) == checksum
 
 
-MAX_VALUES = 1 << 26
-"""Most numbers of one table of values over time."""
+MAX_VALUES = 1 << 26  # most numbers of one table of values over time
 
 Entry = TypeVar("Entry")
 

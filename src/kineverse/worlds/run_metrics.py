@@ -105,12 +105,10 @@ class LimitJudge:
         return np.where(np.isnan(self._checker.excess), np.inf, self._checker.excess)
 
 
-CONTACT_GAP = 1e-3
-"""Largest gap of a contact of a push [m]."""
+CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
 
 _STILL = 5e-3
-_TOUCHING = 1e-6
-"""Depth up to which links of a robot touch and do not overlap [m]."""
+_TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap [m]
 
 
 class JudgedOverlap(NamedTuple):

@@ -29,11 +29,9 @@ from kineverse.symbols import Symbol
 from .sensors import Sensors
 from .world import Contact, Observation
 
-_INSET = 0.9
-"""Points lie at this fraction of the way from the middle of a shape to its corners."""
+_INSET = 0.9  # points lie at this fraction of the way from the middle of a shape to its corners
 
-_MOST_SHAPES = 8
-"""Largest number of shapes of a body whose points are tried."""
+_MOST_SHAPES = 8  # largest number of shapes of a body whose points are tried
 
 
 class LineOfSight:

@@ -13,8 +13,7 @@ from kineverse._checks import check_flag, finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
 
-NEAR = 0.5
-"""Distance from the camera within which the noise of positions is constant [m]."""
+NEAR = 0.5  # distance from the camera within which the noise of positions is constant [m]
 
 EXAMPLE = "3mm+3mm/m,0.5deg,30Hz,drop=0.1,outliers=0.05,delay=30ms"
 

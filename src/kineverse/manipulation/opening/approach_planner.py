@@ -15,16 +15,11 @@ from kineverse.symbols import Symbol
 
 from .base_placement import BasePlacement, PlacementSearch
 
-_PLANNING = 2.0
-"""Largest time to plan the way to the handle [s]."""
-_TUCKED = 300
-"""Number of random arms among which a compact one is chosen."""
-_MOST_TUCKED, _TUCKING = 3, 2.0
-"""Number of compact arms to which a way is planned, and the time for each [s]."""
-_KEPT = 4
-"""Number of searches of drives that are kept."""
-_HERE = 1e-3
-"""Distance of a base from its place at which it stays [m], [rad]."""
+_PLANNING = 2.0  # largest time to plan the way to the handle [s]
+_TUCKED = 300  # number of random arms among which a compact one is chosen
+_MOST_TUCKED, _TUCKING = 3, 2.0  # number of compact arms to which a way is planned, and the time for each [s]
+_KEPT = 4  # number of searches of drives that are kept
+_HERE = 1e-3  # distance of a base from its place at which it stays [m], [rad]
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,7 @@ from .path_collisions import OWN_MARGIN, CandidatePath, PathCheck, PathContacts,
 
 NO_WAY, NO_PLACE = "no way to the handle", "no free place of the base"
 """Reasons of placements that are refused, and of bases that touch something."""
-_DIFFERENCE = 0.025
-"""Difference of the values at the ends of a way to those of the way back [m], [rad]."""
+_DIFFERENCE = 0.025  # difference of the values at the ends of a way to those of the way back [m], [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,17 +103,12 @@ class BasePlacement:
         return f"{found}; failed: {failed}." if failed else f"{found}."
 
 
-_STEP = 0.05
-"""Distance of neighbouring values of the object along its way [m], [rad]."""
-_RANDOM_STATES = 24
-"""Number of random states in which links that are always near to each other are sought."""
-_BESIDE = 0.1
-"""Largest change of each coordinate of the base in these states [m], [rad]."""
+_STEP = 0.05  # distance of neighbouring values of the object along its way [m], [rad]
+_RANDOM_STATES = 24  # number of random states in which links that are always near to each other are sought
+_BESIDE = 0.1  # largest change of each coordinate of the base in these states [m], [rad]
 _START_ITERATIONS = 30
-_CORRECTIONS = 6
-"""Iterations from a configuration to one near it."""
-_STARTS = 4
-"""Arms that are tried for each base."""
+_CORRECTIONS = 6  # iterations from a configuration to one near it
+_STARTS = 4  # arms that are tried for each base
 _MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
 """Shares of the object's way from which the arms of successive batches set out to both ends."""
 _WHOLE = 300
@@ -124,8 +118,7 @@ _NOWHERE = 300
 """Number of bases after which the search ends if each one touched something wherever it was drawn."""
 _AROUND, _HERE = 0.6, 100
 """Distance of the hand from the handle up to which the base may stay [m], and the number of arms there."""
-_LEAST_SHARE = 0.2
-"""Least share of the motion that one grasp is for."""
+_LEAST_SHARE = 0.2  # least share of the motion that one grasp is for
 _MOST_CHECKS, _MOST_REFUSED = 150, 3
 """Most ways that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
 
@@ -472,10 +465,8 @@ class _Search:
         )  # fmt: skip
 
 
-_ARMS = 200
-"""Number of random arms from which the highest one is sought."""
-_STEPS = np.geomspace(0.5, 2e-3, 60)
-"""Largest changes of a coordinate in the steps of the ascent [m], [rad]."""
+_ARMS = 200  # number of random arms from which the highest one is sought
+_STEPS = np.geomspace(0.5, 2e-3, 60)  # largest changes of a coordinate in the steps of the ascent [m], [rad]
 
 
 def find_highest_reach(scene: Scene, paths: CartesianPaths, gripper: Gripper, state: State) -> float:

@@ -12,14 +12,10 @@ from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
 _DAMPING = 1e-6
-_CENTERING = 0.1
-"""Share of the way to the middle of the limits that a step takes in the null space."""
-_LONGEST = 0.4
-"""Largest step of a coordinate [m], [rad]."""
-_JUMP = 0.6
-"""Largest change of a coordinate between neighbouring poses of a sequence [m], [rad]."""
-TOLERANCE = 1e-4
-"""Error of a pose that counts as reached [m], [rad]."""
+_CENTERING = 0.1  # share of the way to the middle of the limits that a step takes in the null space
+_LONGEST = 0.4  # largest step of a coordinate [m], [rad]
+_JUMP = 0.6  # largest change of a coordinate between neighbouring poses of a sequence [m], [rad]
+TOLERANCE = 1e-4  # error of a pose that counts as reached [m], [rad]
 
 
 class CartesianPaths:

@@ -38,8 +38,7 @@ from .hand_motion import HandMotion, move_held
 from .push_regrasp import PushRegrasp
 
 _GRASPS = 96
-_KEPT = 15
-"""Number of sets of grasps that are kept."""
+_KEPT = 15  # number of sets of grasps that are kept
 
 
 class Opener:
@@ -70,17 +69,13 @@ class Opener:
         return self._grasps[key]
 
 
-_SLANT = math.radians(50.0)
-"""Largest slant of grasps where those from across the handle lead nowhere [rad]."""
-_PROOF = 200
-"""Largest number of sampled bases that are to prove that an object is too high."""
+_SLANT = math.radians(50.0)  # largest slant of grasps where those from across the handle lead nowhere [rad]
+_PROOF = 200  # largest number of sampled bases that are to prove that an object is too high
 _MOST_GRASPS, _MOST_PUSHES = 4, 3
-_LATE = 1.0
-"""Time before the end at which it counts as up [s]."""
+_LATE = 1.0  # time before the end at which it counts as up [s]
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
-_HEIGHTS = 12
-"""Number of values at which the height of an object is compared with that of the hand."""
+_HEIGHTS = 12  # number of values at which the height of an object is compared with that of the hand
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
 _NAMED = {"limit": "limit_violation", "penetrating": "penetration", "penetration_from": "penetration"}

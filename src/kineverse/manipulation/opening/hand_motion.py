@@ -29,34 +29,25 @@ from .approach_planner import Approach, ApproachPlanner
 from .base_placement import BasePlacement, PlacementSearch
 from .cartesian_paths import find_least_time, row_at
 
-_CLOSING, _MOST_CLOSING = 1.5, 4.0
-"""Time in which fingers open or close fully, and the largest one [s]."""
-_IDLE = 10
-"""Number of steps in which fingers that stand still have not moved."""
-_LINE_SPEED = 0.1
-"""Speed of the hand on the straight way to the handle and from it [m/s]."""
+_CLOSING, _MOST_CLOSING = 1.5, 4.0  # time in which fingers open or close fully, and the largest one [s]
+_IDLE = 10  # number of steps in which fingers that stand still have not moved
+_LINE_SPEED = 0.1  # speed of the hand on the straight way to the handle and from it [m/s]
 _SETTLED, _MOST_SETTLING = 5e-4, 150
 """Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
-_REFERENCES = 24
-"""Number of poses that pages show of a way."""
+_REFERENCES = 24  # number of poses that pages show of a way
 _KNOWN, _MOST_LOOKING, _UNKNOWN = 1.5e-3, 1.0, 0.02
 """Deviation of a handle's position that is small [m], longest time to look until it is [s], and the deviation
 from which on nothing is done [m]."""
-_SIGMAS = 2.0
-"""Standard deviations of the believed handle by which the hand may be off instead."""
+_SIGMAS = 2.0  # standard deviations of the believed handle by which the hand may be off instead
 FOLLOWING = 5.0
 """Gain of all goals and holds [1/s]. A larger one follows the noise of estimates, and the delay of servos
 adds to it."""
-_POSTURE = 0.5
-"""Weight of the arm beside the object."""
-_LOST = 0.002
-"""Motion of closed fingers that says that nothing is between them any more [m]."""
-_ARRIVED = 0.05
-"""Distance from the end of a way up to which the retreat there is meant [m], [rad]."""
+_POSTURE = 0.5  # weight of the arm beside the object
+_LOST = 0.002  # motion of closed fingers that says that nothing is between them any more [m]
+_ARRIVED = 0.05  # distance from the end of a way up to which the retreat there is meant [m], [rad]
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
-_KEPT = 8
-"""Number of controllers that are kept."""
+_KEPT = 8  # number of controllers that are kept
 
 Targets = TypeVar("Targets")
 
@@ -376,10 +367,8 @@ class HandMotion:
 
 _SPEED, _RAMP = 0.3, 0.5
 """Speed of an object along its planned way [m/s], [rad/s], and the time from rest to it [s]."""
-_LATE = 0.1
-"""Distance from the way at which the reference begins to wait [m], [rad]."""
-_MARGIN = 0.002
-"""Least distance of bodies while the object moves [m]; placements keep more."""
+_LATE = 0.1  # distance from the way at which the reference begins to wait [m], [rad]
+_MARGIN = 0.002  # least distance of bodies while the object moves [m]; placements keep more
 _SLIPPED, _SLIP_SIGMAS = 0.008, 4.0
 """Distance of the bar from its place in the hand from which on it has slipped [m], and the standard
 deviations of its estimate that are added."""
@@ -388,8 +377,7 @@ _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
 _LOCKED, _STANDING = 1.5, 1e-3
 """Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
 beyond some [m/s], [rad/s] for it either: its own constraints hold it."""
-_STEPS_AT_TARGET = 10
-"""Number of steps for which an estimate is at the target when a motion ends."""
+_STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target when a motion ends
 
 
 def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
@@ -478,8 +466,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
 
 _ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))
 """Angles along the bar by which a retreat deviates from the reversed approach [rad]."""
-_STEPS = 12
-"""Number of arms along a retreat."""
+_STEPS = 12  # number of arms along a retreat
 
 
 @dataclass(frozen=True, slots=True, eq=False)

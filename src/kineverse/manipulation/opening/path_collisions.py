@@ -21,10 +21,8 @@ from kineverse.symbols import Symbol
 
 from .cartesian_paths import CartesianPaths
 
-OWN_MARGIN = 0.003
-"""Least distance of the robot's own links [m]; pairs that are always nearer do not count."""
-_BESIDE_BAR = 5e-4
-"""Least distance of the opened fingers from the handle [m]."""
+OWN_MARGIN = 0.003  # least distance of the robot's own links [m]; pairs that are always nearer do not count
+_BESIDE_BAR = 5e-4  # least distance of the opened fingers from the handle [m]
 
 
 class PathContacts:
@@ -97,18 +95,13 @@ class PathContacts:
         return self.scene.watch(self.own, self.own, OWN_MARGIN)
 
 
-_LINE = 5
-"""Number of configurations on the straight way to the handle."""
-_BETWEEN = 4
-"""Number of samples between neighbouring configurations that are checked."""
-_SHORTER = 0.15
-"""Share of the motion by which a way is shortened where that may help."""
+_LINE = 5  # number of configurations on the straight way to the handle
+_BETWEEN = 4  # number of samples between neighbouring configurations that are checked
+_SHORTER = 0.15  # share of the motion by which a way is shortened where that may help
 _ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))
 """Angles along the bar by which a retreat deviates from the reversed approach [rad]."""
-_LEAST_RETREAT = 3
-"""Least number of configurations of a retreat."""
-_SWEEP = 8
-"""Number of gaps of the fingers that are checked while they close or open."""
+_LEAST_RETREAT = 3  # least number of configurations of a retreat
+_SWEEP = 8  # number of gaps of the fingers that are checked while they close or open
 
 
 @dataclass(slots=True, eq=False)

@@ -25,33 +25,25 @@ from kineverse.symbols import Symbol
 
 from .push_controller import Pushing
 
-_STANDOFF = 0.03
-"""Distance of the tip from the contact point at the start [m]."""
+_STANDOFF = 0.03  # distance of the tip from the contact point at the start [m]
 _TILT = math.radians(50.0)
 """Largest angle between the pusher's axis and the direction of the push at a start that is exact."""
-_NEARBY = 0.12
-"""Largest entry of the distance of the tip at a start that is not [m]."""
+_NEARBY = 0.12  # largest entry of the distance of the tip at a start that is not [m]
 _MARGIN = 0.01
 _LEAST_CLEARANCE = 1.5e-3
 """Least distance in a roll-out of pairs that may not touch [m]: pushes in worlds differ a little."""
-_STARTS = 4
-"""Number of arms from which inverse kinematics decides whether an arm that stands reaches a point."""
-_CANDIDATES = 1.0
-"""Largest difference of the score of contact points to the best one."""
+_STARTS = 4  # number of arms from which inverse kinematics decides whether an arm that stands reaches a point
+_CANDIDATES = 1.0  # largest difference of the score of contact points to the best one
 _SOLVER_STARTS = 2, 1
 """Numbers of starts of inverse kinematics: to the point, and out of collisions from there."""
-_DRAWS = 40
-"""Number of times that a place is drawn at which the base touches nothing."""
+_DRAWS = 40  # number of times that a place is drawn at which the base touches nothing
 _MOST_UNMOVED, _MOST_NO_FURTHER = 60, 120
 """Numbers of roll-outs without motion of the object, and without more of it, after which none is expected."""
-_NOWHERE = 200
-"""Number of samples after which the search ends if none could be rolled out."""
-_REPORTED = 20
-"""Number of samples from one text on the progress to the next."""
+_NOWHERE = 200  # number of samples after which the search ends if none could be rolled out
+_REPORTED = 20  # number of samples from one text on the progress to the next
 _NO_ROOM, _UNREACHED, _LATE = "too little room", "out of reach", "out of time"
 _CLASSES = {_UNREACHED: "reach", _LATE: "time"}
-_MOVED = 0.01
-"""Motion of an object that counts as one [m], [rad]."""
+_MOVED = 0.01  # motion of an object that counts as one [m], [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

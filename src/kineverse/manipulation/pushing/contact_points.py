@@ -30,17 +30,13 @@ from kineverse.symbols import Symbol
 
 from .vectors import Vector, inner_product, length
 
-_SPACING = 0.05
-"""Distance of sampled points [m]."""
-_INSET = 0.04
-"""Distance of sampled points from edges, where the surface is that large [m]."""
+_SPACING = 0.05  # distance of sampled points [m]
+_INSET = 0.04  # distance of sampled points from edges, where the surface is that large [m]
 _MOST = 7
-_ROOM = 0.06
-"""Free space in front of a point that a hand needs [m]."""
+_ROOM = 0.06  # free space in front of a point that a hand needs [m]
 _OUTSIDE = 0.1
 _SAME = 0.01
-_FRONT = 0.004
-"""Depth of the foremost part of a pusher [m]."""
+_FRONT = 0.004  # depth of the foremost part of a pusher [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

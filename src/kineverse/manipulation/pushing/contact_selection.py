@@ -16,8 +16,7 @@ CONE, CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
 """Cosines of the friction cone in which a contact point is chosen, and of the one in which it is kept."""
 _DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
 """Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
-_SURROUNDINGS = 0.1
-"""Distance within which other points count as given up, too [m]."""
+_SURROUNDINGS = 0.1  # distance within which other points count as given up, too [m]
 _OUT_OF_REACH = 0.02
 """Distance of the tip from a point that is given up from which on points beyond are out of reach, too [m]."""
 _BLOCKED_STEPS = 60

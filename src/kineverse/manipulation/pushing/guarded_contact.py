@@ -20,27 +20,20 @@ from collections.abc import Sequence
 from .push_program import PRESS
 from .vectors import ZERO, Vector, add, inner_product, length, rotate_back, scale, subtract, transform_point
 
-RAMP = 0.02
-"""Speed of the contact point beyond the measured one that is tried [m/s]."""
-SPEED = 0.25
-"""Largest speed of the contact point [m/s]."""
-_MOST_LAG = 8e-4
-"""Lag at which the press grows no more [m]."""
+RAMP = 0.02  # speed of the contact point beyond the measured one that is tried [m/s]
+SPEED = 0.25  # largest speed of the contact point [m/s]
+_MOST_LAG = 8e-4  # lag at which the press grows no more [m]
 _CREEP = 0.02
 """Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
-STILL = 5e-3
-"""Speed of a contact point that counts as none [m/s]."""
+STILL = 5e-3  # speed of a contact point that counts as none [m/s]
 _DEEPEN, _DEEPER = 0.5, 3.0
 """Time in which a press on what does not move becomes deeper [s], and by how many times its depth."""
 _FORGET, _FORGET_WAY = 1.0, 0.01
 """Time [s] and way [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
 and what moves on gives way."""
-_REMEMBER = 0.1
-"""Time for which a touch counts after the last report [s]."""
-_RETURN = 0.3
-"""Time in which a correction returns to the estimate without a touch [s]."""
-_LEAST_RATE = 0.02
-"""Least rate of a gap over the coordinate for a correction [m/rad]."""
+_REMEMBER = 0.1  # time for which a touch counts after the last report [s]
+_RETURN = 0.3  # time in which a correction returns to the estimate without a touch [s]
+_LEAST_RATE = 0.02  # least rate of a gap over the coordinate for a correction [m/rad]
 
 
 class PushPress:

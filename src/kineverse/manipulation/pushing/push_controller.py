@@ -44,22 +44,16 @@ from .guarded_contact import PushPress, TipAnchor
 from .push_program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
 from .vectors import ZERO, Vector, add, inner_product, length, move_point, scale, subtract
 
-_APART = 4e-3
-"""Gap between pusher and object away from the contact [m]."""
-_FUNNEL = 0.08
-"""Largest height of the way to a contact above the surface [m]."""
+_APART = 4e-3  # gap between pusher and object away from the contact [m]
+_FUNNEL = 0.08  # largest height of the way to a contact above the surface [m]
 _STANDOFF = 2e-3
 _FAR = 0.05
-_RETREAT = 0.1
-"""Distance from the object at which a retreat ends [m]."""
-_LOW = 0.03
-"""Height of the tip above a contact point from which on the pusher may touch [m]."""
+_RETREAT = 0.1  # distance from the object at which a retreat ends [m]
+_LOW = 0.03  # height of the tip above a contact point from which on the pusher may touch [m]
 _HOLD_WEIGHT = 10.0
 _LARGEST_DEVIATION = 0.01
-_LEAST_DEVIATION = 1e-5
-"""Deviation below which gaps count as exact [m]."""
-_JAMMED = 2.0
-"""Depth at which the object counts as not giving way, in depths of the press."""
+_LEAST_DEVIATION = 1e-5  # deviation below which gaps count as exact [m]
+_JAMMED = 2.0  # depth at which the object counts as not giving way, in depths of the press
 _DEEPEST = 2e-4
 
 

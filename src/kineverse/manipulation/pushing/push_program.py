@@ -25,25 +25,17 @@ from kineverse.symbols import Symbol
 from .contact_points import PushTool
 from .vectors import Vector
 
-TOUCHING = 1e-3
-"""Largest gap of a contact [m]."""
-LOST = 3e-3
-"""Gap at which a contact is lost [m]."""
-PRESS = 2e-4
-"""Depth that rows of touching bodies allow, so that contact is kept [m]."""
-NEAR = 0.012
-"""Distance of the tip from the axis of a contact within which it approaches the surface [m]."""
-_REACH_SPEED = 0.5
-"""Largest speed of the tip on its way to a contact [m/s]."""
-_TOUCH_SPEED = 0.15
-"""Rate at which the trend of contact is followed [m/s]."""
+TOUCHING = 1e-3  # largest gap of a contact [m]
+LOST = 3e-3  # gap at which a contact is lost [m]
+PRESS = 2e-4  # depth that rows of touching bodies allow, so that contact is kept [m]
+NEAR = 0.012  # distance of the tip from the axis of a contact within which it approaches the surface [m]
+_REACH_SPEED = 0.5  # largest speed of the tip on its way to a contact [m/s]
+_TOUCH_SPEED = 0.15  # rate at which the trend of contact is followed [m/s]
 _SPIN_WEIGHT = 0.01
 """Weight against turns of the pusher about its axis, which change nothing but the nearest points."""
-_MARGIN, _RADIUS = 5e-3, 0.035
-"""Distance that pairs which may not touch keep, and from which they count [m]."""
+_MARGIN, _RADIUS = 5e-3, 0.035  # distance that pairs which may not touch keep, and from which they count [m]
 _SMOOTH = 0.02
-_ANY = 1e3
-"""Speed that restricts nothing."""
+_ANY = 1e3  # speed that restricts nothing
 _SIZES = {
     "gap": 1, "slip": 2, "pushed": 1, "target": 3, "facing": 3, "normal": 3, "reach": 1, "touch": 1,
     "hold": 1, "engaged": 1, "near": 1, "pace": 1, "free": 1,

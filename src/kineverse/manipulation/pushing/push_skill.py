@@ -34,8 +34,7 @@ from .guarded_contact import STILL
 from .push_controller import Pushing
 
 _STANDOFF = 0.03
-_TILT = math.radians(60.0)
-"""Largest angle between the pusher's axis and the direction of the push."""
+_TILT = math.radians(60.0)  # largest angle between the pusher's axis and the direction of the push
 _CONFIGURATIONS = 48
 
 
@@ -80,14 +79,10 @@ _SETTLED, _SETTLED_ESTIMATE = 5, 25
 _PATIENCE = 25
 """Number of further steps within the tolerance without progress after which a push ends all the same."""
 _PROGRESS = 5e-4
-_AVERAGED = 0.1
-"""Weight of the latest estimate in the mean that counts at the end."""
-_PRESSED = 5
-"""Number of steps for which an object within the tolerance gives way no more when a push ends."""
-_MOST_BLOCKED = 3
-"""Number of contact points given up before an approach is planned."""
-_MOST_JAMMED = 3
-"""Number of contact points at which the object does not move before it counts as jammed."""
+_AVERAGED = 0.1  # weight of the latest estimate in the mean that counts at the end
+_PRESSED = 5  # number of steps for which an object within the tolerance gives way no more when a push ends
+_MOST_BLOCKED = 3  # number of contact points given up before an approach is planned
+_MOST_JAMMED = 3  # number of contact points at which the object does not move before it counts as jammed
 _MOST_APPROACHES = 2
 _UNKNOWN, _LOOK = 0.05, 2.0
 """Deviation of a coordinate that is not known yet [m], [rad], and the time to wait until it is [s]."""

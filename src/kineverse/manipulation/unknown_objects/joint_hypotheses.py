@@ -20,10 +20,8 @@ from .part_belief import PartBelief, measure_way
 from .pull_controllers import place_beside
 from .unmodelled_joint import UnknownPart, find_joint, write_joint
 
-_LEAST_RADIUS = 0.15
-"""Distance of a bar from an edge of its part from which on a hinge may be there [m]."""
-_STEP = 0.05
-"""Way of the handle between two poses of an arm [m]."""
+_LEAST_RADIUS = 0.15  # distance of a bar from an edge of its part from which on a hinge may be there [m]
+_STEP = 0.05  # way of the handle between two poses of an arm [m]
 
 
 def guess_hinges(unknown: UnknownPart, search: PlacementSearch, state: State) -> list[Array]:

@@ -10,12 +10,9 @@ from kineverse.lie import Array
 
 CERTAIN = 0.97
 """Least probability of a family: between nested families such as hinge and screw, 0.99 is hardly exceeded."""
-_LOOKS = 3
-"""Results in a row that a decision takes."""
-_EVERY = 4
-"""Number of new poses between two results."""
-_VISIBLE = 0.005
-"""Way of the part before which no joint is looked for [m]."""
+_LOOKS = 3  # results in a row that a decision takes
+_EVERY = 4  # number of new poses between two results
+_VISIBLE = 0.005  # way of the part before which no joint is looked for [m]
 LEAST_WAY, LEAST_TURN = 0.03, math.radians(4.0)
 """Motion of the part before which nothing is decided [m], [rad]: noise alone looks like any joint."""
 

@@ -25,10 +25,8 @@ _HELD_LOOKS, _STATIC_LOOKS = 16.0, 60.0
 """Number of looks that a mean is worth: of the part in the hand, which slips, and of what stands still."""
 _NEAR, _TURNED = 0.06, 0.35
 """Distance [m] and angle [rad] from where a part is believed beyond which a look is an outlier."""
-_FIRST = 5
-"""Number of first looks of which the largest cluster is believed."""
-_LOST_LOOKS = 6
-"""Outliers in a row after which a part is not where it was believed."""
+_FIRST = 5  # number of first looks of which the largest cluster is believed
+_LOST_LOOKS = 6  # outliers in a row after which a part is not where it was believed
 
 
 @dataclass(slots=True, eq=False)

@@ -24,24 +24,19 @@ from .unmodelled_joint import JointPath
 
 LEAST_OPENING = 0.08, math.radians(10.0)
 """Opening from which a part at its own stop counts as open [m], [rad]."""
-LOOKING, _HELD_LOOKING = 0.6, 1.0
-"""Times of looks at a part that stands, and with the hand closed [s]."""
+LOOKING, _HELD_LOOKING = 0.6, 1.0  # times of looks at a part that stands, and with the hand closed [s]
 _MOST_GRASPS = 3
 _DIRECTIONS = (
     (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0),
 )  # fmt: skip
 """Directions in which a part is pulled one after the other until it follows, in the axes of its handle: along
 its outward normal, to both sides across the bar, and to both ends along it."""
-_REFIT = 0.5
-"""Time between two controllers for a learned joint [s]."""
+_REFIT = 0.5  # time between two controllers for a learned joint [s]
 _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
 """Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
-_SLIPPED = 0.012
-"""Distance of the handle from its place in the hand from which on it has slipped [m]."""
-_LED = 0.06
-"""Way of the handle before which the hand does not rely on a joint that was learned [m]."""
-_ENDING = 0.5
-"""Time without progress where the arm is expected to end [s]."""
+_SLIPPED = 0.012  # distance of the handle from its place in the hand from which on it has slipped [m]
+_LED = 0.06  # way of the handle before which the hand does not rely on a joint that was learned [m]
+_ENDING = 0.5  # time without progress where the arm is expected to end [s]
 _AHEAD, _AHEAD_STEPS = 0.03, 4
 """Way of the handle that an arm must be able to go on [m], and its number of poses."""
 

@@ -27,19 +27,14 @@ from .pull_controllers import point_speed
 from .pulling_policy import LEAST_OPENING, LOOKING, ArmEndError, PartPulling
 from .unmodelled_joint import JointPath, UnknownPart, find_joint, free_part
 
-OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
-"""Opening that is wanted by default [m], [rad]."""
-_MOST_LOOKING = 3.0
-"""Largest time until a part is seen [s]."""
-_REACH = 0.25
-"""Straight way of the handle that a placement should allow [m]."""
+OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)  # opening that is wanted by default [m], [rad]
+_MOST_LOOKING = 3.0  # largest time until a part is seen [s]
+_REACH = 0.25  # straight way of the handle that a placement should allow [m]
 _GRASPS = 128
 _SEARCHES, _ENOUGH = 3, 0.99
 """Number of searches of a first place, and share of possible motions from which on it is taken."""
-_MOST_PLACES = 3
-"""Largest number of places of the robot, or of its hand."""
-_FURTHER = 1.1
-"""Share of the rest of an opening that a further placement should lead along the learned joint."""
+_MOST_PLACES = 3  # largest number of places of the robot, or of its hand
+_FURTHER = 1.1  # share of the rest of an opening that a further placement should lead along the learned joint
 _CLOSED_WAY, _CLOSED_TURN = 0.03, math.radians(6.0)
 """Motion back [m], [rad] after which a part that was open is not."""
 

@@ -26,8 +26,7 @@ from kineverse.symbols import Symbol, position
 _ROTATION_ARM = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 """Lengths that make rotations comparable to distances [m]."""
 _STEPS, _DIFFERENCE = 3, 1e-5
-_STRAIGHT = 1e-3
-"""Turn by way of the handle from which on a motion is a rotation [rad/m]."""
+_STRAIGHT = 1e-3  # turn by way of the handle from which on a motion is a rotation [rad/m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

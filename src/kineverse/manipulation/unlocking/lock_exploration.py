@@ -25,8 +25,7 @@ from .lock_model import SAME, LockModel
 
 MoveFunction = Callable[[Symbol, float], float]
 
-_MOST_DOUBTS = 12
-"""Number of plans that are made by other hypotheses if one is refuted."""
+_MOST_DOUBTS = 12  # number of plans that are made by other hypotheses if one is refuted
 _MOST_CONFIGURATIONS = 3000
 
 

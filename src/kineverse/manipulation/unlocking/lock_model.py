@@ -23,13 +23,10 @@ Costs: TypeAlias = dict[KeySide, float]
 Option: TypeAlias = tuple[float, KeySide, float]
 """Condition that explains a refusal: its rank, the condition, and the tries that it takes to fulfil it."""
 
-SAME = 1e-3
-"""Difference of positions that counts as none, as a share of a coordinate's range."""
+SAME = 1e-3  # difference of positions that counts as none, as a share of a coordinate's range
 _WAYS: tuple[Side, Side] = (1, -1)
-_SPEED = 1.0
-"""Speed limit of a learned lock where the model has none [m/s] or [rad/s]."""
-_DOUBT = 5.0
-"""Tries by which a condition counts as more costly after a plan was refuted because of it."""
+_SPEED = 1.0  # speed limit of a learned lock where the model has none [m/s] or [rad/s]
+_DOUBT = 5.0  # tries by which a condition counts as more costly after a plan was refuted because of it
 _MOST_CHOICES = 500
 
 

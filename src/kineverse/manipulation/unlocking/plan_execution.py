@@ -22,8 +22,7 @@ from kineverse.worlds import World
 from kineverse.worlds.furniture_overlaps import FurnitureOverlaps
 from kineverse.worlds.run_metrics import LimitJudge
 
-TOLERANCE = 1e-4
-"""Distance from a target at which it is reached [m] or [rad]."""
+TOLERANCE = 1e-4  # distance from a target at which it is reached [m] or [rad]
 _TARGET = "unlocking/target"
 
 
@@ -101,10 +100,8 @@ class PartMover:
         return self._controllers[symbol]
 
 
-_SHARE = 0.1
-"""Largest distance from a target, as a share of its distance beyond the threshold."""
-_VIOLATED = 1e-6
-"""Excess of a constraint from which on it is violated, in its unit."""
+_SHARE = 0.1  # largest distance from a target, as a share of its distance beyond the threshold
+_VIOLATED = 1e-6  # excess of a constraint from which on it is violated, in its unit
 
 
 @dataclass(frozen=True, slots=True)
