@@ -25,14 +25,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import finite_number
 from kineverse.compilation import compile
-from kineverse.errors import ExpressionError, InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import as_expression
 from kineverse.formats.mjcf.mujoco_api import mujoco
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
-from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .mujoco_state import MujocoCoordinates
@@ -58,8 +56,7 @@ class SpeedMap:
         rows = [dict(model.rates.row(c) or {c.derivative(): as_expression(1.0)}) for c in coordinates]
         self.speeds = tuple(dict.fromkeys(s for row in rows for s in row))
         column = {speed: k for k, speed in enumerate(self.speeds)}
-        self._known = {str(s): s for s in model.speeds}
-        self._column = column
+        self.columns = {key: column.get(s) for s in model.speeds for key in (s, str(s))}
         self._matrix: Array = np.zeros((len(rows), len(self.speeds)))
         varying = []
         for i, row in enumerate(rows):
@@ -78,27 +75,6 @@ class SpeedMap:
                 "MuJoCo has not as the position of one joint. Replace that part of the robot."
             )
         self._at = np.array([address[s] for s in inputs], dtype=int)
-
-    def vector(self, speeds: StateLike) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return the speeds of the robot in a mapping, (n,), and flags of the given ones, (n,)."""
-        if not isinstance(speeds, Mapping):
-            raise ExpressionError(f"Speeds are given as a mapping {{name: number}}, not as {speeds!r}.")
-        vector, given = np.zeros(len(self.speeds)), np.zeros(len(self.speeds), dtype=bool)
-        for key, value in speeds.items():
-            speed = self._known.get(str(key))
-            if speed is None:
-                if isinstance(speeds, State):
-                    continue  # a state may have further values
-                raise UnknownNameError(
-                    f"The model has no speed '{key}'. {suggest(str(key), self._known, 'speed')}"
-                )
-            number = finite_number(value)
-            if number is None:
-                raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
-            k = self._column.get(speed)
-            if k is not None:
-                vector[k], given[k] = number, True
-        return vector, given
 
     def columns_of(self, coordinates: Sequence[Symbol]) -> npt.NDArray[np.bool_]:
         """Return flags of the speeds (n,) that move some of the coordinates alone."""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from .mujoco_servos import BANDWIDTH, JointServos, SpeedMap, base_coordinates
 from .mujoco_state import MujocoContacts, MujocoCoordinates
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
+from .speed_commands import ROUNDING, SpeedCommands, check_settings, find_robot_coordinates
 from .world import Contact, Observation
 
 _MARGIN = 10.0
@@ -88,16 +88,7 @@ class SimulationBounds:
 
 logger = logging.getLogger(__name__)
 _SAMPLES = 60
-_ROUNDING = 1e-9
 _GRASPS = ("friction", "tie")
-
-
-class _Command(NamedTuple):
-    """Speeds of the robot that act from one time until another [s]."""
-
-    speeds: Array
-    start: float
-    end: float
 
 
 class MujocoWorld:
@@ -177,21 +168,13 @@ class MujocoWorld:
         seed: int = 0,
     ) -> None:
         positive = {"step": step, "grip": grip, "timeout": timeout, "bandwidth": bandwidth, "press": press}
-        for field, value in (*positive.items(), ("friction", friction), ("delay", delay)):
-            number = finite_number(value)
-            if number is None or number < 0 or (field in positive and not number):
-                raise InvalidValueError(f"'{field}' of a world is a positive number, not {value!r}.")
+        check_settings(positive, {"friction": friction, "delay": delay})
         if grasp not in _GRASPS:
             raise InvalidValueError(f"'grasp' of a world is 'friction' or 'tie', not {grasp!r}.")
         self.model, self.robot = model, robot
-        self._step, self.timeout, self._delay = float(step), float(timeout), float(delay)
+        self._step, self.timeout = float(step), float(timeout)
         self._remarks: dict[str, None] = {}
-        coordinates = [s for s in model.degrees_of_freedom if self._is_robot(s.path)]
-        if not coordinates:
-            prefixes = sorted({s.path.split("/")[0] for s in model.degrees_of_freedom})
-            raise UnknownNameError(
-                f"No coordinate of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
-            )
+        coordinates = find_robot_coordinates(model, robot)
         furniture = [s.path for s in model.degrees_of_freedom if not self._is_robot(s.path)]
         frictions = _friction_by_name(door_friction or {}, furniture)
         if gripper is None:
@@ -246,7 +229,8 @@ class MujocoWorld:
         if self._drive is not None:
             self._drive.connect(self._compiled, self._contacts, seed)
         self._map = SpeedMap(model, [*driven, *held], self._coordinates.address)
-        self._is_finger = self._map.columns_of(held)
+        is_finger = self._map.columns_of(held)
+        self._commands = SpeedCommands(self._map.columns, is_finger, self.timeout, float(delay), logger.info)
         self._count = len(driven)
         self._state: State | None = None
         self._sampler = SensorSampler(sensors or Sensors(), model, robot, seed)
@@ -279,7 +263,7 @@ class MujocoWorld:
     @property
     def refused(self) -> int:
         """Number of commands since the last reset that were stale when they came."""
-        return self._refused
+        return self._commands.refused
 
     @property
     def peak_force(self) -> float:
@@ -297,11 +281,9 @@ class MujocoWorld:
         engine.mj_resetData(self._compiled, data)
         data.qpos[:] = qpos
         engine.mj_forward(self._compiled, data)
-        self._ticks, self._end, self._refused, self._peak_force = 0, 0.0, 0, 0.0
+        self._ticks, self._end, self._peak_force = 0, 0.0, 0.0
         self._broken = ""
-        self._speeds = np.zeros(len(self._map.speeds))
-        self._commands: deque[_Command] = deque()
-        self._active: _Command | None = None
+        self._commands.reset()
         self._servos.reset(data)
         if self._drive is not None:
             self._drive.reset(data)
@@ -309,51 +291,20 @@ class MujocoWorld:
         self._sampler.reset()
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
-        """Advance by a duration with speeds of the robot.
+        """Advance by a duration with speeds of the robot, as :meth:`.World.apply`.
 
-        Speeds of anything else are not read. Fingers keep the last speed that was given. Once both touch one
-        body they press it with the world's force, until a speed opens them.
-
-        Parameters
-        ----------
-        speeds
-            Speeds of the robot by symbol or name [m/s], [rad/s]; an empty mapping stops it.
-        duration
-            Time [s]; the world stops at the first time step that is not before.
-        stamp
-            Time of the state from which the speeds were computed [s]: beyond the age of the world's time-out
-            they are refused, or act no longer. None for speeds that act for the whole duration.
+        The world stops at the first time step that is not before the end. Once both fingers touch one body
+        they press it with the world's force, until a speed opens them.
 
         Raises
         ------
-        InvalidValueError
-            For speeds that are not finite, a duration that is not positive, and a stamp that is no number.
-        UnknownNameError
-            For speeds that the model does not have.
         SimulationError
-            If speeds or forces are beyond reason, see :mod:`.mujoco_bounds`. The state is that before then,
-            and the world does not go on until it is reset.
+            If speeds or forces are beyond :class:`SimulationBounds`. The state is that before then, and the
+            world does not go on until it is reset.
         """
-        length = finite_number(duration)
-        if length is None or length <= 0:
-            raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
-        taken = None if stamp is None else finite_number(stamp)
-        if stamp is not None and taken is None:
-            raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
         if self._broken:
             raise SimulationError(self._broken)
-        vector, given = self._map.vector(speeds)
-        keep = self._is_finger & ~given
-        vector[keep] = self._speeds[keep]
-        now = self._end
-        if taken is not None and not now - self.timeout <= taken + _ROUNDING <= now + 2 * _ROUNDING:
-            self._refused += 1
-            logger.info("speeds of %g s are refused at %g s", taken, now)
-            vector = np.where(self._is_finger, self._speeds, 0.0)
-        self._speeds = vector
-        until = now + length if taken is None else min(now + length, taken + self.timeout)
-        self._commands.append(_Command(vector, now + self._delay, until + self._delay))
-        self._end = now + length
+        self._end = self._commands.take(speeds, duration, stamp, self._end)
         if self._drive is not None:
             self._drive.update_limits(self._data)
         self._peak_force, self._state = 0.0, None
@@ -361,7 +312,7 @@ class MujocoWorld:
         handler = engine.get_mju_user_warning()
         engine.set_mju_user_warning(warnings.append)  # else to the terminal, and to a file
         try:
-            while self.time < self._end - _ROUNDING:
+            while self.time < self._end - ROUNDING:
                 before = self._data.qpos.copy()
                 self._advance()
                 force = self._contacts.largest_force(self._data)
@@ -402,17 +353,8 @@ class MujocoWorld:
 
     def _advance(self) -> None:
         """Simulate one time step."""
-        now, data = self.time, self._data
-        while self._commands and self._commands[0].start <= now + _ROUNDING:
-            self._active = self._commands.popleft()
-        active = self._active
-        if active is None:
-            speeds = np.zeros(len(self._map.speeds))
-        elif now < active.end - _ROUNDING:
-            speeds = active.speeds
-        else:
-            speeds = np.where(self._is_finger, active.speeds, 0.0)
-        rates = self._map.rates(speeds, data.qpos)
+        data = self._data
+        rates = self._map.rates(self._commands.acting(self.time), data.qpos)
         self._servos.drive(data, rates[: self._count])
         if self._drive is not None:
             self._drive.drive(data, rates[self._count :])
