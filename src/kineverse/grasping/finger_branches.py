@@ -69,7 +69,6 @@ def find_palms(model: ModelView, robot: str, srdf: Srdf | None = None) -> list[t
 
 
 def _parents_first(parents: Mapping[str, str]) -> Iterable[str]:
-    """Return frames with each after its parent."""
     done: dict[str, None] = {}
     for frame in parents:
         path = []

@@ -145,7 +145,6 @@ def _find_panel(link: Sequence[Part]) -> Part | None:
 
 
 def _clusters(parts: Sequence[Part]) -> list[tuple[Part, ...]]:
-    """Return the connected components of parts that touch."""
     left, clusters = list(parts), []
     while left:
         cluster = [left.pop(0)]

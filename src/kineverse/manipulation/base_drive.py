@@ -213,13 +213,11 @@ class DriveSearch:
         turned = [(i, j, (k + way) % _HEADINGS) for way in (1, -1)]
         for other in (*turned, (i + di, j + dj, k), (i - di, j - dj, k)):
             here, there = self._at(key), self._at(other)
-            cost = self._costs[key] + self._duration(here, there)
+            length = math.hypot(there[0] - here[0], there[1] - here[1])
+            cost = self._costs[key] + length / self._speed + abs(_wrap(there[2] - here[2])) / self._turn
             if cost < self._costs.get(other, math.inf) and self._is_free(_between(here, there)):
                 self._costs[other], self._parents[other] = cost, key
                 heapq.heappush(self._heap, (cost, other))
-
-    def _duration(self, a: Place, b: Place) -> float:
-        return math.hypot(b[0] - a[0], b[1] - a[1]) / self._speed + abs(_wrap(b[2] - a[2])) / self._turn
 
     def _leg(self, start: Place, goal: Place) -> Array | None:
         """Return a turn, a line and a turn to a goal, ahead or backwards; None if both touch something."""
@@ -233,10 +231,7 @@ class DriveSearch:
                 for angle in (ahead, ahead + math.pi)
             ]
         ways.sort(key=lambda way: sum(abs(_wrap(b[2] - a[2])) for a, b in pairwise(way)))
-        return next((way for way in ways if self._goes_through(way)), None)
-
-    def _goes_through(self, way: Array) -> bool:
-        return all(self._is_free(_between(a, b)) for a, b in pairwise(way))
+        return next((w for w in ways if all(self._is_free(_between(a, b)) for a, b in pairwise(w))), None)
 
     def _finish(self, key: _Key, goal: Place) -> Array | None:
         """Return the way by a place of the lattice to a goal, shortened; None if no leg leads on."""

@@ -243,7 +243,6 @@ class Session:
             )
 
     def _resolve(self, speeds: Mapping[Symbol, float] | Mapping[str, float]) -> Speeds:
-        """Return finite speeds by symbol."""
         if not isinstance(speeds, Mapping):
             raise InvalidValueError(f"Speeds are a mapping from symbols or names to numbers, not {speeds!r}.")
         resolved: dict[Symbol, float] = {}
@@ -265,7 +264,6 @@ class Session:
         return resolved
 
     def _advance(self, speeds: Speeds) -> None:
-        """Advance the world by a step, and update the belief."""
         robot = self.world.robot
         self.commands = {s: v for s, v in speeds.items() if is_of_robot(s.path, robot)}
         try:

@@ -314,7 +314,6 @@ class TrackedBelief:
         return total
 
     def _read_robot(self, observation: Observation) -> None:
-        """Take the readings of encoders and odometry."""
         stamp, joints = observation.stamp, observation.joints
         known = [s for s in joints if s in self._place]
         if stamp == self._read:
@@ -348,7 +347,6 @@ class TrackedBelief:
         self._spread = (1.0 - gain) * spread
 
     def _look(self, observation: Observation) -> None:
-        """Update the tracker with the poses of a picture."""
         stamp, self._shared = observation.stamp, None
         poses = np.tile(np.eye(4), (len(self._index), 1, 1))
         mask = np.zeros(len(poses), dtype=bool)

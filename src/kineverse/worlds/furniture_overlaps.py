@@ -174,7 +174,8 @@ class FurnitureOverlaps:
         home = model.default_state()
         scene.update(home)
         default = self._measure()
-        limited = ~flag_relatively_moving(model, scene.bodies, self._without_limits())
+        endless = [v for v in self._objects if not all(map(math.isfinite, model.limits(v.position)))]
+        limited = ~flag_relatively_moving(model, scene.bodies, endless)
         always = limited & adjacent_pairs(model, scene.bodies).astype(bool)
         most = {
             pair: math.inf if limited[pair] else depth + OVERLAP
@@ -203,11 +204,6 @@ class FurnitureOverlaps:
             pair = self._owners(code)
             found[pair] = max(depth, found.get(pair, 0.0))
         return found
-
-    def _without_limits(self) -> list[Symbol]:
-        """Return the speeds of the coordinates of furniture without limits."""
-        model = self.scene.model
-        return [v for v in self._objects if not all(map(math.isfinite, model.limits(v.position)))]
 
     def _measure(self) -> dict[int, float]:
         """Return the depths of the pairs of shapes that overlap at the state of the scene [m]."""

@@ -167,7 +167,8 @@ class KinematicWorld:
         self._integrate = model.integrator(own)
         self._state: State | None = None
         self._contacts: tuple[Contact, ...] | None = None
-        self._watch_contacts()
+        bodies, scene = self._motion.robot_bodies, self._motion.scene
+        self._touching = scene.watch(bodies, [b for b in scene.bodies if b not in {*bodies}], TOUCH)
         self._sampler = SensorSampler(sensors or Sensors(), model, robot, seed)
         self.remarks = (*remarks, "objects have no friction and no inertia, and nothing falls")
         self.reset(model.default_state())
@@ -216,7 +217,6 @@ class KinematicWorld:
         return (*self._touched(), *map(_make_contact, deepest.values()))
 
     def _touched(self) -> tuple[Contact, ...]:
-        """Return the contacts of the robot."""
         if self._contacts is None:
             found = (one if self._is_robot(one.a) else one.swap() for one in self._touching())
             self._contacts = tuple(map(_make_contact, found))
@@ -302,15 +302,7 @@ class KinematicWorld:
             self._motion.resolve(time, moved)
         self._motion.settle()
 
-    def _watch_contacts(self) -> None:
-        """Prepare the query of contacts."""
-        motion, scene = self._motion, self._motion.scene
-        robot = set(motion.robot_bodies)
-        others = [b for b in scene.bodies if b not in robot]
-        self._touching = scene.watch(motion.robot_bodies, others, TOUCH)
-
     def _check_version(self) -> None:
-        """Raise InvalidValueError after an edit of the model."""
         if self.model.version != self._version:
             raise InvalidValueError(
                 "The model of this world was edited. Make another world, or this one of model.snapshot()."

@@ -55,7 +55,10 @@ class GripperDrive:
                 "free coordinate of one joint; give a Gripper with those that open and close the fingers."
             )
         self._gripper, self._force, self._step = gripper, force, step
-        self._map, self._closing = coordinates, np.array([_direction(gripper, s) for s in self.coordinates])
+        self._map, self._closing = (
+            coordinates,
+            np.sign([gripper.closed[s] - gripper.opened[s] for s in self.coordinates]),
+        )
         self._at = np.array([coordinates.address[s] for s in self.coordinates], dtype=int)
         self._dof = np.array([coordinates.dof[s] for s in self.coordinates], dtype=int)
         self._tips = [_deepest(compiled, names) for names in gripper.fingers]
@@ -82,7 +85,7 @@ class GripperDrive:
             drive.trntype, drive.biastype = engine.mjtTrn.mjTRN_JOINT, engine.mjtBias.mjBIAS_AFFINE
             drive.forcelimited, drive.forcerange = True, (-force, force)
             spec.joint(symbol.path).actfrclimited = False
-        self._tied: str | None = None
+        self.tied: str | None = None  # body that is tied to the hand
         self._tie_name = f"{gripper.hand}/tie" if tie else ""
         if tie:
             weld = spec.add_equality(name=self._tie_name, name1=gripper.hand, name2=gripper.fingers[0][0])
@@ -143,11 +146,6 @@ class GripperDrive:
         best = max(found, key=found.__getitem__, default=None)
         return best if best is not None and found[best] > TOUCH_FORCE else None
 
-    @property
-    def tied(self) -> str | None:
-        """Body that is tied to the hand; None if there is none."""
-        return self._tied
-
     def _leverage(self, compiled: Any, data: Any) -> Array:
         """Return |∂y_1/∂q| + |∂y_2/∂q| by coordinate (n,), with all joints that follow."""
         rows = self._rows(compiled, data) @ self._map.followers[:, self._dof]
@@ -180,22 +178,15 @@ class GripperDrive:
         self._compiled.eq_obj2id[self._tie] = body
         self._compiled.eq_data[self._tie, :11] = [0, 0, 0, *position, *quaternion, 1]
         data.eq_active[self._tie] = 1
-        self._tied = name
+        self.tied = name
 
     def _release(self, data: Any) -> None:
-        """Loosen the tie, if there is one."""
-        self._tied = None
+        self.tied = None
         if self._tie >= 0:
             data.eq_active[self._tie] = 0
 
 
-def _direction(gripper: Gripper, symbol: Symbol) -> float:
-    """Return the sign of the speed with which a coordinate closes the fingers."""
-    return float(np.sign(gripper.closed[symbol] - gripper.opened[symbol]))
-
-
 def _is_below(compiled: Any, body: int, root: int) -> bool:
-    """Return whether a body is below another one in the tree."""
     while body not in (0, root):
         body = int(compiled.body_parentid[body])
     return bool(body == root)

@@ -297,7 +297,6 @@ def exclude_overlaps(
 
 
 def _limited_joints(model: ModelView, compiled: Any) -> list[tuple[int, int]]:
-    """Return the pairs of bodies that one joint with limits connects."""
     names = [compiled.body(k).name for k in range(compiled.nbody)]
     known = {name: k for k, name in enumerate(names) if name in model.frames and compiled.body_geomnum[k]}
     found = []
@@ -311,7 +310,6 @@ def _limited_joints(model: ModelView, compiled: Any) -> list[tuple[int, int]]:
 
 
 def _geoms_of(compiled: Any, body: int) -> range:
-    """Return the indices of the shapes of a body."""
     first = int(compiled.body_geomadr[body])
     return range(first, first + int(compiled.body_geomnum[body]))
 

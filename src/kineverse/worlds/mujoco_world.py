@@ -188,10 +188,20 @@ class MujocoWorld:
         mujoco_model.add_joint_friction(spec, compiled, furniture, frictions, self._remark)
         mujoco_model.add_tipping_springs(spec, model, self._remark)
         mujoco_model.add_contact_rules(spec, model, fingers, friction, self._is_robot, self._remark)
-        self._float_robot(spec)
+        for body in spec.bodies:
+            if self._is_robot(body.name):
+                body.gravcomp = 1.0
+        self._remark(f"gravity does not act on '{robot}': its servos are taken to carry the weight")
         compiled = mujoco_model.compile_world(spec)
         self._coordinates = MujocoCoordinates(model, compiled)
-        self._exclude_overlaps(spec, compiled, seed)
+        pairs = mujoco_model.exclude_overlaps(
+            spec, compiled, model, self._coordinates, self._is_robot, _SAMPLES, seed
+        )
+        if pairs:
+            self._remark(
+                "these pairs overlap at the default state, or of the robot always, and do not collide there: "
+                + ", ".join(f"{a} with {b}" for a, b in pairs)
+            )
         if floor:
             add_floor(spec, self._coordinates, self._is_robot, model.frames, _SAMPLES, seed, self._remark)
         else:
@@ -352,7 +362,6 @@ class MujocoWorld:
         return self._sampler.observe(self.time, self.state, self.contacts())
 
     def _advance(self) -> None:
-        """Simulate one time step."""
         data = self._data
         rates = self._map.rates(self._commands.acting(self.time), data.qpos)
         self._servos.drive(data, rates[: self._count])
@@ -362,30 +371,10 @@ class MujocoWorld:
         self._ticks += 1
 
     def _is_robot(self, name: str) -> bool:
-        """Return whether a frame or coordinate is the robot's."""
         return is_of_robot(name, self.robot)
 
     def _remark(self, text: str) -> None:
-        """Add a remark once."""
         self._remarks[text] = None
-
-    def _float_robot(self, spec: Any) -> None:
-        """Take the weight of the robot away."""
-        for body in spec.bodies:
-            if self._is_robot(body.name):
-                body.gravcomp = 1.0
-        self._remark(f"gravity does not act on '{self.robot}': its servos are taken to carry the weight")
-
-    def _exclude_overlaps(self, spec: Any, compiled: Any, seed: int) -> None:
-        """Exclude what overlaps by design, of the robot and of furniture."""
-        pairs = mujoco_model.exclude_overlaps(
-            spec, compiled, self.model, self._coordinates, self._is_robot, _SAMPLES, seed
-        )
-        if pairs:
-            self._remark(
-                "these pairs overlap at the default state, or of the robot always, and do not collide there: "
-                + ", ".join(f"{a} with {b}" for a, b in pairs)
-            )
 
 
 def _friction_by_name(given: Mapping[Any, float], furniture: list[str]) -> dict[str, float]:

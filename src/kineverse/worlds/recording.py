@@ -104,7 +104,8 @@ class McapFile:
                 f"a chunk states {chunk.uncompressed_size} bytes; at most {MAX_CHUNK} are read"
             )
         plain = self._decompress(chunk)
-        if len(plain) != chunk.uncompressed_size or not _matches(plain, chunk.uncompressed_crc):
+        checksum = chunk.uncompressed_crc
+        if len(plain) != chunk.uncompressed_size or (checksum and zlib.crc32(plain) != checksum):
             raise self._damaged(f"a chunk's content does not match its checksum, after {self._last()}")
         self._total += len(plain)
         if self._total > MAX_TOTAL:
@@ -170,10 +171,6 @@ class McapFile:
 
     def _damaged(self, reason: str) -> FormatError:
         return FormatError(f"{self._name}: a damaged MCAP file: {reason}.")
-
-
-def _matches(data: bytes, checksum: int) -> bool:
-    return not checksum or zlib.crc32(data) == checksum
 
 
 MAX_VALUES = 1 << 26  # most numbers of one table of values over time

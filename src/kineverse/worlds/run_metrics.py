@@ -43,12 +43,7 @@ from .furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 
 class LimitJudge:
-    """Largest excess of any constraint of a model in successive states.
-
-    Positions are those of the states, speeds are differences of successive states by time; commanded speeds
-    stand in where no coordinate is the integral of a speed. A limit of a speed that depends on the state,
-    such as a lock, is violated if it was at the begin and at the end of a step.
-    """
+    """Largest excess of any constraint of a model in successive states, see *limit violation* above."""
 
     violation: float  # largest excess since the last reset, in the unit of its constraint
     limit: str  # the constraint's name
@@ -366,7 +361,6 @@ class Judge:
         self._select_pairs()
 
     def _select_pairs(self) -> None:
-        """Set the flags of excepted pairs."""
         number = {b: k for k, b in enumerate(self._scene.bodies)}
         self._is_excepted = np.zeros((len(number),) * 2, dtype=bool)
         for a, b in self.excepted:

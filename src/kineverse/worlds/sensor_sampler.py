@@ -76,7 +76,6 @@ class LineOfSight:
 
 
 def _start(model: ModelView, hidden: Iterable[str]) -> Scene:
-    """Return a scene at the default state without some bodies."""
     scene = Scene(model, leave_out=hidden)
     scene.update(model.default_state())
     scene.collision_world.prepare()

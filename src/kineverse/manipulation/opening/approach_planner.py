@@ -67,7 +67,7 @@ class ApproachPlanner:
         """Plan a way from a state to values of the robot's coordinates."""
         planner, base = self.planner, {s: float(wanted[s]) for s in self.search.standing}
         places, tuck, arms = None, None, state
-        if base and self.can_drive(state):
+        if base and self.drive is not None and self.drive.is_possible and self._drives(state).begins_free:
             found = self._find_drive(state, base)
             if found is None:
                 return Approach("no way for the base, with the arm as it is or compact")
@@ -84,12 +84,6 @@ class ApproachPlanner:
         """Plan a way from a state to the pose before the handle of a placement, within 2 s."""
         wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
         return self.plan(state, wanted, seconds=_PLANNING, seed=seed)
-
-    def can_drive(self, state: State) -> bool:
-        """Return whether the base rolls to other places by itself from a state."""
-        if self.drive is None or not self.drive.is_possible:
-            return False
-        return self._drives(state).begins_free
 
     def _drives(self, state: State) -> DriveSearch:
         assert self.drive is not None
@@ -110,19 +104,16 @@ class ApproachPlanner:
         places = self._drives(state).find(goal)
         if places is not None:
             return places, None, state
-        tucked = self._tuck(state)
+        if state not in self._tucked:
+            self._tucked = {state: self._plan_tuck(state)}
+        tucked = self._tucked[state]
         if tucked is None:
             return None
         places = self._drives(tucked[1]).find(goal)
         return None if places is None else (places, *tucked)
 
-    def _tuck(self, state: State) -> tuple[Trajectory, State] | None:
-        """Return a way of the arm to a compact configuration, and the state there; None without one."""
-        if state not in self._tucked:
-            self._tucked = {state: self._plan_tuck(state)}
-        return self._tucked[state]
-
     def _plan_tuck(self, state: State) -> tuple[Trajectory, State] | None:
+        """Return a way of the arm to a compact configuration, and the state there; None without one."""
         planner = self.planner
         planner.place(state)
         here = state.vector(planner.symbols)

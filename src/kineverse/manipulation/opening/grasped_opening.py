@@ -221,7 +221,12 @@ class _Run:
         self._earlier: list[Mapping[str, Any]] = []
         self._overlaps: list[JudgedOverlap] = []
         self._approach = Approach()
-        self._ways_back = [made for made in session.made if self._is_of_this(made)]
+        held = self.gripper.hand, handle.frame, handle.coordinate
+        self._ways_back = [
+            made
+            for made in session.made
+            if (g := made.grasp) and (g.gripper.hand, g.handle.frame, g.handle.coordinate) == held
+        ]
         self.judge = Judge(
             self.model, session.world.robot, self.gripper, handle.frame,
             coordinate=handle.coordinate, start=session.start,
@@ -295,7 +300,6 @@ class _Run:
         return failure or SkillError(kind, f"After {self.grasps} grasps '{what}' is not at the target.")
 
     def _move(self, placement: BasePlacement) -> None:
-        """Move the object with one grasp as far as the way of a placement leads."""
         assert placement.grasp is not None
         self.grasps += 1
         self._come(placement)
@@ -428,11 +432,6 @@ class _Run:
             raise failure
         return back
 
-    def _is_of_this(self, made: BasePlacement) -> bool:
-        """Return whether a placement is one of this hand, handle and coordinate."""
-        grasp, own = made.grasp, (self.gripper.hand, self.handle.frame, self.handle.coordinate)
-        return grasp is not None and (grasp.gripper.hand, grasp.handle.frame, grasp.handle.coordinate) == own
-
     def _retrace(self, *, whole: bool) -> BasePlacement | None:
         """Return the way back of a motion that ended here, to the target or at least on; None without any."""
         session, here = self.session, float(self.session.state[self.handle.coordinate])
@@ -491,7 +490,6 @@ class _Run:
         return bool(self._approach)
 
     def _come(self, placement: BasePlacement) -> None:
-        """Bring the base to its place, and the hand to the handle."""
         self._bring_base(self._approach)
         self.session.phase = "approach"
         assert self._approach.trajectory is not None

@@ -28,6 +28,7 @@ from kineverse.worlds import Judge
 from .approach_planner import Approach, ApproachPlanner
 from .base_placement import BasePlacement, PlacementSearch
 from .cartesian_paths import find_least_time, row_at
+from .path_collisions import draw_retreats
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0  # time in which fingers open or close fully, and the largest one [s]
 _IDLE = 10  # number of steps in which fingers that stand still have not moved
@@ -464,8 +465,6 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             )
 
 
-_ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))
-"""Angles along the bar by which a retreat deviates from the reversed approach [rad]."""
 _STEPS = 12  # number of arms along a retreat
 
 
@@ -483,17 +482,9 @@ def find_retreat(motion: HandMotion, grasp: Grasp, world_T_handle: Array, world_
     It is the reversed approach of the grasp, or deviates from it along the bar.
     """
     search, state = motion.search, motion.state
-    out = grasp.approach[:3, 3] - grasp.pose[:3, 3]
-    bar, length = grasp.handle.pose[:3, 2], float(np.linalg.norm(out))
-    ends = np.repeat(world_T_hand[None], len(_ASIDE), axis=0)
-    for k, angle in enumerate(_ASIDE):
-        away = math.cos(angle) * out + math.sin(angle) * length * bar
-        ends[k, :3, 3] += world_T_handle[:3, :3] @ away
-    share = np.linspace(0.0, 1.0, _STEPS)[:, None]
-    lines = np.repeat(ends[:, None], _STEPS, axis=1)
-    lines[:, :, :3, 3] = world_T_hand[:3, 3] + share * (ends[:, None, :3, 3] - world_T_hand[:3, 3])
+    lines = draw_retreats(grasp, world_T_handle, world_T_hand, _STEPS)
     arm, base = state.vector(search.moving), state.vector(search.standing)
-    count = len(_ASIDE)
+    count, ends = len(lines), lines[:, -1]
     ways, reached = search.paths.follow(np.tile(arm, (count, 1)), np.tile(base, (count, 1)), lines)
     best, farthest = HandRetreat(ends[0], None), 0
     for end, way, number in zip(ends, ways, reached.tolist(), strict=True):

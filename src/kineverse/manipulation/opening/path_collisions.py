@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -39,8 +38,8 @@ class PathContacts:
     ) -> None:
         self.scene, self.gripper, self.margin = scene, gripper, margin
         self.own, self.others = tuple(own), tuple(others)
-        self._model = model
-        self._hand = {b for b in own if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
+        self._own_watch = scene.watch(self.own, self.own, OWN_MARGIN)
+        self.hand = {b for b in own if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
         self._around: dict[str, PreparedQuery] = {}
         self._beside: dict[str, PreparedQuery] = {}
         self._found: tuple[PreparedQuery, float] | None = None
@@ -55,7 +54,9 @@ class PathContacts:
         self.scene.update(state.updated(dict(zip(columns, rows[0].tolist(), strict=True))))
         queries = [(self._watch_around(handle), self.margin), (self._own_watch, OWN_MARGIN)]
         if opened and handle:
-            queries.append((self._watch_beside(handle), _BESIDE_BAR))
+            if handle not in self._beside:
+                self._beside[handle] = self.scene.watch([*self.gripper.bodies], [handle], _BESIDE_BAR)
+            queries.append((self._beside[handle], _BESIDE_BAR))
         first: int | None = None
         for query, radius in queries:
             found = query.first_within(columns, rows[:first], radius) if first != 0 else None
@@ -70,11 +71,7 @@ class PathContacts:
         assert self._found is not None
         query, radius = self._found
         pair = query(radius)[0]
-        return (pair.b, pair.a) if pair.b in self._hand else (pair.a, pair.b)
-
-    def is_of_hand(self, body: str) -> bool:
-        """Return True if a body is rigid with the hand or one of its fingers."""
-        return body in self._hand
+        return (pair.b, pair.a) if pair.b in self.hand else (pair.a, pair.b)
 
     def _watch_around(self, handle: str) -> PreparedQuery:
         """Return the query of the robot's distance from everything else, but of the hand from the handle."""
@@ -83,16 +80,6 @@ class PathContacts:
             allowed = [Rule(b, handle, False, "grasped") for b in bodies]
             self._around[handle] = self.scene.watch(self.own, self.others, self.margin, rules=allowed)
         return self._around[handle]
-
-    def _watch_beside(self, handle: str) -> PreparedQuery:
-        """Return the query of the hand's distance from the handle."""
-        if handle not in self._beside:
-            self._beside[handle] = self.scene.watch([*self.gripper.bodies], [handle], _BESIDE_BAR)
-        return self._beside[handle]
-
-    @cached_property
-    def _own_watch(self) -> PreparedQuery:
-        return self.scene.watch(self.own, self.own, OWN_MARGIN)
 
 
 _LINE = 5  # number of configurations on the straight way to the handle
@@ -133,7 +120,6 @@ class PathCheck:
         self.reasons = Counter[str]()
         gripper, handle = grasps[0].gripper, grasps[0].handle
         self._gripper, self._frame = gripper, handle.frame
-        self._bar = handle.pose[:3, 2]
         self._columns: tuple[Symbol, ...] = (
             *paths.moving, *paths.still, *gripper.joints, handle.coordinate,
         )  # fmt: skip
@@ -160,7 +146,7 @@ class PathCheck:
         ]
         for rows, frame, fingers_open in parts:
             if self._find(rows, frame, opened=fingers_open) is not None:
-                if self.contacts.is_of_hand(self._note()) and frame:
+                if self._note() in self.contacts.hand and frame:
                     self.free[candidate.choice] = -1
                 candidate.end = -1
                 return True
@@ -174,7 +160,7 @@ class PathCheck:
         first = self._find(rows, self._frame, opened=False)
         if first is not None:
             candidate.end = first // _BETWEEN - 1
-            if self.contacts.is_of_hand(self._note()):
+            if self._note() in self.contacts.hand:
                 self.free[candidate.choice] = min(int(self.free[candidate.choice]), candidate.end)
             return True
         return False
@@ -190,15 +176,8 @@ class PathCheck:
         if self._find(sweep, self._frame, opened=False) is not None:
             self._note()
             return None
-        out = grasp.approach[:3, 3] - grasp.pose[:3, 3]
-        pose = self.handles[end] @ grasp.pose
-        ends = np.repeat(pose[None], len(_ASIDE), axis=0)
-        length = float(np.linalg.norm(out))
-        for k, angle in enumerate(_ASIDE):
-            away = math.cos(angle) * out + math.sin(angle) * length * self._bar
-            ends[k, :3, 3] += self.handles[end, :3, :3] @ away
-        count = len(_ASIDE)
-        lines = interpolate_poses(np.repeat(pose[None], count, axis=0), ends)
+        lines = draw_retreats(grasp, self.handles[end], self.handles[end] @ grasp.pose, _LINE)
+        count = len(lines)
         ways, reached = self.paths.follow(np.tile(Q, (count, 1)), np.tile(base, (count, 1)), lines)
         opened = self._gripper.opened
         blocked = False
@@ -245,9 +224,21 @@ class PathCheck:
         return one
 
 
-def interpolate_poses(a: Array, b: Array) -> Array:
+def draw_retreats(grasp: Grasp, world_T_handle: Array, world_T_hand: Array, count: int) -> Array:
+    """Return straight retreats (N, L, 4, 4): the reversed approach of a grasp, and others along the bar."""
+    out, bar = grasp.approach[:3, 3] - grasp.pose[:3, 3], grasp.handle.pose[:3, 2]
+    length = float(np.linalg.norm(out))
+    starts = np.repeat(world_T_hand[None], len(_ASIDE), axis=0)
+    ends = starts.copy()
+    for k, angle in enumerate(_ASIDE):
+        away = math.cos(angle) * out + math.sin(angle) * length * bar
+        ends[k, :3, 3] += world_T_handle[:3, :3] @ away
+    return interpolate_poses(starts, ends, count)
+
+
+def interpolate_poses(a: Array, b: Array, count: int = _LINE) -> Array:
     """Return poses (N, L, 4, 4) on the straight way between poses of one orientation, a first."""
-    share = np.linspace(0.0, 1.0, _LINE)
-    poses = np.repeat(a[:, None], _LINE, axis=1)
+    share = np.linspace(0.0, 1.0, count)
+    poses = np.repeat(a[:, None], count, axis=1)
     poses[:, :, :3, 3] += share[:, None] * (b - a)[:, None, :3, 3]
     return poses

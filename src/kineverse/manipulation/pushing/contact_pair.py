@@ -157,7 +157,6 @@ class PairFinder:
         return best, clearance
 
     def _make_pair(self, found: DistanceResults, row: int, gap: float, swapped: bool) -> PushPair:
-        """Return a pair of results as one of robot and object."""
         robot, thing = found.body_indices[row].tolist()
         a, b, c, d, e, f, u, v, w = found.witnesses[row].tolist()
         r, p, n = (a, b, c), (d, e, f), (-u, -v, -w)

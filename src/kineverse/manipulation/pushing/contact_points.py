@@ -194,7 +194,6 @@ class PushSurface:
 
 
 def _without_doubles(found: list[tuple[int, Array, Array]]) -> list[tuple[int, Array, Array]]:
-    """Return points without those that are about the same."""
     kept: dict[tuple[float, ...], tuple[int, Array, Array]] = {}
     for body, point, normal in found:
         kept.setdefault(

@@ -385,7 +385,6 @@ class _Run:
         return ""
 
     def _follow(self, path: Path) -> None:
-        """Follow a path at the speeds of its trajectory."""
         session, trajectory = self._session, path.trajectory()
         session.phase = "approach"
         dt = session.dt

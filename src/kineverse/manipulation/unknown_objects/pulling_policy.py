@@ -117,7 +117,6 @@ class PartPulling:
         self.begin, self._reached = self.begin - gone, self._reached - gone
 
     def _let_go(self) -> None:
-        """Open the fingers, and look where the part is."""
         self.session.phase = "let go"
         self.belief.release()
         self.motion.move_fingers(self.motion.gripper.opened)

@@ -237,7 +237,6 @@ class _Run:
             self.measures |= self.pulling.measures
 
     def _prepare(self, unknown: UnknownPart) -> None:
-        """Prepare motions of the hand at a part."""
         session = self.session
         with session.timed("place"):
             self.search = PlacementSearch(unknown.model, self.gripper, session.state)
@@ -319,7 +318,6 @@ class _Run:
         motion.stand(LOOKING)
 
     def _look(self) -> None:
-        """Look at the part while the robot stands."""
         self.session.phase = "look"
         begin = self.world.time
         self.motion.stand(LOOKING)
@@ -343,12 +341,10 @@ class _Run:
             )
 
     def _plan(self, placement: BasePlacement) -> bool:
-        """Plan the way to the pose before the handle, and return whether there is one."""
         self.approach = self.approaches.plan_to(self.session.state, placement, self.seed)
         return bool(self.approach)
 
     def _come(self, placement: BasePlacement) -> None:
-        """Bring a base on wheels to its place, and the hand to the handle."""
         session, approach, motion = self.session, self.approach, self.motion
         if approach.places is not None:
             motion.drive(approach)

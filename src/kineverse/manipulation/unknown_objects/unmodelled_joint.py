@@ -147,7 +147,7 @@ def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
     name = next(iter(records), f"{frame}/joint")
     writer = model.history.writers(f"frames/{frame}")[-1]
     with model.edit() as edit:
-        if f"articulations/{name}" in _written(model, writer):
+        if ("articulations", name) in model.history.entry(writer).writes:
             edit.replace(writer, fit.operation(name, parent, frame, limits=False))
         else:
             child = f"{frame}/learned"
@@ -155,11 +155,6 @@ def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
             edit.attach(frame, child, translation(0, 0, 0))
     (coordinate,) = model.fk(frame, parent).symbols
     return coordinate
-
-
-def _written(model: Model, tag: str) -> set[str]:
-    """Return the paths that an operation writes."""
-    return {f"{kind}/{name}" for kind, name in model.history.entry(tag).writes}
 
 
 class JointPath:

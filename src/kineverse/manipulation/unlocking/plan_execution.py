@@ -88,7 +88,6 @@ class PartMover:
         return session.state[symbol]
 
     def _controller(self, symbol: Symbol) -> Controller:
-        """Return the controller that moves a coordinate."""
         if symbol not in self._controllers:
             goal = Goal(
                 symbol, self._target, name=f"move {symbol}", gain=0.5 / self.session.dt, speed=self._speed
