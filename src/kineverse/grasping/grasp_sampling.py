@@ -36,7 +36,7 @@ _CANDIDATES = 6  # candidates for each grasp that is asked for
 _NEAR = 0.6  # distance from the bar up to which shapes are looked at [m]
 _REACH = 0.05  # distance up to which the clearance of a grasp counts [m]
 _CLOSING, _AWAY = 14, np.array([0.1, 0.25, 0.5, 1.0])
-"""Number of gaps of fingers that close, and parts of the way to the pose before the approach."""
+"""Number of gaps of fingers that close, and parts of the path to the pose before the approach."""
 _ADVANCES, _TOUCHING = 20, 1e-4
 """Most steps in which fingers close, and the distance at which one touches [m]."""
 
@@ -97,7 +97,7 @@ def sample_grasps(
     """Return grasps across a bar, without contact of the gripper with the object, the best first.
 
     Grasps differ in the angle about the bar, the place along it, the depth, and by half a turn about the
-    approach; around a knob also in the angle about its axis. The way from ``approach`` to ``pose`` and the
+    approach; around a knob also in the angle about its axis. The path from ``approach`` to ``pose`` and the
     closing fingers are free of collisions with everything that is not the robot's.
     Upright grasps at the middle of the bar and of the pads come first, of similar ones the clearer.
 

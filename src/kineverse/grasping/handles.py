@@ -165,12 +165,12 @@ def _search_anew(
         for bar in find_bars(body, around):
             before, after = poses[bar.part.body], shifts[bar.part.body]
             shift = (after @ lie.inverse(before) @ np.append(bar.part.middle, 1.0))[:3] - bar.part.middle
-            way = float(np.linalg.norm(shift))
-            along = float(bar.rotation[:, 0] @ shift) / max(way, 1e-6) if is_known else 0.0
+            distance = float(np.linalg.norm(shift))
+            along = float(bar.rotation[:, 0] @ shift) / max(distance, 1e-6) if is_known else 0.0
             if along < -_WITHIN or not _is_free(bar, body, around):
                 continue
             handle = _make_handle(model, symbol, bar, before, body, around)
-            rated.append((link not in own, along < _WITHIN, -round(way, 4), handle.thickness, handle))
+            rated.append((link not in own, along < _WITHIN, -round(distance, 4), handle.thickness, handle))
     rated.sort(key=lambda row: row[:4])
     why = f"It moves {_listed([f for f in moved if f in scene.bodies])}: no slim shape of these stands out, "
     why += "with free space in front of it."

@@ -65,8 +65,8 @@ class BaseFilter:
         adjoint = np.eye(3)
         adjoint[:2, 2] = -step[1], step[0]
         adjoint[:2] = rotation_z(-step[2])[:2, :2] @ adjoint[:2]
-        way = float(np.linalg.norm(step[:2]) + abs(step[2]))
-        self.covariance = adjoint @ self.covariance @ adjoint.T + way * np.diag(self._variance)
+        distance = float(np.linalg.norm(step[:2]) + abs(step[2]))
+        self.covariance = adjoint @ self.covariance @ adjoint.T + distance * np.diag(self._variance)
 
     def correct(self, seen: Array, known: Array, deviations: Array) -> None:
         """Correct the estimate by landmarks."""

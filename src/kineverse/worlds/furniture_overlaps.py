@@ -12,7 +12,7 @@ frame. What counts is what was not there at the start. Shapes overlap from 0.5 m
 - Everything else counts, a door and its own frame included, but for pairs of bodies that a rule of the scene
   or of the model excepts.
 
-Skills that look at the way, the kinematic world, judges, and the execution of unlocking plans share this
+Skills that look ahead, the kinematic world, judges, and the execution of unlocking plans share this
 rule. The default state excuses nothing but hulls: a drawer that stands fully out of a solid box at the start
 is in its way.
 """

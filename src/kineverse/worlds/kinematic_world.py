@@ -39,11 +39,11 @@ from .world import Contact, Observation
 
 logger = logging.getLogger(__name__)
 
-_SUBSTEP = 0.002  # longest way of a body between two checks of its gaps, while it is near an object [m]
+_SUBSTEP = 0.002  # longest motion of a body between two checks of its gaps, while it is near an object [m]
 _HELD_SUBSTEP = 0.01
-"""Longest way of a hand between two checks of what it holds [m]: thinner furniture is rare."""
+"""Longest motion of a hand between two checks of what it holds [m]: thinner furniture is rare."""
 _MOST_SUBSTEPS = 10_000
-_UNKNOWN_WAY = 0.1
+_UNKNOWN_TRAVEL = 0.1
 
 
 class Event(NamedTuple):
@@ -277,22 +277,22 @@ class KinematicWorld:
         motion.place(self._integrate(start, arm, time))
         moved = motion.travel() - before
         # The travel begins anew at some time.
-        moved[moved < 0.0] = _UNKNOWN_WAY
-        way = float(moved.max(initial=0.0)) + reach
+        moved[moved < 0.0] = _UNKNOWN_TRAVEL
+        travel = float(moved.max(initial=0.0)) + reach
         grips = grip is not None and (grip.held is not None or reach > 0.0)
         # What is not near now has not been touched on the way.
-        longest = motion.longest_way(moved, way)
+        longest = motion.longest_motion(moved, travel)
         count = 0 if longest is None else math.ceil((longest + reach) / _SUBSTEP)
         if grip is not None and grip.held is not None:
-            count = max(count, math.ceil(way / _HELD_SUBSTEP))
+            count = max(count, math.ceil(travel / _HELD_SUBSTEP))
         count = min(count, _MOST_SUBSTEPS)
         if count > 1:
             motion.place(start)
             for _ in range(count):
                 motion.place(self._integrate(motion.q, arm, time / count))
-                self._settle(time / count, way / count, grips)
+                self._settle(time / count, travel / count, grips)
         elif longest is not None or grips:
-            self._settle(time, way, grips)
+            self._settle(time, travel, grips)
 
     def _settle(self, time: float, moved: float, grips: bool) -> None:
         """Move fingers and objects after the rest of the robot has moved."""

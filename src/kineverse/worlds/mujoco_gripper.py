@@ -123,13 +123,13 @@ class GripperDrive:
 
     def drive(self, data: Any, rates: Array) -> None:
         """Set the controls for one time step at speeds of the fingers (n,)."""
-        way = rates * self._closing
-        if (way < -_STILL).any():
+        closing = rates * self._closing
+        if (closing < -_STILL).any():
             if self.is_gripping:
                 self.is_gripping = False
                 self._target = data.qpos[self._at].copy()
                 self._release(data)
-        elif not self.is_gripping and (way > _STILL).any() and self.pressed(data) is not None:
+        elif not self.is_gripping and (closing > _STILL).any() and self.pressed(data) is not None:
             self.is_gripping = True
             self._bind(data)
         if self.is_gripping:

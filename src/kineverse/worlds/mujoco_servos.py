@@ -220,7 +220,7 @@ def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, 
 def _sampled_loads(
     compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int
 ) -> tuple[Array, Array]:
-    """Return the largest force of gravity on each joint, and the way of the farthest point that it moves.
+    """Return the largest force of gravity on each joint, and the motion of the farthest point that it moves.
 
     Both are the largest in sampled configurations, (n,): [N], [N m], and [m/m], [m/rad].
     """
@@ -237,9 +237,9 @@ def _sampled_loads(
         for geom in own:
             body = int(compiled.geom_bodyid[geom])
             engine.mj_jac(compiled, data, slide, turn, data.geom_xpos[geom], body)
-            ways = np.linalg.norm(slide @ columns, axis=0)
-            ways += compiled.geom_rbound[geom] * np.linalg.norm(turn @ columns, axis=0)
-            np.maximum(levers, ways, out=levers)
+            reaches = np.linalg.norm(slide @ columns, axis=0)
+            reaches += compiled.geom_rbound[geom] * np.linalg.norm(turn @ columns, axis=0)
+            np.maximum(levers, reaches, out=levers)
     return weights, levers
 
 

@@ -61,10 +61,12 @@ class SimulationBounds:
         for geom in range(compiled.ngeom):
             body = int(compiled.geom_bodyid[geom])
             engine.mj_jac(compiled, data, slide, turn, data.geom_xpos[geom], body)
-            ways = np.linalg.norm(slide, axis=0) + np.linalg.norm(turn, axis=0) * compiled.geom_rbound[geom]
-            np.maximum(levers, ways, out=levers)
+            reaches = (
+                np.linalg.norm(slide, axis=0) + np.linalg.norm(turn, axis=0) * compiled.geom_rbound[geom]
+            )
+            np.maximum(levers, reaches, out=levers)
             if own[body]:
-                fastest = max(fastest, float(limits @ ways))
+                fastest = max(fastest, float(limits @ reaches))
         fall = math.sqrt(2.0 * abs(float(compiled.opt.gravity[2])) * float(compiled.stat.extent))
         with np.errstate(divide="ignore"):
             others = (2.0 * fastest + fall) / levers

@@ -9,7 +9,7 @@ with the rows A of the model's limits, locks and closures. An object is pushed a
 where nothing touches it. A contact jams if its normal is 60° or more off all motions that the object has at
 that point, as with a friction of 0.58: then it does not move the object. What was penetrated before comes
 free at 0.1 m/s at most. So a contact moves an object's point there by at most twice the sum of the robot's
-way and that way out. The slacks s are zero unless the object is blocked; then the penetration remains. The
+motion and that motion out. The slacks s are zero unless the object is blocked; then the penetration remains. The
 weights w are the squares of the speeds that coordinates give to points of bodies, so rotations and
 translations compare. The problem is linear in the neighbourhood of a configuration, and it is solved again
 where it led, until nothing changes (sequential quadratic programming).
@@ -156,12 +156,12 @@ class ObjectMotion:
         self.scene.update(self.q[self._inputs])
 
     def travel(self) -> Array:
-        """Return the ways that shapes of the robot have gone so far, at most (K,) [m]."""
+        """Return the distances that shapes of the robot have moved so far, at most (K,) [m]."""
         travel: Array = self.scene.collision_world.table.travel[self._robot_objects]
         return travel
 
-    def longest_way(self, moved: Array, radius: float) -> float | None:
-        """Return the longest way of a body in a pair within a radius [m]; None without such a pair."""
+    def longest_motion(self, moved: Array, radius: float) -> float | None:
+        """Return the longest motion of a body in a pair within a radius [m]; None without such a pair."""
         pairs, index = self.find_near(radius)
         if not len(index):
             return None
@@ -292,7 +292,7 @@ class ObjectMotion:
                 if furniture is not None:
                     found = self._solve(h, v, gaps, aims, furniture, rates, limits, pulled)
             else:
-                # The gaps bend too much, as of bodies that are jammed: half of the way.
+                # The gaps bend too much, as of bodies that are jammed: half of the motion.
                 found = 0.5 * (best + v)
             change = float(np.max(np.abs(found - v) * np.sqrt(self.weights[: self.count]), initial=0.0)) * h
             v = found
@@ -307,15 +307,15 @@ class ObjectMotion:
 
     def _cost(
         self,
-        way: Array,
+        motion: Array,
         gaps: Gaps,
         aims: Array,
         furniture: FurnitureGaps | None,
         pulled: tuple[Array, Array] | None,
     ) -> float:
-        """Return twice the cost of a motion by some way of the objects (n,)."""
+        """Return twice the cost of a motion by some motion of the objects (n,)."""
         depths = np.minimum(gaps.distances - np.minimum(aims, 0.0), 0.0)[~gaps.jammed]
-        moved = float(self.weights[: self.count] @ way**2)
+        moved = float(self.weights[: self.count] @ motion**2)
         if pulled is not None:
             moved = _HELD * moved + float(pulled[0] @ pulled[0])
         squares = float(depths @ depths)

@@ -40,11 +40,11 @@ class Gaps:
 
 def align_motion(normal: Array, point: Array, twists: Array) -> float:
     """Return the largest cosine of the angle between a normal and the motions of a point by twists (6, n)."""
-    ways = twists[:3] + np.cross(twists[3:].T, point).T
-    lengths = np.linalg.norm(ways, axis=0)
+    motions = twists[:3] + np.cross(twists[3:].T, point).T
+    lengths = np.linalg.norm(motions, axis=0)
     moves = (lengths > 0.0) & np.isfinite(lengths)
-    ways = ways[:, moves] / lengths[moves]
-    values, directions = np.linalg.eigh(ways @ ways.T)
+    motions = motions[:, moves] / lengths[moves]
+    values, directions = np.linalg.eigh(motions @ motions.T)
     return float(np.linalg.norm(normal @ directions[:, values > _PARALLEL]))
 
 
@@ -216,7 +216,7 @@ Flags = npt.NDArray[np.bool_]
 class FurnitureGaps(NamedTuple):
     """Gaps of pairs of shapes of furniture that meet."""
 
-    distances: Array  # (K,) ways to where the shapes stop [m]
+    distances: Array  # (K,) motions to where the shapes stop [m]
     rows: Array  # (K, n) derivatives by the displacement of objects
     jammed: Flags  # (K,) flags of contacts that move nothing
     moved: Flags  # (n,) flags of coordinates that move, those that are pushed along included
@@ -259,8 +259,8 @@ class FurnitureContacts:
             jammed, driven = np.zeros(len(index), dtype=bool), self._link(driven)
             for k in np.flatnonzero(distances < 0.0).tolist():
                 relative, point = of_b[k] - of_a[k], pairs.points_b[index[k]]
-                ways = np.linalg.norm(relative[:3] + np.cross(relative[3:].T, point).T, axis=0)
-                yields = driven | (np.abs(rows[k]) >= JAM * ways)
+                motions = np.linalg.norm(relative[:3] + np.cross(relative[3:].T, point).T, axis=0)
+                yields = driven | (np.abs(rows[k]) >= JAM * motions)
                 jammed[k] = not rows[k, yields].any()
                 if not jammed[k]:
                     rows[k, ~yields] = 0.0

@@ -226,7 +226,7 @@ class Judge:
         - ``grasp_error`` [m] and ``grasp_rotation`` [rad], NaN if nothing was held
         - ``contact_losses``
         - ``jitter`` [m/s], [rad/s] and ``reversals`` [1/s], NaN without commands
-        - ``distance`` and ``hand_distance``, the ways of the robot's root and of the hand [m]
+        - ``distance`` and ``hand_distance``, the distances of the robot's root and of the hand [m]
         - ``excepted``, pairs of bodies that do not count
         """
         rms = math.sqrt(self._squares / self._seconds) if self._seconds else math.nan
@@ -244,8 +244,8 @@ class Judge:
             "contact_losses": self._losses,
             "jitter": rms,
             "reversals": self._reversals / elapsed if self._commanded and elapsed > 0 else math.nan,
-            "distance": float(self._way[0]),
-            "hand_distance": float(self._way[-1]) if self.gripper is not None else math.nan,
+            "distance": float(self._distances[0]),
+            "hand_distance": float(self._distances[-1]) if self.gripper is not None else math.nan,
             "excepted": self.excepted,
         }
 
@@ -270,7 +270,7 @@ class Judge:
         self._signs = np.zeros(len(self._robot_speeds))
         self._touched = False
         self._held: str | None = None
-        self._way = np.zeros(2)
+        self._distances = np.zeros(2)
         self._places = np.zeros((0, 3))
 
     def update(
@@ -312,7 +312,7 @@ class Judge:
         if commanded is not None:
             self._measure_jitter(commanded)
         self._measure_hold(values, held)
-        self._measure_way(values)
+        self._measure_distance(values)
         searches = self._steps % self._every == 0
         if searches or self._touches is not None:
             self._scene.update(values[self._scene_values])
@@ -368,7 +368,7 @@ class Judge:
                 self._is_excepted[number[a], number[b]] = self._is_excepted[number[b], number[a]] = True
 
     def _followed(self) -> tuple[str, ...]:
-        """Return the frames whose ways are measured: the root of what moves of the robot, and the hand."""
+        """Return the frames whose distances are measured: the root of what moves of the robot, and the hand."""
         motion = FrameDependence(self.model, self._robot_speeds)
         moved = [b for b in self._own if motion.moves(b)] or self._own
         root = min(moved, key=lambda b: len(motion.moving_ancestors(b)))
@@ -416,10 +416,10 @@ class Judge:
         turned = float(rotation_angle(pose[:3, :3] @ self._pose[:3, :3].T))
         self._slip, self._turn = max(self._slip, apart), max(self._turn, turned)
 
-    def _measure_way(self, values: Array) -> None:
+    def _measure_distance(self, values: Array) -> None:
         places = np.array(self._place(values[self._place_values]))
         if self._first is not None:
-            self._way[: len(places)] += np.linalg.norm(places - self._places, axis=1)
+            self._distances[: len(places)] += np.linalg.norm(places - self._places, axis=1)
         self._places = places
 
     def _measure_penetration(self, state: State, stamp: float) -> None:

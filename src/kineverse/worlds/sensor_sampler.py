@@ -29,7 +29,7 @@ from kineverse.symbols import Symbol
 from .sensors import Sensors
 from .world import Contact, Observation
 
-_INSET = 0.9  # points lie at this fraction of the way from the middle of a shape to its corners
+_INSET = 0.9  # points lie at this fraction of the distance from the middle of a shape to its corners
 
 _MOST_SHAPES = 8  # largest number of shapes of a body whose points are tried
 
@@ -65,11 +65,11 @@ class LineOfSight:
             return True
         world_T_body = self._scene.pose(body)
         for point in self._points[body] @ world_T_body[:3, :3].T + world_T_body[:3, 3]:
-            way = point - eye
-            distance = float(np.linalg.norm(way))
+            ray = point - eye
+            distance = float(np.linalg.norm(ray))
             if distance == 0.0:
                 return True
-            hit = self._scene.ray(eye, way, distance)
+            hit = self._scene.ray(eye, ray, distance)
             if hit is None or hit.body == body:
                 return True
         return False
@@ -236,7 +236,7 @@ class SensorSampler:
         return Observation(now, joints, poses, frozenset(touching))
 
     def _read_odometry(self, base: Array) -> Array:
-        """Return the readings of the base's coordinates, which drift with the way."""
+        """Return the readings of the base's coordinates, which drift with the distance."""
         if self._last is None and not self._coming:
             self._true_base, self._read_base = base, base.copy()
             return base
@@ -245,8 +245,8 @@ class SensorSampler:
         if self._planar:
             # In the base's own axes: a wrong heading leads the position astray.
             step[:2] = rotation_z(-self._true_base[2])[:2, :2] @ step[:2]
-            way = math.sqrt(np.linalg.norm(step[:2]) + abs(step[2]))
-            step += way * noise * (self.sensors.odometry, self.sensors.odometry, self.sensors.turn)
+            distance = math.sqrt(np.linalg.norm(step[:2]) + abs(step[2]))
+            step += distance * noise * (self.sensors.odometry, self.sensors.odometry, self.sensors.turn)
             step[:2] = rotation_z(self._read_base[2])[:2, :2] @ step[:2]
         else:
             step += self.sensors.odometry * noise * np.sqrt(np.abs(step))

@@ -48,7 +48,7 @@ class Sensors:
         Standard deviation of the encoders of joints [m], [rad].
     odometry
         Standard deviation of the base's position after one metre, or one radian, of motion [m]. The variance
-        grows with the way.
+        grows with the distance.
     turn
         Standard deviation of the base's heading after one metre, or one radian, of motion [rad].
     touch

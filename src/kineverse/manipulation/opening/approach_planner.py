@@ -1,4 +1,4 @@
-"""Ways of a robot to where it begins a motion: the drive of a base on wheels, and the path of the rest."""
+"""Paths of a robot to where it begins a motion: the drive of a base on wheels, and the path of the rest."""
 
 from __future__ import annotations
 
@@ -15,20 +15,23 @@ from kineverse.symbols import Symbol
 
 from .base_placement import BasePlacement, PlacementSearch
 
-_PLANNING = 2.0  # largest time to plan the way to the handle [s]
+_PLANNING = 2.0  # largest time to plan the path to the handle [s]
 _TUCKED = 300  # number of random arms among which a compact one is chosen
-_MOST_TUCKED, _TUCKING = 3, 2.0  # number of compact arms to which a way is planned, and the time for each [s]
+_MOST_TUCKED, _TUCKING = (
+    3,
+    2.0,
+)  # number of compact arms to which a path is planned, and the time for each [s]
 _KEPT = 4  # number of searches of drives that are kept
 _HERE = 1e-3  # distance of a base from its place at which it stays [m], [rad]
 
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """Way of a robot to a configuration."""
+    """Path of a robot to a configuration."""
 
     why: str = ""  # why there is none; empty if there is one
     trajectory: Trajectory | None = None
-    tuck: Trajectory | None = None  # way of the arm before the drive; None if it stays
+    tuck: Trajectory | None = None  # path of the arm before the drive; None if it stays
     places: Array | None = None  # places (K, 3) of the drive; None if the base does not drive by itself
     base: Mapping[Symbol, float] | None = None  # values of the coordinates of a base on wheels at the end
 
@@ -37,12 +40,12 @@ class Approach:
 
     @property
     def barrier(self) -> str:
-        """Sentence that there is no way, to be added to another one; empty if there is a way."""
-        return f" There is no way to the handle: {self.why}" if self.why else ""
+        """Sentence that there is no path, to be added to another one; empty if there is a path."""
+        return f" There is no path to the handle: {self.why}" if self.why else ""
 
 
 class ApproachPlanner:
-    """Planner of ways to configurations, with the hand empty.
+    """Planner of paths to configurations, with the hand empty.
 
     A base that moves freely is planned with the arm. One on wheels drives first, with the arm as it is or,
     where that leads nowhere, with a compact one. A base on wheels that cannot turn on the spot, or that
@@ -64,13 +67,13 @@ class ApproachPlanner:
     def plan(
         self, state: State, wanted: Mapping[Symbol, float], *, seconds: float, seed: int = 0
     ) -> Approach:
-        """Plan a way from a state to values of the robot's coordinates."""
+        """Plan a path from a state to values of the robot's coordinates."""
         planner, base = self.planner, {s: float(wanted[s]) for s in self.search.standing}
         places, tuck, arms = None, None, state
         if base and self.drive is not None and self.drive.is_possible and self._drives(state).begins_free:
             found = self._find_drive(state, base)
             if found is None:
-                return Approach("no way for the base, with the arm as it is or compact")
+                return Approach("no path for the base, with the arm as it is or compact")
             places, tuck, arms = found
         planner.place(state.updated(base))
         here = arms.vector(planner.symbols)
@@ -81,7 +84,7 @@ class ApproachPlanner:
         return Approach("", path.trajectory(), tuck, places, base)
 
     def plan_to(self, state: State, placement: BasePlacement, seed: int) -> Approach:
-        """Plan a way from a state to the pose before the handle of a placement, within 2 s."""
+        """Plan a path from a state to the pose before the handle of a placement, within 2 s."""
         wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
         return self.plan(state, wanted, seconds=_PLANNING, seed=seed)
 
@@ -96,7 +99,7 @@ class ApproachPlanner:
     def _find_drive(
         self, state: State, base: Mapping[Symbol, float]
     ) -> tuple[Array, Trajectory | None, State] | None:
-        """Return places of a drive, the way of the arm before it, and the state of the arm on the way."""
+        """Return places of a drive, the path of the arm before it, and the state of the arm on the way."""
         x, y, angle = (base[s] for s in self.search.base)
         goal: Place = (x, y, angle)
         if max(abs(state[s] - v) for s, v in base.items()) < _HERE:
@@ -113,7 +116,7 @@ class ApproachPlanner:
         return None if places is None else (places, *tucked)
 
     def _plan_tuck(self, state: State) -> tuple[Trajectory, State] | None:
-        """Return a way of the arm to a compact configuration, and the state there; None without one."""
+        """Return a path of the arm to a compact configuration, and the state there; None without one."""
         planner = self.planner
         planner.place(state)
         here = state.vector(planner.symbols)

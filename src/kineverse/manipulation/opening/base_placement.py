@@ -1,4 +1,4 @@
-"""Base placement: a base, a grasp and a way of the arm along which a held object can be moved."""
+"""Base placement: a base, a grasp and a path of the arm along which a held object can be moved."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from .cartesian_paths import TOLERANCE, CartesianPaths
 from .grasp_selection import PlacementSampler
 from .path_collisions import OWN_MARGIN, CandidatePath, PathCheck, PathContacts, interpolate_poses
 
-NO_WAY, NO_PLACE = "no way to the handle", "no free place of the base"
+NO_PATH, NO_PLACE = "no path to the handle", "no free place of the base"
 """Reasons of placements that are refused, and of bases that touch something."""
-_DIFFERENCE = 0.025  # difference of the values at the ends of a way to those of the way back [m], [rad]
+_DIFFERENCE = 0.025  # difference of the values at the ends of a path and of its reversal [m], [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BasePlacement:
-    """Base, grasp and way of the arm, true if they were found.
+    """Base, grasp and path of the arm, true if they were found.
 
     Attributes
     ----------
@@ -46,9 +46,9 @@ class BasePlacement:
         Coordinates (n,) of the robot: base and arm.
     approach, line
         Configuration (n,) before the hand is at the handle, and those (L, n) from there to the grasp.
-    values, way
+    values, path
         Values (K,) of the object's coordinate [m], [rad], and configurations (K, n) of the robot there. They
-        end at the target, or where the arm or something in the way ends them.
+        end at the target, or where the arm or an obstacle ends them.
     retreat
         Configurations (L, n) with which the hand goes away from the handle at the end.
     samples
@@ -66,7 +66,7 @@ class BasePlacement:
     approach: Array
     line: Array
     values: Array
-    way: Array
+    path: Array
     retreat: Array
     samples: int
     reasons: Counter[str]
@@ -77,9 +77,9 @@ class BasePlacement:
         return self.grasp is not None
 
     def find_end_backwards(self, value: float, target: float) -> float | None:
-        """Return the value to which the way leads back from a value, towards a target; None if it does not.
+        """Return the value to which the reversed path leads from a value, towards a target; None if it does not.
 
-        It begins where the way ends, and small differences [m], [rad] at both ends are made up for.
+        It begins where the path ends, and small differences [m], [rad] at both ends are made up for.
         """
         ahead = math.copysign(1.0, target - value)
         begin, end = float(self.values[-1]), float(self.values[0])
@@ -89,8 +89,8 @@ class BasePlacement:
 
     @property
     def failure(self) -> str:
-        """Class of the failure: ``"collision"`` if an arm reaches along the way, otherwise ``"reach"``."""
-        return "collision" if any(" at " in r or r in (NO_WAY, NO_PLACE) for r in self.reasons) else "reach"
+        """Class of the failure: ``"collision"`` if an arm reaches along the path, otherwise ``"reach"``."""
+        return "collision" if any(" at " in r or r in (NO_PATH, NO_PLACE) for r in self.reasons) else "reach"
 
     @property
     def why(self) -> str:
@@ -103,24 +103,24 @@ class BasePlacement:
         return f"{found}; failed: {failed}." if failed else f"{found}."
 
 
-_STEP = 0.05  # distance of neighbouring values of the object along its way [m], [rad]
+_STEP = 0.05  # distance of neighbouring values of the object along its path [m], [rad]
 _RANDOM_STATES = 24  # number of random states in which links that are always near to each other are sought
 _BESIDE = 0.1  # largest change of each coordinate of the base in these states [m], [rad]
 _START_ITERATIONS = 30
 _CORRECTIONS = 6  # iterations from a configuration to one near it
 _STARTS = 4  # arms that are tried for each base
 _MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
-"""Shares of the object's way from which the arms of successive batches set out to both ends."""
+"""Shares of the object's motion from which the arms of successive batches set out to both ends."""
 _WHOLE = 300
-"""Number of bases after which a way to a part of the motion is taken, and after which the search ends if no
-arm has reached the handle anywhere: at the middle of its way, or at a quarter of it."""
+"""Number of bases after which a path to a part of the motion is taken, and after which the search ends if no
+arm has reached the handle anywhere: at the middle of its motion, or at a quarter of it."""
 _NOWHERE = 300
 """Number of bases after which the search ends if each one touched something wherever it was drawn."""
 _AROUND, _HERE = 0.6, 100
 """Distance of the hand from the handle up to which the base may stay [m], and the number of arms there."""
 _LEAST_SHARE = 0.2  # least share of the motion that one grasp is for
 _MOST_CHECKS, _MOST_REFUSED = 150, 3
-"""Most ways that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
+"""Most paths that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
 
 
 class PlacementSearch:
@@ -140,7 +140,7 @@ class PlacementSearch:
     Attributes
     ----------
     moving, standing
-        Coordinates that move along ways, and those of a base that only stands somewhere.
+        Coordinates that move along paths, and those of a base that only stands somewhere.
     scene
         Scene of the checks, with the rules for pairs that overlap always.
     """
@@ -183,14 +183,14 @@ class PlacementSearch:
             yield state.updated(arm | {s: state[s] + by for s, by in zip(self.base, beside, strict=True)})
 
     def find_too_high(self, state: State, coordinate: Symbol, values: Array) -> str:
-        """Return why an object on its way is out of reach above the hand; empty if it is not.
+        """Return why an object is out of reach above the hand along its motion; empty if it is not.
 
         Parameters
         ----------
         state
             State of everything.
         coordinate, values
-            Coordinate of the object, and its values (N,) on the way [m], [rad].
+            Coordinate of the object, and its values (N,) along the motion [m], [rad].
         """
         moved = [b for b in self.scene.bodies_moved_by([coordinate]) if b in self.others]
         value, lowest = find_highest_passage(self.scene, moved, state, coordinate, values)
@@ -219,9 +219,9 @@ class PlacementSearch:
 
         Bases are sampled in front of the handle, arms at random. Where none of the first batch leads to the
         target and the hand is near, so that it has just let go, the base may stay as well. All of them
-        follow the way of the handle at once, and the straight ways to it and from it; those that arrive are
+        follow the path of the handle at once, and the straight paths to it and from it; those that arrive are
         checked for contacts, the quickest first. Where none of many bases arrives, the one with the longest
-        way is returned. The search ends early if no arm reaches the handle on its way, or if the base touches
+        path is returned. The search ends early if no arm reaches the handle anywhere, or if the base touches
         something at all of the first places.
 
         Parameters
@@ -273,17 +273,17 @@ class PlacementSearch:
         target: float,
         accept: Callable[[BasePlacement], bool] = lambda placement: True,
     ) -> BasePlacement | None:
-        """Return the way of an earlier placement backwards, from the object's value to a target.
+        """Return the path of an earlier placement backwards, from the object's value to a target.
 
-        What was possible once is possible backwards, also where an open door leaves no way to another place.
-        Contacts are looked for anew, and None is returned if there are any.
+        What was possible once is possible backwards, also where an open door leaves no path to another place.
+        Contacts are checked again, and None is returned if there are any.
 
         Parameters
         ----------
         state
             State of everything at the beginning.
         earlier
-            Placement whose way leads back to the target, see :meth:`.BasePlacement.find_end_backwards`.
+            Placement whose path leads back to the target, see :meth:`.BasePlacement.find_end_backwards`.
         target, accept
             As for :meth:`find`.
 
@@ -351,7 +351,7 @@ class _Search:
             self._keep(*samples.stay(self.random, self.state, _HERE), choice, 0)
 
     def add(self, batch: int, middle_share: float) -> None:
-        """Sample bases, arms and grasps, and keep those that reach along the way."""
+        """Sample bases, arms and grasps, and keep those that reach along the path."""
         paths, handles = self.owner.paths, self.handles
         middle = round(middle_share * self.last)
         samples = self.owner.samples
@@ -361,7 +361,7 @@ class _Search:
             return
         hands = handles[middle] @ self.poses[choice]
         outside = handles[middle] @ self.approaches[choice]
-        # A base that stands has to be free on all the way.
+        # A base that stands has to be free along the whole motion.
         stops = (middle, 0, self.last) if samples.stands(paths.ease) else (middle,)
         states = [self.state.updated({self.coordinate: float(self.values[k])}) for k in stops]
         Q, base = samples.draw(self.random, states, hands, outside, _STARTS, self.owner.bases)
@@ -374,7 +374,7 @@ class _Search:
         self._keep(Q, base, choice, middle)
 
     def _keep(self, Q: Array, base: Array, choice: npt.NDArray[np.intp], middle: int) -> None:
-        """Keep those arms (N, n) that reach along the way, from a value with the index ``middle`` on."""
+        """Keep those arms (N, n) that reach along the path, from a value with the index ``middle`` on."""
         paths, handles = self.owner.paths, self.handles
         Q, error = paths.solve(Q, base, handles[middle] @ self.poses[choice], _START_ITERATIONS)
         good = self._count(error < 1e-3, "out of reach")
@@ -391,12 +391,14 @@ class _Search:
         after, passed = paths.follow(Q, base, handles[None, middle:] @ poses[:, None])
         ends = np.minimum(middle + passed - 1, self.free[choice])
         good = self._count(ends >= self.least, "the arm ends on the way")
-        way = np.concatenate([before[:, :0:-1], after], axis=1)
+        path = np.concatenate([before[:, :0:-1], after], axis=1)
         if not good.any():
             return
-        score = self.owner.samples.cost(self.state, way, back[:, -1], ends) + 0.02 * choice
+        score = self.owner.samples.cost(self.state, path, back[:, -1], ends) + 0.02 * choice
         for k in np.flatnonzero(good):
-            self._push(CandidatePath(int(choice[k]), base[k], back[k], way[k], int(ends[k])), float(score[k]))
+            self._push(
+                CandidatePath(int(choice[k]), base[k], back[k], path[k], int(ends[k])), float(score[k])
+            )
 
     def _count(self, good: npt.NDArray[np.bool_], reason: str) -> npt.NDArray[np.bool_]:
         self.reasons[reason] += int((~good).sum()) // _STARTS
@@ -406,20 +408,20 @@ class _Search:
         heappush(self.heap, (-candidate.end, score, next(self.number), candidate))
 
     def retrace(self, earlier: BasePlacement) -> BasePlacement | None:
-        """Return the way of an earlier placement backwards, without contacts; None if there is none."""
+        """Return the path of an earlier placement backwards, without contacts; None if there is none."""
         paths, count = self.owner.paths, len(self.owner.moving)
-        base = earlier.way[0, count:]
+        base = earlier.path[0, count:]
         order = np.argsort(earlier.values)
-        rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.way.T[:count]]
+        rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.path.T[:count]]
         hands = self.handles @ self.poses[0]
-        way = self._correct(np.stack(rows, axis=1), base, hands)
+        path = self._correct(np.stack(rows, axis=1), base, hands)
         # The hand comes on the way on which it left, in the same place beside the handle.
         retreat = earlier.retreat[:, :count]
         poses = paths.find_poses(retreat, base)
         back = self._correct(retreat, base, hands[0] @ np.linalg.inv(poses[0]) @ poses)
-        if way is None or back is None:
+        if path is None or back is None:
             return None
-        found = self._check(CandidatePath(0, base, back, way, self.last))
+        found = self._check(CandidatePath(0, base, back, path, self.last))
         if found is None or len(found.values) <= self.last or not self.accept(found):
             return None
         return found
@@ -444,7 +446,7 @@ class _Search:
                     return found
                 if found is not None:
                     self.refused += 1
-                    self.reasons[NO_WAY] += 1
+                    self.reasons[NO_PATH] += 1
                     continue
             candidate.end = min(candidate.end, int(self.free[candidate.choice]))
             if candidate.end >= self.least:
@@ -452,12 +454,12 @@ class _Search:
         return None
 
     def _check(self, candidate: CandidatePath) -> BasePlacement | None:
-        """Return the placement of a candidate without contacts; otherwise shorten its way."""
+        """Return the placement of a candidate without contacts; otherwise shorten its path."""
         retreat = self.check.find_retreat(candidate)
         if retreat is None:
             return None
         end, base = candidate.end, candidate.base
-        parts = (candidate.back[::-1], candidate.way[: end + 1], retreat)
+        parts = (candidate.back[::-1], candidate.path[: end + 1], retreat)
         full = [np.hstack([a, np.tile(base, (len(a), 1))]) for a in parts]
         return BasePlacement(
             self.grasps[candidate.choice], self.owner.coordinates, full[0][0], full[0],

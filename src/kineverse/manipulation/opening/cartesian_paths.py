@@ -12,7 +12,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
 _DAMPING = 1e-6
-_CENTERING = 0.1  # share of the way to the middle of the limits that a step takes in the null space
+_CENTERING = 0.1  # share of the distance to the middle of the limits that a step takes in the null space
 _LONGEST = 0.4  # largest step of a coordinate [m], [rad]
 _JUMP = 0.6  # largest change of a coordinate between neighbouring poses of a sequence [m], [rad]
 TOLERANCE = 1e-4  # error of a pose that counts as reached [m], [rad]
@@ -111,7 +111,7 @@ def find_least_time(rows: Array, speeds: Array) -> float:
 
 
 def row_at(rows: Array, share: float) -> Array:
-    """Return the configuration (n,) at a share of the way along some (K, n)."""
+    """Return the configuration (n,) at a share of the path along some (K, n)."""
     place = share * (len(rows) - 1)
     k = min(max(int(place), 0), max(len(rows) - 2, 0))
     rest = min(max(place - k, 0.0), 1.0)

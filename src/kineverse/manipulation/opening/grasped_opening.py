@@ -53,7 +53,7 @@ class Opener:
 
     @property
     def approaches(self) -> ApproachPlanner:
-        """Planner of the robot's ways with the hand empty."""
+        """Planner of the robot's paths with the hand empty."""
         if self._approaches is None:
             self._approaches = ApproachPlanner(self.search)
         return self._approaches
@@ -96,7 +96,7 @@ def open_object(
 ) -> Outcome:
     """Move an object to a value of its coordinate by its handle.
 
-    A base, a grasp and a way of the arm are found, see :class:`.PlacementSearch`. The robot goes to the
+    A base, a grasp and a path of the arm are found, see :class:`.PlacementSearch`. The robot goes to the
     handle on a planned path, closes its fingers, moves the object, lets go and retracts. Where one grasp does
     not lead to the target, the object is released on the way and grasped anew. Where no grasp leads on,
     such as at an oven door whose handle faces the floor, it is pushed. A base on two wheels drives to its
@@ -117,7 +117,7 @@ def open_object(
     seconds
         Largest time in the world [s].
     tolerance
-        Largest distance from the target [m], [rad]; by default 2 % of the way, and 20 mm at a limit, see
+        Largest distance from the target [m], [rad]; by default 2 % of the distance, and 20 mm at a limit, see
         :func:`.choose_tolerance`.
     placements
         Largest number of sampled bases for one grasp.
@@ -130,7 +130,7 @@ def open_object(
         With ``measures``: those of :class:`.Judge`, ``placements``, ``grasps`` and ``slips`` (number of
         grasps, and of those that the handle slipped out of), ``tolerance``, ``peak_force`` [N] in a world
         with forces, and ``failure``: ``"collision"``, ``"reach"``, ``"time"`` or ``"other"`` if it was not
-        done; ``free``, the value up to which the way is free, if something is in it.
+        done; ``free``, the value up to which the path is free, if something is in the way.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def open_object(
 
 
 class _Run:
-    """One opening: its phases, and what was measured on the way."""
+    """One opening: its phases, and its measurements."""
 
     def __init__(
         self,
@@ -222,7 +222,7 @@ class _Run:
         self._overlaps: list[JudgedOverlap] = []
         self._approach = Approach()
         held = self.gripper.hand, handle.frame, handle.coordinate
-        self._ways_back = [
+        self._reversible = [
             made
             for made in session.made
             if (g := made.grasp) and (g.gripper.hand, g.handle.frame, g.handle.coordinate) == held
@@ -416,7 +416,7 @@ class _Run:
     # -- phases --------------------------------------------------------------------------------------------
 
     def _place(self) -> BasePlacement:
-        """Return a placement that leads as far as possible, and plan the way to the handle."""
+        """Return a placement that leads as far as possible, and plan the path to the handle."""
         back = self._retrace(whole=True)
         if back is not None:
             return back
@@ -433,11 +433,11 @@ class _Run:
         return back
 
     def _retrace(self, *, whole: bool) -> BasePlacement | None:
-        """Return the way back of a motion that ended here, to the target or at least on; None without any."""
+        """Return an earlier motion, reversed, that starts here and leads at least part of the path; or None."""
         session, here = self.session, float(self.session.state[self.handle.coordinate])
         session.phase = "place"
         with session.timed("place"):
-            for earlier in reversed(self._ways_back):
+            for earlier in reversed(self._reversible):
                 end = earlier.find_end_backwards(here, self.target)
                 if (
                     end is None
@@ -447,7 +447,7 @@ class _Run:
                     continue
                 found = self.opener.search.retrace(session.state, earlier, end, self._plan)
                 if found is not None:
-                    self._ways_back.remove(earlier)
+                    self._reversible.remove(earlier)
                     return found
         self._approach = Approach()
         return None
@@ -485,7 +485,7 @@ class _Run:
         return found
 
     def _plan(self, placement: BasePlacement) -> bool:
-        """Plan the way to the pose before the handle, and return whether there is one."""
+        """Plan the path to the pose before the handle, and return whether there is one."""
         self._approach = self.opener.approaches.plan_to(self.session.state, placement, self.seed)
         return bool(self._approach)
 

@@ -32,10 +32,10 @@ from .path_collisions import draw_retreats
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0  # time in which fingers open or close fully, and the largest one [s]
 _IDLE = 10  # number of steps in which fingers that stand still have not moved
-_LINE_SPEED = 0.1  # speed of the hand on the straight way to the handle and from it [m/s]
+_LINE_SPEED = 0.1  # speed of the hand on the straight path to the handle and from it [m/s]
 _SETTLED, _MOST_SETTLING = 5e-4, 150
-"""Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
-_REFERENCES = 24  # number of poses that pages show of a way
+"""Error of the hand's pose at the end of a straight path [m], [rad], and the most steps until it is met."""
+_REFERENCES = 24  # number of poses that pages show of a path
 _KNOWN, _MOST_LOOKING, _UNKNOWN = 1.5e-3, 1.0, 0.02
 """Deviation of a handle's position that is small [m], longest time to look until it is [s], and the deviation
 from which on nothing is done [m]."""
@@ -45,7 +45,7 @@ FOLLOWING = 5.0
 adds to it."""
 _POSTURE = 0.5  # weight of the arm beside the object
 _LOST = 0.002  # motion of closed fingers that says that nothing is between them any more [m]
-_ARRIVED = 0.05  # distance from the end of a way up to which the retreat there is meant [m], [rad]
+_ARRIVED = 0.05  # distance from the end of a path up to which the retreat there is meant [m], [rad]
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
 _KEPT = 8  # number of controllers that are kept
@@ -180,12 +180,12 @@ class HandMotion:
 
         bar = compile(self._bar, tier="interpreter")  # some hundred calls
         controller, (wanted, rate, posture, follow) = self.find_controller(("line", rows is None), make)
-        way = end[:3, 3] - start[:3, 3]
-        seconds = float(np.linalg.norm(way)) / _LINE_SPEED
+        displacement = end[:3, 3] - start[:3, 3]
+        seconds = float(np.linalg.norm(displacement)) / _LINE_SPEED
         if rows is not None:
             seconds = max(seconds, find_least_time(rows, self.search.samples.speeds))
         steps = max(2, math.ceil(seconds / session.dt))
-        speed = np.concatenate([end[:3, :3].T @ way / (steps * session.dt), np.zeros(3)])
+        speed = np.concatenate([end[:3, :3].T @ displacement / (steps * session.dt), np.zeros(3)])
         uncertain = [session.deviation(x) for x in (self._bar @ end)[:3, 3]]
         settled = max(_SETTLED, _SIGMAS * float(np.linalg.norm(uncertain)))
         self.refer(self._bar(session.state) @ np.array([start, end]))
@@ -200,7 +200,7 @@ class HandMotion:
                 controller.set(wanted, bar(state.vector(bar.inputs)) @ pose)
                 controller.set(rate, speed if k < steps else 0.0 * speed)
                 if posture is not None and follow is not None and rows is not None:
-                    # A base that lags would lead the arm along another way than the checked one.
+                    # A base that lags would lead the arm along a path that was not checked.
                     row, next_row = row_at(rows, share), row_at(rows, min(1.0, (k + 1) / steps))
                     controller.set(posture, row)
                     controller.set(follow, (next_row - row) / session.dt)
@@ -352,11 +352,11 @@ class HandMotion:
         self.judge.update(session.world.state, session.commands, held=session.world.held)
 
     def refer(self, poses: npt.ArrayLike) -> None:
-        """State the world poses (K, 4, 4) of the hand along the way that begins."""
+        """State the world poses (K, 4, 4) of the hand along the path that begins."""
         self.session.reference = HandReference(np.asarray(poses, dtype=float))
 
     def refer_to(self, share: float) -> None:
-        """State the share of the way that lies behind, in [0, 1]."""
+        """State the share of the path that was passed, in [0, 1]."""
         if self.session.reference is not None:
             self.session.reference.share = share
 
@@ -367,14 +367,14 @@ class HandMotion:
 
 
 _SPEED, _RAMP = 0.3, 0.5
-"""Speed of an object along its planned way [m/s], [rad/s], and the time from rest to it [s]."""
-_LATE = 0.1  # distance from the way at which the reference begins to wait [m], [rad]
+"""Speed of an object along its planned path [m/s], [rad/s], and the time from rest to it [s]."""
+_LATE = 0.1  # distance from the path at which the reference begins to wait [m], [rad]
 _MARGIN = 0.002  # least distance of bodies while the object moves [m]; placements keep more
 _SLIPPED, _SLIP_SIGMAS = 0.008, 4.0
 """Distance of the bar from its place in the hand from which on it has slipped [m], and the standard
 deviations of its estimate that are added."""
 _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
-"""Least progress of the object [m], [rad] in a time [s], and in one at the end of the way."""
+"""Least progress of the object [m], [rad] in a time [s], and in one at the end of the path."""
 _LOCKED, _STANDING = 1.5, 1e-3
 """Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
 beyond some [m/s], [rad/s] for it either: its own constraints hold it."""
@@ -382,7 +382,7 @@ _STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target 
 
 
 def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
-    """Move a held object along the way of a placement."""
+    """Move a held object along the path of a placement."""
     bar, hand = motion.model.fk(motion.handle.frame), motion.model.fk(motion.gripper.hand)
     session, coordinate, grasp = motion.session, motion.handle.coordinate, placement.grasp
     assert grasp is not None
@@ -395,7 +395,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     poses = compile([bar, hand], tier="interpreter")  # a call a step
     target = float(placement.values[-1])
     moving = motion.search.moving
-    rows = motion.rows(placement.way)
+    rows = motion.rows(placement.path)
     values = placement.values
 
     def make() -> tuple[Controller, tuple[Target, Target, Target, Target]]:
@@ -413,7 +413,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     share, speed, length = 0.0, 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time
     controller.set(grasped, held)
-    controller.set(arm_speeds, np.zeros(len(moving)))  # the way waits for the arm
+    controller.set(arm_speeds, np.zeros(len(moving)))  # the path waits for the arm
     places = np.linspace(values[0], target, len(values)).tolist()
     motion.refer([bar(session.state.updated({coordinate: v})) @ held for v in places])
     within, enough = 0, _STEPS_AT_TARGET if session.deviation(coordinate) else 1
@@ -470,7 +470,7 @@ _STEPS = 12  # number of arms along a retreat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandRetreat:
-    """Straight way of a hand from a handle."""
+    """Straight path of a hand from a handle."""
 
     end: Array  # last pose world_T_hand (4, 4)
     arms: Array | None  # configurations (L, n) of the arm along it; None if the arm does not reach the end
@@ -485,14 +485,14 @@ def find_retreat(motion: HandMotion, grasp: Grasp, world_T_handle: Array, world_
     lines = draw_retreats(grasp, world_T_handle, world_T_hand, _STEPS)
     arm, base = state.vector(search.moving), state.vector(search.standing)
     count, ends = len(lines), lines[:, -1]
-    ways, reached = search.paths.follow(np.tile(arm, (count, 1)), np.tile(base, (count, 1)), lines)
+    paths, reached = search.paths.follow(np.tile(arm, (count, 1)), np.tile(base, (count, 1)), lines)
     best, farthest = HandRetreat(ends[0], None), 0
-    for end, way, number in zip(ends, ways, reached.tolist(), strict=True):
+    for end, path, number in zip(ends, paths, reached.tolist(), strict=True):
         if number < 2:
             continue
-        rows = way[:number]
+        rows = path[:number]
         hit = search.contacts.first(state, search.moving, rows, motion.handle.frame, opened=False)
         free = number if hit is None else hit
         if free > farthest:
-            best, farthest = HandRetreat(end, way if number == _STEPS else None), free
+            best, farthest = HandRetreat(end, path if number == _STEPS else None), free
     return best

@@ -25,7 +25,7 @@ _BESIDE_BAR = 5e-4  # least distance of the opened fingers from the handle [m]
 
 
 class PathContacts:
-    """Queries of the distances of a robot along ways."""
+    """Queries of the distances of a robot along paths."""
 
     def __init__(
         self,
@@ -82,9 +82,9 @@ class PathContacts:
         return self._around[handle]
 
 
-_LINE = 5  # number of configurations on the straight way to the handle
+_LINE = 5  # number of configurations on the straight path to the handle
 _BETWEEN = 4  # number of samples between neighbouring configurations that are checked
-_SHORTER = 0.15  # share of the motion by which a way is shortened where that may help
+_SHORTER = 0.15  # share of the motion by which a path is shortened where that may help
 _ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))
 """Angles along the bar by which a retreat deviates from the reversed approach [rad]."""
 _LEAST_RETREAT = 3  # least number of configurations of a retreat
@@ -93,17 +93,17 @@ _SWEEP = 8  # number of gaps of the fingers that are checked while they close or
 
 @dataclass(slots=True, eq=False)
 class CandidatePath:
-    """Way of an arm that reaches, until the value with the index ``end``."""
+    """Path of an arm that reaches, until the value with the index ``end``."""
 
     choice: int  # index of the grasp
     base: Array  # values of the coordinates that stand
     back: Array  # configurations (L, n) from the handle to the pose before it
-    way: Array  # configurations (K, n) along the values of the object
+    path: Array  # configurations (K, n) along the values of the object
     end: int  # index of the last value
 
 
 class PathCheck:
-    """Check of ways in one state, of one object."""
+    """Check of paths in one state, of one object."""
 
     def __init__(
         self,
@@ -125,7 +125,7 @@ class PathCheck:
         )  # fmt: skip
 
     def find_retreat(self, candidate: CandidatePath) -> Array | None:
-        """Return a retreat (L, n) of a candidate without contacts; otherwise shorten its way."""
+        """Return a retreat (L, n) of a candidate without contacts; otherwise shorten its path."""
         if self._is_blocked_before(candidate) or self._is_blocked_along(candidate):
             return None
         retreat = self._retreat(candidate)
@@ -153,10 +153,10 @@ class PathCheck:
         return False
 
     def _is_blocked_along(self, candidate: CandidatePath) -> bool:
-        """Return True, and shorten the way of the candidate, if something is in it."""
+        """Return True, and shorten the path of the candidate, if something is in the way."""
         grasp, end, base = self.grasps[candidate.choice], candidate.end, candidate.base
         closed = self._gripper.values_at(grasp.thickness)
-        rows = self._rows(candidate.way[: end + 1], base, closed, self.values[: end + 1])
+        rows = self._rows(candidate.path[: end + 1], base, closed, self.values[: end + 1])
         first = self._find(rows, self._frame, opened=False)
         if first is not None:
             candidate.end = first // _BETWEEN - 1
@@ -171,25 +171,25 @@ class PathCheck:
         It is the reversed approach, or deviates from it along the bar, between the fingers.
         """
         grasp, end, base = self.grasps[candidate.choice], candidate.end, candidate.base
-        Q = candidate.way[end]
+        Q = candidate.path[end]
         sweep = self._sweep(grasp, Q, base, end)
         if self._find(sweep, self._frame, opened=False) is not None:
             self._note()
             return None
         lines = draw_retreats(grasp, self.handles[end], self.handles[end] @ grasp.pose, _LINE)
         count = len(lines)
-        ways, reached = self.paths.follow(np.tile(Q, (count, 1)), np.tile(base, (count, 1)), lines)
+        paths, reached = self.paths.follow(np.tile(Q, (count, 1)), np.tile(base, (count, 1)), lines)
         opened = self._gripper.opened
         blocked = False
         for k in np.argsort(-reached, kind="stable"):
-            way = ways[k, : reached[k]]
-            if len(way) < _LEAST_RETREAT:
+            path = paths[k, : reached[k]]
+            if len(path) < _LEAST_RETREAT:
                 break
-            rows = self._rows(way, base, opened, np.full(len(way), self.values[end]))
+            rows = self._rows(path, base, opened, np.full(len(path), self.values[end]))
             # At its end the hand is free: a path begins there.
             parts = ((rows, self._frame), (rows[-1:], ""))
             if all(self._find(part, frame, opened=True) is None for part, frame in parts):
-                return np.asarray(way)
+                return np.asarray(path)
             blocked = True
             self._note()
         if not blocked:
@@ -237,7 +237,7 @@ def draw_retreats(grasp: Grasp, world_T_handle: Array, world_T_hand: Array, coun
 
 
 def interpolate_poses(a: Array, b: Array, count: int = _LINE) -> Array:
-    """Return poses (N, L, 4, 4) on the straight way between poses of one orientation, a first."""
+    """Return poses (N, L, 4, 4) on the straight path between poses of one orientation, a first."""
     share = np.linspace(0.0, 1.0, count)
     poses = np.repeat(a[:, None], count, axis=1)
     poses[:, :, :3, 3] += share[:, None] * (b - a)[:, None, :3, 3]

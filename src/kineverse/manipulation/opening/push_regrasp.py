@@ -19,7 +19,7 @@ _SAMPLES = 960
 _LEAST_SHARE = 0.2  # least share of the motion that a push is for
 _LONGER, _SETTLING = 1.5, 2.0
 """Share of its time in the roll-out for which a push to a part of the motion lasts, and what is added [s]."""
-_PLANNING = 1.0  # largest time to plan the way to a start [s]
+_PLANNING = 1.0  # largest time to plan the path to a start [s]
 _PUSHING = 10.0  # time in the world that a push is given at least [s]
 
 
@@ -33,7 +33,7 @@ class PushRegrasp:
         self.approach = Approach()
 
     def find_start(self, seed: int) -> None:
-        """Find a state of the robot from which the push goes through, or far, and to which a way leads."""
+        """Find a state of the robot from which the push goes through, or far, and to which a path leads."""
         motion, session = self.motion, self.motion.session
         session.phase = "place"
         session.report_search("starts of a push, as no grasp leads on")
@@ -69,7 +69,7 @@ class PushRegrasp:
             self._seconds = _LONGER * found.steps * session.dt + _SETTLING
 
     def _plan(self, start: State) -> str:
-        """Plan the way to a start, and return why there is none."""
+        """Plan the path to a start, and return why there is none."""
         motion, state = self.motion, self.motion.session.state
         self.approach = motion.approaches.plan(state, start, seconds=_PLANNING)
         if self.approach.trajectory is None:

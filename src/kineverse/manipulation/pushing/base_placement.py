@@ -122,12 +122,12 @@ def find_push_start(
             reasons[start] += 1
             continue
         end, rolled = roll_out(pushing, start, steps), rolled + 1
-        problem, way = end.problem, abs(end.value - here)
+        problem, distance = end.problem, abs(end.value - here)
         # Pushes that go through and are not accepted tell nothing about those to come.
-        since = 0 if not problem or way > furthest + _MOVED else since + 1
-        furthest = max(furthest, way) if way > _MOVED else furthest
-        if problem and problem != _NO_ROOM and way >= least * abs(pushing.target - here):
-            parts.append((-way, count, start, end.steps))
+        since = 0 if not problem or distance > furthest + _MOVED else since + 1
+        furthest = max(furthest, distance) if distance > _MOVED else furthest
+        if problem and problem != _NO_ROOM and distance >= least * abs(pushing.target - here):
+            parts.append((-distance, count, start, end.steps))
         if not problem and accept is not None:
             problem = accept(start)
         if not problem:
@@ -199,11 +199,11 @@ class _Sampler:
             for tasks, tolerance in goals
         ]
         self._coordinates = clear[0].coordinates
-        self._ways: list[tuple[InverseKinematics, ...]] = [(last,) for last in clear]
+        self._solvers: list[tuple[InverseKinematics, ...]] = [(last,) for last in clear]
         if self.base:
             # Steps out of collisions take most of the time, and seldom lead a base out of one.
             arm = all({s.position for s in e.gradient()} - {*self.base} for e in (tip, axis))
-            self._ways = [
+            self._solvers = [
                 (InverseKinematics(model, tasks, still=[*still, *standing], tolerance=tolerance), last)
                 for standing in ((self.base, ()) if arm else ((),))
                 for (tasks, tolerance), last in zip(goals, clear, strict=True)
@@ -228,16 +228,16 @@ class _Sampler:
         random, state = self._generator, self._state
         k = int(random.choice(self._candidates, p=self._weights))
         at = state.updated(self._arm())
-        way = self._ways[self._tried % len(self._ways)]
+        solvers = self._solvers[self._tried % len(self._solvers)]
         self._tried += 1
         if self.base:
             place, free = self._draw_place(k)
             # A base that moves may leave what it touches: below a flap most places are in cupboards.
-            if not free and self.base[0] not in way[0].coordinates:
+            if not free and self.base[0] not in solvers[0].coordinates:
                 return "no free place of the base"
             at = at.updated(dict(zip(self.base, place.tolist(), strict=True)))
         seed = int(random.integers(2**31))
-        for starts, solver in zip(_SOLVER_STARTS, way, strict=False):
+        for starts, solver in zip(_SOLVER_STARTS, solvers, strict=False):
             reached = solver.solve(dict(at) | self._targets(k, solver), starts=starts, seed=seed)
             if not reached.solved:
                 (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or [_UNREACHED]

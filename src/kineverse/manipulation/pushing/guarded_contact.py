@@ -28,8 +28,8 @@ _CREEP = 0.02
 STILL = 5e-3  # speed of a contact point that counts as none [m/s]
 _DEEPEN, _DEEPER = 0.5, 3.0
 """Time in which a press on what does not move becomes deeper [s], and by how many times its depth."""
-_FORGET, _FORGET_WAY = 1.0, 0.01
-"""Time [s] and way [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
+_FORGET, _FORGET_DISTANCE = 1.0, 0.01
+"""Time [s] and distance [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
 and what moves on gives way."""
 _REMEMBER = 0.1  # time for which a touch counts after the last report [s]
 _RETURN = 0.3  # time in which a correction returns to the estimate without a touch [s]
@@ -47,7 +47,7 @@ class PushPress:
     def reset(self) -> None:
         """Forget everything but the deviation."""
         self.speed = self.lag = self.correction = 0.0
-        self._way = self._crept = self._stuck = 0.0
+        self._travel = self._crept = self._stuck = 0.0
         self._touch, self._estimate, self._value = math.inf, math.nan, math.nan
         self._tip: Vector | None = None
         self._planned, self._velocity = ZERO, ZERO
@@ -76,20 +76,20 @@ class PushPress:
         moved = ZERO if self._tip is None else subtract(tip, self._tip)
         leverage = length(self._velocity)
         along = scale(1.0 / max(leverage, 1e-9), self._velocity)
-        self._way = way = inner_product(along, moved)
+        self._travel = travel = inner_product(along, moved)
         shift = self._sign * (estimate - self._estimate) if math.isfinite(self._estimate) else 0.0
         if touching and self.touched:
-            self.speed = max(way / self._dt, 0.0)
+            self.speed = max(travel / self._dt, 0.0)
         else:
             self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
         if touching:
-            kept = self.lag * math.exp(-self._dt / _FORGET - max(way, 0.0) / _FORGET_WAY)
-            self.lag = max(kept + inner_product(along, self._planned) - way, 0.0)
+            kept = self.lag * math.exp(-self._dt / _FORGET - max(travel, 0.0) / _FORGET_DISTANCE)
+            self.lag = max(kept + inner_product(along, self._planned) - travel, 0.0)
         else:
             self.lag = 0.0
         self._stuck = self._stuck + self._dt if touching and self.speed < STILL else 0.0
         if touching and self.touched and leverage > _LEAST_RATE:
-            self.correction += self._sign * (max(way, 0.0) / leverage - shift)
+            self.correction += self._sign * (max(travel, 0.0) / leverage - shift)
         elif not self.touched:
             self.correction *= 1.0 - self._dt / _RETURN
         self._tip, self._estimate = tip, estimate
@@ -97,7 +97,7 @@ class PushPress:
 
     def correct(self, gap: float, rate: float) -> None:
         """Correct the value by a gap, for the next step."""
-        self._crept = self._crept + max(self._way, 0.0) if gap < self.slack else 0.0
+        self._crept = self._crept + max(self._travel, 0.0) if gap < self.slack else 0.0
         if self.deviation > 0.0 and abs(rate) > _LEAST_RATE and gap < (self.slack if self.touched else 0.0):
             most = self.slack / abs(rate)
             self.correction = min(max(self.correction - gap / rate, -most), most)

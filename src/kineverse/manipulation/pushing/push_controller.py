@@ -45,7 +45,7 @@ from .push_program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
 from .vectors import ZERO, Vector, add, inner_product, length, move_point, scale, subtract
 
 _APART = 4e-3  # gap between pusher and object away from the contact [m]
-_FUNNEL = 0.08  # largest height of the way to a contact above the surface [m]
+_FUNNEL = 0.08  # largest height of the path to a contact above the surface [m]
 _STANDOFF = 2e-3
 _FAR = 0.05
 _RETREAT = 0.1  # distance from the object at which a retreat ends [m]
@@ -225,7 +225,7 @@ class Pushing:
         return f"contact of {deep[0].a} and {deep[0].b}" if deep else ""
 
     def find_obstacle(self, state: State) -> Obstacle | None:
-        """Return the first thing in the way of the object to its target; None if the way is free."""
+        """Return the first thing in the way of the object to its target; None if the path is free."""
         others = tuple(v for s, v in state.items() if not is_of_robot(s.path, self.robot))
         if others != self._swept[0]:  # roll-outs begin where the object is, with the robot elsewhere
             found = find_obstacle(

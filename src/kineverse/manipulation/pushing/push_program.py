@@ -53,7 +53,7 @@ class PushNumbers:
     target: Vector  # [m]
     facing: Vector
     normal: Vector
-    reach: float  # weights of the ways to that point
+    reach: float  # weights of the goals at that point
     touch: float  # to a contact
     hold: float  # of the goals that keep a contact
     engaged: float  # 1 while the pusher touches, else 0

@@ -43,7 +43,7 @@ def plan_push_approach(
 ) -> tuple[Path, int]:
     """Return a path of the robot to a contact point, and the index of the point.
 
-    Coordinates that rates drive, such as those of a base on rolling wheels, stand still. Without a way the
+    Coordinates that rates drive, such as those of a base on rolling wheels, stand still. If none is found, the
     path is that of the last point, and says why.
     """
     model, tool = pushing.model, pushing.tool
@@ -130,12 +130,12 @@ def push(
     seconds
         Largest time in the world [s].
     tolerance
-        Largest distance from the target [m], [rad]; by default 2 % of the way, and 20 mm at a limit, see
+        Largest distance from the target [m], [rad]; by default 2 % of the distance, and 20 mm at a limit, see
         :func:`.choose_tolerance`.
     still, rules, leave_out, logic
         As for :class:`.Pushing`.
     plan
-        Whether approaches are planned where the way of the controller is blocked.
+        Whether approaches are planned where the path of the controller is blocked.
     retreat
         Whether the pusher is taken away from the object at the end.
     pushing
@@ -151,8 +151,8 @@ def push(
         With ``measures``: those of :class:`.Judge`, ``losses``, ``blocked``, ``contacts``, ``jammed``,
         ``planned``, ``jitter`` (largest mean change of a speed from step to step while touching, [m/s],
         [rad/s]), ``tolerance``, ``peak_force`` [N] in a world with forces, and ``failure``: ``"collision"``,
-        ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the way is free, if
-        something is in it.
+        ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the path is free, if
+        something is in the way.
 
     Raises
     ------
@@ -368,13 +368,13 @@ class _Run:
             self._judge.update(session.world.state, session.commands, pushing=self._pushing.touching)
 
     def _approach(self) -> str:
-        """Plan a way to another contact point and follow it; return what prevents it."""
+        """Plan a path to another contact point and follow it; return what prevents it."""
         if self._approaches >= _MOST_APPROACHES:
             tried = self._pushing.choice.contacts
             return f"No contact point was reached, of {tried} and {self._approaches} plans."
         self._approaches += 1
         session, pushing = self._session, self._pushing
-        self.retreat()  # a way that begins with a contact cannot be planned
+        self.retreat()  # a path that begins with a contact cannot be planned
         self.act({})
         path, point = plan_push_approach(pushing, session.state)
         if not path.found:

@@ -254,6 +254,6 @@ def _fuse(looks: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
 
 
 def measure_way(first: Array, last: Array, point: Array) -> tuple[float, float]:
-    """Return the way [m] of a point (3,) of a part between two poses (4, 4), and the angle [rad]."""
+    """Return the distance [m] of a point (3,) of a part between two poses (4, 4), and the angle [rad]."""
     a, b = (pose @ np.append(point, 1.0) for pose in (first, last))
     return float(np.linalg.norm((b - a)[:3])), float(rotation_angle(first[:3, :3].T @ last[:3, :3]))

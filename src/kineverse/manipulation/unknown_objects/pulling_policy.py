@@ -35,14 +35,14 @@ _REFIT = 0.5  # time between two controllers for a learned joint [s]
 _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
 """Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
 _SLIPPED = 0.012  # distance of the handle from its place in the hand from which on it has slipped [m]
-_LED = 0.06  # way of the handle before which the hand does not rely on a joint that was learned [m]
+_LED = 0.06  # distance of the handle before which the hand does not rely on a joint that was learned [m]
 _ENDING = 0.5  # time without progress where the arm is expected to end [s]
 _AHEAD, _AHEAD_STEPS = 0.03, 4
-"""Way of the handle that an arm must be able to go on [m], and its number of poses."""
+"""Distance of the handle that an arm must be able to go on [m], and its number of poses."""
 
 
 class ArmEndError(SkillError):
-    """End of the arm's way, or something in it, before the part is open."""
+    """End of the arm's reach, or an obstacle, before the part is open."""
 
 
 class PartPulling:
@@ -76,7 +76,7 @@ class PartPulling:
         A handle that slips is grasped anew.
         """
         self.motion = motion
-        way = self.opening[0] if self.learning.poses else -math.inf
+        distance = self.opening[0] if self.learning.poses else -math.inf
         for _ in range(_MOST_GRASPS):
             self._measures["grasps"] += 1
             barrier = ""
@@ -89,11 +89,11 @@ class PartPulling:
             if not why:
                 return self._describe_opening("is open")
             self._let_go()
-            last, way = way, self.opening[0]
-            if barrier and way >= _FOLLOWS:
+            last, distance = distance, self.opening[0]
+            if barrier and distance >= _FOLLOWS:
                 kind = ArmEndError if self.learning.learned is not None else SkillError
                 raise kind(barrier, f"{self._describe_opening('was pulled')} {why}")
-            if way - last < _FOLLOWS:
+            if distance - last < _FOLLOWS:
                 break
             self._measures["opened_seconds"] = self._reached - self.begin
             pose = inverse(self.belief.pose @ self.frame_T_handle) @ self.belief.hand_pose
@@ -144,12 +144,12 @@ class PartPulling:
             for look in belief.looks:
                 learning.add(look.pose, look.covariance)
             belief.looks.clear()
-            way, turn = self.opening
+            distance, turn = self.opening
             now = self.session.world.time
             with session.timed("learn"):
-                if learning.update(way, turn, now - self.begin):
+                if learning.update(distance, turn, now - self.begin):
                     known = True
-                if known and now - fitted >= _REFIT and way >= _LED and learning.learned is not None:
+                if known and now - fitted >= _REFIT and distance >= _LED and learning.learned is not None:
                     fit, fitted = learning.learned.fit, now
                     pull = LearnedPull(
                         motion, belief, learn_model(self.model, belief, fit), bar_T_hand, self.start,
@@ -161,10 +161,10 @@ class PartPulling:
                 self._let_go()
                 raise BlockedError(pull.obstacle)
             with session.timed("open"):
-                command = pull.step(way)
+                command = pull.step(distance)
             motion.act(command.speeds)
-            way, turn = self.opening
-            if self._is_open(way, turn):
+            distance, turn = self.opening
+            if self._is_open(distance, turn):
                 self._measures["opened_seconds"] = now - self.begin
                 return "", ""
             if belief.slip(part_T_hand, self.point) > _SLIPPED:
@@ -172,11 +172,11 @@ class PartPulling:
                 ends = isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand)
                 why = "The handle slipped in the hand"
                 return (f"{why} where the arm ends.", "reach") if ends else (f"{why}.", "")
-            if way > best + _STALLED:
-                best, since = way, now
+            if distance > best + _STALLED:
+                best, since = distance, now
                 self._reached = now
             elif now - since > (_ENDING if isinstance(pull, LearnedPull) and pull.ends else _PATIENCE):
-                if isinstance(pull, StraightPull) and way < _FOLLOWS and self._others:
+                if isinstance(pull, StraightPull) and distance < _FOLLOWS and self._others:
                     # It may slide to a side.
                     self._direction, since = self._others.pop(0), now
                     pull = StraightPull(motion, belief, bar_T_hand, self._direction)
@@ -208,15 +208,15 @@ class PartPulling:
 
     @property
     def opening(self) -> tuple[float, float]:
-        """Believed way of the handle [m] and angle of the part [rad] since the first grasp."""
+        """Believed distance of the handle [m] and angle of the part [rad] since the first grasp."""
         return measure_way(self.start, self.belief.relative_pose, self.point)
 
-    def _is_open(self, way: float, turn: float) -> bool:
+    def _is_open(self, distance: float, turn: float) -> bool:
         learned = self.learning.learned
         if learned is not None and learned.fit.motion.kinds[0]:
             return turn >= self.wanted[1]
-        return way >= self.wanted[0] or turn >= self.wanted[1]
+        return distance >= self.wanted[0] or turn >= self.wanted[1]
 
     def _describe_opening(self, verb: str) -> str:
-        way, turn = self.opening
-        return f"'{self.part}' {verb}, by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
+        distance, turn = self.opening
+        return f"'{self.part}' {verb}, by {100 * distance:.0f} cm and {math.degrees(turn):.0f}°."

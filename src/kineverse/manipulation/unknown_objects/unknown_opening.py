@@ -29,7 +29,7 @@ from .unmodelled_joint import JointPath, UnknownPart, find_joint, free_part
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)  # opening that is wanted by default [m], [rad]
 _MOST_LOOKING = 3.0  # largest time until a part is seen [s]
-_REACH = 0.25  # straight way of the handle that a placement should allow [m]
+_REACH = 0.25  # straight distance of the handle that a placement should allow [m]
 _GRASPS = 128
 _SEARCHES, _ENOUGH = 3, 0.99
 """Number of searches of a first place, and share of possible motions from which on it is taken."""
@@ -58,7 +58,7 @@ def open_unknown(
 
     The robot sees markers on the part and on what it moves in. It grasps the handle, pulls straight along its
     outward normal and yields to all other motion, while the joint is identified. As soon as its family is
-    certain, it is a joint of a model that a controller holds the hand to, and it is fitted anew on the way.
+    certain, it is a joint of a model that a controller holds the hand to, and it is fitted again on the way.
     A handle that slips out of the hand is grasped anew.
 
     If the model has a joint for the part already, that is tested meanwhile. It stays if it explains what was
@@ -81,7 +81,7 @@ def open_unknown(
     sensors
         Stated noise of the observations; exact by default.
     way, turn
-        Wanted opening: way of the handle of a part that slides [m], angle of one that turns [rad].
+        Wanted opening: distance of the handle of a part that slides [m], angle of one that turns [rad].
     hand
         Frame of the hand, found by default.
     seconds
@@ -123,7 +123,7 @@ def open_unknown(
 
 
 class _Run:
-    """One opening: its phases, and what was found on the way."""
+    """One opening: its phases, and its results."""
 
     def __init__(
         self,
@@ -329,15 +329,15 @@ class _Run:
                 )
             self.motion.stand(self.session.dt)
 
-    def _search(self, way: float, accept: Callable[[BasePlacement], bool], seed: int) -> BasePlacement:
-        """Search a placement from which the handle can be pulled by a way [m], or as far as possible."""
+    def _search(self, distance: float, accept: Callable[[BasePlacement], bool], seed: int) -> BasePlacement:
+        """Search a placement from which the handle can be pulled by a distance [m], or as far as possible."""
         session, self.approach = self.session, Approach()
         session.phase = "place"
         with session.timed("place"):
             model, handle = self.unknown.model, self.unknown.handle
             grasps = sample_grasps(model, self.gripper, handle, _GRASPS, seed, state=session.state)
             return self.search.find(
-                session.state, grasps, way, accept=accept, samples=self.samples, seed=seed
+                session.state, grasps, distance, accept=accept, samples=self.samples, seed=seed
             )
 
     def _plan(self, placement: BasePlacement) -> bool:
@@ -366,7 +366,7 @@ class _Run:
         """Write the learned joint into the model if it had another one or none, and say so."""
         self.measures |= {
             "family": learned.family,
-            "decided_way": learned.way,
+            "decided_way": learned.distance,
             "decided_turn": learned.turn,
             "decided_seconds": learned.time,
             "parent": self.belief.beside,

@@ -26,7 +26,7 @@ from kineverse.symbols import Symbol, position
 _ROTATION_ARM = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 """Lengths that make rotations comparable to distances [m]."""
 _STEPS, _DIFFERENCE = 3, 1e-5
-_STRAIGHT = 1e-3  # turn by way of the handle from which on a motion is a rotation [rad/m]
+_STRAIGHT = 1e-3  # turn by motion of the handle from which on a motion is a rotation [rad/m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +35,7 @@ class UnknownPart:
 
     model: Model  # copy of a model in which the part floats, and is pulled
     frame: str
-    handle: Handle  # handle; its coordinate is the way of its middle by the pull [m]
+    handle: Handle  # handle; its coordinate is the distance of its middle by the pull [m]
     parent: str  # frame in which the part floats
     origin: Array  # pose (4, 4) of the part in the parent, in the model that was copied
     floating: tuple[Symbol, ...]  # seven coordinates of the floating joint

@@ -271,9 +271,9 @@ class _Explorer:
     def find_unexplored(self) -> list[KeySide]:
         """Return the fewest known moves to a try of unknown result, and that try; none if there is none."""
         known, still = self.known, self.still
-        ways: dict[Configuration, list[KeySide]] = {self.here: []}
-        waiting = deque(ways)
-        while waiting and len(ways) < _MOST_CONFIGURATIONS:
+        paths: dict[Configuration, list[KeySide]] = {self.here: []}
+        waiting = deque(paths)
+        while waiting and len(paths) < _MOST_CONFIGURATIONS:
             here = waiting.popleft()
             chances = {
                 move: lock.probability(here)
@@ -282,11 +282,11 @@ class _Explorer:
             }
             unknown = {move: chance for move, chance in chances.items() if 0.0 < chance < 1.0}
             if unknown:
-                return [*ways[here], max(unknown, key=unknown.__getitem__)]
+                return [*paths[here], max(unknown, key=unknown.__getitem__)]
             for move in (move for move, chance in chances.items() if chance == 1.0):
                 there = (*here[: move.key], known.end(move), *here[move.key + 1 :])
-                if there not in ways:
-                    ways[there] = [*ways[here], move]
+                if there not in paths:
+                    paths[there] = [*paths[here], move]
                     waiting.append(there)
         return []
 
