@@ -89,7 +89,7 @@ def test_family_is_known_before_8_cm_with_outliers(path, family):
         found = learning.learned
         assert found is not None
         assert found.family == family
-        assert found.way < 0.08
+        assert found.distance < 0.08
 
 
 def test_mean_of_poses_leaves_a_first_outlier_out():

@@ -93,7 +93,7 @@ def find_shut_value(model: ModelView, coordinate: Symbol) -> float:
 def select_objects(
     objects: Sequence[ArticulatedObject], patterns: Iterable[str]
 ) -> tuple[ArticulatedObject, ...]:
-    """Return objects whose coordinates match any of some names or patterns, in the order of the patterns."""
+    """Return the objects whose coordinates match names or patterns, in the order of the patterns."""
     found: dict[Symbol, ArticulatedObject] = {}
     for pattern in patterns:
         matching = [one for one in objects if matches_pattern(str(one.coordinate), [pattern])]

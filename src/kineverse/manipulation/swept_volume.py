@@ -1,9 +1,9 @@
 """Swept volume of an object: what is in its way from one value of its coordinate to another.
 
-The bodies that a coordinate moves are placed along the path so densely that no point of them goes further than
-:data:`STEP` at a time. There they are measured against everything that is not the robot's and that they move
-relative to: fixed furniture, furniture that other coordinates move, and what carries the object itself. Which
-overlaps mean nothing is said by :class:`.FurnitureOverlaps`, as it is for worlds and for their judge.
+The bodies that a coordinate moves are placed along the path so densely that no point of them moves by more
+than :data:`STEP` at a time. There they are checked against everything that is not the robot's and that they
+move relative to: fixed furniture, furniture that other coordinates move, and what carries the object itself.
+:class:`.FurnitureOverlaps` excepts overlaps that mean nothing, as it does for worlds and their judge.
 """
 
 from __future__ import annotations

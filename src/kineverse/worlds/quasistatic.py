@@ -9,7 +9,7 @@ with the rows A of the model's limits, locks and closures. An object is pushed a
 where nothing touches it. A contact jams if its normal is 60° or more off all motions that the object has at
 that point, as with a friction of 0.58: then it does not move the object. What was penetrated before comes
 free at 0.1 m/s at most. So a contact moves an object's point there by at most twice the sum of the robot's
-motion and that motion out. The slacks s are zero unless the object is blocked; then the penetration remains. The
+motion and that retreat. The slacks s are zero unless the object is blocked; then the penetration remains. The
 weights w are the squares of the speeds that coordinates give to points of bodies, so rotations and
 translations compare. The problem is linear in the neighbourhood of a configuration, and it is solved again
 where it led, until nothing changes (sequential quadratic programming).

@@ -114,7 +114,7 @@ class ObjectLimits:
         self.reset()
 
     def find_linked(self, moved: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], ...]:
-        """Return indices of speeds that share rows with some, directly or by others, and of these rows."""
+        """Return the indices of speeds linked to flagged ones by rows, and of these rows."""
         key = moved.tobytes()
         if key not in self._found:
             linked = moved | self._linked[moved].any(axis=0)

@@ -368,7 +368,7 @@ class Judge:
                 self._is_excepted[number[a], number[b]] = self._is_excepted[number[b], number[a]] = True
 
     def _followed(self) -> tuple[str, ...]:
-        """Return the frames whose distances are measured: the root of what moves of the robot, and the hand."""
+        """Return the frames whose paths are measured: the root of what moves of the robot, and the hand."""
         motion = FrameDependence(self.model, self._robot_speeds)
         moved = [b for b in self._own if motion.moves(b)] or self._own
         root = min(moved, key=lambda b: len(motion.moving_ancestors(b)))

@@ -77,7 +77,7 @@ class BasePlacement:
         return self.grasp is not None
 
     def find_end_backwards(self, value: float, target: float) -> float | None:
-        """Return the value to which the reversed path leads from a value, towards a target; None if it does not.
+        """Return the value to which the reversed path leads towards a target; None if it leads nowhere.
 
         It begins where the path ends, and small differences [m], [rad] at both ends are made up for.
         """
@@ -501,7 +501,7 @@ def find_highest_reach(scene: Scene, paths: CartesianPaths, gripper: Gripper, st
 def find_highest_passage(
     scene: Scene, bodies: Iterable[str], state: State, coordinate: Symbol, values: Array
 ) -> tuple[float, float]:
-    """Return value (of some) at which an object is the highest, and the height of its lowest point [m]."""
+    """Return the one of some values at which an object is the highest, and the height of its lowest point."""
     names = tuple(bodies)
     lowest = [
         _find_corners(scene, names, state.updated({coordinate: v}))[:, 2].min() for v in values.tolist()

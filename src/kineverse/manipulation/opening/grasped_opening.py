@@ -433,7 +433,7 @@ class _Run:
         return back
 
     def _retrace(self, *, whole: bool) -> BasePlacement | None:
-        """Return an earlier motion, reversed, that starts here and leads at least part of the path; or None."""
+        """Return an earlier motion, reversed, that leads on from here or to the target; None without any."""
         session, here = self.session, float(self.session.state[self.handle.coordinate])
         session.phase = "place"
         with session.timed("place"):

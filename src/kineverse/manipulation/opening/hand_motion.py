@@ -297,7 +297,7 @@ class HandMotion:
     def find_controller(
         self, key: Hashable, make: Callable[[], tuple[Controller, Targets]]
     ) -> tuple[Controller, Targets]:
-        """Return a controller at rest and targets of its tasks, those of an earlier motion if there are."""
+        """Return a controller at rest and the targets of its tasks, those of an earlier motion if any."""
         key = key, self.session.dt
         found = self.controllers.pop(key) if key in self.controllers else make()
         self.controllers[key] = found  # the last one is the one used last

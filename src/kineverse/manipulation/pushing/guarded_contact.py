@@ -29,8 +29,8 @@ STILL = 5e-3  # speed of a contact point that counts as none [m/s]
 _DEEPEN, _DEEPER = 0.5, 3.0
 """Time in which a press on what does not move becomes deeper [s], and by how many times its depth."""
 _FORGET, _FORGET_DISTANCE = 1.0, 0.01
-"""Time [s] and distance [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
-and what moves on gives way."""
+"""Time [s] and distance [m] after which a lag is forgotten: lag of acceleration and delays is no press, and
+what moves on gives way."""
 _REMEMBER = 0.1  # time for which a touch counts after the last report [s]
 _RETURN = 0.3  # time in which a correction returns to the estimate without a touch [s]
 _LEAST_RATE = 0.02  # least rate of a gap over the coordinate for a correction [m/rad]

@@ -43,8 +43,8 @@ def plan_push_approach(
 ) -> tuple[Path, int]:
     """Return a path of the robot to a contact point, and the index of the point.
 
-    Coordinates that rates drive, such as those of a base on rolling wheels, stand still. If none is found, the
-    path is that of the last point, and says why.
+    Coordinates that rates drive, such as those of a base on rolling wheels, stand still. If no path is found,
+    the returned one says why.
     """
     model, tool = pushing.model, pushing.tool
     moving = [s.position for s in pushing.speeds if s.position != pushing.coordinate]

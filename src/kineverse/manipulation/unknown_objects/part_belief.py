@@ -124,7 +124,7 @@ class PartBelief:
         return next(seen, WORLD) if self._beside is None else self._beside
 
     def slip(self, part_T_hand: Array, point: Array) -> float:
-        """Return distance [m] of a point (3,) of the part from its place in the hand, inf if unseen."""
+        """Return the distance [m] of a point (3,) from its place in the hand; infinite if it is not seen."""
         if self.held is None or self.held.pose is None or self.held.missed >= _LOST_LOOKS:
             return math.inf
         place = np.append(point, 1.0)
