@@ -243,7 +243,7 @@ def make_graph(
     limits: Mapping[Symbol, Interval],
     start: Mapping[Symbol, float],
     goals: Mapping[Symbol, float],
-    still: Collection[Symbol] = (),
+    fixed: Collection[Symbol] = (),
 ) -> CellGraph:
     """Return the cells between the thresholds of rules, and the steps that the rules allow."""
     cells: list[tuple[Interval, ...]] = []
@@ -291,7 +291,7 @@ def make_graph(
             both.append(
                 tuple(
                     None
-                    if symbol in still
+                    if symbol in fixed
                     else _make_step(cells[k], n, way, whole[k], first[k], about, entered[symbol])
                     for n in range(len(cells[k]))
                 )

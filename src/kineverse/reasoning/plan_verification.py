@@ -211,7 +211,7 @@ def refutation_gaps(model: ModelView, plan: UnlockingPlan, state: StateLike | No
         return ["there is no set of positions that no move leaves"]
     given = start_point(model, state)
     start = {s: given.get(s, 0.0) for s in known.coordinates}
-    check = _InvarianceCheck(ConstraintRanges(model), known, frozenset(plan.still), start)
+    check = _InvarianceCheck(ConstraintRanges(model), known, frozenset(plan.fixed), start)
     return list(check.run(plan.goal))
 
 
@@ -221,7 +221,7 @@ class _InvarianceCheck:
 
     ranges: ConstraintRanges
     known: InvariantSet
-    still: frozenset[Symbol]
+    fixed: frozenset[Symbol]
     start: Mapping[Symbol, float]
 
     def run(self, goal: Mapping[Symbol, float]) -> Iterator[str]:
@@ -237,7 +237,7 @@ class _InvarianceCheck:
         for n, region in enumerate(known.regions):
             following = known.following[n] if known.following else ()
             for k, symbol in enumerate(known.coordinates):
-                for way in () if symbol in self.still else (1, -1):
+                for way in () if symbol in self.fixed else (1, -1):
                     into = self._neighbour(region, k, way)
                     if into is None or into in index:
                         continue

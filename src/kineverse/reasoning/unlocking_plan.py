@@ -99,7 +99,7 @@ class UnlockingPlan:
         True if the last of these depends on the first one.
     unread
         Interlocks, and undecided constraints, that count as shut because they could not be read completely.
-    still
+    fixed
         Coordinates that were said not to move.
     explored
         Number of combinations of intervals that were looked at.
@@ -116,7 +116,7 @@ class UnlockingPlan:
     blocking: tuple[Interlock | Undecided, ...] = ()
     is_circle: bool = False
     unread: tuple[Interlock | Undecided, ...] = ()
-    still: tuple[Symbol, ...] = ()
+    fixed: tuple[Symbol, ...] = ()
     explored: int = 0
     reason: str = ""
     invariant: InvariantSet | None = field(default=None, repr=False)
@@ -131,7 +131,7 @@ class UnlockingPlan:
             "blocking": [str(lock) for lock in self.blocking],
             "circle": self.is_circle,
             "unread": [str(lock) for lock in self.unread],
-            "still": [str(s) for s in self.still],
+            "still": [str(s) for s in self.fixed],
             "explored": self.explored,
             "reason": self.reason,
         }
@@ -153,7 +153,7 @@ class UnlockingPlan:
     def _explain(self) -> str:
         if self.verdict == "undecided":
             return f"undecided, since {self.reason}"
-        without = f" without {_list_words(map(str, self.still))}" if self.still else ""
+        without = f" without {_list_words(map(str, self.fixed))}" if self.fixed else ""
         if not self.blocking:
             return f"cannot be reached{without}"
         how = "lock each other in a circle" if self.is_circle else "keep it out of reach"
@@ -166,7 +166,7 @@ def plan_unlocking(
     state: StateLike | None = None,
     *,
     found: Interlocks | None = None,
-    still: Collection[Symbol | str] = (),
+    fixed: Collection[Symbol | str] = (),
     budget: float = BUDGET,
 ) -> UnlockingPlan:
     """Return the order in which coordinates have to move so that a goal is reached, or a refutation.
@@ -192,7 +192,7 @@ def plan_unlocking(
         positions beyond limits count as at the limit.
     found
         Interlocks of the model if they are known, see :func:`.interlocks`.
-    still
+    fixed
         Coordinates that do not move, such as those that did not move when they should have.
     budget
         Time for the search [s], after which the verdict is ``"undecided"``. Reading the interlocks takes time
@@ -213,7 +213,7 @@ def plan_unlocking(
     limits = constant_limits(dict(model.constraints.items()))
     goals = {model.degree_of_freedom(name): value for name, value in goal.items()}
     goals = {s: _check_goal(s, value, limits.get(s, Interval())) for s, value in goals.items()}
-    fixed = tuple(model.degree_of_freedom(name) for name in still)
+    resting = tuple(model.degree_of_freedom(name) for name in fixed)
     known = interlocks(model) if found is None else found
     end = perf_counter() + budget
     coordinates, rules = relevant_rules(make_rules(model, known), goals)
@@ -221,13 +221,13 @@ def plan_unlocking(
     start = {s: _clip(float(given.get(s, 0.0)), limits.get(s, Interval())) for s in coordinates}
 
     def search(some: Sequence[MoveRule]) -> tuple[CellGraph, MoveSearchResult]:
-        graph = make_graph(coordinates, some, limits, start, goals, fixed)
+        graph = make_graph(coordinates, some, limits, start, goals, resting)
         return graph, MoveSearch(graph, lambda: perf_counter() > end).run()
 
     graph, result = search(rules)
     unread = tuple(dict.fromkeys(rule.lock for rule in rules if not rule.is_exact))
     plan = UnlockingPlan(
-        MappingProxyType(goals), result.verdict, unread=unread, still=fixed, explored=result.explored
+        MappingProxyType(goals), result.verdict, unread=unread, fixed=resting, explored=result.explored
     )
     if result.verdict == "found":
         steps = _make_steps(graph, result.moves, {s: given.get(s, 0.0) for s in coordinates}, goals)

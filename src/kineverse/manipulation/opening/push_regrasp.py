@@ -48,7 +48,7 @@ class PushRegrasp:
                     target=self.target,
                     robot=session.world.robot,
                     dt=session.dt,
-                    still=motion.gripper.joints,
+                    fixed=motion.gripper.joints,
                 )
                 found = find_push_start(
                     self.pushing,

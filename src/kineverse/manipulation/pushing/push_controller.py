@@ -78,8 +78,8 @@ class Pushing:
         Bodies of the object that may be pushed, names or patterns; by default all that the coordinate moves.
     dt
         Time of a step [s].
-    still
-        Further coordinates that stay still.
+    fixed
+        Further coordinates that stay fixed.
     rules, leave_out
         Rules of the collision filter, and excluded bodies, as for :class:`.Scene`.
     logic
@@ -127,7 +127,7 @@ class Pushing:
         robot: str | None = None,
         object_frames: str | Iterable[str] | None = None,
         dt: float = 0.02,
-        still: Iterable[Symbol | str] = (),
+        fixed: Iterable[Symbol | str] = (),
         rules: Iterable[Rule] = (),
         leave_out: Iterable[Exclusion] = (),
         logic: str | None = "and",
@@ -170,7 +170,7 @@ class Pushing:
             model, rules=(*furniture, *self.overlapping, *self.rules), leave_out=self.leave_out
         )
         self._program = PushProgram(
-            model, coordinate, self.target, self.tool, self.scene, dt=dt, still=still, logic=logic
+            model, coordinate, self.target, self.tool, self.scene, dt=dt, fixed=fixed, logic=logic
         )
         self.controller = self._program.controller
         self.speeds = self.controller.speeds

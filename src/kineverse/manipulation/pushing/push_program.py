@@ -82,13 +82,13 @@ class PushProgram:
         scene: Scene,
         *,
         dt: float,
-        still: Iterable[Symbol | str],
+        fixed: Iterable[Symbol | str],
         logic: str | None,
     ) -> None:
-        still = tuple(still)
+        fixed = tuple(fixed)
         speed = coordinate.derivative()
         tip, axis = tool.locate_tip(model), tool.point_axis(model)
-        resting = find_speeds(model, still, "still")
+        resting = find_speeds(model, fixed, "fixed")
         moving = set(model.rates.over_free_speeds(tip.gradient())) - resting - {speed}
         speeds = [*sorted(moving, key=lambda s: s.sort_key), speed]
 
@@ -139,7 +139,7 @@ class PushProgram:
             model,
             tasks,
             dt=dt,
-            still=still,
+            still=fixed,
             scene=scene,
             margin=_MARGIN,
             radius=_RADIUS,

@@ -98,7 +98,7 @@ def push(
     object_frames: str | Iterable[str] | None = None,
     seconds: float = 30.0,
     tolerance: float | None = None,
-    still: Iterable[Symbol | str] = (),
+    fixed: Iterable[Symbol | str] = (),
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
     logic: str | None = "and",
@@ -132,7 +132,7 @@ def push(
     tolerance
         Largest distance from the target [m], [rad]; by default 2 % of the distance, and 20 mm at a limit, see
         :func:`.choose_tolerance`.
-    still, rules, leave_out, logic
+    fixed, rules, leave_out, logic
         As for :class:`.Pushing`.
     plan
         Whether approaches are planned where the path of the controller is blocked.
@@ -188,8 +188,8 @@ def push(
         if abs(session.state[coordinate] - target) <= tolerance / 2:
             done = abs(world.state[coordinate] - target) <= tolerance
             return skip(done, f"'{coordinate}' is there from the start")
-        if fixed := explain_fixed(model, coordinate, session.state):
-            return skip(False, fixed)
+        if why := explain_fixed(model, coordinate, session.state):
+            return skip(False, why)
         own = tuple(rules), tuple(leave_out)
         obstacle = find_obstacle(
             model, coordinate, session.state, target,
@@ -208,7 +208,7 @@ def push(
             robot=world.robot,
             object_frames=object_frames,
             dt=session.dt,
-            still=still,
+            fixed=fixed,
             rules=own[0],
             leave_out=own[1],
             logic=logic,

@@ -178,7 +178,7 @@ class _Explorer:
         return self.known.read(self.state)
 
     @property
-    def still(self) -> set[Symbol]:
+    def erratic(self) -> set[Symbol]:
         """Coordinates that moved at one time, and did not at another one in the same configuration."""
         known = self.known
         return {known.coordinates[move.key] for move, lock in known.locks.items() if lock.is_erratic}
@@ -222,7 +222,7 @@ class _Explorer:
         for _ in range(_MOST_DOUBTS):
             costs = known.expected_tries(here)
             known.write_hypotheses(here, costs)
-            plan = plan_unlocking(known.model, goal, self.near(goal), still=self.still)
+            plan = plan_unlocking(known.model, goal, self.near(goal), fixed=self.erratic)
             blocking = (lock for lock in plan.blocking if isinstance(lock, Interlock))
             if not known.doubt({name for lock in blocking for name in lock.constraints}, here, costs):
                 break
@@ -270,7 +270,7 @@ class _Explorer:
 
     def find_unexplored(self) -> list[KeySide]:
         """Return the fewest known moves to a try of unknown result, and that try; none if there is none."""
-        known, still = self.known, self.still
+        known, erratic = self.known, self.erratic
         paths: dict[Configuration, list[KeySide]] = {self.here: []}
         waiting = deque(paths)
         while waiting and len(paths) < _MOST_CONFIGURATIONS:
@@ -278,7 +278,7 @@ class _Explorer:
             chances = {
                 move: lock.probability(here)
                 for move, lock in known.locks.items()
-                if here[move.key] != known.end(move) and known.coordinates[move.key] not in still
+                if here[move.key] != known.end(move) and known.coordinates[move.key] not in erratic
             }
             unknown = {move: chance for move, chance in chances.items() if 0.0 < chance < 1.0}
             if unknown:

@@ -226,7 +226,7 @@ def execute_unlocking(
     goal: Mapping[Symbol, float] | Mapping[str, float],
     *,
     model: ModelView | None = None,
-    still: Collection[Symbol | str] = (),
+    fixed: Collection[Symbol | str] = (),
     budget: float = BUDGET,
     dt: float = 0.05,
     patience: float = 1.0,
@@ -248,7 +248,7 @@ def execute_unlocking(
         Positions to reach, by coordinate or its name [m] or [rad].
     model
         Model by which it is planned and controlled; None for the model of the world.
-    still
+    fixed
         Coordinates that are known not to move.
     budget
         Time for each plan [s].
@@ -283,7 +283,7 @@ def execute_unlocking(
     moves, stuck, plans = list[ExecutedMove](), list[Symbol](), 0
     obstacles: list[Obstacle] = []
     while True:
-        plan = plan_unlocking(known, goal, session.state, still=[*still, *stuck], budget=budget)
+        plan = plan_unlocking(known, goal, session.state, fixed=[*fixed, *stuck], budget=budget)
         plans += 1
         made: list[ExecutedMove] = []
         for step in plan.steps:
