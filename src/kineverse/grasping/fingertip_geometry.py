@@ -44,7 +44,7 @@ class Pads:
     size: tuple[float, float]  # lengths along x and z
     opened: Mapping[Symbol, float]  # values of the joints at both ends of the motion
     closed: Mapping[Symbol, float]
-    stroke: Array  # rows (n, 5)
+    stroke: Array  # (n, 5): part of the motion in [0, 1], gap [m], middle between the pads [m]
 
     def parts_at(self, gaps: Array) -> Array:
         """Return the parts of the motion at which the pads have gaps (n,) [m], or the nearest ends of it."""
@@ -100,7 +100,7 @@ def _find_pads(motion: _Motion, root: Array) -> tuple[Pads | None, str]:
         return None, "they do not move against each other"
     outwards = moved[0].mean(axis=0) - root
     if np.linalg.norm(np.cross(outwards, y)) < 1e-4:
-        return None, "nothing tells which way they point"
+        return None, "their direction is undetermined"
     x = _approach(motion, y, outwards)
     axes = lie.round_exact(np.stack([x, y, np.cross(x, y)], axis=1))
     return _measure(motion, axes, float(moved[0].mean(axis=0) @ y))

@@ -33,7 +33,7 @@ _MOST_TILT, _MOST_TILT_OF_KNOB = math.radians(100), math.radians(20)
 _DEPTHS = (0.0, 0.5, 1.0, -0.5)
 """Parts of the depth of the pads at which a bar is tried first; 1 is at their tips."""
 _CANDIDATES = 6  # candidates for each grasp that is asked for
-_NEAR = 0.6  # distance from the bar up to which shapes are looked at [m]
+_NEAR = 0.6  # distance from the bar up to which shapes are checked [m]
 _REACH = 0.05  # distance up to which the clearance of a grasp counts [m]
 _CLOSING, _AWAY = 14, np.array([0.1, 0.25, 0.5, 1.0])
 """Number of gaps of fingers that close, and parts of the path to the pose before the approach."""
@@ -216,7 +216,7 @@ class _Surroundings:
                 pieces.append(part)
         # Of a decomposed handle, the bar is the piece in its middle.
         if not pieces:
-            raise InvalidValueError(f"The model has no shape {handle.shape} of {handle.frame}: find it anew.")
+            raise InvalidValueError(f"{handle.frame} has no shape {handle.shape}: find the handle again.")
         bar = min(pieces, key=lambda part: float(np.linalg.norm(part.middle - middle)))
         self.bar = replace(bar, pose=frame_T_world @ bar.pose)
         obstacles = {}

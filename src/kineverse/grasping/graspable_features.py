@@ -1,4 +1,4 @@
-"""Convex parts of placed bodies, and bars among them: slim parts that stand out from what they are fixed to.
+"""Convex parts of placed bodies, and bars: thin parts that protrude from their parent body.
 
 All poses, points and directions are in the world [m].
 """

@@ -1,4 +1,4 @@
-"""Articulated objects of a model: doors, flaps and drawers, told apart by their motions."""
+"""Articulated objects of a model: doors, flaps and drawers, distinguished by their motions."""
 
 from __future__ import annotations
 

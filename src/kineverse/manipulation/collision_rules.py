@@ -1,4 +1,4 @@
-"""Bodies and collision rules of skills: which pairs may touch, and which mean nothing."""
+"""Collision rules of skills: allowed and ignored contact pairs."""
 
 from __future__ import annotations
 

@@ -31,12 +31,12 @@ from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 from .outcome import SkillError
 
-STEP = 5e-4  # longest distance of a point of the object between two places where it is looked at [m]
+STEP = 5e-4  # longest distance of a point of the object between two places where it is checked [m]
 
 _COARSE = 32  # number of parts of a path whose lengths are measured
 _MOST_PLACES = 100_000
 _TURNED = 1e-6  # change of an entry of a rotation from which on a body has turned
-_CLEAR = 3e-3  # distance before the first contact up to which a path is said to be free [m]
+_CLEAR = 3e-3  # distance before the first contact up to which a path is reported as free [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +46,13 @@ class Obstacle:
     coordinate: Symbol  # coordinate of the object, and the value that it was to reach [m], [rad]
     target: float
     body: str  # body of the object
-    other: str  # the one that is in its way
+    other: str  # body in its way
     value: float  # value of the coordinate from which on they overlap [m], [rad]
     depth: float  # largest depth of the two on the way to the target [m]
     free: float  # value up to which the path is free, a little before the contact [m], [rad]
     unit: str = ""  # "rad" if the object turns, "m" if it slides
     carrier: Symbol | None = None  # coordinate that moves the other body; None if none does
-    aside: float | None = None  # [m], [rad]
+    aside: float | None = None  # value of the carrier at which the path is free [m], [rad]; None if none is
 
     @property
     def measures(self) -> dict[str, Any]:

@@ -111,7 +111,7 @@ _MOVED, _REFUTED = 1.0, 0.3
 In the latter all of the tracker's process noise counts."""
 _STILL = 1e-3  # largest speed of a part that rests [m/s], [rad/s]
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
-"""Error of the motion of joints relative to the commanded one, and beside it [rad/√s], [m/√s]."""
+"""Error of the motion of joints relative to the commanded one, and independent of it [rad/√s], [m/√s]."""
 _HORIZON = 0.04  # longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays
 
 
@@ -119,7 +119,7 @@ class TrackedBelief:
     """Belief that reads observations and commands, and never the truth.
 
     Coordinates that were never seen have their default value, and half the width of their limits as
-    deviation. If the time of the world goes back, as by a reset, all begins anew: objects are believed where
+    deviation. If the time of the world goes back, as by a reset, all starts again: objects are believed where
     they were, with that same deviation until they are seen.
 
     Parameters
@@ -286,7 +286,7 @@ class TrackedBelief:
         return self._predict(horizon)
 
     def _begin(self, stamp: float) -> None:
-        """Begin anew at a time, with objects where they were believed."""
+        """Start again at a time, with objects where they were believed."""
         self.tracker.wait()  # each update before would take a hundred times as long
         if not math.isinf(self._now):
             self._estimate = self.tracker.reset(dict(self.tracker.estimate.state), at=stamp)

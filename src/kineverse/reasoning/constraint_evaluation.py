@@ -76,7 +76,7 @@ class ConstraintRanges:
         return self._about.get(symbol, ())
 
     def refuses(self, speed: Symbol, forward: float, box: Box, start: Mapping[Symbol, float]) -> bool:
-        """Return whether constraints admit no slow speed anywhere in a box, but beside thresholds.
+        """Return whether constraints admit no slow speed anywhere in a box, but next to thresholds.
 
         If intervals do not decide it at once, the box is divided at the thresholds of these constraints. At
         one of them, a coordinate is at most at the start.

@@ -318,7 +318,7 @@ def find_circle(graph: CellGraph, reached: int) -> tuple[tuple[MoveRule, ...], b
         closing = next((k for k in concerned if k in seen), None)
         if closing is not None:
             return tuple(chain[seen[closing] :]), True
-        # Of several ways out, one that a lock closes tells more than one whose coordinate does not move.
+        # Of several exits, one that a lock closes explains more than one whose coordinate does not move.
         found = ((k, _blocking_rule(graph, k, graph.field(k) & wanted, reached)) for k in concerned)
         blocked = next(((k, one) for k, one in found if one is not None), None)
         if blocked is None:

@@ -268,7 +268,7 @@ class _InvarianceCheck:
         return True
 
     def _neighbour(self, region: Region, k: int, way: int) -> Region | None:
-        """Return the positions beside a region in one direction, None at the end of the range."""
+        """Return the positions next to a region in one direction, None at the end of the range."""
         cell = region[k][way > 0] + way
         rests = self.known.rests[k]
         while 0 <= cell < len(rests) and not rests[cell]:
@@ -297,12 +297,12 @@ class _InvarianceCheck:
         least, most = ranges.excesses(name, there)[way > 0]
         if row.expression != symbol or least <= NOTHING:
             return False
-        # Its own position may change the bound, unless that is constant beside the region.
+        # Its own position may change the bound, unless that is constant next to the region.
         room = there[symbol][1] - there[symbol][0] + NOTHING
         return symbol not in (row.upper if way > 0 else row.lower).symbols or most - least <= room < math.inf
 
     def _box(self, region: Region) -> _Box:
-        """Return the positions of a region, without those beside thresholds but with the start."""
+        """Return the positions of a region, without those next to thresholds but with the start."""
         box = {}
         for (first, last), symbol, cells in zip(
             region, self.known.coordinates, self.known.cells, strict=True

@@ -100,9 +100,9 @@ class UnlockingPlan:
     unread
         Interlocks, and undecided constraints, that count as shut because they could not be read completely.
     fixed
-        Coordinates that were said not to move.
+        Coordinates that do not move, as stated.
     explored
-        Number of combinations of intervals that were looked at.
+        Number of combinations of intervals that were examined.
     reason
         Reason why it is undecided.
     invariant

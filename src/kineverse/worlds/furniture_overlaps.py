@@ -1,7 +1,7 @@
-"""Overlaps of furniture that a motion made, beside those that were there at the start.
+"""Overlaps of furniture that a motion caused, other than those at the start.
 
-Shapes of furniture overlap in many models and mean nothing by it: a drawer in a solid box, a hinge in its
-frame. What counts is what was not there at the start. Shapes overlap from 0.5 mm on, and:
+In many models shapes of furniture overlap without meaning: a drawer in a solid box, a hinge in its
+frame. Only overlaps that were not there at the start count. Shapes overlap from 0.5 mm on, and:
 
 - Two bodies that overlap at the start are *made to overlap*, and count no more at all, if an articulation
   with limits joins them, or if they overlap in all of 200 random states. Where something between them has no
@@ -66,7 +66,7 @@ class Overlap(NamedTuple):
 
 
 class FurnitureOverlaps:
-    """Overlaps of furniture in a scene, beside those that were there at the start.
+    """Overlaps of furniture in a scene, other than those at the start.
 
     The start is the default state until :meth:`begin` is called.
     """

@@ -1,7 +1,7 @@
-"""World without forces: what a robot touches gives way along the normal, and a held body follows the hand.
+"""Quasi-static world: touched bodies are displaced along the contact normal, a held body follows the hand.
 
 It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it; then
-it moves by the least that its limits, speed limits and locks allow, see :mod:`.object_motion`. So objects can
+it moves by the least that its limits, speed limits and locks allow, see :mod:`.quasistatic`. So objects can
 be pushed and not dragged, have no inertia, and nothing falls. What cannot give way is penetrated, and
 :meth:`KinematicWorld.contacts` reports it; so is furniture that never moves. What the robot moves stops at
 other furniture, beyond the overlaps of the start, see :mod:`.furniture_overlaps`. The robot goes exactly
@@ -229,7 +229,7 @@ class KinematicWorld:
     # -- what happens --------------------------------------------------------------------------------------
 
     def reset(self, state: StateLike) -> None:
-        """Start anew from a state, at time 0, with nothing in the gripper and all speeds zero.
+        """Start again from a state, at time 0, with nothing in the gripper and all speeds zero.
 
         Coordinates without a value have their default one.
 
@@ -276,7 +276,7 @@ class KinematicWorld:
         before = motion.travel()
         motion.place(self._integrate(start, arm, time))
         moved = motion.travel() - before
-        # The travel begins anew at some time.
+        # The travel restarts at some time.
         moved[moved < 0.0] = _UNKNOWN_TRAVEL
         travel = float(moved.max(initial=0.0)) + reach
         grips = grip is not None and (grip.held is not None or reach > 0.0)

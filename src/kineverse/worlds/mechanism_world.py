@@ -87,7 +87,7 @@ class MechanismWorld:
         return State(values, stamp=self._time, source=self.name)
 
     def reset(self, state: StateLike) -> None:
-        """Start anew from a state, at time 0; coordinates without a value have their default one.
+        """Start again from a state, at time 0; coordinates without a value have their default one.
 
         Raises
         ------

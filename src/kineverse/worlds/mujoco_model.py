@@ -32,7 +32,7 @@ _CONDIM = 6
 _STIFF_SOLIMP = (0.99, 0.999, 0.001)
 """Impedance of limits, ties and friction in joints; MuJoCo's default gives way by some 10 %."""
 _RESTING = 1e-4  # depth up to which shapes of furniture rest on each other, and collide [m]
-_SWEEP = 65  # number of places between its limits where a joint is looked at
+_SWEEP = 65  # number of places between its limits at which a joint is checked
 _FOLDER = Path("/")
 
 
@@ -188,7 +188,7 @@ def add_contact_rules(
     option = spec.option
     option.cone, option.impratio = engine.mjtCone.mjCONE_ELLIPTIC, 10.0
     option.integrator = engine.mjtIntegrator.mjINT_IMPLICITFAST
-    # Which bodies may touch is said for each pair; MuJoCo would leave out a door with a frame that moves.
+    # Pairs that may touch are listed one by one; MuJoCo would leave out a door with a frame that moves.
     option.disableflags |= engine.mjtDisableBit.mjDSBL_FILTERPARENT
     bodies = [body.name for body in spec.bodies if body.geoms and body.name in model.frames]
     furniture = np.array([not is_robot(name) for name in bodies], dtype=bool)

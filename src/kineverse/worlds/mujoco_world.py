@@ -34,7 +34,13 @@ _UNSTATED = 1.0  # limit of a speed that states none [m/s], [rad/s]: walking pac
 
 
 class SimulationBounds:
-    """Largest credible speeds and force of one ``MjModel``."""
+    """Largest credible speeds and force of one ``MjModel``: what is beyond them was made by the solver.
+
+    They follow from what the robot can do, with a wide margin. Its coordinates move at ten times their limits
+    at most. Another coordinate moves no point faster than twice the fastest point of the robot, as after an
+    elastic impact, plus a fall through the scene. The force on the robot stops it from the largest speed of
+    its base within a time step, plus ten times what all servos press at their farthest points.
+    """
 
     def __init__(
         self,
@@ -286,7 +292,7 @@ class MujocoWorld:
         return self._peak_force
 
     def reset(self, state: StateLike) -> None:
-        """Start anew from a state, at time 0, with nothing in the gripper and all speeds zero."""
+        """Start again from a state, at time 0, with nothing in the gripper and all speeds zero."""
         qpos = self._coordinates.positions(state)
         self._state = None
         engine, data = mujoco(), self._data
@@ -350,7 +356,7 @@ class MujocoWorld:
         engine.mj_forward(self._compiled, data)
         self._broken = (
             f"The simulation is not to be trusted: {problem} at {now:.3f} s. The state is that before. "
-            "A start without overlaps, or a smaller time step (step=), may help; reset() begins anew."
+            "A start without overlaps, or a smaller time step (step=), may help; reset() starts again."
         )
         logger.warning(self._broken)
         raise SimulationError(self._broken)

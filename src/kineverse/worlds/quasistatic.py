@@ -57,13 +57,13 @@ SKIN = 1e-6  # gap to which objects are pushed [m]: below, normals of nearest po
 _REACH = 0.005  # distance beyond the robot's motion up to which gaps are rows [m]
 _ROUNDS = 10
 _STEADY = 2e-7  # change of displacements below which a solution is final [m]
-_SLACK = 1e-7  # reciprocal ρ of the weight of slacks, beside weights near 1 kg of least motion
+_SLACK = 1e-7  # reciprocal ρ of the weight of slacks; weights of least motion are near 1 kg
 _HARD = 1e-10  # reciprocal weight of exceeded limits, where solutions of curved problems are compared
-_HELD = 1e-7  # weight of least motion beside the error of a hold
+_HELD = 1e-7  # weight of least motion relative to the error of a hold
 _LIGHTEST = 1e-4
 _DEEP = 1e-4  # penetration of what does not yield, from which on its side is remembered [m]
 _RELEASE = 0.1  # largest speed out of a penetration that was there before a motion [m/s]
-_FIRM = 100.0  # weight of gaps between furniture beside those to the robot: it is the robot that penetrates
+_FIRM = 100.0  # weight of gaps between furniture relative to the robot: so it is the robot that penetrates
 
 Residual: TypeAlias = Callable[[], tuple[Array, Array]]
 """Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""
@@ -142,7 +142,7 @@ class ObjectMotion:
         return weights
 
     def reset(self, q: Array) -> None:
-        """Begin anew at a configuration."""
+        """Start again at a configuration."""
         self._penetrated.clear()
         self._limits.reset()
         self.place(q)

@@ -1,4 +1,8 @@
-"""Constraints of a quasi-static step: gaps between bodies, and limits, locks and closures of objects."""
+"""Constraints of a quasi-static step: gaps between bodies, and limits, locks and closures of objects.
+
+What a robot moves pushes other furniture along, and stops where that cannot yield. It does not push what
+its contact jams: where the normal is 60° or more off the motion that a coordinate causes there.
+"""
 
 from __future__ import annotations
 
@@ -216,7 +220,7 @@ Flags = npt.NDArray[np.bool_]
 class FurnitureGaps(NamedTuple):
     """Gaps of pairs of shapes of furniture that meet."""
 
-    distances: Array  # (K,) motions to where the shapes stop [m]
+    distances: Array  # (K,) distances to where the shapes stop [m]
     rows: Array  # (K, n) derivatives by the displacement of objects
     jammed: Flags  # (K,) flags of contacts that move nothing
     moved: Flags  # (n,) flags of coordinates that move, those that are pushed along included

@@ -218,7 +218,7 @@ class Recorded:
     """Things that were recorded at some times."""
 
     times: Array  # (T,) not decreasing [s]
-    entries: tuple[Any, ...]  # T things
+    entries: tuple[Any, ...]  # T records
 
     def __len__(self) -> int:
         return len(self.entries)

@@ -109,7 +109,7 @@ _TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap 
 class JudgedOverlap(NamedTuple):
     """Overlap that came in a run."""
 
-    a: str  # bodies
+    a: str  # names of the bodies
     b: str
     depth: float  # largest depth [m]
     value: float  # value of the judged coordinate at which it came [m], [rad]; NaN without a coordinate
@@ -134,7 +134,7 @@ class Judge:
     handle
         Body that is grasped or pushed. Contacts with all bodies that move with it are counted.
     coordinate
-        Coordinate of the object, whose value tells where an overlap came.
+        Coordinate of the object, whose value is noted where an overlap occurs.
     start
         Earlier state in which furniture may have overlapped, such as the one before it was opened.
     scene

@@ -173,7 +173,7 @@ class SensorSampler:
         return compile_expressions(self._seen[0])
 
     def reset(self) -> None:
-        """Begin anew, with the noise of the same seed and nothing on its way."""
+        """Start again, with the noise of the same seed and no readings pending."""
         streams = np.random.SeedSequence(self._seed).spawn(3)
         self._encoder_noise, self._odometry_noise, self._camera_noise = map(np.random.default_rng, streams)
         self._coming: deque[Observation] = deque()
@@ -203,7 +203,7 @@ class SensorSampler:
         """
         if (now := finite_number(time)) is None or now < self._time:
             raise InvalidValueError(
-                f"Sensors were read at {self._time:.6g} s, and now at {time!r} s; reset() begins anew."
+                f"Sensors were read at {self._time:.6g} s, and now at {time!r} s; reset() starts again."
             )
         if now > self._time:
             self._coming.append(self._capture(now, state, contacts))

@@ -105,7 +105,7 @@ class BasePlacement:
 
 _STEP = 0.05  # distance of neighbouring values of the object along its path [m], [rad]
 _RANDOM_STATES = 24  # number of random states in which links that are always near to each other are sought
-_BESIDE = 0.1  # largest change of each coordinate of the base in these states [m], [rad]
+_OFFSET = 0.1  # largest change of each coordinate of the base in these states [m], [rad]
 _START_ITERATIONS = 30
 _CORRECTIONS = 6  # iterations from a configuration to one near it
 _STARTS = 4  # arms that are tried for each base
@@ -170,7 +170,7 @@ class PlacementSearch:
         self._reach: float | None = None
 
     def _random_states(self, state: State) -> Iterator[State]:
-        """Yield states with random arms, and the base a little beside its place.
+        """Yield states with random arms, and the base a little off its place.
 
         So what is always near is the robot's own or the floor, and not a wall that it stands at.
         """
@@ -179,8 +179,8 @@ class PlacementSearch:
         lower, upper = np.array([self.model.limits(s) for s in bounded]).reshape(-1, 2).T
         for _ in range(_RANDOM_STATES):
             arm = dict(zip(bounded, random.uniform(lower, upper).tolist(), strict=True))
-            beside = random.uniform(-_BESIDE, _BESIDE, len(self.base)).tolist()
-            yield state.updated(arm | {s: state[s] + by for s, by in zip(self.base, beside, strict=True)})
+            off = random.uniform(-_OFFSET, _OFFSET, len(self.base)).tolist()
+            yield state.updated(arm | {s: state[s] + by for s, by in zip(self.base, off, strict=True)})
 
     def find_too_high(self, state: State, coordinate: Symbol, values: Array) -> str:
         """Return why an object is out of reach above the hand along its motion; empty if it is not.
@@ -415,7 +415,7 @@ class _Search:
         rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.path.T[:count]]
         hands = self.handles @ self.poses[0]
         path = self._correct(np.stack(rows, axis=1), base, hands)
-        # The hand comes on the way on which it left, in the same place beside the handle.
+        # The hand comes on the path on which it left, at the same place at the handle.
         retreat = earlier.retreat[:, :count]
         poses = paths.find_poses(retreat, base)
         back = self._correct(retreat, base, hands[0] @ np.linalg.inv(poses[0]) @ poses)

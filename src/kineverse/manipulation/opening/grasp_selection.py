@@ -16,7 +16,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 _BASE_EASE, _BASE_SPEED = (0.1, 0.01), 1.0
-"""Weights of a base that can move beside those of joints, so that it moves where they are not enough, or
+"""Weights of a base that can move relative to those of joints, so that it moves where they are not enough, or
 nearly stands where there is little room; and its speed where the model has no limit [m/s]."""
 _WHOLE_ARM, _STANDING_EASE = 6, (0.1, 0.0, 0.0)
 """Number of joints from which on an arm needs no motion of the base, and the weights of its base."""

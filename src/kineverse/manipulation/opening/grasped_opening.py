@@ -98,7 +98,7 @@ def open_object(
 
     A base, a grasp and a path of the arm are found, see :class:`.PlacementSearch`. The robot goes to the
     handle on a planned path, closes its fingers, moves the object, lets go and retracts. Where one grasp does
-    not lead to the target, the object is released on the way and grasped anew. Where no grasp leads on,
+    not lead to the target, the object is released on the way and grasped again. Where no grasp leads on,
     such as at an oven door whose handle faces the floor, it is pushed. A base on two wheels drives to its
     place before the arm moves. One that cannot turn on the spot, or that begins in contact, is put there by a
     reset of the world. Nothing is moved where something is in the way of the object, see
@@ -147,7 +147,7 @@ def open_object(
         return Outcome(False, here, fixed, world.name, 0.0, 0, {"failure": "other"})
     goal = choose_target(model, coordinate, session.state, check_target(target))
     tolerance = choose_tolerance(model, coordinate, session.state, goal, tolerance)
-    if not session.deviation(coordinate):  # an estimate is looked at before, see _Run
+    if not session.deviation(coordinate):  # with an estimate the robot looks first, see _Run
         obstacle = find_obstacle(
             model, coordinate, session.state, goal, robot=world.robot, start=session.start
         )
@@ -259,7 +259,7 @@ class _Run:
 
     @property
     def how(self) -> str:
-        """Words on what was done beside a grasped motion."""
+        """Words on pushes that helped the grasped motions."""
         if self.pushed_from is None:
             return ""
         return f"; it was pushed from {self.pushed_from:.3f} on, where no grasp led further"

@@ -43,7 +43,7 @@ _SIGMAS = 2.0  # standard deviations of the believed handle by which the hand ma
 FOLLOWING = 5.0
 """Gain of all goals and holds [1/s]. A larger one follows the noise of estimates, and the delay of servos
 adds to it."""
-_POSTURE = 0.5  # weight of the arm beside the object
+_POSTURE = 0.5  # weight of the arm relative to the object
 _LOST = 0.002  # motion of closed fingers that says that nothing is between them any more [m]
 _ARRIVED = 0.05  # distance from the end of a path up to which the retreat there is meant [m], [rad]
 _BESIDE = 0.008
@@ -269,7 +269,7 @@ class HandMotion:
         pose = inverse(world_T_bar) @ world_T_hand
         self.session.phase = "retract"
         if abs(state[self.handle.coordinate] - placement.values[-1]) > _ARRIVED:
-            # The retreat of the placement was looked at for an object that has arrived.
+            # The retreat of the placement was checked for an object that has arrived.
             retreat = find_retreat(self, grasp, world_T_bar, world_T_hand)
             self.follow_line(pose, inverse(world_T_bar) @ retreat.end, retreat.arms)
             return
@@ -342,7 +342,7 @@ class HandMotion:
         begin = session.world.time
         while (seen := session.observation) is not None and seen.stamp < begin - 1e-9:
             if session.world.time - begin > _MOST_LOOKING:
-                raise SkillError("other", f"The sensors have said nothing for {_MOST_LOOKING:g} s.")
+                raise SkillError("other", f"The sensors have been silent for {_MOST_LOOKING:g} s.")
             self.act({})
 
     def act(self, speeds: Mapping[Symbol, float], command: Command | None = None) -> None:

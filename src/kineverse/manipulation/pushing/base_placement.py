@@ -123,7 +123,7 @@ def find_push_start(
             continue
         end, rolled = roll_out(pushing, start, steps), rolled + 1
         problem, distance = end.problem, abs(end.value - here)
-        # Pushes that go through and are not accepted tell nothing about those to come.
+        # A push that goes through and is not accepted says nothing about later ones.
         since = 0 if not problem or distance > furthest + _MOVED else since + 1
         furthest = max(furthest, distance) if distance > _MOVED else furthest
         if problem and problem != _NO_ROOM and distance >= least * abs(pushing.target - here):

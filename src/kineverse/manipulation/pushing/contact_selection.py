@@ -1,4 +1,4 @@
-"""Choice of contact points of a push: ranking, progress, and points that were given up."""
+"""Selection of contact points of a push: ranking, progress, and points that were given up."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ContactSelection:
         self.restart()
 
     def restart(self) -> None:
-        """Count progress anew."""
+        """Start counting progress again."""
         self._best, self._since = math.inf, 0
 
     def score(self, points: PushContacts) -> Array:

@@ -1,4 +1,4 @@
-"""Press of a pusher on an object: touch, lag of the servos, speed, and the object's value at the contact.
+"""Guarded contact of a pusher with an object: touch, lag of the servos, speed, and value at the contact.
 
 A robot that is late presses: its servos are springs between where it should be and where it is. The lag
 

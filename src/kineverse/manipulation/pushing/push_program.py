@@ -45,17 +45,17 @@ _SIZES = {
 
 @dataclass(slots=True)
 class PushNumbers:
-    """Numbers of the present contact, which a program is set to in each step."""
+    """Parameters of a push program at the present contact."""
 
     gap: float  # distance of pusher and object [m]
     slip: Sequence[float]  # how far the tip has moved along both tangents since it touched [m]
     pushed: float  # derivative of the gap over the object's speed
-    target: Vector  # [m]
+    target: Vector  # contact point [m], direction of the push, and outward normal
     facing: Vector
     normal: Vector
-    reach: float  # weights of the goals at that point
-    touch: float  # to a contact
-    hold: float  # of the goals that keep a contact
+    reach: float  # weight of the goal that moves the tip to the contact point
+    touch: float  # weight of the trend towards a contact
+    hold: float  # weight of the goals that keep a contact
     engaged: float  # 1 while the pusher touches, else 0
     near: float  # gap from which on the pusher touches [m]
     pace: float  # largest speed of the coordinate [m/s], [rad/s]

@@ -12,7 +12,7 @@ CERTAIN = 0.97
 """Least probability of a family: between nested families such as hinge and screw, 0.99 is hardly exceeded."""
 _LOOKS = 3  # results in a row that a decision takes
 _EVERY = 4  # number of new poses between two results
-_VISIBLE = 0.005  # distance of the part before which no joint is looked for [m]
+_VISIBLE = 0.005  # motion of the part before which no joint is fitted [m]
 LEAST_DISTANCE, LEAST_TURN = 0.03, math.radians(4.0)
 """Motion of the part before which nothing is decided [m], [rad]: noise alone looks like any joint."""
 
@@ -22,7 +22,7 @@ class LearnedJoint:
     """Decision for the family of a joint."""
 
     fit: Fit  # identified joint
-    distance: float  # motion of the part until the decision [m], [rad]
+    distance: float  # motion of the part until the decision [m], and its angle [rad]
     turn: float
     time: float  # time of the decision [s]
 

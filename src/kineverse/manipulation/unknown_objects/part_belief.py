@@ -173,7 +173,7 @@ class PartBelief:
         self.held, self.path, self.still = None, None, PoseMean(_STATIC_LOOKS)
 
     def reset(self) -> None:
-        """Forget all looks, as the time of the world begins anew."""
+        """Forget all looks, as the time of the world restarts."""
         self.held, self.path, self.looks = None, None, []
         self._earlier, self._stamp = self._earlier + self._stamp, 0.0
         self.observation: Observation | None = None

@@ -73,7 +73,7 @@ class PartPulling:
     def perform(self, motion: HandMotion, grasp: Grasp) -> str:
         """Pull until the part is open or at its own stop, and return how far that is.
 
-        A handle that slips is grasped anew.
+        A handle that slips is grasped again.
         """
         self.motion = motion
         distance = self.opening[0] if self.learning.poses else -math.inf
@@ -81,7 +81,7 @@ class PartPulling:
             self._measures["grasps"] += 1
             barrier = ""
             if not self.motion.close(grasp):
-                why = "The fingers closed beside the handle."
+                why = "The fingers closed next to the handle."
             else:
                 if not self.learning.poses:
                     self.begin = self.session.world.time

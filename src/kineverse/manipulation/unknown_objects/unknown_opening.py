@@ -1,4 +1,4 @@
-"""Opening of a part whose joint nobody described: its handle is pulled, and the joint is learned."""
+"""Opening of a part with an unknown joint: the hand pulls at its handle, and the joint is learned."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def open_unknown(
     placements: int = 1000,
     seed: int = 0,
 ) -> Outcome:
-    """Open a part whose joint is unknown, or not as believed, and write the learned joint into a model.
+    """Open a part whose joint is unknown or wrong, and write the learned joint into a model.
 
     The robot sees markers on the part and on what it moves in. It grasps the handle, pulls straight along its
     outward normal and yields to all other motion, while the joint is identified. As soon as its family is
     certain, it is a joint of a model that a controller holds the hand to, and it is fitted again on the way.
-    A handle that slips out of the hand is grasped anew.
+    A handle that slips out of the hand is grasped again.
 
     If the model has a joint for the part already, that is tested meanwhile. It stays if it explains what was
     seen. Else the learned joint replaces it.

@@ -1,4 +1,4 @@
-"""Part of unknown motion in a model: where it was seen, and as something that a hand pulls straight."""
+"""Part with an unmodelled joint: floating where it was seen, or pulled straight by its handle."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class UnknownPart:
 
     model: Model  # copy of a model in which the part floats, and is pulled
     frame: str
-    handle: Handle  # handle; its coordinate is the distance of its middle by the pull [m]
+    handle: Handle  # its coordinate is the distance by which the pull moves its middle [m]
     parent: str  # frame in which the part floats
     origin: Array  # pose (4, 4) of the part in the parent, in the model that was copied
     floating: tuple[Symbol, ...]  # seven coordinates of the floating joint

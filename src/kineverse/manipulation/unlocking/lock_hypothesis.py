@@ -46,7 +46,7 @@ class Enclosure(NamedTuple):
 
 @dataclass
 class LockHypothesis:
-    """Lock of a coordinate in one direction, as far as tries tell."""
+    """Lock of a coordinate in one direction, as far as tries show."""
 
     number: int  # number of the locked coordinate, which is no key of its own
     limits: Enclosure  # limits of all coordinates

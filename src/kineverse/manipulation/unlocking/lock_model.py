@@ -39,7 +39,7 @@ class LockModel:
         for s, (low, high) in zip(self.coordinates, ends, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise InvalidValueError(
-                    f"'{s}' has no limits, so nobody knows how far to move it when locks are explored. Give "
+                    f"'{s}' has no limits, so it is unknown how far to move it when locks are explored. Give "
                     f"it some: edit.constrain('{s} range', lower, model.symbol('{s}'), upper)."
                 )
         self.limits = Enclosure(tuple(low for low, _ in ends), tuple(high for _, high in ends))
