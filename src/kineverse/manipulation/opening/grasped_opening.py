@@ -13,7 +13,7 @@ from kineverse._checks import as_count
 from kineverse.control import Controller
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
 from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
-from kineverse.manipulation.outcome import Outcome, SkillError, SlipError
+from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
     check_positive,
@@ -23,6 +23,7 @@ from kineverse.manipulation.skill_arguments import (
     explain_fixed,
     find_object_coordinate,
 )
+from kineverse.manipulation.slip_detection import SlipError
 from kineverse.manipulation.swept_volume import BlockedError, find_obstacle
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView

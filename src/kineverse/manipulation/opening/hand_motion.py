@@ -17,8 +17,9 @@ from kineverse.control.tasks import Task
 from kineverse.geometry import Rule, Scene
 from kineverse.grasping import Grasp, Gripper, Handle
 from kineverse.lie import Array, inverse
-from kineverse.manipulation.outcome import SkillError, SlipError
+from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import HandReference, Session, Speeds
+from kineverse.manipulation.slip_detection import SlipDetector
 from kineverse.model.frame import is_of_robot
 from kineverse.planning import Trajectory, TrajectoryFollower
 from kineverse.state import State
@@ -44,7 +45,6 @@ FOLLOWING = 5.0
 """Gain of all goals and holds [1/s]. A larger one follows the noise of estimates, and the delay of servos
 adds to it."""
 _POSTURE = 0.5  # weight of the arm relative to the object
-_LOST = 0.002  # motion of closed fingers that says that nothing is between them any more [m]
 _ARRIVED = 0.05  # distance from the end of a path up to which the retreat there is meant [m], [rad]
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
@@ -76,7 +76,7 @@ class HandMotion:
         self._slope = self._bar[:3, 3].partial([handle.coordinate])
         limits = {s: self.model.limits(s) for s in (*search.moving, handle.coordinate)}
         self._limits = {s: (float(a), float(b)) for s, (a, b) in limits.items()}
-        self._closed_at: dict[Symbol, float] = {}
+        self.fingers: dict[Symbol, float] = {}  # where they stood around the bar
 
     @property
     def deviation(self) -> float:
@@ -240,24 +240,13 @@ class HandMotion:
         self.move_fingers(self.gripper.closed)
         self._await_readings()
         state, gripper = self.session.state, self.gripper
-        self._closed_at = {s: state[s] for s in gripper.joints}
+        self.fingers = {s: state[s] for s in gripper.joints}
         narrow = gripper.values_at(max(0.25 * grasp.thickness, grasp.thickness - _BESIDE))
         wide = gripper.values_at(grasp.thickness + _BESIDE)
         return all(
             min(narrow[s], wide[s]) - 1e-4 <= state[s] <= max(narrow[s], wide[s]) + 1e-4
             for s in gripper.joints
         )
-
-    def is_lost(self) -> bool:
-        """Return True if the fingers have closed further since they stood around the bar."""
-        gripper, state = self.gripper, self.session.state
-        closed = 0.0
-        for s, held in self._closed_at.items():
-            range_ = gripper.closed[s] - gripper.opened[s]
-            noise = math.copysign(4.0 * self.session.deviation(s), range_)
-            further = (state[s] - held - noise) / range_ if range_ else 0.0
-            closed = max(closed, gripper.width * further)
-        return closed > _LOST
 
     def release(self, placement: BasePlacement) -> None:
         """Open the fingers, and take the hand away."""
@@ -370,9 +359,6 @@ _SPEED, _RAMP = 0.3, 0.5
 """Speed of an object along its planned path [m/s], [rad/s], and the time from rest to it [s]."""
 _LATE = 0.1  # distance from the path at which the reference begins to wait [m], [rad]
 _MARGIN = 0.002  # least distance of bodies while the object moves [m]; placements keep more
-_SLIPPED, _SLIP_SIGMAS = 0.008, 4.0
-"""Distance of the bar from its place in the hand from which on it has slipped [m], and the standard
-deviations of its estimate that are added."""
 _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
 """Least progress of the object [m], [rad] in a time [s], and in one at the end of the path."""
 _LOCKED, _STANDING = 1.5, 1e-3
@@ -387,12 +373,8 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     session, coordinate, grasp = motion.session, motion.handle.coordinate, placement.grasp
     assert grasp is not None
     session.phase = "move"
-    state = session.state
-    held = inverse(bar(state)) @ hand(state)
-    middle = motion.gripper.grasp_pose[:, 3]
-    uncertain = [session.deviation(x) for x in ((bar @ held - hand) @ middle)[:3]]
-    slipped = _SLIPPED + _SLIP_SIGMAS * float(np.linalg.norm(uncertain))
-    poses = compile([bar, hand], tier="interpreter")  # a call a step
+    slip = SlipDetector(session, motion.gripper, bar, hand, motion.fingers)
+    held = slip.bar_T_hand
     target = float(placement.values[-1])
     moving = motion.search.moving
     rows = motion.rows(placement.path)
@@ -438,17 +420,10 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             speed = min(speed + _SPEED / _RAMP * session.dt, _SPEED)
             speed *= min(1.0, max(0.0, 1.5 - late / _LATE))
             share = min(1.0, share + speed * session.dt / length)
-            world_T_bar, world_T_hand = poses(state.vector(poses.inputs))
-            apart = float(np.linalg.norm(((world_T_bar @ held - world_T_hand) @ middle)[:3]))
+            apart = slip.measure(state)
         motion.refer_to(share)
         motion.act(command.speeds, command)
-        if motion.is_lost() or apart > slipped:
-            how = (
-                "It is out of the hand."
-                if motion.is_lost()
-                else f"It moved {1e3 * apart:.0f} mm in the hand."
-            )
-            raise SlipError(f"The handle slipped at {session.state[coordinate]:.3f} of '{coordinate}'. {how}")
+        slip.check(apart, coordinate)
         done = abs(session.state[coordinate] - values[0])
         if done > best + _STALLED:
             best, since = done, session.world.time

@@ -13,6 +13,7 @@ from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.slip_detection import PULLED_OUT
 from kineverse.manipulation.swept_volume import BlockedError
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
@@ -34,7 +35,6 @@ its outward normal, to both sides across the bar, and to both ends along it."""
 _REFIT = 0.5  # time between two controllers for a learned joint [s]
 _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
 """Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
-_SLIPPED = 0.012  # distance of the handle from its place in the hand from which on it has slipped [m]
 _LED = 0.06  # distance of the handle before which the hand does not rely on a joint that was learned [m]
 _ENDING = 0.5  # time without progress where the arm is expected to end [s]
 _AHEAD, _AHEAD_STEPS = 0.03, 4
@@ -167,7 +167,7 @@ class PartPulling:
             if self._is_open(distance, turn):
                 self._measures["opened_seconds"] = now - self.begin
                 return "", ""
-            if belief.slip(part_T_hand, self.point) > _SLIPPED:
+            if belief.slip(part_T_hand, self.point) > PULLED_OUT:
                 session.stop()
                 ends = isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand)
                 why = "The handle slipped in the hand"
