@@ -37,8 +37,7 @@ _NEAR = 0.6  # distance from the bar up to which shapes are checked [m]
 _REACH = 0.05  # distance up to which the clearance of a grasp counts [m]
 _CLOSING, _AWAY = 14, np.array([0.1, 0.25, 0.5, 1.0])
 """Number of gaps of fingers that close, and parts of the path to the pose before the approach."""
-_ADVANCES, _TOUCHING = 20, 1e-4
-"""Most steps in which fingers close, and the distance at which one touches [m]."""
+_ADVANCES, _TOUCHING = 20, 1e-4  # most steps in which fingers close, and distance of a touch [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,8 +22,7 @@ from kineverse.model.body import Geometry, Mesh, Sphere
 
 MOST_THICK = 0.09  # largest thickness of a bar [m]: hardly a gripper opens further
 _LONG = 1.5  # length per width above which a part is a bar, and a knob below
-_FLAT, _WIDE = 3.0, 2.0
-"""Width per thickness from which on a part is a plate, and per width of what it carries, if it is a panel."""
+_FLAT, _WIDE = 3.0, 2.0  # width by thickness of a plate, width of a panel by that of what it carries
 _STANDS_OUT = 3e-3  # least length by which a bar stands out from what it is fixed to [m]
 _TOUCH = 2e-3  # largest gap of parts that are fixed to each other [m]
 _STEPS = 144

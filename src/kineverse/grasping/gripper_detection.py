@@ -217,8 +217,7 @@ def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> 
 _MOST_LISTED = 6
 _LARGEST = 0.5  # diagonal of the box around a finger that is too large for one [m]
 
-_STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))
-"""Ball at the origin of a frame, in place of shapes that cannot be read."""
+_STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))  # for shapes that cannot be read
 
 
 def _reach(pads: Pads) -> float:

@@ -23,8 +23,7 @@ from .graspable_features import Part, ProtrudingBar, find_bars, find_parts, free
 
 _FREE = 0.15  # free space in front of a bar that a hand needs [m]
 _PART_OF_RANGE = 0.05
-_WITHIN = 0.5
-"""Cosine above which a bar points along the opening motion, and below minus which it points inside."""
+_WITHIN = 0.5  # cosine above which a bar points along the opening motion, or inside below minus it
 _PLACES = 9
 
 

@@ -30,19 +30,16 @@ _ACCELERATION = 0.5  # acceleration and deceleration [m/s²], [rad/s²]
 _SHARE = 0.8  # share of the limits of speeds that a drive takes
 _GRID, _HEADINGS = 0.15, 8  # distance of neighbouring places of the lattice [m], and number of headings
 _FINE, _FINE_TURN = 0.02, math.radians(2.0)  # distances of the places of a path that are checked [m], [rad]
-_NEAR, _MOST_LEGS = 0.5, 40
-"""Distance from a goal at which direct legs are tried [m], and the largest number of known places tried."""
+_NEAR, _MOST_LEGS = 0.5, 40  # distance from a goal [m], and number of known places, for direct legs
 _MOST_PLACES = 3000  # largest number of places of the lattice from one start
 _ARRIVED, _TURNED = 5e-4, 5e-4  # errors at the end of a line and of a turn [m], [rad]
-_CROSS, _HEADING = 3.0, 4.0
-"""Gains of the steering: heading by the distance from the line [rad/m], and rate by the heading [1/s]."""
+_CROSS, _HEADING = 3.0, 4.0  # gains: heading by distance from the line [rad/m], rate by heading [1/s]
 _STEERING = 0.25  # share of the speed of turns that steers along a line
 _START_SHARE = 0.8  # share of the distance at the start that a drive keeps, where it is less than the margin
 _EXACT = 1e-9
 
 Place: TypeAlias = tuple[float, float, float]  # place of a base: x [m], y [m] and angle [rad]
-_Key: TypeAlias = tuple[int, int, int]
-"""Place of the lattice: steps ahead and to the left of the start, and number of the heading."""
+_Key: TypeAlias = tuple[int, int, int]  # steps ahead and to the left of the start, number of the heading
 
 
 class BaseDrive:

@@ -16,8 +16,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 _NEAREST, _FARTHEST = 0.3, 1.1  # distance of a base from the point that the hand has to reach [m]
-_SIDE, _TURN = math.radians(110.0), math.radians(60.0)
-"""Largest angles between base and coming hand, and between the front of the base and the point [rad]."""
+_SIDE, _TURN = math.radians(110.0), math.radians(60.0)  # of base from hand, of its front from the point [rad]
 
 
 class BaseSampler:

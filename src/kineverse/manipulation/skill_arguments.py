@@ -17,9 +17,7 @@ TOLERANCE = 0.02
 """Distance from a limit within which an object is open or shut, unless its range is short [m], [rad]."""
 
 _FIXED = 1e-9  # range of a coordinate up to which it counts as fixed [m], [rad]
-_LEAST_TOLERANCE, _SHARE = 1e-3, 0.02
-"""Least tolerance of a value between the limits [m], [rad], as near as controllers settle, and its share of
-the distance."""
+_LEAST_TOLERANCE, _SHARE = 1e-3, 0.02  # least tolerance between limits [m], [rad], and share of the distance
 
 
 def find_object_coordinate(world: World, what: Symbol | str) -> Symbol:

@@ -101,8 +101,7 @@ def motion_of(poses: Array) -> Array:
     return slopes
 
 
-_LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4
-"""Smallest stated noise of poses [m], [rad], for sensors without any."""
+_LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4  # of poses [m], [rad], for sensors without noise
 _MOVING, _RESTING = 0.04, 4e-4
 """Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
 and .002 rad/√s and .0013 m/√s at rest."""

@@ -28,8 +28,7 @@ from .boxes import IntervalBox
 
 SLOW = 1e-6  # speed that constraints admit wherever a coordinate may move [m/s] or [rad/s]
 NOTHING = 1e-9  # largest excess of a constraint that counts as satisfied; also a speed that is none
-BESIDE = SATURATED / SHARP_CONTRAST
-"""Distance from a threshold within which a position counts as at it [m] or [rad]: its ramp is no wider."""
+BESIDE = SATURATED / SHARP_CONTRAST  # distance at which a position is at a threshold [m] or [rad]
 _MOST_PIECES = 4096
 
 _NOT_MOVING: RealInterval = (0.0, 0.0)

@@ -14,8 +14,7 @@ from typing import Literal, TypeAlias
 from .cell_graph import CellGraph, CellStep, Move, MoveRule
 
 Verdict: TypeAlias = Literal["found", "refuted", "undecided"]
-Edge: TypeAlias = tuple[int, int, int, CellStep]
-"""Number of a coordinate, bits of a cell and of its neighbour, and the step between them."""
+Edge: TypeAlias = tuple[int, int, int, CellStep]  # coordinate, bits of a cell and its neighbour, step
 
 _EXHAUSTED_AT_MOST = 50_000  # largest number of states for which the shortest sequence is searched
 _PRUNED_AT_MOST = 300

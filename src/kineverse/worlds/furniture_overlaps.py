@@ -43,8 +43,7 @@ from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
-OVERLAP = 5e-4
-"""Depth from which on furniture overlaps, at the start and beyond the allowance [m]: less is resting."""
+OVERLAP = 5e-4  # depth from which on furniture overlaps, beyond the allowance [m]: less is resting
 
 _SAMPLES = 200
 

@@ -40,8 +40,7 @@ from .world import Contact, Observation
 logger = logging.getLogger(__name__)
 
 _SUBSTEP = 0.002  # longest motion of a body between two checks of its gaps, while it is near an object [m]
-_HELD_SUBSTEP = 0.01
-"""Longest motion of a hand between two checks of what it holds [m]: thinner furniture is rare."""
+_HELD_SUBSTEP = 0.01  # longest motion of a hand between two checks of what it holds [m]
 _MOST_SUBSTEPS = 10_000
 _UNKNOWN_TRAVEL = 0.1
 

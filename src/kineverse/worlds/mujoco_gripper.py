@@ -17,8 +17,7 @@ from .mujoco_servos import sampled_inertia
 from .mujoco_state import MujocoContacts, MujocoCoordinates
 
 TOUCH_FORCE = 1.0  # normal force of each finger [N] above which a body between them is held
-_FINGER_MASS = 2.0
-"""Mass of a finger with its motor [kg]: with some grams, what ties fingers together does not carry force."""
+_FINGER_MASS = 2.0  # of a finger with its motor [kg]: light ones do not carry the force of their ties
 _SMALLEST_LEVER = 0.02
 _STIFFNESS = 10.0  # speed by the distance of a finger from its set point [1/s]
 _LEAD = 0.01  # largest distance of the gap between the fingers from that of the set point [m]

@@ -20,17 +20,14 @@ from kineverse.model.model_view import ModelView
 
 from .mujoco_state import MujocoCoordinates
 
-CURVE_TOLERANCE = 0.01
-"""Largest error of a frame [m], [rad] where a joint follows a curve, which MuJoCo has as a polynomial."""
+CURVE_TOLERANCE = 0.01  # largest error of a joint on a curve, which MuJoCo has as a polynomial [m], [rad]
 _DRAWER = 3.0, 5.0
 _DOOR = 1.0, 1.0
 _KNOB = 0.02, 0.02  # friction [N], [N m] and damping [N s/m], [N m s] of furniture that states neither
 _KNOB_MASS = 1.0
-_DENSITY, _MESH_MASS = 500.0, 0.5
-"""Assumed density of bodies without inertia [kg/m³], and mass of a mesh [kg], whose volume is not known."""
+_DENSITY, _MESH_MASS = 500.0, 0.5  # assumed for bodies without inertia [kg/m³], and for a mesh [kg]
 _CONDIM = 6
-_STIFF_SOLIMP = (0.99, 0.999, 0.001)
-"""Impedance of limits, ties and friction in joints; MuJoCo's default gives way by some 10 %."""
+_STIFF_SOLIMP = (0.99, 0.999, 0.001)  # MuJoCo's default impedance gives way by some 10 %
 _RESTING = 1e-4  # depth up to which shapes of furniture rest on each other, and collide [m]
 _SWEEP = 65  # number of places between its limits at which a joint is checked
 _FOLDER = Path("/")

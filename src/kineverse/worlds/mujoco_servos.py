@@ -41,8 +41,7 @@ _ARMATURE = 0.1  # part of the largest inertia that is added to a joint as that 
 _ACCELERATION, _TRACTION = 20.0, 6.0
 """Acceleration that a servo without a stated effort can give to the largest inertia [m/s²], [rad/s²], and
 that of a base that slides along the floor: its wheels have some friction of 0.6."""
-_RAMP, _RESERVE = 0.05, 0.8
-"""Time from rest to the limit of a speed [s], and the part of the effort that an acceleration may take."""
+_RAMP, _RESERVE = 0.05, 0.8  # time from rest to the limit of a speed [s], part of the effort to accelerate
 _CONFIGURATIONS = 40
 _PLANAR = 3
 

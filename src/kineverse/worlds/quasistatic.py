@@ -65,8 +65,7 @@ _DEEP = 1e-4  # penetration of what does not yield, from which on its side is re
 _RELEASE = 0.1  # largest speed out of a penetration that was there before a motion [m/s]
 _FIRM = 100.0  # weight of gaps between furniture relative to the robot: so it is the robot that penetrates
 
-Residual: TypeAlias = Callable[[], tuple[Array, Array]]
-"""Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""
+Residual: TypeAlias = Callable[[], tuple[Array, Array]]  # error of a hold (6,), Jacobian (6, n)
 
 
 class ObjectMotion:

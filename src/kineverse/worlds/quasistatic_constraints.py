@@ -73,8 +73,7 @@ _EXACT = 1e-6  # excess of a limit that is a matter of rounding, and is taken ba
 _HARMLESS = ("nothing that moves changes it", "it has no bounds")
 _STEP = Symbol("world/step", 0, "parameter", 0.01)
 
-Rows: TypeAlias = tuple[Array, Array, Array, Array]
-"""Matrix (m, n), lower and upper bounds, and signed excess of position constraints, (m,) each."""
+Rows: TypeAlias = tuple[Array, Array, Array, Array]  # matrix (m, n), bounds, excess (m,)
 
 
 class ObjectLimits:
@@ -209,8 +208,7 @@ def _link_columns(count: int, patterns: Sequence[npt.NDArray[np.bool_]]) -> npt.
     return linked
 
 
-RESTING = OVERLAP / 2
-"""Depth beyond the allowance at which furniture stops [m]: shapes that rest on each other slide freely."""
+RESTING = OVERLAP / 2  # depth beyond the allowance at which furniture stops [m]: resting shapes slide freely
 
 _REACH = 0.001  # largest gap of pairs that have met [m]
 

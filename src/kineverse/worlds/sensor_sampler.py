@@ -314,8 +314,7 @@ def find_marked_frames(model: ModelView, robot: str) -> tuple[str, ...]:
     return tuple(name for name in model.frames if name in found and not is_of_robot(name, robot))
 
 
-_CAMERA_WORDS = (("head", "tilt"), ("camera",), ("head",))
-"""Words in the names of frames with a camera, the likeliest first."""
+_CAMERA_WORDS = (("head", "tilt"), ("camera",), ("head",))  # in names, the likeliest first
 
 
 def find_camera(frames: Sequence[str]) -> str | None:

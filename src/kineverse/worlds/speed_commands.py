@@ -19,8 +19,7 @@ from kineverse.symbols import Symbol
 
 ROUNDING = 1e-9  # difference of times that counts as none [s]
 
-SpeedColumns = Mapping[Symbol | str, int | None]
-"""Column of each speed of a model, by symbol and by name; None for a speed that is not read."""
+SpeedColumns = Mapping[Symbol | str, int | None]  # by symbol and name; None for a speed that is not read
 
 
 class _Command(NamedTuple):

@@ -29,8 +29,7 @@ from .cartesian_paths import TOLERANCE, CartesianPaths
 from .grasp_selection import PlacementSampler
 from .path_collisions import OWN_MARGIN, CandidatePath, PathCheck, PathContacts, interpolate_poses
 
-NO_PATH, NO_PLACE = "no path to the handle", "no free place of the base"
-"""Reasons of placements that are refused, and of bases that touch something."""
+NO_PATH, NO_PLACE = "no path to the handle", "no free place of the base"  # reasons of refusals
 _DIFFERENCE = 0.025  # difference of the values at the ends of a path and of its reversal [m], [rad]
 
 
@@ -109,18 +108,14 @@ _OFFSET = 0.1  # largest change of each coordinate of the base in these states [
 _START_ITERATIONS = 30
 _CORRECTIONS = 6  # iterations from a configuration to one near it
 _STARTS = 4  # arms that are tried for each base
-_MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
-"""Shares of the object's motion from which the arms of successive batches set out to both ends."""
+_MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)  # shares of the motion from which arms of successive batches follow it
 _WHOLE = 300
 """Number of bases after which a path to a part of the motion is taken, and after which the search ends if no
 arm has reached the handle anywhere: at the middle of its motion, or at a quarter of it."""
-_NOWHERE = 300
-"""Number of bases after which the search ends if each one touched something wherever it was drawn."""
-_AROUND, _HERE = 0.6, 100
-"""Distance of the hand from the handle up to which the base may stay [m], and the number of arms there."""
+_NOWHERE = 300  # number of bases after which the search ends if each one touched something
+_AROUND, _HERE = 0.6, 100  # distance of the hand up to which the base may stay [m], and number of arms there
 _LEAST_SHARE = 0.2  # least share of the motion that one grasp is for
-_MOST_CHECKS, _MOST_REFUSED = 150, 3
-"""Most paths that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
+_MOST_CHECKS, _MOST_REFUSED = 150, 3  # most paths checked after a batch, and most that may be refused
 
 
 class PlacementSearch:

@@ -18,10 +18,8 @@ from kineverse.symbols import Symbol
 _BASE_EASE, _BASE_SPEED = (0.1, 0.01), 1.0
 """Weights of a base that can move relative to those of joints, so that it moves where they are not enough, or
 nearly stands where there is little room; and its speed where the model has no limit [m/s]."""
-_WHOLE_ARM, _STANDING_EASE = 6, (0.1, 0.0, 0.0)
-"""Number of joints from which on an arm needs no motion of the base, and the weights of its base."""
-_QUICK, _SOON = 0.5, 4.0
-"""Speed from which on a joint has the full weight [m/s], [rad/s]; time in which most arms are reached [s]."""
+_WHOLE_ARM, _STANDING_EASE = 6, (0.1, 0.0, 0.0)  # joints of an arm that needs no base, weights of its base
+_QUICK, _SOON = 0.5, 4.0  # speed of joints with full weight [m/s], [rad/s]; time to reach most arms [s]
 
 
 class PlacementSampler:

@@ -46,8 +46,7 @@ FOLLOWING = 5.0
 adds to it."""
 _POSTURE = 0.5  # weight of the arm relative to the object
 _ARRIVED = 0.05  # distance from the end of a path up to which the retreat there is meant [m], [rad]
-_BESIDE = 0.008
-"""Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
+_BESIDE = 0.008  # difference of the gap to the thickness of the bar if it is not between the fingers [m]
 _KEPT = 8  # number of controllers that are kept
 
 Targets = TypeVar("Targets")
@@ -355,12 +354,10 @@ class HandMotion:
             raise SkillError("time", f"The time is up in '{self.session.phase}'.")
 
 
-_SPEED, _RAMP = 0.3, 0.5
-"""Speed of an object along its planned path [m/s], [rad/s], and the time from rest to it [s]."""
+_SPEED, _RAMP = 0.3, 0.5  # speed of an object on its path [m/s], [rad/s], and time from rest to it [s]
 _LATE = 0.1  # distance from the path at which the reference begins to wait [m], [rad]
 _MARGIN = 0.002  # least distance of bodies while the object moves [m]; placements keep more
-_STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
-"""Least progress of the object [m], [rad] in a time [s], and in one at the end of the path."""
+_STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5  # least progress [m], [rad] in a time [s], and at the end
 _LOCKED, _STANDING = 1.5, 1e-3
 """Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
 beyond some [m/s], [rad/s] for it either: its own constraints hold it."""

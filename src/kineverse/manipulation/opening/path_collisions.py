@@ -85,8 +85,7 @@ class PathContacts:
 _LINE = 5  # number of configurations on the straight path to the handle
 _BETWEEN = 4  # number of samples between neighbouring configurations that are checked
 _SHORTER = 0.15  # share of the motion by which a path is shortened where that may help
-_ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))
-"""Angles along the bar by which a retreat deviates from the reversed approach [rad]."""
+_ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))  # of retreats, along the bar [rad]
 _LEAST_RETREAT = 3  # least number of configurations of a retreat
 _SWEEP = 8  # number of gaps of the fingers that are checked while they close or open
 

@@ -14,11 +14,9 @@ from kineverse.state import State
 from .approach_planner import Approach
 from .hand_motion import HandMotion
 
-_SAMPLES = 960
-"""Largest number of sampled starts. A limit of time would let results depend on other processes."""
+_SAMPLES = 960  # most sampled starts; a limit of time would let results depend on other processes
 _LEAST_SHARE = 0.2  # least share of the motion that a push is for
-_LONGER, _SETTLING = 1.5, 2.0
-"""Share of its time in the roll-out for which a push to a part of the motion lasts, and what is added [s]."""
+_LONGER, _SETTLING = 1.5, 2.0  # share of the time in the roll-out that a partial push lasts, and rest [s]
 _PLANNING = 1.0  # largest time to plan the path to a start [s]
 _PUSHING = 10.0  # time in the world that a push is given at least [s]
 

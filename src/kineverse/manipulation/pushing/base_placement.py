@@ -26,16 +26,14 @@ from kineverse.symbols import Symbol
 from .push_controller import Pushing
 
 _STANDOFF = 0.03  # distance of the tip from the contact point at the start [m]
-_TILT = math.radians(50.0)
-"""Largest angle between the pusher's axis and the direction of the push at a start that is exact."""
+_TILT = math.radians(50.0)  # largest angle of the pusher's axis to the push at an exact start
 _NEARBY = 0.12  # largest entry of the distance of the tip at a start that is not [m]
 _MARGIN = 0.01
 _LEAST_CLEARANCE = 1.5e-3
 """Least distance in a roll-out of pairs that may not touch [m]: pushes in worlds differ a little."""
 _STARTS = 4  # number of arms from which inverse kinematics decides whether an arm that stands reaches a point
 _CANDIDATES = 1.0  # largest difference of the score of contact points to the best one
-_SOLVER_STARTS = 2, 1
-"""Numbers of starts of inverse kinematics: to the point, and out of collisions from there."""
+_SOLVER_STARTS = 2, 1  # starts of inverse kinematics: to the point, and out of collisions from there
 _DRAWS = 40  # number of times that a place is drawn at which the base touches nothing
 _MOST_UNMOVED, _MOST_NO_FURTHER = 60, 120
 """Numbers of roll-outs without motion of the object, and without more of it, after which none is expected."""

@@ -23,6 +23,7 @@ from kineverse.geometry import Scene
 from kineverse.geometry.gjk import smoothed_support
 from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.shapes import Solid
+from kineverse.grasping.finger_branches import path_to_root
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
@@ -240,7 +241,7 @@ def find_push_tool(
     model: ModelView, bodies: Sequence[str], state: State, leave_out: Iterable[Exclusion] = ()
 ) -> PushTool:
     """Return the foremost point of a group of bodies, away from what carries the group."""
-    chains = [_ancestors(model, body) for body in bodies]
+    chains = [path_to_root(model, body) for body in bodies]
     common = [frame for frame in chains[0] if all(frame in chain for chain in chains)]
     frame = common[0]
     scene = Scene(model, leave_out=leave_out)
@@ -278,15 +279,6 @@ def _front(placed: tuple[Solid, Array, Array], axis: Array) -> Array:
         return np.asarray(smoothed_support(placed, axis))
     half = np.abs(R.T @ axis) @ solid.half
     return np.asarray(R @ solid.centre + t + axis * half)
-
-
-def _ancestors(model: ModelView, frame: str) -> list[str]:
-    """Return a frame and all that carry it, nearest first."""
-    frames, found = model.frames, []
-    while frame in frames:
-        found.append(frame)
-        frame = frames[frame].parent
-    return found
 
 
 def find_alignment(normal: Vector, velocity: Vector) -> float:

@@ -12,8 +12,7 @@ from kineverse.state import State
 from .contact_points import PushContacts, PushPoint, PushSurface
 from .vectors import Vector, length
 
-CONE, CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
-"""Cosines of the friction cone in which a contact point is chosen, and of the one in which it is kept."""
+CONE, CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))  # to choose, and to keep
 _DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
 """Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
 _SURROUNDINGS = 0.1  # distance within which other points count as given up, too [m]

@@ -23,11 +23,9 @@ from .vectors import ZERO, Vector, add, inner_product, length, rotate_back, scal
 RAMP = 0.02  # speed of the contact point beyond the measured one that is tried [m/s]
 SPEED = 0.25  # largest speed of the contact point [m/s]
 _MOST_LAG = 8e-4  # lag at which the press grows no more [m]
-_CREEP = 0.02
-"""Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
+_CREEP = 0.02  # speed at which a pusher feels for an object whose distance is uncertain [m/s]
 STILL = 5e-3  # speed of a contact point that counts as none [m/s]
-_DEEPEN, _DEEPER = 0.5, 3.0
-"""Time in which a press on what does not move becomes deeper [s], and by how many times its depth."""
+_DEEPEN, _DEEPER = 0.5, 3.0  # time in which a press on what does not move gets deeper [s], and its factor
 _FORGET, _FORGET_DISTANCE = 1.0, 0.01
 """Time [s] and distance [m] after which a lag is forgotten: lag of acceleration and delays is no press, and
 what moves on gives way."""

@@ -31,8 +31,7 @@ PRESS = 2e-4  # depth that rows of touching bodies allow, so that contact is kep
 NEAR = 0.012  # distance of the tip from the axis of a contact within which it approaches the surface [m]
 _REACH_SPEED = 0.5  # largest speed of the tip on its way to a contact [m/s]
 _TOUCH_SPEED = 0.15  # rate at which the trend of contact is followed [m/s]
-_SPIN_WEIGHT = 0.01
-"""Weight against turns of the pusher about its axis, which change nothing but the nearest points."""
+_SPIN_WEIGHT = 0.01  # against turns of the pusher about its axis, which change nothing but nearest points
 _MARGIN, _RADIUS = 5e-3, 0.035  # distance that pairs which may not touch keep, and from which they count [m]
 _SMOOTH = 0.02
 _ANY = 1e3  # speed that restricts nothing

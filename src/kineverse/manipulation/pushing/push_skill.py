@@ -76,16 +76,14 @@ def plan_push_approach(
 
 _SETTLED, _SETTLED_ESTIMATE = 5, 25
 """Number of steps for which the value, or its estimate, is within half of the tolerance when a push ends."""
-_PATIENCE = 25
-"""Number of further steps within the tolerance without progress after which a push ends all the same."""
+_PATIENCE = 25  # further steps within the tolerance without progress that end a push
 _PROGRESS = 5e-4
 _AVERAGED = 0.1  # weight of the latest estimate in the mean that counts at the end
 _PRESSED = 5  # number of steps for which an object within the tolerance gives way no more when a push ends
 _MOST_BLOCKED = 3  # number of contact points given up before an approach is planned
 _MOST_JAMMED = 3  # number of contact points at which the object does not move before it counts as jammed
 _MOST_APPROACHES = 2
-_UNKNOWN, _LOOK = 0.05, 2.0
-"""Deviation of a coordinate that is not known yet [m], [rad], and the time to wait until it is [s]."""
+_UNKNOWN, _LOOK = 0.05, 2.0  # deviation of an unknown coordinate [m], [rad], and time to look for it [s]
 _RETREAT_STEPS = 100
 
 

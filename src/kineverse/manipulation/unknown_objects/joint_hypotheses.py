@@ -75,8 +75,7 @@ def least_share(
 
 _DISTANCE, _FLOOR_POSITION, _FLOOR_ORIENTATION = 1.0, 1e-3, 2e-3
 """Distance of the camera, and least standard deviations, for the test of a believed joint [m], [rad]."""
-_MOVED, _TURNED = 0.01, math.radians(1.0)
-"""Distance [m] and angle [rad] of furniture from where it was believed that are reported."""
+_MOVED, _TURNED = 0.01, math.radians(1.0)  # motion of furniture that is reported [m], [rad]
 
 
 def watch_joint(model: Model, belief: PartBelief) -> PlausibilityMonitor | None:

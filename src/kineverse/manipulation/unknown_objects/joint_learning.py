@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from kineverse.estimation import Fit, Identifier
 from kineverse.lie import Array
 
-CERTAIN = 0.97
-"""Least probability of a family: between nested families such as hinge and screw, 0.99 is hardly exceeded."""
+CERTAIN = 0.97  # least probability: between nested families such as hinge and screw, .99 is hardly exceeded
 _LOOKS = 3  # results in a row that a decision takes
 _EVERY = 4  # number of new poses between two results
 _VISIBLE = 0.005  # motion of the part before which no joint is fitted [m]
-LEAST_DISTANCE, LEAST_TURN = 0.03, math.radians(4.0)
-"""Motion of the part before which nothing is decided [m], [rad]: noise alone looks like any joint."""
+LEAST_DISTANCE, LEAST_TURN = 0.03, math.radians(4.0)  # before, noise alone looks like any joint [m], [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

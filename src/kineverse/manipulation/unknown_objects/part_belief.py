@@ -19,12 +19,10 @@ from kineverse.worlds.sensor_sampler import find_camera
 
 from .unmodelled_joint import JointPath, UnknownPart
 
-_FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4
-"""Least standard deviations of observed poses [m], [rad]: no camera is exact."""
+_FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4  # least noise of poses [m], [rad]: no camera is exact
 _HELD_LOOKS, _STATIC_LOOKS = 16.0, 60.0
 """Number of looks that a mean is worth: of the part in the hand, which slips, and of what stands still."""
-_NEAR, _TURNED = 0.06, 0.35
-"""Distance [m] and angle [rad] from where a part is believed beyond which a look is an outlier."""
+_NEAR, _TURNED = 0.06, 0.35  # distance [m] and angle [rad] from the believed pose that make an outlier
 _FIRST = 5  # number of first looks of which the largest cluster is believed
 _LOST_LOOKS = 6  # outliers in a row after which a part is not where it was believed
 

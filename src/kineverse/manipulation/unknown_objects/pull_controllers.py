@@ -24,18 +24,15 @@ from kineverse.symbols import Symbol
 from .part_belief import PartBelief
 from .unmodelled_joint import JointPath, write_joint
 
-_FIRST_SPEED, PULL_SPEED, _SPEED_UP = 0.02, 0.05, 0.04
-"""Speeds of the straight pull at first and after a distance [m/s], [m]."""
+_FIRST_SPEED, PULL_SPEED, _SPEED_UP = 0.02, 0.05, 0.04  # at first, and after a distance [m/s], [m]
 PATH_SPEED = 0.1  # speed of the handle along a learned joint [m/s]
 _BEYOND = 1.2  # place of the goal by the wanted opening: before a goal the motion slows down
 _GAIN = 5.0  # rate at which errors of the hand's place on the part decay [1/s]
-_STRAIGHT = 0.035
-"""Distance of the handle after which the likeliest joint counts as much as the first direction [m]."""
+_STRAIGHT = 0.035  # distance after which the likeliest joint counts as much as the first direction [m]
 _RAMP = 0.5  # time in which the pull begins [s]
 _STEP = 0.03  # distance of the handle between two arms that are found for a learned joint [m]
 _QUICK = 0.5  # speed from which on joints take their whole part [m/s], [rad/s]
-_UNSURE = 0.01
-"""Depth from which on something is in the way along a learned joint, which is off by millimetres [m]."""
+_UNSURE = 0.01  # depth of obstacles along a learned joint, which is off by millimetres [m]
 _MARGIN = 0.002  # least distance of bodies while the part moves [m]
 
 

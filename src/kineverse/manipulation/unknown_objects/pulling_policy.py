@@ -23,8 +23,7 @@ from .part_belief import PartBelief, measure_way
 from .pull_controllers import LearnedPull, StraightPull, learn_model, point_speed
 from .unmodelled_joint import JointPath
 
-LEAST_OPENING = 0.08, math.radians(10.0)
-"""Opening from which a part at its own stop counts as open [m], [rad]."""
+LEAST_OPENING = 0.08, math.radians(10.0)  # from which a part at its own stop is open [m], [rad]
 LOOKING, _HELD_LOOKING = 0.6, 1.0  # times of looks at a part that stands, and with the hand closed [s]
 _MOST_GRASPS = 3
 _DIRECTIONS = (
@@ -37,8 +36,7 @@ _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
 """Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
 _LED = 0.06  # distance of the handle before which the hand does not rely on a joint that was learned [m]
 _ENDING = 0.5  # time without progress where the arm is expected to end [s]
-_AHEAD, _AHEAD_STEPS = 0.03, 4
-"""Distance of the handle that an arm must be able to go on [m], and its number of poses."""
+_AHEAD, _AHEAD_STEPS = 0.03, 4  # distance that an arm must be able to go on [m], and number of poses
 
 
 class ArmEndError(SkillError):

@@ -9,6 +9,7 @@ from typing import Any
 from kineverse.compilation import compile
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
+from kineverse.grasping.finger_branches import path_to_root
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.approach_planner import Approach, ApproachPlanner
@@ -16,7 +17,7 @@ from kineverse.manipulation.opening.hand_motion import HandMotion, find_retreat
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import check_positive
-from kineverse.model.frame import WORLD, is_of_robot
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
 from kineverse.worlds import Judge, Sensors
 
@@ -31,12 +32,10 @@ OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)  # opening that is wanted by defa
 _MOST_LOOKING = 3.0  # largest time until a part is seen [s]
 _REACH = 0.25  # straight distance of the handle that a placement should allow [m]
 _GRASPS = 128
-_SEARCHES, _ENOUGH = 3, 0.99
-"""Number of searches of a first place, and share of possible motions from which on it is taken."""
+_SEARCHES, _ENOUGH = 3, 0.99  # searches of a first place, share of possible motions that is enough
 _MOST_PLACES = 3  # largest number of places of the robot, or of its hand
 _FURTHER = 1.1  # share of the rest of an opening that a further placement should lead along the learned joint
-_CLOSED_WAY, _CLOSED_TURN = 0.03, math.radians(6.0)
-"""Motion back [m], [rad] after which a part that was open is not."""
+_CLOSED_WAY, _CLOSED_TURN = 0.03, math.radians(6.0)  # motion back after which a part is not open [m], [rad]
 
 
 def open_unknown(
@@ -142,7 +141,7 @@ class _Run:
         self.session, self.model, self.world = session, model, session.world
         self.wanted, self.seconds, self.samples, self.seed = wanted, seconds, placements, seed
         self.gripper = find_gripper(model, self.world.robot, hand)
-        above = _ancestors(model, handle)
+        _, *above = path_to_root(model, handle)
         self.part = part or next((f for f in (handle, *above) if find_joint(model, f)), handle)
         if self.part not in (handle, *above):
             raise InvalidValueError(
@@ -151,9 +150,9 @@ class _Run:
         before = model.default_state()
         before = before.updated({s: v for s, v in session.state.items() if s in before})
         self.unknown = unknown = free_part(model, self.part, handle, before)
-        rigid = [f for f in model.frames if f == self.part or self.part in _ancestors(model, f)]
+        rigid = [f for f in model.frames if self.part in path_to_root(model, f)]
         markers = [f for f in rigid if not unknown.model.fk(f, self.part).symbols]
-        still = [f for f in _ancestors(model, self.part) if not model.fk(f).symbols]
+        still = [f for f in path_to_root(model, self.part)[1:] if not model.fk(f).symbols]
         references = still if beside is None else [beside]
         stated = sensors or Sensors()
         self.belief = PartBelief(unknown, self.world, before, self.gripper.hand, markers, references, stated)
@@ -375,11 +374,3 @@ class _Run:
         self.measures |= {key: parameters[key] for key in ("axis", "point") if key in parameters}
         self.measures["believed"], words = revise_joint(self.model, self.belief, learned)
         return words
-
-
-def _ancestors(model: Model, frame: str) -> list[str]:
-    """Return the frames above a frame, the nearest first, without the world."""
-    found = []
-    while (frame := model.frames[frame].parent) != WORLD:
-        found.append(frame)
-    return found

@@ -23,8 +23,7 @@ from kineverse.spatial import axis_angle, translation
 from kineverse.state import State
 from kineverse.symbols import Symbol, position
 
-_ROTATION_ARM = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
-"""Lengths that make rotations comparable to distances [m]."""
+_ROTATION_ARM = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])  # make rotations comparable to distances [m]
 _STEPS, _DIFFERENCE = 3, 1e-5
 _STRAIGHT = 1e-3  # turn by motion of the handle from which on a motion is a rotation [rad/m]
 

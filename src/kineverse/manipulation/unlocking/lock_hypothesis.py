@@ -18,8 +18,7 @@ _SIDES: tuple[Side, Side] = (1, -1)
 Configuration: TypeAlias = tuple[float, ...]
 
 
-_HELD = 0.1
-"""Probability of a condition that holds at the start, relative to one that does not: boxes come shut."""
+_HELD = 0.1  # relative probability of a condition that holds at the start: boxes come shut
 
 
 class KeySide(NamedTuple):
