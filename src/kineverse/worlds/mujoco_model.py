@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from kineverse.formats.mjcf.mujoco_api import capture_mujoco_warnings, mujoco
 from kineverse.formats.mjcf.writer import to_mjcf
 from kineverse.geometry.collision_filter import adjacent_pairs, allowed_pairs, apply_rules, read_rules
 from kineverse.geometry.distance_queries import flag_between, flag_relatively_moving
+from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 
 from .mujoco_state import MujocoCoordinates
@@ -238,32 +240,22 @@ def exclude_overlaps(
     of shapes of furniture that overlap at the default state. Of two bodies of furniture, some of whose shapes
     overlap, the others collide. Excluded are also bodies that one joint keeps apart between its limits.
     """
-    engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
+    data, random = mujoco().MjData(compiled), np.random.default_rng(seed)
     own = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
 
-    def touching() -> dict[tuple[int, int], float]:
-        """Return the pairs of shapes that overlap, with their distances."""
-        engine.mj_kinematics(compiled, data)
-        engine.mj_comPos(compiled, data)
-        engine.mj_collision(compiled, data)
-        return {
-            (a, b): gap
-            for (a, b), gap in zip(
-                np.sort(data.contact.geom, axis=1).tolist(), data.contact.dist.tolist(), strict=True
-            )
-            if gap < 0.0
-        }
+    def find_overlaps() -> dict[tuple[int, int], float]:
+        return {(min(a, b), max(a, b)): gap for a, b, gap in _find_contacts(compiled, data) if gap < 0.0}
 
     def pairs_of_robot(found: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
         pairs = (sorted(compiled.geom_bodyid[list(pair)].tolist()) for pair in found)
         return {(a, b) for a, b in pairs if own[a] and own[b]}
 
     data.qpos[:] = coordinates.positions(coordinates.default)
-    at_home, move, sweep = touching(), coordinates.sampler(), coordinates.sweep()
+    at_home, move = find_overlaps(), coordinates.mover()
     always: set[tuple[int, int]] | None = None
     for _ in range(samples):
-        move(data, random)
-        here = pairs_of_robot(touching())
+        move(data, random.uniform)
+        here = pairs_of_robot(find_overlaps())
         always = here if always is None else always & here
         if not always:
             break
@@ -283,14 +275,28 @@ def exclude_overlaps(
                 pair.condim, pair.friction[:2] = 3, geoms[0].friction[0]
     names = [(compiled.body(a).name, compiled.body(b).name) for a, b in sorted(bodies)]
     met = {*shapes}
-    for share in np.linspace(0.0, 1.0, _SWEEP):
-        sweep(data, float(share))
-        deep = (pair for pair, gap in touching().items() if gap < -_RESTING)
+    for share in np.linspace(0.0, 1.0, _SWEEP).tolist():
+        move(data, partial(_between, share=share))
+        deep = (pair for pair, gap in find_overlaps().items() if gap < -_RESTING)
         met |= {tuple(sorted(compiled.geom_bodyid[list(pair)].tolist())) for pair in deep}
     apart = [pair for pair in _limited_joints(model, compiled) if tuple(sorted(pair)) not in met]
     for a, b in (*names, *((compiled.body(a).name, compiled.body(b).name) for a, b in apart)):
         spec.add_exclude(bodyname1=a, bodyname2=b)
     return names
+
+
+def _between(lower: Array, upper: Array, share: float) -> Array:
+    return lower + share * (upper - lower)
+
+
+def _find_contacts(compiled: Any, data: Any) -> Iterator[tuple[int, int, float]]:
+    """Yield the pairs of shapes that MuJoCo's collision detection finds, with their distances [m]."""
+    engine = mujoco()
+    engine.mj_kinematics(compiled, data)
+    engine.mj_comPos(compiled, data)
+    engine.mj_collision(compiled, data)
+    for (a, b), gap in zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True):
+        yield a, b, gap
 
 
 def _limited_joints(model: ModelView, compiled: Any) -> list[tuple[int, int]]:
@@ -349,22 +355,19 @@ def add_floor(
     floor = compiled.body(name).id
 
     def touching() -> dict[str, float]:
-        engine.mj_kinematics(compiled, data)
-        engine.mj_comPos(compiled, data)
-        engine.mj_collision(compiled, data)
         found: dict[str, float] = {}
-        bodies = compiled.geom_bodyid[data.contact.geom]
-        for (a, b), gap in zip(bodies.tolist(), data.contact.dist.tolist(), strict=True):
+        for one, other, gap in _find_contacts(compiled, data):
+            a, b = compiled.geom_bodyid[[one, other]].tolist()
             if floor in (a, b):
-                other = compiled.body(a + b - floor).name
-                found[other] = min(gap, found.get(other, gap))
+                touched = compiled.body(a + b - floor).name
+                found[touched] = min(gap, found.get(touched, gap))
         return found
 
     data.qpos[:] = coordinates.positions(coordinates.default)
-    standing, move = touching(), coordinates.sampler()
+    standing, move = touching(), coordinates.mover()
     below = {b for b, gap in standing.items() if gap < _STANDS[0]}
     for _ in range(samples):
-        move(data, random)
+        move(data, random.uniform)
         below |= {b for b, gap in touching().items() if gap < _STANDS[0] and not is_robot(b)}
     geom.margin = 0.0
     if below:

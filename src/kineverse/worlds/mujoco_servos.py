@@ -202,11 +202,11 @@ class JointServos:
 def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int) -> Array:
     """Return the largest inertia about each joint in sampled configurations (n,); what follows counts."""
     engine = mujoco()
-    data, random, move = engine.MjData(compiled), np.random.default_rng(seed), coordinates.sampler()
+    data, random, move = engine.MjData(compiled), np.random.default_rng(seed), coordinates.mover()
     columns = np.ascontiguousarray(coordinates.followers[:, dofs].T)
     largest, product = np.zeros(len(dofs)), np.zeros(compiled.nv)
     for _ in range(_CONFIGURATIONS):
-        move(data, random)
+        move(data, random.uniform)
         engine.mj_kinematics(compiled, data)
         engine.mj_comPos(compiled, data)
         engine.mj_crb(compiled, data)
@@ -224,13 +224,13 @@ def _sampled_loads(
     Both are the largest in sampled configurations, (n,): [N], [N m], and [m/m], [m/rad].
     """
     engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
-    move, columns = coordinates.sampler(), np.ascontiguousarray(coordinates.followers[:, dofs])
+    move, columns = coordinates.mover(), np.ascontiguousarray(coordinates.followers[:, dofs])
     weights, levers = np.zeros(len(dofs)), np.zeros(len(dofs))
     slide, turn = np.zeros((3, compiled.nv)), np.zeros((3, compiled.nv))
     roots = compiled.body_rootid[compiled.dof_bodyid[dofs]]
     own = np.flatnonzero(np.isin(compiled.body_rootid[compiled.geom_bodyid], roots)).tolist()
     for _ in range(_CONFIGURATIONS):
-        move(data, random)
+        move(data, random.uniform)
         engine.mj_forward(compiled, data)
         np.maximum(weights, np.abs(data.qfrc_gravcomp @ columns), out=weights)
         for geom in own:

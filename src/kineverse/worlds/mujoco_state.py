@@ -113,25 +113,15 @@ class MujocoCoordinates:
             values.update(zip(symbols, [*pose[:3, 3].tolist(), w, x, y, z], strict=True))
         return State({s: values[s] for s in self._symbols}, stamp=stamp, source="mujoco")
 
-    def sampler(self) -> Callable[[Any, np.random.Generator], None]:
-        """Return a function that sets an ``MjData`` to a random state within the limits.
+    def mover(self) -> Callable[[Any, Callable[[Array, Array], Array]], None]:
+        """Return a function that sets an ``MjData`` to values which a function takes from the ends of ranges.
 
         Coordinates without limits are within half a turn, loops stay where they are.
         """
         free, lower, upper = self._ranges()
 
-        def move(data: Any, random: np.random.Generator) -> None:
-            data.qpos[free] = random.uniform(lower, upper)
-            self.follow(data.qpos)
-
-        return move
-
-    def sweep(self) -> Callable[[Any, float], None]:
-        """Return a function that sets an ``MjData`` to a share of the range of all coordinates."""
-        free, lower, upper = self._ranges()
-
-        def move(data: Any, share: float) -> None:
-            data.qpos[free] = lower + share * (upper - lower)
+        def move(data: Any, draw: Callable[[Array, Array], Array]) -> None:
+            data.qpos[free] = draw(lower, upper)
             self.follow(data.qpos)
 
         return move
