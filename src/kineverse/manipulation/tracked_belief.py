@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from kineverse.compilation import compile
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError
 from kineverse.estimation import ObservedPose, Outliers, Tracker, pose_covariance
 from kineverse.estimation.noise import CHI_SQUARED_6
 from kineverse.lie import Array, inverse, pose_difference, rotation_z, transform
@@ -24,7 +24,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Sensors, World
-from kineverse.worlds.sensor_sampler import find_camera, find_marked_frames, find_robot_base
+from kineverse.worlds.sensor_sampler import find_observed_frames, find_robot_base
 
 from .belief import check_believed
 
@@ -154,22 +154,14 @@ class TrackedBelief:
     def __init__(self, model: ModelView, robot: str, sensors: Sensors | None = None) -> None:
         self.sensors = sensors = Sensors() if sensors is None else sensors
         self._model = model
-        own = [name for name in model.frames if is_of_robot(name, robot)]
-        if not own:
-            prefixes = {name.partition("/")[0] for name in model.frames}
-            raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
         remarks = []
-        found = sensors.camera or find_camera(own)
-        if found is None:
+        frames = find_observed_frames(model, robot, sensors)
+        self.camera, marked = frames.camera, frames.marked
+        if not frames.has_camera:
             remarks.append(
-                f"No frame of '{robot}' is named like a camera, so markers are seen from '{own[0]}'; "
+                f"No frame of '{robot}' is named like a camera, so markers are seen from '{self.camera}'; "
                 "camera= names another one."
             )
-        self.camera = found or own[0]
-        marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
-        for name in (self.camera, *marked):
-            if name not in model.frames:
-                raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
         coordinates = {*model.degrees_of_freedom}
         moving = {name: coordinates.intersection(model.fk(name).symbols) for name in marked}
         self._landmarks = {name: np.asarray(model.fk(name)({})) for name in marked if not moving[name]}

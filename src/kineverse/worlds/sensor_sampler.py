@@ -139,21 +139,13 @@ class SensorSampler:
 
     def __init__(self, sensors: Sensors, model: ModelView, robot: str, seed: int = 0) -> None:
         self.sensors, self._seed = sensors, seed
-        own = [name for name in model.frames if is_of_robot(name, robot)]
-        if not own:
-            prefixes = {name.partition("/")[0] for name in model.frames}
-            raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
-        self.marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
-        found = sensors.camera or find_camera(own)
-        if found is None and (sensors.field_of_view is not None or sensors.sight):
+        seen = find_observed_frames(model, robot, sensors)
+        if not seen.has_camera and (sensors.field_of_view is not None or sensors.sight):
             raise InvalidValueError(
                 f"What is visible depends on a camera, and no frame of '{robot}' is named like one. "
-                f"Name it by camera=. {suggest('head', own, 'frame')}"
+                f"Name it by camera=. {suggest('head', seen.robot, 'frame')}"
             )
-        self.camera = found or own[0]
-        for name in (self.camera, *self.marked):
-            if name not in model.frames:
-                raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
+        self.camera, self.marked = seen.camera, seen.marked
         self._robot = robot
         self._joints = tuple(s for s in model.symbols if is_of_robot(s.path, robot) and not s.order)
         base = find_robot_base(model, robot)
@@ -161,7 +153,7 @@ class SensorSampler:
         self._encoded = tuple(s for s in self._joints if s not in set(self._base))
         # Compiled for the first picture: many worlds are never observed.
         self._seen = [model.fk(name) for name in (self.camera, *self.marked)]
-        self._sight = LineOfSight(model, self.camera, own, self.marked) if sensors.sight else None
+        self._sight = LineOfSight(model, self.camera, seen.robot, self.marked) if sensors.sight else None
         self.reset()
 
     @cached_property
@@ -295,6 +287,29 @@ class SensorSampler:
             known = not math.isnan(contact.force)
             if contact.force >= sensors.touch_force if known else contact.distance <= sensors.touch_gap:
                 yield from (name for name in (contact.a, contact.b) if is_of_robot(name, self._robot))
+
+
+class ObservedFrames(NamedTuple):
+    """Frames of a robot, that of its camera, and those with markers."""
+
+    robot: tuple[str, ...]
+    camera: str  # the robot's first frame if none is named like a camera
+    marked: tuple[str, ...]
+    has_camera: bool
+
+
+def find_observed_frames(model: ModelView, robot: str, sensors: Sensors) -> ObservedFrames:
+    """Return the frames that sensors concern, or raise UnknownNameError for those that do not exist."""
+    own = tuple(name for name in model.frames if is_of_robot(name, robot))
+    if not own:
+        prefixes = {name.partition("/")[0] for name in model.frames}
+        raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
+    camera = sensors.camera or find_camera(own)
+    marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
+    for name in (camera or own[0], *marked):
+        if name not in model.frames:
+            raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
+    return ObservedFrames(own, camera or own[0], marked, camera is not None)
 
 
 def find_marked_frames(model: ModelView, robot: str) -> tuple[str, ...]:
