@@ -339,7 +339,8 @@ def test_hand_believes_that_a_locked_door_is_open_where_it_is():
     search = SimpleNamespace(model=model, moving=())
     state = model.default_state().updated({door: 0.5, "microwave/oven/button": 0.006})
     hand = SimpleNamespace(hand="world")
-    motion = HandMotion(SimpleNamespace(state=state), hand, handle, search, None, None, 0.0)
+    opener = SimpleNamespace(gripper=hand, search=search, approaches=None, controllers={})
+    motion = HandMotion(SimpleNamespace(state=state), opener, handle, None, 0.0)
     assert motion.state[door] == 0.5
 
 

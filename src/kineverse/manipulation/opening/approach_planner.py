@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from kineverse.control import Controller
+from kineverse.grasping import Grasp, Gripper, Handle, sample_grasps
 from kineverse.lie import Array
 from kineverse.manipulation.base_drive import BaseDrive, DriveSearch, Place
+from kineverse.model.frame import is_of_robot
+from kineverse.model.model_view import ModelView
 from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -144,3 +149,28 @@ class ApproachPlanner:
                 places = np.array([scene.pose(b)[:2, 3] for b in search.own])
                 found.append((float(np.hypot(*(places - [x, y]).T).max()), k))
         return rows[[k for _, k in sorted(found)]]
+
+
+_GRASPS = 96
+_KEPT_GRASPS = 15  # number of sets of grasps that are kept
+
+
+class Opener:
+    """Searches, planner and controllers of a gripper in a model, made once."""
+
+    def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
+        self.model, self.gripper = model, gripper
+        self.search = PlacementSearch(model, gripper, state)
+        self.approaches = ApproachPlanner(self.search)
+        self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
+        self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
+
+    def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:
+        """Return the grasps of a handle where everything but the robot is as in a state, up to a slant."""
+        robot = self.gripper.robot
+        others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
+        key = handle.frame, handle.coordinate, seed, slant, others
+        if key not in self._grasps:
+            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
+            self._grasps = {**dict([*self._grasps.items()][-_KEPT_GRASPS:]), key: found}
+        return self._grasps[key]

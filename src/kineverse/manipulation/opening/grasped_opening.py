@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from kineverse._checks import as_count
-from kineverse.control import Controller
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
-from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
+from kineverse.grasping import Handle, find_gripper, find_handle
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
@@ -25,50 +24,15 @@ from kineverse.manipulation.skill_arguments import (
 )
 from kineverse.manipulation.slip_detection import SlipError
 from kineverse.manipulation.swept_volume import BlockedError, find_obstacle
-from kineverse.model.frame import is_of_robot
-from kineverse.model.model_view import ModelView
 from kineverse.model.symbolic_view import cached_for_version
-from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 from kineverse.worlds.run_metrics import JudgedOverlap
 
-from .approach_planner import Approach, ApproachPlanner
-from .base_placement import BasePlacement, PlacementSearch
+from .approach_planner import Approach, Opener
+from .base_placement import BasePlacement
 from .hand_motion import HandMotion, move_held
 from .push_regrasp import PushRegrasp
-
-_GRASPS = 96
-_KEPT = 15  # number of sets of grasps that are kept
-
-
-class Opener:
-    """Searches and controllers of a gripper in a model, made once."""
-
-    def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
-        self.model, self.gripper = model, gripper
-        self.search = PlacementSearch(model, gripper, state)
-        self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
-        self._approaches: ApproachPlanner | None = None
-        self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
-
-    @property
-    def approaches(self) -> ApproachPlanner:
-        """Planner of the robot's paths with the hand empty."""
-        if self._approaches is None:
-            self._approaches = ApproachPlanner(self.search)
-        return self._approaches
-
-    def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:
-        """Return the grasps of a handle where everything but the robot is as in a state, up to a slant."""
-        robot = self.gripper.robot
-        others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
-        key = handle.frame, handle.coordinate, seed, slant, others
-        if key not in self._grasps:
-            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
-            self._grasps = {**dict([*self._grasps.items()][-_KEPT:]), key: found}
-        return self._grasps[key]
-
 
 _SLANT = math.radians(50.0)  # largest slant of grasps where those from across the handle lead nowhere [rad]
 _PROOF = 200  # largest number of sampled bases that are to prove that an object is too high
@@ -233,10 +197,7 @@ class _Run:
             coordinate=handle.coordinate, start=session.start,
         )  # fmt: skip
         self.judge.update(session.world.state)
-        self.motion = HandMotion(
-            session, self.gripper, handle, opener.search, opener.approaches, self.judge, self.begin + seconds,
-            opener.controllers,
-        )  # fmt: skip
+        self.motion = HandMotion(session, opener, handle, self.judge, self.begin + seconds)
 
     @property
     def measures(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from kineverse.compilation import compile
 from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
 from kineverse.geometry import Rule, Scene
-from kineverse.grasping import Grasp, Gripper, Handle
+from kineverse.grasping import Grasp, Handle
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import HandReference, Session, Speeds
@@ -26,8 +26,8 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
-from .approach_planner import Approach, ApproachPlanner
-from .base_placement import BasePlacement, PlacementSearch
+from .approach_planner import Approach, Opener
+from .base_placement import BasePlacement
 from .cartesian_paths import find_least_time, row_at
 from .path_collisions import draw_retreats
 
@@ -55,25 +55,14 @@ Targets = TypeVar("Targets")
 class HandMotion:
     """Motions of the hand of a robot at a handle."""
 
-    def __init__(
-        self,
-        session: Session,
-        gripper: Gripper,
-        handle: Handle,
-        search: PlacementSearch,
-        approaches: ApproachPlanner,
-        judge: Judge,
-        until: float,
-        controllers: dict[Hashable, tuple[Controller, Any]] | None = None,
-    ) -> None:
-        self.session, self.gripper, self.handle = session, gripper, handle
-        self.search, self.approaches, self.judge, self.until = search, approaches, judge, until
-        self.model = search.model
-        self.turns: Array = np.zeros(len(search.moving))
-        self.controllers = {} if controllers is None else controllers
-        self._hand, self._bar = self.model.fk(gripper.hand), self.model.fk(handle.frame)
+    def __init__(self, session: Session, opener: Opener, handle: Handle, judge: Judge, until: float) -> None:
+        self.session, self.handle, self.judge, self.until = session, handle, judge, until
+        self.gripper, self.search, self.approaches = opener.gripper, opener.search, opener.approaches
+        self.controllers, self.model = opener.controllers, opener.search.model
+        self.turns: Array = np.zeros(len(self.search.moving))
+        self._hand, self._bar = self.model.fk(self.gripper.hand), self.model.fk(handle.frame)
         self._slope = self._bar[:3, 3].partial([handle.coordinate])
-        limits = {s: self.model.limits(s) for s in (*search.moving, handle.coordinate)}
+        limits = {s: self.model.limits(s) for s in (*self.search.moving, handle.coordinate)}
         self._limits = {s: (float(a), float(b)) for s, (a, b) in limits.items()}
         self.fingers: dict[Symbol, float] = {}  # where they stood around the bar
 

@@ -11,8 +11,8 @@ from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError,
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
 from kineverse.grasping.finger_branches import path_to_root
 from kineverse.lie import Array, inverse
-from kineverse.manipulation.opening import BasePlacement, PlacementSearch
-from kineverse.manipulation.opening.approach_planner import Approach, ApproachPlanner
+from kineverse.manipulation.opening import BasePlacement
+from kineverse.manipulation.opening.approach_planner import Approach, Opener
 from kineverse.manipulation.opening.hand_motion import HandMotion, find_retreat
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
@@ -238,24 +238,21 @@ class _Run:
     def _prepare(self, unknown: UnknownPart) -> None:
         session = self.session
         with session.timed("place"):
-            self.search = PlacementSearch(unknown.model, self.gripper, session.state)
-            self.approaches = ApproachPlanner(self.search)
+            self.opener = Opener(unknown.model, self.gripper, session.state)
         until = self.begin + self.seconds
-        self.motion = HandMotion(
-            session, self.gripper, unknown.handle, self.search, self.approaches, self.judge, until
-        )
+        self.motion = HandMotion(session, self.opener, unknown.handle, self.judge, until)
         self.unknown = unknown
 
     def _place_first(self) -> BasePlacement:
         """Return a placement for a straight pull, from which the arm follows possible hinges, too."""
         session, unknown = self.session, self.unknown
         with session.timed("place"):
-            twists = guess_hinges(unknown, self.search, session.state)
+            twists = guess_hinges(unknown, self.opener.search, session.state)
         found: list[tuple[float, BasePlacement]] = []
 
         def accept(placement: BasePlacement) -> bool:
             share = least_share(
-                unknown, self.search, placement, session.state, twists, _REACH, self.wanted[1]
+                unknown, self.opener.search, placement, session.state, twists, _REACH, self.wanted[1]
             )
             found.append((share, placement))
             return share > _ENOUGH and self._plan(placement)
@@ -335,12 +332,12 @@ class _Run:
         with session.timed("place"):
             model, handle = self.unknown.model, self.unknown.handle
             grasps = sample_grasps(model, self.gripper, handle, _GRASPS, seed, state=session.state)
-            return self.search.find(
+            return self.opener.search.find(
                 session.state, grasps, distance, accept=accept, samples=self.samples, seed=seed
             )
 
     def _plan(self, placement: BasePlacement) -> bool:
-        self.approach = self.approaches.plan_to(self.session.state, placement, self.seed)
+        self.approach = self.opener.approaches.plan_to(self.session.state, placement, self.seed)
         return bool(self.approach)
 
     def _come(self, placement: BasePlacement) -> None:
