@@ -195,12 +195,7 @@ class _Surroundings:
     """Bodies around a handle, and a hand that is tried there, all in the frame of the handle."""
 
     def __init__(
-        self,
-        model: ModelView,
-        gripper: Gripper,
-        handle: Handle,
-        decomposed: tuple[str, ...],
-        state: State,
+        self, model: ModelView, gripper: Gripper, handle: Handle, decomposed: tuple[str, ...], state: State
     ) -> None:
         robot = _frames_of_robot(model, gripper)
         scene = Scene(model, leave_out=[f for f in model.bodies if f in robot], decomposed=decomposed)

@@ -98,11 +98,7 @@ def find_handles(
 
 
 def find_handle(
-    model: ModelView,
-    coordinate: Symbol | str,
-    frame: str | None = None,
-    *,
-    decomposed: Iterable[str] = (),
+    model: ModelView, coordinate: Symbol | str, frame: str | None = None, *, decomposed: Iterable[str] = ()
 ) -> Handle:
     """Return the best handle that a coordinate moves, or the one at a frame.
 

@@ -222,9 +222,7 @@ def _unary(term: Term, a: AbstractValue, sign: Signs, live: frozenset[Symbol]) -
     turn = sign(term.args[0]) if op == ca.OP_FABS else None
     if op == ca.OP_NEG or turn == -1:
         return AbstractValue(
-            interval_negate(a.range),
-            None if a.polynomial is None else a.polynomial.scale(-1),
-            live,
+            interval_negate(a.range), None if a.polynomial is None else a.polynomial.scale(-1), live
         )
     if op == ca.OP_ASSIGN or turn is not None:
         return a
@@ -264,9 +262,7 @@ def _product(a: AbstractValue, b: AbstractValue, same: bool, live: frozenset[Sym
     if a.polynomial is not None and b.polynomial is not None:
         exact = a.polynomial.multiply(b.polynomial)
     return AbstractValue(
-        interval_square(a.range) if same else interval_multiply(a.range, b.range),
-        exact,
-        live,
+        interval_square(a.range) if same else interval_multiply(a.range, b.range), exact, live
     )
 
 

@@ -138,10 +138,7 @@ def _isolate_speed(constraint: Constraint) -> tuple[Expression, Expression, Expr
 
 
 def _collect_regions(
-    start: Case,
-    factor: Term,
-    side: tuple[Term, Term, Region, Region],
-    unknown: list[tuple[str, IntervalBox]],
+    start: Case, factor: Term, side: tuple[Term, Term, Region, Region], unknown: list[tuple[str, IntervalBox]]
 ) -> None:
     slack, opposite, blocks, forces = side
     if start.sign(factor) == 1:

@@ -28,12 +28,7 @@ import numpy.typing as npt
 from kineverse.errors import NoSolutionError
 from kineverse.geometry import Scene
 from kineverse.geometry.collision_filter import adjacent_pairs, apply_rules
-from kineverse.geometry.distance_queries import (
-    PairFlags,
-    PreparedQuery,
-    flag_between,
-    flag_relatively_moving,
-)
+from kineverse.geometry.distance_queries import PairFlags, PreparedQuery, flag_between, flag_relatively_moving
 from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
 from kineverse.model.body import Mesh

@@ -158,12 +158,7 @@ class ObjectLimits:
 class _CompiledRows:
     """Rows as a function of the model's symbols and the time of a step."""
 
-    def __init__(
-        self,
-        parts: Sequence[VelocityRows],
-        count: int,
-        place: Mapping[Symbol, int],
-    ) -> None:
+    def __init__(self, parts: Sequence[VelocityRows], count: int, place: Mapping[Symbol, int]) -> None:
         rows = [row for part in parts for row in part.rows]
         columns = parts[0].speeds
         self.pattern = np.array([[s in row.weights for s in columns] for row in rows], dtype=bool)

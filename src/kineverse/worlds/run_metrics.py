@@ -274,12 +274,7 @@ class Judge:
         self._places = np.zeros((0, 3))
 
     def update(
-        self,
-        state: State,
-        speeds: StateLike | None = None,
-        *,
-        held: str | None = None,
-        pushing: bool = False,
+        self, state: State, speeds: StateLike | None = None, *, held: str | None = None, pushing: bool = False
     ) -> None:
         """Measure a state, the first one of a run or the one after a step.
 

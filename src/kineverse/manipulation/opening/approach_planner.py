@@ -22,10 +22,7 @@ from .base_placement import BasePlacement, PlacementSearch
 
 _PLANNING = 2.0  # largest time to plan the path to the handle [s]
 _TUCKED = 300  # number of random arms among which a compact one is chosen
-_MOST_TUCKED, _TUCKING = (
-    3,
-    2.0,
-)  # number of compact arms that are tried, and the time to plan for each [s]
+_MOST_TUCKED, _TUCKING = (3, 2.0)  # number of compact arms that are tried, and the time to plan for each [s]
 _KEPT = 4  # number of searches of drives that are kept
 _HERE = 1e-3  # distance of a base from its place at which it stays [m], [rad]
 

@@ -26,11 +26,7 @@ class PlacementSampler:
     """Random bases, arms and grasps."""
 
     def __init__(
-        self,
-        model: ModelView,
-        moving: Sequence[Symbol],
-        standing: Sequence[Symbol],
-        base: Sequence[Symbol],
+        self, model: ModelView, moving: Sequence[Symbol], standing: Sequence[Symbol], base: Sequence[Symbol]
     ) -> None:
         self.moving, self.standing, self.base = tuple(moving), tuple(standing), tuple(base)
         limits = np.array([model.limits(s) for s in moving], dtype=float).reshape(-1, 2)
