@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from kineverse.errors import KineverseError
 from kineverse.state import State
@@ -119,7 +120,7 @@ class OpenCloseRunner:
         self.current: ArticulatedObject | None = None
         self.opening = True
         self._start, self._on_step = start, on_step
-        self._hand, self._seconds, self._seed = hand, seconds, seed
+        self._options: dict[str, Any] = {"hand": hand, "seconds": seconds, "seed": seed}
         self._error, self._failed = 0.0, False
 
     def open_and_close(self, one: ArticulatedObject) -> OpenCloseReport:
@@ -143,14 +144,7 @@ class OpenCloseRunner:
         return OpenCloseReport(one, opened, closed, self._error, tuple(times))
 
     def _move(self, one: ArticulatedObject, target: float) -> Outcome:
-        return open_object(
-            self.session,
-            one.coordinate,
-            target=target,
-            hand=self._hand,
-            seconds=self._seconds,
-            seed=self._seed,
-        )
+        return open_object(self.session, one.coordinate, target=target, **self._options)
 
     def _act(self, skill: Callable[[], Outcome]) -> Outcome:
         """Return the outcome of a skill; an error of the library is one that is not done."""
@@ -160,17 +154,10 @@ class OpenCloseRunner:
         try:
             return skill()
         except KineverseError as error:
-            value, world = float(session.world.state[one.coordinate]), session.world
-            reason = f"{type(error).__name__}: {error}"
-            return Outcome(
-                False,
-                value,
-                reason,
-                world.name,
-                world.time - begin,
-                session.steps - first,
-                {"failure": "other"},
-            )
+            world, reason = session.world, f"{type(error).__name__}: {error}"
+            value, seconds = float(world.state[one.coordinate]), world.time - begin
+            steps, measures = session.steps - first, {"failure": "other"}
+            return Outcome(False, value, reason, world.name, seconds, steps, measures)
         finally:
             session.phase, session.reference, session.vectors = "", None, {}
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from itertools import count, product
+from itertools import count
 from time import perf_counter
 
 import numpy as np
@@ -17,6 +17,7 @@ from kineverse._checks import as_count
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
 from kineverse.grasping import Grasp, Gripper
+from kineverse.grasping.hand_model import find_box_corners
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.base_sampling import BaseSampler, find_planar_base
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules
@@ -473,10 +474,10 @@ def find_highest_reach(scene: Scene, paths: CartesianPaths, gripper: Gripper, st
     great than too small. Contacts are left out.
     """
     hand_T_world = inverse(np.asarray(scene.model.fk(gripper.hand)(state)))
-    corners = [
-        _find_corners(scene, gripper.bodies, state.updated(gripper.values_at(gap)))
-        for gap in (0.0, gripper.width)
-    ]
+    corners = []
+    for gap in (0.0, gripper.width):
+        scene.update(state.updated(gripper.values_at(gap)))
+        corners.append(find_box_corners(scene, gripper.bodies))
     points = np.vstack(corners) @ hand_T_world[:3, :3].T + hand_T_world[:3, 3]
     random = np.random.default_rng(0)
     bounded = np.isfinite(paths.lower) & np.isfinite(paths.upper)
@@ -497,23 +498,9 @@ def find_highest_passage(
     scene: Scene, bodies: Iterable[str], state: State, coordinate: Symbol, values: Array
 ) -> tuple[float, float]:
     """Return the one of some values at which an object is the highest, and the height of its lowest point."""
-    names = tuple(bodies)
-    lowest = [
-        _find_corners(scene, names, state.updated({coordinate: v}))[:, 2].min() for v in values.tolist()
-    ]
+    names, lowest = tuple(bodies), []
+    for value in values.tolist():
+        scene.update(state.updated({coordinate: value}))
+        lowest.append(find_box_corners(scene, names)[:, 2].min())
     highest = int(np.argmax(lowest))
     return float(values[highest]), float(lowest[highest])
-
-
-def _find_corners(scene: Scene, bodies: Iterable[str], state: State) -> Array:
-    """Return the corners (N, 3) of the boxes around the shapes of bodies at a state, in the world."""
-    scene.update(state)
-    world = scene.collision_world
-    world.prepare()
-    signs = np.array(list(product((-1.0, 1.0), repeat=3)))
-    found = []
-    for body in bodies:
-        for item in world.members[world.body_index(body)] if body in world.bodies else ():
-            solid, pose = world.solid(item), world.table.poses[item]
-            found.append((solid.centre + signs * solid.half) @ pose[:, :3].T + pose[:, 3])
-    return np.vstack(found)
