@@ -272,8 +272,8 @@ class _Motion:
 
     def nearest(self) -> DistanceResult:
         """Return the nearest pair of bodies at the tips of the two branches, the first one's first."""
-        found = self.scene.distances((f, g) for f in self.tips[0] for g in self.tips[1])
-        return min(found, key=lambda pair: pair.distance)
+        result = self.scene.distances((f, g) for f in self.tips[0] for g in self.tips[1])
+        return min(result, key=lambda pair: pair.distance)
 
     def track(self, frames: Sequence[str], points: Sequence[Array], parts: Iterable[float]) -> Array:
         """Return the positions (n, 2, 3) of points of two frames at parts of the motion."""

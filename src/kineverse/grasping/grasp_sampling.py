@@ -129,7 +129,7 @@ def sample_grasps(
             f"{gripper.hand} opens {gripper.width * 1e3:.0f} mm. find_handles and find_grippers list others."
         )
     surroundings = _Surroundings(model, gripper, handle, tuple(decomposed), state or model.default_state())
-    found: list[tuple[float, Grasp]] = []
+    result: list[tuple[float, Grasp]] = []
     hits: Counter[tuple[str, str]] = Counter()
     rng = np.random.default_rng(seed)
     for grasp, cost in _candidates(gripper, handle, surroundings.bar, _CANDIDATES * count, slant, rng):
@@ -143,13 +143,13 @@ def sample_grasps(
         clearance = surroundings.clearance(closed)
         # Edges of a bar that is not round spread the fingers, and hold it less well than its sides.
         cost += closed.thickness / handle.thickness - min(clearance, 0.02) / 0.02
-        found.append((cost, replace(closed, clearance=clearance)))
-        if len(found) == count:
+        result.append((cost, replace(closed, clearance=clearance)))
+        if len(result) == count:
             break
-    if not found:
+    if not result:
         raise InvalidValueError(_explain(gripper, handle, hits))
-    found.sort(key=lambda entry: entry[0])
-    return tuple(grasp for _, grasp in found)
+    result.sort(key=lambda entry: entry[0])
+    return tuple(grasp for _, grasp in result)
 
 
 def _candidates(

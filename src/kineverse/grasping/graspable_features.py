@@ -123,12 +123,12 @@ def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBa
     for cluster in _clusters([part for part in link if part.is_slim and part is not panel]):
         inside = {id(part) for part in cluster}
         rest = [part for part in link if id(part) not in inside]
-        found = [bar for part in cluster if (bar := _bar(part, cluster, rest, around))]
-        if found:
+        result = [bar for part in cluster if (bar := _bar(part, cluster, rest, around))]
+        if result:
             # The bar between its mounts, and not a mount, whichever stands out further.
-            found = [bar for bar in found if not bar.is_knob] or found
-            furthest = max(bar.stands_out for bar in found)
-            outer = [bar for bar in found if bar.stands_out > furthest - _STANDS_OUT]
+            result = [bar for bar in result if not bar.is_knob] or result
+            furthest = max(bar.stands_out for bar in result)
+            outer = [bar for bar in result if bar.stands_out > furthest - _STANDS_OUT]
             bars.append(max(outer, key=lambda bar: float(bar.part.size[0])))
     return bars
 
@@ -160,10 +160,10 @@ def _bar(
 ) -> ProtrudingBar | None:
     # A part that moves alone is fixed to something of another link, each of what it touches is tried.
     fixtures = [rest] if rest else [[other] for other in _fixed_to(part, around)]
-    found = [_stand_out(part, fixture) for fixture in fixtures]
-    if not found:
+    result = [_stand_out(part, fixture) for fixture in fixtures]
+    if not result:
         return None
-    stands_out, x, is_knob = max(found, key=lambda entry: entry[0])
+    stands_out, x, is_knob = max(result, key=lambda entry: entry[0])
     if stands_out < _STANDS_OUT:
         return None
     along = [axis - (axis @ x) * x for axis in part.axes.T if abs(axis @ x) < 0.5]

@@ -73,13 +73,13 @@ class HandModel:
 
 def find_box_corners(scene: Scene, frames: Iterable[str]) -> Array:
     """Return the corners (n, 3) of the boxes around the shapes of bodies in a scene, in the world [m]."""
-    wanted, found = set(frames), []
+    wanted, result = set(frames), []
     for item in scene.collision_world.objects:
         if item.body in wanted:
             solid = item.make_solid()
             pose = scene.pose(item.body) @ item.shape.origin.matrix
-            found.append((solid.centre + _SIGNS * solid.half) @ pose[:3, :3].T + pose[:3, 3])
-    return np.concatenate(found)
+            result.append((solid.centre + _SIGNS * solid.half) @ pose[:3, :3].T + pose[:3, 3])
+    return np.concatenate(result)
 
 
 _SIGNS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T

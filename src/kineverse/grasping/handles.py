@@ -107,17 +107,17 @@ def find_handle(
     UnknownNameError
         If there is none; the message says which bodies the coordinate moves and why none is a handle.
     """
-    found, why = _search(model, coordinate, decomposed)
+    result, why = _search(model, coordinate, decomposed)
     if frame is not None:
         model.fk(frame)  # raises for an unknown frame
-        at = [handle for handle in found if handle.frame == frame]
-        if found and not at:
-            listed = ", ".join(repr(handle.frame) for handle in found)
+        at = [handle for handle in result if handle.frame == frame]
+        if result and not at:
+            listed = ", ".join(repr(handle.frame) for handle in result)
             raise UnknownNameError(f"'{coordinate}' moves no handle at '{frame}'. Its handles: {listed}.")
-        found = tuple(at)
-    if not found:
+        result = tuple(at)
+    if not result:
         raise UnknownNameError(f"'{coordinate}' moves no handle. {why}")
-    return found[0]
+    return result[0]
 
 
 def _search(

@@ -73,14 +73,14 @@ def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[Articul
         raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
     free = [s for s in model.degrees_of_freedom if not (robot and is_of_robot(s.path, robot))]
     defaults = model.default_state()
-    found = []
+    result = []
     for coordinate, frames in moved_frames(model, free).items():
         limits = sorted(map(float, model.limits(coordinate)), key=lambda v: abs(v - defaults[coordinate]))
         bodies = [name for name in frames if name in model.bodies and collision_shapes(model.bodies[name])]
         if bodies and all(map(math.isfinite, limits)) and limits[0] != limits[1]:
             kind = _find_kind(model, coordinate, bodies, limits)
-            found.append(ArticulatedObject(coordinate, kind, *limits))
-    return tuple(found)
+            result.append(ArticulatedObject(coordinate, kind, *limits))
+    return tuple(result)
 
 
 def find_shut_value(model: ModelView, coordinate: Symbol) -> float:
@@ -94,7 +94,7 @@ def select_objects(
     objects: Sequence[ArticulatedObject], patterns: Iterable[str]
 ) -> tuple[ArticulatedObject, ...]:
     """Return the objects whose coordinates match names or patterns, in the order of the patterns."""
-    found: dict[Symbol, ArticulatedObject] = {}
+    result: dict[Symbol, ArticulatedObject] = {}
     for pattern in patterns:
         matching = [one for one in objects if matches_pattern(str(one.coordinate), [pattern])]
         if not matching:
@@ -102,8 +102,8 @@ def select_objects(
             raise UnknownNameError(
                 f"No door, drawer or other object is named '{pattern}'. {suggest(pattern, names, 'object')}"
             )
-        found.update((one.coordinate, one) for one in matching)
-    return tuple(found.values())
+        result.update((one.coordinate, one) for one in matching)
+    return tuple(result.values())
 
 
 def _find_kind(

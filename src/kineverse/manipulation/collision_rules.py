@@ -38,12 +38,12 @@ def find_overlapping_links(scene: Scene, own: tuple[str, ...], state: State) -> 
     ]
     free = {s: (a, b) for s, a, b in bounds if math.isfinite(a) and math.isfinite(b)}
     generator = np.random.default_rng(0)
-    found: list[set[tuple[str, str]]] = []
+    result: list[set[tuple[str, str]]] = []
     for k in range(_SAMPLES):
         values = {s: float(generator.uniform(a, b)) for s, (a, b) in free.items()}
         scene.update(state.updated(values) if k else state)
-        found.append({(pair.a, pair.b) for pair in watch()})
-    pairs = found[0] | set.intersection(*found[1:])
+        result.append({(pair.a, pair.b) for pair in watch()})
+    pairs = result[0] | set.intersection(*result[1:])
     return tuple(Rule(a, b, False, "overlapping") for a, b in sorted(pairs))
 
 

@@ -63,8 +63,8 @@ class OpenCloseReport:
     @property
     def grasp_error(self) -> float:
         """Largest motion of the held object in the hand [m]; NaN if nothing was held."""
-        found = [float(one.measures.get("grasp_error", math.nan)) for one in self.outcomes]
-        return max((error for error in found if not math.isnan(error)), default=math.nan)
+        result = [float(one.measures.get("grasp_error", math.nan)) for one in self.outcomes]
+        return max((error for error in result if not math.isnan(error)), default=math.nan)
 
     @property
     def reason(self) -> str:

@@ -104,8 +104,8 @@ def find_obstacle(
 
     sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot), make)
     sweep.start = start
-    found = sweep.find(coordinate, state, target, least)
-    return None if found is None else sweep.find_aside(found, state)
+    result = sweep.find(coordinate, state, target, least)
+    return None if result is None else sweep.find_aside(result, state)
 
 
 class _Sweep:
@@ -134,12 +134,12 @@ class _Sweep:
             return None
         values = self._divide(coordinate, state, start, target)
         for k in self._find_near(query, coordinate, values):
-            found = query(0.0)
-            excess = -found.distances - self._overlaps.allowances(found)
+            result = query(0.0)
+            excess = -result.distances - self._overlaps.allowances(result)
             worst = int(np.argmax(excess)) if len(excess) else 0
             if not len(excess) or excess[worst] <= least:
                 continue
-            pair = found[worst]
+            pair = result[worst]
             one, other = (pair.a, pair.b) if motion.moves(pair.a) else (pair.b, pair.a)
             deepest = self._find_deepest(query, coordinate, values[k:], one, other)
             first = values[max(0, k - math.ceil(_CLEAR / STEP))]
@@ -239,6 +239,6 @@ class _Sweep:
         """Return the largest depth of two bodies at some values [m]."""
         pair, deepest = {one, other}, 0.0
         for _ in self._find_near(query, coordinate, values):
-            depths = (-found.distance for found in query(0.0) if {found.a, found.b} == pair)
+            depths = (-result.distance for result in query(0.0) if {result.a, result.b} == pair)
             deepest = max(deepest, *depths, 0.0)
         return deepest

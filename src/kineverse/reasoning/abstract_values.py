@@ -43,8 +43,8 @@ def enclose_loop(term: Term, inputs: list[TaylorSeries]) -> TaylorSeries:
 
 def find_implicit_functions(terms: Iterable[Term]) -> set[ImplicitFunction]:
     """Return the implicit functions among terms, including those in their equations."""
-    found = {term.data[0].function for term in terms if term.op == "implicit"}
-    return found.union(*map(_nested_loops, found))
+    result = {term.data[0].function for term in terms if term.op == "implicit"}
+    return result.union(*map(_nested_loops, result))
 
 
 @lru_cache(256)
@@ -319,8 +319,8 @@ def _piecewise(term: Term, x: AbstractValue, values: dict[int, AbstractValue], s
         for k in range(first, last + 1):
             start = -math.inf if k == 0 else starts[k]
             spans.append((pieces[k], max(low, start) - starts[k], min(high, ends[k]) - starts[k]))
-    found = [interval_polynomial(p, round_outwards(a, b)) for p, a, b in spans if a <= b]
-    span = (min(f[0] for f in found), max(f[1] for f in found)) if found else REALS
+    result = [interval_polynomial(p, round_outwards(a, b)) for p, a, b in spans if a <= b]
+    span = (min(f[0] for f in result), max(f[1] for f in result)) if result else REALS
     return AbstractValue(span, None, x.live)
 
 

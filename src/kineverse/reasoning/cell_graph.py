@@ -90,14 +90,14 @@ def relevant_rules(rules: Iterable[MoveRule], goals: Iterable[Symbol]) -> tuple[
         for symbol in rule.symbols if rule.way == "enter" else (rule.coordinate,):
             if symbol is not None:
                 about.setdefault(symbol, []).append(rule)
-    found, waiting = set[Symbol](), list(goals)
+    result, waiting = set[Symbol](), list(goals)
     while waiting:
         symbol = waiting.pop()
-        if symbol not in found:
-            found.add(symbol)
+        if symbol not in result:
+            result.add(symbol)
             waiting += [other for rule in about.get(symbol, ()) for other in rule.symbols]
-    chosen = {id(rule): rule for symbol in found for rule in about.get(symbol, ())}
-    return sorted(found, key=lambda s: s.sort_key), [r for r in rules if id(r) in chosen]
+    chosen = {id(rule): rule for symbol in result for rule in about.get(symbol, ())}
+    return sorted(result, key=lambda s: s.sort_key), [r for r in rules if id(r) in chosen]
 
 
 def _lock_rules(lock: Interlock, reader: _BoxReader) -> Iterator[MoveRule]:

@@ -100,8 +100,8 @@ class ConstraintRanges:
         )
 
     def _symbols_within(self, names: Iterable[str]) -> list[Symbol]:
-        found = {s for name in names for s in self._row(name).symbols}
-        return sorted((s for s in found if not s.order), key=lambda s: s.sort_key)
+        result = {s for name in names for s in self._row(name).symbols}
+        return sorted((s for s in result if not s.order), key=lambda s: s.sort_key)
 
     def _pieces(
         self, symbol: Symbol, side: RealInterval, names: Iterable[str], start: float | None
@@ -118,13 +118,13 @@ class ConstraintRanges:
         """Return where comparisons in the bounds of a constraint change, as far as one position decides."""
         key = name, symbol
         if key not in self._cuts:
-            row, found = self._row(name), list[float]()
+            row, result = self._row(name), list[float]()
             terms = reachable_terms(tuple(t for t in (row.lower, row.upper) if isinstance(t, Term)))
             for decider in dict.fromkeys(d for t in terms for d in t.deciders):
                 own = {t.data for t in reachable_terms((decider,)) if t.op == ca.OP_PARAMETER}
                 if own == {symbol}:
-                    found += self._linear_root(decider, symbol)
-            self._cuts[key] = found
+                    result += self._linear_root(decider, symbol)
+            self._cuts[key] = result
         return self._cuts[key]
 
     def _linear_root(self, term: Term, symbol: Symbol) -> list[float]:

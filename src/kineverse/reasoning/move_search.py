@@ -153,7 +153,7 @@ class MoveSearch:
         the coordinate farther away can also be reached from there. All other cells may have to be left
         backwards before there is a way to the best one.
         """
-        graph, found = self.graph, list[frozenset[int]]()
+        graph, result = self.graph, list[frozenset[int]]()
         for k, best in enumerate(self._best):
             cells = range(len(graph.cells[k]))
             serves = [
@@ -166,8 +166,8 @@ class MoveSearch:
                     beyond = range(cell) if cell <= best else range(cell + 1, len(cells))
                     if cell == best or all(serves[cell] >= serves[other] for other in beyond):
                         fine.add(cell)
-            found.append(frozenset(fine))
-        return found
+            result.append(frozenset(fine))
+        return result
 
     def advance(self, state: int) -> tuple[int, list[Move]]:
         """Move all coordinates that have a best cell towards it, as far as that never harms."""
@@ -318,8 +318,8 @@ def find_circle(graph: CellGraph, reached: int) -> tuple[tuple[MoveRule, ...], b
         if closing is not None:
             return tuple(chain[seen[closing] :]), True
         # Of several exits, one that a lock closes explains more than one whose coordinate does not move.
-        found = ((k, _blocking_rule(graph, k, graph.field(k) & wanted, reached)) for k in concerned)
-        blocked = next(((k, one) for k, one in found if one is not None), None)
+        result = ((k, _blocking_rule(graph, k, graph.field(k) & wanted, reached)) for k in concerned)
+        blocked = next(((k, one) for k, one in result if one is not None), None)
         if blocked is None:
             break
         k, (rule, wanted) = blocked

@@ -58,17 +58,17 @@ def plan_violations(model: ModelView, plan: UnlockingPlan, state: StateLike | No
     settle_point(model, point)
     for row in ranges.rows.values():
         point = {**{s: s.value or 0.0 for s in row.symbols if s not in point}, **point}
-    found: list[str] = []
+    result: list[str] = []
     for number, step in enumerate(plan.steps, 1):
         about = f"move {number}, {step.coordinate}"
         if abs(point[step.coordinate] - step.start) > NOTHING * (1 + abs(step.start)):
-            found.append(f"{about}: it begins at {step.start:g}, and not at {point[step.coordinate]:g}")
-        found += dict.fromkeys(f"{about}: {name}" for name in _check_step(model, ranges, point, step))
+            result.append(f"{about}: it begins at {step.start:g}, and not at {point[step.coordinate]:g}")
+        result += dict.fromkeys(f"{about}: {name}" for name in _check_step(model, ranges, point, step))
     if plan.verdict == "found":
         for symbol, value in plan.goal.items():
             if abs(point[symbol] - value) > NOTHING * (1 + abs(value)):
-                found.append(f"{symbol} ends at {point[symbol]:g}, and not at {value:g}")
-    return found
+                result.append(f"{symbol} ends at {point[symbol]:g}, and not at {value:g}")
+    return result
 
 
 def _check_step(

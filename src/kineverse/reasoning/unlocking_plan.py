@@ -323,13 +323,13 @@ def _released(
 ) -> tuple[Interlock, ...]:
     """Return the interlocks that would stop later moves if this one were not made."""
     k = moves[n][0]
-    before, found = states[n] & graph.field(k), dict[Interlock, None]()
+    before, result = states[n] & graph.field(k), dict[Interlock, None]()
     for later in range(n + 1, until):
         for at, step in graph.path(states[later] & ~graph.field(k) | before, moves[later]):
             if step is not None:
                 blocked = (r for m, r in zip(step.needs, step.rules, strict=True) if not m & at)
-                found |= dict.fromkeys(r.lock for r in blocked if isinstance(r.lock, Interlock))
-    return tuple(found)
+                result |= dict.fromkeys(r.lock for r in blocked if isinstance(r.lock, Interlock))
+    return tuple(result)
 
 
 def _inside(side: Interval, way: int) -> float:

@@ -112,18 +112,18 @@ class FurnitureOverlaps:
 
         ``least`` is the excess from which on they count [m].
         """
-        found = [Overlap(r.a, r.b, -r.distance, allowed) for r, allowed in self.find_beyond(least)]
-        return sorted(found, key=lambda one: -one.excess)
+        result = [Overlap(r.a, r.b, -r.distance, allowed) for r, allowed in self.find_beyond(least)]
+        return sorted(result, key=lambda one: -one.excess)
 
     def find_beyond(self, excess: float) -> list[tuple[DistanceResult, float]]:
         """Return the pairs of shapes with a depth beyond their allowance by an excess [m], the deepest first.
 
         Each pair is there with its allowance [m].
         """
-        found = self._query()
-        allowed = self.allowances(found)
-        beyond = np.flatnonzero(-found.distances > allowed + excess).tolist()
-        return [(found[k], float(allowed[k])) for k in beyond]
+        result = self._query()
+        allowed = self.allowances(result)
+        beyond = np.flatnonzero(-result.distances > allowed + excess).tolist()
+        return [(result[k], float(allowed[k])) for k in beyond]
 
     @property
     def excepted(self) -> tuple[tuple[str, str], ...]:
@@ -193,16 +193,16 @@ class FurnitureOverlaps:
 
     def _deepest(self, depths: dict[int, float]) -> dict[tuple[int, int], float]:
         """Return the largest depths [m] by pair of bodies, of those by pair of shapes."""
-        found: dict[tuple[int, int], float] = {}
+        result: dict[tuple[int, int], float] = {}
         for code, depth in depths.items():
             pair = self._owners(code)
-            found[pair] = max(depth, found.get(pair, 0.0))
-        return found
+            result[pair] = max(depth, result.get(pair, 0.0))
+        return result
 
     def _measure(self) -> dict[int, float]:
         """Return the depths of the pairs of shapes that overlap at the state of the scene [m]."""
-        found = self._query()
-        pairs = zip(self.encode(found).tolist(), (-found.distances).tolist(), strict=True)
+        result = self._query()
+        pairs = zip(self.encode(result).tolist(), (-result.distances).tolist(), strict=True)
         return {code: depth for code, depth in pairs if depth > OVERLAP}
 
     def encode(self, found: DistanceResults) -> Indices:

@@ -217,8 +217,8 @@ class KinematicWorld:
 
     def _touched(self) -> tuple[Contact, ...]:
         if self._contacts is None:
-            found = (one if self._is_robot(one.a) else one.swap() for one in self._touching())
-            self._contacts = tuple(map(_make_contact, found))
+            result = (one if self._is_robot(one.a) else one.swap() for one in self._touching())
+            self._contacts = tuple(map(_make_contact, result))
         return self._contacts
 
     def observe(self) -> Observation:

@@ -141,8 +141,8 @@ class MechanismWorld:
         after, rest = self._integrate(q, v, time), np.zeros(len(v))
         # Limits of speeds are those at the beginning of a step, before any coordinate has moved.
         moving, before, now = self._excesses(self._q, v), self._excesses(q, rest), self._excesses(after, rest)
-        found = np.where(self._about_speeds, moving, now - np.maximum(before, 0.0))
-        return after if bool(np.all(found <= _ALLOWED)) else None
+        result = np.where(self._about_speeds, moving, now - np.maximum(before, 0.0))
+        return after if bool(np.all(result <= _ALLOWED)) else None
 
     def _excesses(self, q: Array, v: Array) -> Array:
         """Return the excess of each constraint, a large one where it has no value."""

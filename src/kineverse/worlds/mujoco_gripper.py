@@ -141,9 +141,9 @@ class GripperDrive:
 
     def pressed(self, data: Any) -> str | None:
         """Return the body that both fingers press, the one with most force; None if there is none."""
-        found = {body: min(forces) for body, forces in self._contacts.grip(data).items()}
-        best = max(found, key=found.__getitem__, default=None)
-        return best if best is not None and found[best] > TOUCH_FORCE else None
+        result = {body: min(forces) for body, forces in self._contacts.grip(data).items()}
+        best = max(result, key=result.__getitem__, default=None)
+        return best if best is not None and result[best] > TOUCH_FORCE else None
 
     def _leverage(self, compiled: Any, data: Any) -> Array:
         """Return |∂y_1/∂q| + |∂y_2/∂q| by coordinate (n,), with all joints that follow."""

@@ -302,14 +302,14 @@ def _find_contacts(compiled: Any, data: Any) -> Iterator[tuple[int, int, float]]
 def _limited_joints(model: ModelView, compiled: Any) -> list[tuple[int, int]]:
     names = [compiled.body(k).name for k in range(compiled.nbody)]
     known = {name: k for k, name in enumerate(names) if name in model.frames and compiled.body_geomnum[k]}
-    found = []
+    result = []
     bodies = list(known)
     for i, k in np.argwhere(np.triu(adjacent_pairs(model, bodies), 1)).tolist():
         symbols = model.fk(bodies[i], bodies[k]).symbols
         limited = all(np.isfinite(model.limits(s)).all() for s in symbols)
         if len(symbols) == 1 and limited:
-            found.append((known[bodies[i]], known[bodies[k]]))
-    return found
+            result.append((known[bodies[i]], known[bodies[k]]))
+    return result
 
 
 def _geoms_of(compiled: Any, body: int) -> range:
@@ -355,13 +355,13 @@ def add_floor(
     floor = compiled.body(name).id
 
     def touching() -> dict[str, float]:
-        found: dict[str, float] = {}
+        result: dict[str, float] = {}
         for one, other, gap in _find_contacts(compiled, data):
             a, b = compiled.geom_bodyid[[one, other]].tolist()
             if floor in (a, b):
                 touched = compiled.body(a + b - floor).name
-                found[touched] = min(gap, found.get(touched, gap))
-        return found
+                result[touched] = min(gap, result.get(touched, gap))
+        return result
 
     data.qpos[:] = coordinates.positions(coordinates.default)
     standing, move = touching(), coordinates.mover()

@@ -387,7 +387,7 @@ class MujocoWorld:
 
 def _friction_by_name(given: Mapping[Any, float], furniture: list[str]) -> dict[str, float]:
     """Return friction by the name of a coordinate of furniture, after checking it."""
-    found = {}
+    result = {}
     for key, value in given.items():
         number = finite_number(value)
         if str(key) not in furniture:
@@ -397,5 +397,5 @@ def _friction_by_name(given: Mapping[Any, float], furniture: list[str]) -> dict[
             )
         if number is None or number < 0:
             raise InvalidValueError(f"The friction of '{key}' is a number of N or N m, not {value!r}.")
-        found[str(key)] = number
-    return found
+        result[str(key)] = number
+    return result

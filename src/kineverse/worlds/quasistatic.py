@@ -186,11 +186,11 @@ class ObjectMotion:
 
     def find_near(self, radius: float) -> tuple[DistanceResults, npt.NDArray[np.intp]]:
         """Return the pairs within a radius [m], and the indices of those that are not ignored."""
-        found = self._query(radius)
-        if not len(found):
-            return found, np.zeros(0, dtype=np.intp)
-        i, j = found.body_indices.T
-        return found, np.flatnonzero(~self._ignored[i, j])
+        result = self._query(radius)
+        if not len(result):
+            return result, np.zeros(0, dtype=np.intp)
+        i, j = result.body_indices.T
+        return result, np.flatnonzero(~self._ignored[i, j])
 
     def measure_gaps(self, radius: float) -> Gaps:
         """Return the gaps within a radius [m] with their derivatives.
@@ -287,14 +287,14 @@ class ObjectMotion:
             if better:
                 least, best = cost, v
                 self._note_penetrated(gaps)
-                found = v
+                result = v
                 if furniture is not None:
-                    found = self._solve(h, v, gaps, aims, furniture, rates, limits, pulled)
+                    result = self._solve(h, v, gaps, aims, furniture, rates, limits, pulled)
             else:
                 # The gaps bend too much, as of bodies that are jammed: half of the motion.
-                found = 0.5 * (best + v)
-            change = float(np.max(np.abs(found - v) * np.sqrt(self.weights[: self.count]), initial=0.0)) * h
-            v = found
+                result = 0.5 * (best + v)
+            change = float(np.max(np.abs(result - v) * np.sqrt(self.weights[: self.count]), initial=0.0)) * h
+            v = result
             self.place(self._integrate(start, v, h))
             if change <= _STEADY:
                 break
@@ -373,11 +373,11 @@ class ObjectMotion:
         x, _, flag, _ = self._daqp.solve(
             H, f, rows, most, least, sense, rho_soft=_SLACK, primal_tol=1e-10, sing_tol=1e-14
         )
-        found = np.zeros(n)
+        result = np.zeros(n)
         if flag >= 1 and np.isfinite(x).all():
             _clip_to_bounds(x, rows[:hard], least[:hard], most[:hard])
-            found[use] = x
-        return found
+            result[use] = x
+        return result
 
 
 _SOFT, _UNBOUNDED = 8, 1e9

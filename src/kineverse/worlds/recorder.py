@@ -180,10 +180,10 @@ class Recorder:
 
     def write_contacts(self, stamp: float, contacts: Iterable[Contact]) -> None:
         """Write the contacts at a time [s]."""
-        found = [
+        result = [
             {**{name: _plain(getattr(one, name)) for name in _CONTACT["properties"]}} for one in contacts
         ]
-        self._write("/contacts", stamp, {"contacts": found})
+        self._write("/contacts", stamp, {"contacts": result})
 
     def write_observation(self, stamp: float, observation: Observation) -> None:
         """Write readings that arrived at a time [s]; they keep their own stamp."""
@@ -210,11 +210,11 @@ class Recorder:
         vectors
             By name, the origin (3,) in the world [m], and the vector (3,).
         """
-        found = {
+        result = {
             str(name): {"origin": _plain(origin), "vector": _plain(vector)}
             for name, (origin, vector) in vectors.items()
         }
-        self._write("/controller", stamp, {"vectors": found})
+        self._write("/controller", stamp, {"vectors": result})
 
     def write_outcome(self, outcome: Any) -> None:
         """Write the result of the skill: a dataclass, or a mapping."""

@@ -146,8 +146,8 @@ class McapFile:
             channel = self._parse(records.Channel.read, body, "channel")
             self._channels[channel.id] = channel
         elif code == _METADATA:
-            found = self._parse(records.Metadata.read, body, "metadata")
-            self.metadata[found.name] = dict(found.metadata)
+            result = self._parse(records.Metadata.read, body, "metadata")
+            self.metadata[result.name] = dict(result.metadata)
         elif code == _MESSAGE:
             if len(body) < 22:
                 raise self._damaged("a message is too short")
@@ -316,9 +316,9 @@ def read_run_recording(
             by_topic[message.topic].append(message)
     if not by_topic["/model"]:
         topics = sorted({message.topic for message in file.messages})
-        found = f"its topics are {', '.join(topics[:12])}" if topics else "it has no messages"
+        listed = f"its topics are {', '.join(topics[:12])}" if topics else "it has no messages"
         raise FormatError(
-            f"{path.name}: no recording of a world, which has a /model of the schema kineverse.Model; {found}"
+            f"{path.name}: no recording of a world, which has a /model of the schema kineverse.Model; {listed}"
             f"{'' if file.complete else '; the file was cut'}."
         )
     model = _read_model(by_topic["/model"][0].data, path, root)
@@ -457,12 +457,12 @@ class _Decoder:
         return {name: self._array(rows, key, (4, 4)) for name, rows in members.items()}
 
     def contacts(self, content: dict[str, Any]) -> tuple[Contact, ...]:
-        found = []
+        result = []
         for one in self._member(content, "contacts", list):
             if not isinstance(one, dict):
                 self._refuse(f"{one!r:.60} is no contact")
             force = one.get("force")
-            found.append(
+            result.append(
                 Contact(
                     self.text(one, "a"),
                     self.text(one, "b"),
@@ -472,7 +472,7 @@ class _Decoder:
                     math.nan if force is None else self._number(force, "force"),
                 )
             )
-        return tuple(found)
+        return tuple(result)
 
     def observation(self, content: dict[str, Any]) -> Observation:
         touching = self._member(content, "touching", list)
@@ -486,9 +486,9 @@ class _Decoder:
         )
 
     def vectors(self, content: dict[str, Any]) -> dict[str, tuple[Array, Array]]:
-        found = {}
+        result = {}
         for name, one in self._member(content, "vectors", dict).items():
             if not isinstance(one, dict):
                 self._refuse(f"{one!r:.60} is no vector")
-            found[name] = tuple(self._array(one.get(key), key, (3,)) for key in ("origin", "vector"))
-        return found  # type: ignore[return-value]
+            result[name] = tuple(self._array(one.get(key), key, (3,)) for key in ("origin", "vector"))
+        return result  # type: ignore[return-value]

@@ -350,8 +350,8 @@ class Judge:
     def _begin(self) -> None:
         """Except what overlaps at the first state: pairs of the robot, and of furniture as far as it does."""
         own = set(self._own)
-        found = ((pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_TOUCHING)
-        self._first_overlapping = tuple((a, b) for a, b in found if a in own and b in own)
+        result = ((pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_TOUCHING)
+        self._first_overlapping = tuple((a, b) for a, b in result if a in own and b in own)
         self._furniture.begin(*(() if self._start is None else (self._start,)))
         self._select_pairs()
 
@@ -371,12 +371,12 @@ class Judge:
 
     def _select_speeds(self, speeds: StateLike) -> Array:
         """Return the commanded speeds of the robot; 0 for missing ones."""
-        found = np.zeros(len(self._robot_speeds))
+        result = np.zeros(len(self._robot_speeds))
         for v, value in speeds.items():
             k = self._speed_place.get(v)
             if k is not None:
-                found[k] = value
-        return found
+                result[k] = value
+        return result
 
     # -- measurements --------------------------------------------------------------------------------------
 
@@ -418,11 +418,11 @@ class Judge:
         self._places = places
 
     def _measure_penetration(self, state: State, stamp: float) -> None:
-        found = self._penetrations()
-        for k in range(len(found)):
-            i, j = found.body_indices[k].tolist()
+        result = self._penetrations()
+        for k in range(len(result)):
+            i, j = result.body_indices[k].tolist()
             if not self._is_excepted[i, j]:
-                pair = found[k]
+                pair = result[k]
                 self._note_overlap(pair.a, pair.b, -pair.distance, state, stamp)
         for one in self._furniture.find(0.0):
             self._note_overlap(one.a, one.b, one.excess, state, stamp)

@@ -84,19 +84,19 @@ def _start(model: ModelView, hidden: Iterable[str]) -> Scene:
 
 def _inner_points(world: CollisionWorld, body: str) -> Array:
     """Return points (n, 3) inside of the shapes of a body, in its frame [m]."""
-    found: list[Array] = []
+    result: list[Array] = []
     for k in world.members[world.body_index(body)][:_MOST_SHAPES]:
         origin, solid = world.objects[k].shape.origin.matrix, world.solid(k)
         rotation, middle = origin[:3, :3], origin[:3, 3]
         if solid.core is None:
-            found.append(middle)
+            result.append(middle)
             continue
         corners = np.array(
             [support((solid, rotation, middle), rotation @ corner / np.sqrt(3.0)) for corner in _CORNERS]
         )
         middle = corners.mean(axis=0)
-        found += [middle, *(middle + _INSET * (corners - middle))]
-    return np.array(found)
+        result += [middle, *(middle + _INSET * (corners - middle))]
+    return np.array(result)
 
 
 _CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -320,13 +320,13 @@ def find_marked_frames(model: ModelView, robot: str) -> tuple[str, ...]:
     objects = [s for s in model.degrees_of_freedom if not is_of_robot(s.path, robot)]
     motion = FrameDependence(model, objects)
     bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}
-    found = {name for name in bodies if motion.moves(name)}
+    result = {name for name in bodies if motion.moves(name)}
     for name, frame in model.frames.items():
         if motion.moves_between(name, carrier := frame.parent):
             while carrier != WORLD and carrier not in bodies:
                 carrier = model.frames[carrier].parent
-            found.add(carrier)
-    return tuple(name for name in model.frames if name in found and not is_of_robot(name, robot))
+            result.add(carrier)
+    return tuple(name for name in model.frames if name in result and not is_of_robot(name, robot))
 
 
 _CAMERA_WORDS = (("head", "tilt"), ("camera",), ("head",))  # in names, the likeliest first

@@ -124,10 +124,10 @@ def check_settings(positive: Mapping[str, Any], others: Mapping[str, Any]) -> No
 
 def find_robot_coordinates(model: ModelView, robot: str) -> list[Symbol]:
     """Return the degrees of freedom of a robot, or raise UnknownNameError if it has none."""
-    found = [s for s in model.degrees_of_freedom if is_of_robot(s.path, robot)]
-    if not found:
+    result = [s for s in model.degrees_of_freedom if is_of_robot(s.path, robot)]
+    if not result:
         prefixes = sorted({s.path.partition("/")[0] for s in model.degrees_of_freedom})
         raise UnknownNameError(
             f"No coordinate of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
         )
-    return found
+    return result

@@ -73,10 +73,10 @@ class ApproachPlanner:
         planner, base = self.planner, {s: float(wanted[s]) for s in self.search.standing}
         places, tuck, arms = None, None, state
         if base and self.drive is not None and self.drive.is_possible and self._drives(state).begins_free:
-            found = self._find_drive(state, base)
-            if found is None:
+            result = self._find_drive(state, base)
+            if result is None:
                 return Approach("no path for the base, with the arm as it is or compact")
-            places, tuck, arms = found
+            places, tuck, arms = result
         planner.place(state.updated(base))
         here = arms.vector(planner.symbols)
         end = np.array([wanted[s] for s in planner.symbols])
@@ -139,13 +139,13 @@ class ApproachPlanner:
         itself = scene.watch(search.own, search.own, 0.0)
         touching = itself, scene.watch(search.own, search.others, search.margin)
         x, y, _ = (state[s] for s in search.base)
-        found: list[tuple[float, int]] = []
+        result: list[tuple[float, int]] = []
         for k, row in enumerate(rows):
             scene.update(state.updated(dict(zip(symbols, row.tolist(), strict=True))))
             if not any(len(watch()) for watch in touching):
                 places = np.array([scene.pose(b)[:2, 3] for b in search.own])
-                found.append((float(np.hypot(*(places - [x, y]).T).max()), k))
-        return rows[[k for _, k in sorted(found)]]
+                result.append((float(np.hypot(*(places - [x, y]).T).max()), k))
+        return rows[[k for _, k in sorted(result)]]
 
 
 _GRASPS = 96
@@ -168,6 +168,6 @@ class Opener:
         others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
         key = handle.frame, handle.coordinate, seed, slant, others
         if key not in self._grasps:
-            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
-            self._grasps = {**dict([*self._grasps.items()][-_KEPT_GRASPS:]), key: found}
+            result = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
+            self._grasps = {**dict([*self._grasps.items()][-_KEPT_GRASPS:]), key: result}
         return self._grasps[key]

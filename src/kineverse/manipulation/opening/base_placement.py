@@ -97,10 +97,10 @@ class BasePlacement:
         """Text with the number of samples and the reasons of failures."""
         failed = ", ".join(f"{n} {reason}" for reason, n in self.reasons.most_common(6) if n)
         what = "arms of a robot without a mobile base" if self.stands else "bases"
-        found = (
+        result = (
             f"Found after {self.samples} {what}" if self else f"None of {self.samples} {what} goes through"
         )
-        return f"{found}; failed: {failed}." if failed else f"{found}."
+        return f"{result}; failed: {failed}." if failed else f"{result}."
 
 
 _STEP = 0.05  # distance of neighbouring values of the object along its path [m], [rad]
@@ -249,18 +249,18 @@ class PlacementSearch:
             samples = batch
         for number in count():
             whole = number * batch < min(_WHOLE, samples)
-            found = search.take(whole)
+            result = search.take(whole)
             ended = number * batch >= samples or (not whole and not search.reached)
             ended = ended or (number * batch >= _NOWHERE and search.nowhere)
-            if number and found is None and not ended:
+            if number and result is None and not ended:
                 report(search.nothing.why)
-            if found is not None or ended or search.refused >= _MOST_REFUSED:
+            if result is not None or ended or search.refused >= _MOST_REFUSED:
                 break
             self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
             search.add(min(batch, samples - number * batch), _MIDDLES[number % len(_MIDDLES)])
             if number == 1:
                 search.add_here()
-        return found or search.nothing
+        return result or search.nothing
 
     def retrace(
         self,
@@ -417,15 +417,15 @@ class _Search:
         back = self._correct(retreat, base, hands[0] @ np.linalg.inv(poses[0]) @ poses)
         if path is None or back is None:
             return None
-        found = self._check(CandidatePath(0, base, back, path, self.last))
-        if found is None or len(found.values) <= self.last or not self.accept(found):
+        result = self._check(CandidatePath(0, base, back, path, self.last))
+        if result is None or len(result.values) <= self.last or not self.accept(result):
             return None
-        return found
+        return result
 
     def _correct(self, Q: Array, base: Array, poses: Array) -> Array | None:
         """Return configurations near to some (K, n) at which the hand is at poses; None if one fails."""
-        found, error = self.owner.paths.solve(Q, np.tile(base, (len(Q), 1)), poses, _CORRECTIONS)
-        return found if error.max() < TOLERANCE else None
+        result, error = self.owner.paths.solve(Q, np.tile(base, (len(Q), 1)), poses, _CORRECTIONS)
+        return result if error.max() < TOLERANCE else None
 
     # -- checks --------------------------------------------------------------------------------------------
 
@@ -437,10 +437,10 @@ class _Search:
             _, score, _, candidate = heappop(self.heap)
             free = int(self.free[candidate.choice])
             if candidate.end <= free:
-                found = self._check(candidate)
-                if found is not None and self.accept(found):
-                    return found
-                if found is not None:
+                result = self._check(candidate)
+                if result is not None and self.accept(result):
+                    return result
+                if result is not None:
                     self.refused += 1
                     self.reasons[NO_PATH] += 1
                     continue

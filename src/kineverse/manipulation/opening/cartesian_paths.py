@@ -95,11 +95,11 @@ class CartesianPaths:
         for k in range(count):
             if not len(going):
                 break
-            found, error = self.solve(paths[going, max(k - 1, 0)], base[going], targets[going, k], 6)
-            jump = np.abs(found - paths[going, max(k - 1, 0)]).max(axis=1, initial=0.0)
+            result, error = self.solve(paths[going, max(k - 1, 0)], base[going], targets[going, k], 6)
+            jump = np.abs(result - paths[going, max(k - 1, 0)]).max(axis=1, initial=0.0)
             good = (error < TOLERANCE) & (jump < _JUMP)
-            going, found = going[good], found[good]
-            paths[going, k] = found
+            going, result = going[good], result[good]
+            paths[going, k] = result
             reached[going] = k + 1
         return paths, reached
 
@@ -115,5 +115,5 @@ def row_at(rows: Array, share: float) -> Array:
     place = share * (len(rows) - 1)
     k = min(max(int(place), 0), max(len(rows) - 2, 0))
     rest = min(max(place - k, 0.0), 1.0)
-    found = (1.0 - rest) * rows[k] + rest * rows[min(k + 1, len(rows) - 1)]
-    return np.asarray(found)
+    result = (1.0 - rest) * rows[k] + rest * rows[min(k + 1, len(rows) - 1)]
+    return np.asarray(result)

@@ -118,13 +118,13 @@ def open_object(
         )
         if obstacle is not None:
             return Outcome(False, here, str(obstacle), world.name, 0.0, 0, obstacle.measures)
-    found = find_handle(model, coordinate, handle)
+    result = find_handle(model, coordinate, handle)
     gripper = find_gripper(model, world.robot, hand)
     opener = cached_for_version(
         model, ("opener", gripper.hand), lambda: Opener(model, gripper, session.state)
     )
     session.peak_force = math.nan
-    run = _Run(session, opener, found, goal, seconds, tolerance, placements, seed)
+    run = _Run(session, opener, result, goal, seconds, tolerance, placements, seed)
     reason, kind, measures = "", "", dict[str, Any]()
     try:
         run.perform()
@@ -202,22 +202,22 @@ class _Run:
     @property
     def measures(self) -> dict[str, Any]:
         """Measures of the judge, also of those parts that ended with a reset of the world."""
-        found = [*self._earlier, self.judge.measures]
-        last = dict(found[-1])
+        result = [*self._earlier, self.judge.measures]
+        last = dict(result[-1])
         for name in _LARGEST:
-            last[name] = max((m[name] for m in found if not math.isnan(m[name])), default=math.nan)
+            last[name] = max((m[name] for m in result if not math.isnan(m[name])), default=math.nan)
         for what, name in _NAMED.items():
-            last[what] = max(found, key=lambda m: float(m[name]))[what]
+            last[what] = max(result, key=lambda m: float(m[name]))[what]
         for name in _SUMS:
-            last[name] = sum(m[name] for m in found)
-        last["excepted"] = tuple(dict.fromkeys(pair for m in found for pair in m["excepted"]))
+            last[name] = sum(m[name] for m in result)
+        last["excepted"] = tuple(dict.fromkeys(pair for m in result for pair in m["excepted"]))
         return last
 
     @property
     def overlap(self) -> JudgedOverlap | None:
         """The deepest overlap that came on the way, also before a reset of the world; None without any."""
-        found = [*self._overlaps, *filter(None, (self.judge.overlap,))]
-        return max(found, key=lambda one: one.depth, default=None)
+        result = [*self._overlaps, *filter(None, (self.judge.overlap,))]
+        return max(result, key=lambda one: one.depth, default=None)
 
     @property
     def how(self) -> str:
@@ -371,9 +371,9 @@ class _Run:
         here = float(state[coordinate])
         last = self.target - math.copysign(min(self.tolerance, self.left), self.target - here)
         why = search.find_too_high(state, coordinate, np.linspace(here, last, _HEIGHTS))
-        found = self._search(min(self.samples, _PROOF)) if why else None
-        if found is not None and not (found and found.values[-1] == self.target):
-            raise SkillError("reach", f"{why} None of {found.samples} bases leads to {self.target:.3f}.")
+        result = self._search(min(self.samples, _PROOF)) if why else None
+        if result is not None and not (result and result.values[-1] == self.target):
+            raise SkillError("reach", f"{why} None of {result.samples} bases leads to {self.target:.3f}.")
 
     # -- phases --------------------------------------------------------------------------------------------
 
@@ -383,10 +383,10 @@ class _Run:
         if back is not None:
             return back
         try:
-            found = self._search(self.samples)
-            if found:
-                return found
-            failure = SkillError(found.failure, f"{found.why}{self._approach.barrier}")
+            result = self._search(self.samples)
+            if result:
+                return result
+            failure = SkillError(result.failure, f"{result.why}{self._approach.barrier}")
         except SkillError as error:  # no grasp has room
             failure = error
         back = self._retrace(whole=False)
@@ -407,20 +407,20 @@ class _Run:
                     or abs(end - here) < _LEAST_PROGRESS * self.left
                 ):
                     continue
-                found = self.opener.search.retrace(session.state, earlier, end, self._plan)
-                if found is not None:
+                result = self.opener.search.retrace(session.state, earlier, end, self._plan)
+                if result is not None:
                     self._reversible.remove(earlier)
-                    return found
+                    return result
         self._approach = Approach()
         return None
 
     def _search(self, samples: int) -> BasePlacement:
         """Search a placement, with hands that come from along the bar where no other one leads to it."""
-        found = self._search_with(samples, 0.0)
-        if not found and not self.handle.is_knob:
+        result = self._search_with(samples, 0.0)
+        if not result and not self.handle.is_knob:
             with contextlib.suppress(SkillError):  # there may be no room for such a hand
-                found = self._search_with(samples, _SLANT) or found
-        return found
+                result = self._search_with(samples, _SLANT) or result
+        return result
 
     def _search_with(self, samples: int, slant: float) -> BasePlacement:
         """Search a placement among the most sampled bases that are allowed, and count them."""
@@ -434,7 +434,7 @@ class _Run:
                 grasps = self.opener.grasps(self.handle, session.state, self.seed, slant)
             except InvalidValueError as error:
                 raise SkillError("collision", str(error)) from error
-            found = search.find(
+            result = search.find(
                 session.state,
                 grasps,
                 self.target,
@@ -443,8 +443,8 @@ class _Run:
                 seed=self.seed + self.grasps,
                 report=session.report_search,
             )
-        self.placements += found.samples
-        return found
+        self.placements += result.samples
+        return result
 
     def _plan(self, placement: BasePlacement) -> bool:
         """Plan the path to the pose before the handle, and return whether there is one."""

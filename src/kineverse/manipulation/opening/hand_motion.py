@@ -137,8 +137,8 @@ class HandMotion:
         session = self.session
 
         def make() -> tuple[Controller, TrajectoryFollower]:
-            found = TrajectoryFollower(trajectory)
-            return self.controller(found.tasks, posture=0.0), found
+            result = TrajectoryFollower(trajectory)
+            return self.controller(result.tasks, posture=0.0), result
 
         controller, follower = self.find_controller(("follow", trajectory.symbols), make)
         follower.trajectory = trajectory
@@ -276,12 +276,12 @@ class HandMotion:
     ) -> tuple[Controller, Targets]:
         """Return a controller at rest and the targets of its tasks, those of an earlier motion if any."""
         key = key, self.session.dt
-        found = self.controllers.pop(key) if key in self.controllers else make()
-        self.controllers[key] = found  # the last one is the one used last
+        result = self.controllers.pop(key) if key in self.controllers else make()
+        self.controllers[key] = result  # the last one is the one used last
         if len(self.controllers) > _KEPT:
             del self.controllers[next(iter(self.controllers))]
-        found[0].reset()
-        return found
+        result[0].reset()
+        return result
 
     def move_fingers(self, values: Mapping[Symbol, float]) -> None:
         """Move the fingers to values, or until they stand still."""
@@ -373,8 +373,8 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
         hold = Hold(same_pose(bar @ grasped.expression, hand), gain=FOLLOWING, name="grasp")
         goal = Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")
         scene = Scene(motion.model, rules=motion.holding_rules)
-        found = motion.controller([hold, goal, *goals], scene=scene, margin=_MARGIN)
-        return found, (grasped, wanted, posture, arm_speeds)
+        result = motion.controller([hold, goal, *goals], scene=scene, margin=_MARGIN)
+        return result, (grasped, wanted, posture, arm_speeds)
 
     key = "held", motion.handle.frame, coordinate
     controller, (grasped, wanted, posture, arm_speeds) = motion.find_controller(key, make)

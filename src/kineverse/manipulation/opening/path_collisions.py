@@ -59,9 +59,9 @@ class PathContacts:
             queries.append((self._beside[handle], _BESIDE_BAR))
         first: int | None = None
         for query, radius in queries:
-            found = query.first_within(columns, rows[:first], radius) if first != 0 else None
-            if found is not None:
-                first, self._found = found, (query, radius)
+            result = query.first_within(columns, rows[:first], radius) if first != 0 else None
+            if result is not None:
+                first, self._found = result, (query, radius)
         if first is not None:
             self.scene.update(state.updated(dict(zip(columns, rows[first].tolist(), strict=True))))
         return first

@@ -48,7 +48,7 @@ class PushRegrasp:
                     dt=session.dt,
                     fixed=motion.gripper.joints,
                 )
-                found = find_push_start(
+                result = find_push_start(
                     self.pushing,
                     state,
                     samples=_SAMPLES,
@@ -60,11 +60,11 @@ class PushRegrasp:
                 )
             except InvalidValueError as error:
                 raise SkillError("reach", f"It cannot be pushed: {error}") from error
-        self.samples += found.samples
-        if found.state is None:
-            raise SkillError(found.failure, f"Nor does a push: {found.why}")
-        if not found.whole:
-            self._seconds = _LONGER * found.steps * session.dt + _SETTLING
+        self.samples += result.samples
+        if result.state is None:
+            raise SkillError(result.failure, f"Nor does a push: {result.why}")
+        if not result.whole:
+            self._seconds = _LONGER * result.steps * session.dt + _SETTLING
 
     def _plan(self, start: State) -> str:
         """Plan the path to a start, and return why there is none."""

@@ -69,8 +69,8 @@ class PushStart:
     def why(self) -> str:
         """Text with the number of samples and the reasons of failures."""
         failed = ", ".join(f"{count} {reason}" for reason, count in self.reasons.most_common(6))
-        found = f"Found after {self.samples} samples" if self else f"None of {self.samples} samples"
-        return f"{found}; failed: {failed}." if failed else f"{found}."
+        result = f"Found after {self.samples} samples" if self else f"None of {self.samples} samples"
+        return f"{result}; failed: {failed}." if failed else f"{result}."
 
 
 def find_push_start(
@@ -260,10 +260,10 @@ class _Sampler:
         near, unknown = np.zeros(len(chosen), dtype=bool), np.ones(len(chosen), dtype=bool)
         while unknown.any():
             i = int(np.argmax(unknown))
-            found = solver.solve(dict(self._state) | self._targets(int(chosen[i]), solver), starts=_STARTS)
-            near[i], unknown[i] = found.solved, False
+            result = solver.solve(dict(self._state) | self._targets(int(chosen[i]), solver), starts=_STARTS)
+            near[i], unknown[i] = result.solved, False
             # What is around a point that is far out of reach is so, too.
-            around = found.residuals["tip"] - math.sqrt(3.0) * _NEARBY
+            around = result.residuals["tip"] - math.sqrt(3.0) * _NEARBY
             unknown &= np.linalg.norm(points - points[i], axis=1) > around
         return chosen[near]
 

@@ -87,16 +87,16 @@ class PushSurface:
         self.sign = 1.0 if values[-1] >= values[0] else -1.0
         scene = Scene(model, leave_out=tuple(ignored))
         states = [state.updated({coordinate: value}) for value in values]
-        found = [point for at in states for point in self._sample(scene, at)]
-        if not found:
+        result = [point for at in states for point in self._sample(scene, at)]
+        if not result:
             raise InvalidValueError(
                 f"No surface of {', '.join(bodies)} opposes the motion of '{coordinate}' towards "
                 f"{values[-1]:g}, so it cannot be pushed there."
             )
-        found = _without_doubles(found)
-        self.owner = np.array([k for k, *_ in found], dtype=np.intp)
-        self._points = np.array([p for _, p, _ in found])
-        self._normals = np.array([n for _, _, n in found])
+        result = _without_doubles(result)
+        self.owner = np.array([k for k, *_ in result], dtype=np.intp)
+        self._points = np.array([p for _, p, _ in result])
+        self._normals = np.array([n for _, _, n in result])
         self._compile_one(poses, twists, tip)
         self.room = np.min([self._find_room(scene, at) for at in states], axis=0)
 
@@ -164,7 +164,7 @@ class PushSurface:
         world.prepare()
         poses, twists = self._place(state)
         twists = self.sign * twists
-        found = []
+        result = []
         for k, body in enumerate(self.bodies):
             R, t = poses[k, :, :3], poses[k, :, 3]
             for item in world.members[world.body_index(body)]:
@@ -179,8 +179,8 @@ class PushSurface:
                     hit = scene.ray(start, u, _OUTSIDE + 4 * solid.radius)
                     if hit is None or hit.body != body or hit.distance <= 0.0 or -hit.normal @ u < 0.5:
                         continue
-                    found.append((k, R.T @ (hit.point - t), R.T @ hit.normal))
-        return found
+                    result.append((k, R.T @ (hit.point - t), R.T @ hit.normal))
+        return result
 
     def _find_room(self, scene: Scene, state: State) -> Array:
         """Return the free space (N,) in front of all points at a state."""

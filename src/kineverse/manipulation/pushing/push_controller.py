@@ -220,19 +220,19 @@ class Pushing:
     def first_contact(self, state: State) -> str:
         """Return which body of the robot penetrates something at a state; empty if none does."""
         self.scene.update(state)
-        found = self._all()
-        deep = [pair for pair in found if pair.distance < -_DEEPEST]
+        result = self._all()
+        deep = [pair for pair in result if pair.distance < -_DEEPEST]
         return f"contact of {deep[0].a} and {deep[0].b}" if deep else ""
 
     def find_obstacle(self, state: State) -> Obstacle | None:
         """Return the first thing in the way of the object to its target; None if the path is free."""
         others = tuple(v for s, v in state.items() if not is_of_robot(s.path, self.robot))
         if others != self._swept[0]:  # roll-outs begin where the object is, with the robot elsewhere
-            found = find_obstacle(
+            result = find_obstacle(
                 self.model, self.coordinate, state, self.target,
                 robot=self.robot, rules=self.rules, leave_out=self.leave_out,
             )  # fmt: skip
-            self._swept = others, found
+            self._swept = others, result
         return self._swept[1]
 
     def find_deviation(self, state: State, deviation: Callable[[Symbol], float]) -> float:

@@ -58,14 +58,14 @@ def plan_push_approach(
     for chosen in pushing.rank(state)[:points]:
         point, normal = at.points[chosen], at.normals[chosen]
         goal = Goal(tip, point + _STANDOFF * normal, name="tip")
-        found = planner.solutions(goal, _CONFIGURATIONS, seconds=seconds, seed=seed)
-        if not len(found):
+        result = planner.solutions(goal, _CONFIGURATIONS, seconds=seconds, seed=seed)
+        if not len(result):
             continue
-        states = [state.updated(dict(zip(planner.symbols, q, strict=True))) for q in found.tolist()]
+        states = [state.updated(dict(zip(planner.symbols, q, strict=True))) for q in result.tolist()]
         facing = np.array([-normal @ axis(at_goal) for at_goal in states])
-        good = found[facing > math.cos(_TILT)]
+        good = result[facing > math.cos(_TILT)]
         here = state.vector(planner.symbols)
-        ends = [planner.space.nearest_turn(q, here) for q in (good if len(good) else found)]
+        ends = [planner.space.nearest_turn(q, here) for q in (good if len(good) else result)]
         path = planner.plan(None, ends, seconds=seconds, seed=seed)
         if path.found:
             break

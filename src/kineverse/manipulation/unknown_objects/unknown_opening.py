@@ -280,10 +280,10 @@ class _Run:
         kind = learned.fit.motion.kinds[0]
         scale = point_speed(path.twist(), self.unknown.point)
         rest = self.wanted[kind] - self.pulling.opening[kind]
-        found = self._search(_FURTHER * scale * rest, self._plan, self.seed)
-        if not found:
-            raise SkillError(found.failure, f"{found.why}{self.approach.barrier}")
-        return found
+        result = self._search(_FURTHER * scale * rest, self._plan, self.seed)
+        if not result:
+            raise SkillError(result.failure, f"{result.why}{self.approach.barrier}")
+        return result
 
     def _pull(self, placement: BasePlacement) -> str:
         """Take the handle, pull, let go, and return how far the part is open."""

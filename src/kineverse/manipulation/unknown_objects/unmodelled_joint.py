@@ -87,18 +87,18 @@ def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPar
         edit.apply(floating)
         edit.attach(frame, name, translation(pull, 0, 0), tag)
     try:
-        found = find_handle(copy, pull, handle)
+        result = find_handle(copy, pull, handle)
     except UnknownNameError as error:
         raise UnknownNameError(
             f"'{handle}' has no slim shape that stands out of '{frame}', so no hand closes around it. "
             "Name the body of a handle."
         ) from error
     frame_T_handle = copy.fk(handle, frame)({})
-    outward = frame_T_handle[:3, :3] @ found.pose[:3, 0]
+    outward = frame_T_handle[:3, :3] @ result.pose[:3, 0]
     with copy.edit() as edit:
         edit.remove(tag)
         edit.attach(frame, name, translation(*(float(v) * pull for v in outward)), tag)
-    return UnknownPart(copy, frame, found, parent, parent_T_frame, copy.articulations[name].coordinates)
+    return UnknownPart(copy, frame, result, parent, parent_T_frame, copy.articulations[name].coordinates)
 
 
 def _pull_tag(frame: str) -> str:

@@ -292,12 +292,12 @@ class _Explorer:
 
     def list_locks(self) -> tuple[LearnedLock, ...]:
         """Return what is known about each lock that was tried."""
-        names, found = self.known.coordinates, list[LearnedLock]()
+        names, result = self.known.coordinates, list[LearnedLock]()
         for move, lock in self.known.locks.items():
             if lock.is_tried:
                 certain = lock.necessary()
                 further = {s for one in lock.sufficient() for s in one if lock.refused and s not in certain}
-                found.append(
+                result.append(
                     LearnedLock(
                         names[move.key],
                         move.side,
@@ -308,4 +308,4 @@ class _Explorer:
                         lock.is_conjunction,
                     )
                 )
-        return tuple(found)
+        return tuple(result)

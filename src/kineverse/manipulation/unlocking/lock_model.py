@@ -53,11 +53,11 @@ class LockModel:
 
     def read(self, state: State) -> Configuration:
         """Return the configuration of a state, with positions near a limit at the limit."""
-        found = []
+        result = []
         for s, low, high in zip(self.coordinates, *self.limits, strict=True):
             step = SAME * (high - low)
-            found.append(min(max(low + step * round((state[s] - low) / step), low), high))
-        return tuple(found)
+            result.append(min(max(low + step * round((state[s] - low) / step), low), high))
+        return tuple(result)
 
     def end(self, move: KeySide) -> float:
         """Return the limit of a coordinate in a direction."""
@@ -85,7 +85,7 @@ class LockModel:
         self, move: KeySide, here: Configuration, costs: Costs
     ) -> tuple[float, list[dict[KeySide, None]]]:
         """Return the expected tries of a move, and the conditions of its lock."""
-        lock, best, found = self.locks[move], math.inf, list[dict[KeySide, None]]()
+        lock, best, result = self.locks[move], math.inf, list[dict[KeySide, None]]()
         for box in lock.alternatives:
             refusals = [(q, lock.suspects(q, box)) for q in reversed(lock.refused)]
             chosen = _explain(
@@ -103,21 +103,21 @@ class LockModel:
             if chance:
                 # Not 1 / chance: a try that fails is not made again, since it teaches something.
                 best = min(best, sum(tries for _, tries in chosen.values()) + 1 / math.sqrt(chance))
-            found.append(dict.fromkeys(s for s, _ in chosen.values()))
-        return best, found
+            result.append(dict.fromkeys(s for s, _ in chosen.values()))
+        return best, result
 
     def _rank(
         self, move: KeySide, here: Configuration, q: Configuration, suspects: list[KeySide], costs: Costs
     ) -> list[Option]:
         """Return the possible reasons of a refusal, the one that is cleared most easily first."""
-        lock, found = self.locks[move], list[Option]()
+        lock, result = self.locks[move], list[Option]()
         total = sum(map(lock.weight, suspects))
         for s in suspects:
             tries = 0.0 if s.side * (here[s.key] - q[s.key]) > 0 else costs[s]
             if math.isfinite(tries):
                 rank = tries + total / lock.weight(s) + self._doubts.get((move, s), 0.0)
-                found.append((rank, s, tries))
-        return sorted(found, key=lambda option: (option[0], self.priority[option[1].key]))
+                result.append((rank, s, tries))
+        return sorted(result, key=lambda option: (option[0], self.priority[option[1].key]))
 
     # -- constraints of the model --------------------------------------------------------------------------
 
@@ -180,14 +180,14 @@ class LockModel:
 
     def doubt(self, names: Collection[str], here: Configuration, costs: Costs) -> bool:
         """Make the uncertain conditions of learned constraints less attractive; return if there are any."""
-        found = False
+        result = False
         for move, lock in self.locks.items():
             if self.constraint_name(move.key) in names:
                 certain = lock.necessary()
                 for s in {s for one in self.conditions(move, here, costs) for s in one if s not in certain}:
                     self._doubts[move, s] = self._doubts.get((move, s), 0.0) + _DOUBT
-                    found = True
-        return found
+                    result = True
+        return result
 
     def forget_doubts(self) -> None:
         """Forget all doubts."""
@@ -203,8 +203,8 @@ def _explain(
             continue
         for _, s, tries in options:
             if s.key not in chosen and next(left) > 0:
-                found = _explain(refusals[n + 1 :], {**chosen, s.key: (s, tries)}, left)
-                if found is not None:
-                    return found
+                result = _explain(refusals[n + 1 :], {**chosen, s.key: (s, tries)}, left)
+                if result is not None:
+                    return result
         return None
     return chosen
