@@ -316,9 +316,9 @@ def read_run_recording(
             by_topic[message.topic].append(message)
     if not by_topic["/model"]:
         topics = sorted({message.topic for message in file.messages})
-        listed = f"its topics are {', '.join(topics[:12])}" if topics else "it has no messages"
+        text = f"its topics are {', '.join(topics[:12])}" if topics else "it has no messages"
         raise FormatError(
-            f"{path.name}: no recording of a world, which has a /model of the schema kineverse.Model; {listed}"
+            f"{path.name}: no recording of a world, which has a /model of the schema kineverse.Model; {text}"
             f"{'' if file.complete else '; the file was cut'}."
         )
     model = _read_model(by_topic["/model"][0].data, path, root)
