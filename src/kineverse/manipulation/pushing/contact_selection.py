@@ -20,6 +20,7 @@ _OUT_OF_REACH = 0.02
 """Distance of the tip from a point that is given up from which on points beyond are out of reach, too [m]."""
 _BLOCKED_STEPS = 60
 _BLOCKED_WAY = 0.004
+_MOST_JAMMED = 3  # number of contact points at which the object does not move before it counts as jammed
 
 
 class ContactSelection:
@@ -40,6 +41,11 @@ class ContactSelection:
     def restart(self) -> None:
         """Start counting progress again."""
         self._best, self._since = math.inf, 0
+
+    @property
+    def is_jammed(self) -> bool:
+        """True if the object did not move at several contact points."""
+        return self.jammed >= _MOST_JAMMED
 
     def score(self, points: PushContacts) -> Array:
         """Return how well the object can be pushed at each point (N,)."""

@@ -81,7 +81,6 @@ _PROGRESS = 5e-4
 _AVERAGED = 0.1  # weight of the latest estimate in the mean that counts at the end
 _PRESSED = 5  # number of steps for which an object within the tolerance gives way no more when a push ends
 _MOST_BLOCKED = 3  # number of contact points given up before an approach is planned
-_MOST_JAMMED = 3  # number of contact points at which the object does not move before it counts as jammed
 _MOST_APPROACHES = 2
 _UNKNOWN, _LOOK = 0.05, 2.0  # deviation of an unknown coordinate [m], [rad], and time to look for it [s]
 _RETREAT_STEPS = 100
@@ -317,7 +316,7 @@ class _Run:
             if end.reached(session.state):
                 self.claimed = True
                 return SkillError("other", "The estimate is at the target, and the world is not.")
-            if pushing.choice.jammed >= _MOST_JAMMED:
+            if pushing.choice.is_jammed:
                 force = session.peak_force
                 strength = "" if math.isnan(force) else f" with up to {force:.0f} N"
                 return SkillError(
