@@ -50,12 +50,12 @@ class BaseDrive:
         model: ModelView,
         base: Sequence[Symbol],
         scene: Scene,
-        own: Sequence[str],
+        robot_bodies: Sequence[str],
         others: Sequence[str],
         margin: float,
     ) -> None:
         self._model, self.base = model, tuple(base)
-        self._scene, self._watch = scene, scene.watch(own, others, margin)
+        self._scene, self._watch = scene, scene.watch(robot_bodies, others, margin)
         rates = [model.rates.get(s, {}) for s in base]
         self._speeds = tuple(dict.fromkeys(v for row in rates for v in row))
         here = State(dict.fromkeys((*model.symbols, *model.speeds), 0.0))

@@ -241,14 +241,14 @@ def exclude_overlaps(
     overlap, the others collide. Excluded are also bodies that one joint keeps apart between its limits.
     """
     data, random = mujoco().MjData(compiled), np.random.default_rng(seed)
-    own = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
+    of_robot = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
 
     def find_overlaps() -> dict[tuple[int, int], float]:
         return {(min(a, b), max(a, b)): gap for a, b, gap in _find_contacts(compiled, data) if gap < 0.0}
 
     def pairs_of_robot(found: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
         pairs = (sorted(compiled.geom_bodyid[list(pair)].tolist()) for pair in found)
-        return {(a, b) for a, b in pairs if own[a] and own[b]}
+        return {(a, b) for a, b in pairs if of_robot[a] and of_robot[b]}
 
     data.qpos[:] = coordinates.positions(coordinates.default)
     at_home, move = find_overlaps(), coordinates.mover()
@@ -263,7 +263,7 @@ def exclude_overlaps(
     shapes: dict[tuple[int, int], set[tuple[int, int]]] = {}
     for (a, b), gap in at_home.items():
         one, other = compiled.geom_bodyid[[a, b]].tolist()
-        if gap < -_RESTING and not own[one] and not own[other]:
+        if gap < -_RESTING and not of_robot[one] and not of_robot[other]:
             pair = (a, b) if one < other else (b, a)
             shapes.setdefault((min(one, other), max(one, other)), set()).add(pair)
     for (one, other), overlapping in shapes.items():

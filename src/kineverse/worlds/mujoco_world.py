@@ -54,10 +54,10 @@ class SimulationBounds:
         self._names = [compiled.joint(int(k)).name for k in compiled.dof_jntid]
         data.qpos[:] = coordinates.positions(coordinates.default)
         engine.mj_forward(compiled, data)
-        own = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
+        of_robot = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
         limits, base = np.zeros(compiled.nv), np.zeros(compiled.nv)
         for symbol, dof in coordinates.dof.items():
-            if own[compiled.dof_bodyid[dof]]:
+            if of_robot[compiled.dof_bodyid[dof]]:
                 limit = float(np.abs(model.limits(symbol.derivative())).min())
                 limits[dof] = limit if 0.0 < limit < math.inf else _UNSTATED
         for symbol in base_coordinates(model) & coordinates.dof.keys():
@@ -71,13 +71,13 @@ class SimulationBounds:
                 np.linalg.norm(slide, axis=0) + np.linalg.norm(turn, axis=0) * compiled.geom_rbound[geom]
             )
             np.maximum(levers, reaches, out=levers)
-            if own[body]:
+            if of_robot[body]:
                 fastest = max(fastest, float(limits @ reaches))
         fall = math.sqrt(2.0 * abs(float(compiled.opt.gravity[2])) * float(compiled.stat.extent))
         with np.errstate(divide="ignore"):
             others = (2.0 * fastest + fall) / levers
         self.speeds: Array = np.where(limits > 0.0, _MARGIN * limits, others)
-        mass = float(compiled.body_mass[own].sum())
+        mass = float(compiled.body_mass[of_robot].sum())
         reach = {s: max(float(levers[coordinates.dof[s]]), 1e-3) for s in efforts}
         pressed = sum(effort / reach[s] for s, effort in efforts.items())
         step = float(compiled.opt.timestep)

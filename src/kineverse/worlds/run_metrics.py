@@ -174,8 +174,8 @@ class Judge:
         self._every = as_count("every=", every, 1)
         self._symbols = model.symbols
         self._scene = scene or Scene(model)
-        self._own = [b for b in self._scene.bodies if is_of_robot(b, robot)]
-        if not self._own:
+        self._robot_bodies = [b for b in self._scene.bodies if is_of_robot(b, robot)]
+        if not self._robot_bodies:
             prefixes = {name.partition("/")[0] for name in model.frames}
             raise UnknownNameError(
                 f"No body of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
@@ -187,7 +187,7 @@ class Judge:
         self._speed_place |= {str(v): k for k, v in enumerate(self._robot_speeds)}
         self._scene_values = self._indices(self._scene.inputs)
         self._coordinate, self._start = coordinate, start
-        self._penetrations = self._scene.watch(self._own, radius=0.0)
+        self._penetrations = self._scene.watch(self._robot_bodies, radius=0.0)
         self._furniture = FurnitureOverlaps(self._scene, robot)
         self._first_overlapping: tuple[tuple[str, str], ...] = ()
         self._gripping: dict[str, set[str]] = {}
@@ -344,14 +344,14 @@ class Judge:
             )
         motion = FrameDependence(self.model, self.model.speeds)
         group = [b for b in bodies if motion.moving_ancestors(b) == motion.moving_ancestors(handle)]
-        rules = [Rule(a, b, True) for a in self._own for b in group if a != b]
-        self._touches = self._scene.watch(self._own, group, gap, rules=rules)
+        rules = [Rule(a, b, True) for a in self._robot_bodies for b in group if a != b]
+        self._touches = self._scene.watch(self._robot_bodies, group, gap, rules=rules)
 
     def _begin(self) -> None:
         """Except what overlaps at the first state: pairs of the robot, and of furniture as far as it does."""
-        own = set(self._own)
+        robot = set(self._robot_bodies)
         result = ((pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_TOUCHING)
-        self._first_overlapping = tuple((a, b) for a, b in result if a in own and b in own)
+        self._first_overlapping = tuple((a, b) for a, b in result if a in robot and b in robot)
         self._furniture.begin(*(() if self._start is None else (self._start,)))
         self._select_pairs()
 
@@ -365,7 +365,7 @@ class Judge:
     def _followed(self) -> tuple[str, ...]:
         """Return the frames whose paths are measured: the root of what moves of the robot, and the hand."""
         motion = FrameDependence(self.model, self._robot_speeds)
-        moved = [b for b in self._own if motion.moves(b)] or self._own
+        moved = [b for b in self._robot_bodies if motion.moves(b)] or self._robot_bodies
         root = min(moved, key=lambda b: len(motion.moving_ancestors(b)))
         return (root,) if self.gripper is None else (root, self.gripper.hand)
 

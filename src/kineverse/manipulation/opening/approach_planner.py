@@ -59,7 +59,9 @@ class ApproachPlanner:
         self.planner = Planner(search.model, search.moving, rules=search.scene.rules)
         standing = {*search.standing}
         self.drive = (
-            BaseDrive(search.model, search.base, search.scene, search.own, search.others, search.margin)
+            BaseDrive(
+                search.model, search.base, search.scene, search.robot_bodies, search.others, search.margin
+            )
             if standing and standing == {*search.base}
             else None
         )
@@ -136,14 +138,14 @@ class ApproachPlanner:
         limits = np.array([search.model.limits(s) for s in symbols])
         lower, upper = np.where(np.isfinite(limits), limits, np.array([-np.pi, np.pi])).T
         rows = np.random.default_rng(0).uniform(lower, upper, (_TUCKED, len(lower)))
-        itself = scene.watch(search.own, search.own, 0.0)
-        touching = itself, scene.watch(search.own, search.others, search.margin)
+        itself = scene.watch(search.robot_bodies, search.robot_bodies, 0.0)
+        touching = itself, scene.watch(search.robot_bodies, search.others, search.margin)
         x, y, _ = (state[s] for s in search.base)
         result: list[tuple[float, int]] = []
         for k, row in enumerate(rows):
             scene.update(state.updated(dict(zip(symbols, row.tolist(), strict=True))))
             if not any(len(watch()) for watch in touching):
-                places = np.array([scene.pose(b)[:2, 3] for b in search.own])
+                places = np.array([scene.pose(b)[:2, 3] for b in search.robot_bodies])
                 result.append((float(np.hypot(*(places - [x, y]).T).max()), k))
         return rows[[k for _, k in sorted(result)]]
 

@@ -143,26 +143,31 @@ class PlacementSearch:
 
     def __init__(self, model: ModelView, gripper: Gripper, state: State, margin: float = 0.006) -> None:
         self.model, self.gripper, self.margin = model, gripper, margin
-        own = model.symbols_of(gripper.hand)
-        free = {s for s in own if s in model.degrees_of_freedom and s not in gripper.joints}
-        self.standing = tuple(s for s in own if s in model.rates and s in free)
-        self.moving = tuple(s for s in own if s in free and s not in self.standing)
-        self.base = find_planar_base(model, own)
+        symbols = model.symbols_of(gripper.hand)
+        free = {s for s in symbols if s in model.degrees_of_freedom and s not in gripper.joints}
+        self.standing = tuple(s for s in symbols if s in model.rates and s in free)
+        self.moving = tuple(s for s in symbols if s in free and s not in self.standing)
+        self.base = find_planar_base(model, symbols)
         self.coordinates = (*self.moving, *self.standing)
         self.samples = PlacementSampler(model, self.moving, self.standing, self.base)
         self.paths = CartesianPaths(model, gripper.hand, self.moving, self.standing, self.samples.eases[0])
         self.scene = Scene(model)
         bodies = self.scene.bodies
-        self.own = tuple(b for b in bodies if gripper.robot and is_of_robot(b, gripper.robot))
-        others = tuple(b for b in bodies if b not in self.own)
+        self.robot_bodies = tuple(b for b in bodies if gripper.robot and is_of_robot(b, gripper.robot))
+        others = tuple(b for b in bodies if b not in self.robot_bodies)
         if not others:
             raise InvalidValueError("The model has nothing but the robot, so there is nothing to hold.")
         self.others = others
         add_rules = self.scene.collision_world.add_rules
-        add_rules((*find_overlapping_links(self.scene, self.own, state), *furniture_rules(bodies, self.own)))
+        add_rules(
+            (
+                *find_overlapping_links(self.scene, self.robot_bodies, state),
+                *furniture_rules(bodies, self.robot_bodies),
+            )
+        )
         add_rules(self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN))
-        self.contacts = PathContacts(model, self.scene, gripper, self.own, others, margin)
-        self.bases = BaseSampler(self.scene, self.base, self.own, others, margin)
+        self.contacts = PathContacts(model, self.scene, gripper, self.robot_bodies, others, margin)
+        self.bases = BaseSampler(self.scene, self.base, self.robot_bodies, others, margin)
         self._reach: float | None = None
 
     def _random_states(self, state: State) -> Iterator[State]:

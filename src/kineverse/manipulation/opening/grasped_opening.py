@@ -360,7 +360,7 @@ class _Run:
         if search.standing:
             return  # the base is put elsewhere
         search.scene.update(self.session.state)
-        touching = search.scene.watch(search.own, search.others, 0.0)()
+        touching = search.scene.watch(search.robot_bodies, search.others, 0.0)()
         if len(touching):
             pair = touching[0]
             raise SkillError("collision", f"The robot begins in contact: '{pair.a}' at '{pair.b}'.")

@@ -32,14 +32,14 @@ class PathContacts:
         model: ModelView,
         scene: Scene,
         gripper: Gripper,
-        own: Sequence[str],
+        robot_bodies: Sequence[str],
         others: Sequence[str],
         margin: float,
     ) -> None:
         self.scene, self.gripper, self.margin = scene, gripper, margin
-        self.own, self.others = tuple(own), tuple(others)
-        self._own_watch = scene.watch(self.own, self.own, OWN_MARGIN)
-        self.hand = {b for b in own if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
+        self.robot_bodies, self.others = tuple(robot_bodies), tuple(others)
+        self._self_watch = scene.watch(self.robot_bodies, self.robot_bodies, OWN_MARGIN)
+        self.hand = {b for b in robot_bodies if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
         self._around: dict[str, PreparedQuery] = {}
         self._beside: dict[str, PreparedQuery] = {}
         self._found: tuple[PreparedQuery, float] | None = None
@@ -52,7 +52,7 @@ class PathContacts:
         The scene is placed there.
         """
         self.scene.update(state.updated(dict(zip(columns, rows[0].tolist(), strict=True))))
-        queries = [(self._watch_around(handle), self.margin), (self._own_watch, OWN_MARGIN)]
+        queries = [(self._watch_around(handle), self.margin), (self._self_watch, OWN_MARGIN)]
         if opened and handle:
             if handle not in self._beside:
                 self._beside[handle] = self.scene.watch([*self.gripper.bodies], [handle], _BESIDE_BAR)
@@ -78,7 +78,9 @@ class PathContacts:
         if handle not in self._around:
             bodies = self.gripper.bodies if handle else ()
             allowed = [Rule(b, handle, False, "grasped") for b in bodies]
-            self._around[handle] = self.scene.watch(self.own, self.others, self.margin, rules=allowed)
+            self._around[handle] = self.scene.watch(
+                self.robot_bodies, self.others, self.margin, rules=allowed
+            )
         return self._around[handle]
 
 

@@ -207,9 +207,9 @@ class _Sampler:
                 for (tasks, tolerance), last in zip(goals, clear, strict=True)
             ]
         self._tried = 0
-        own = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
-        others = [b for b in pushing.scene.bodies if b not in own]
-        self._bases = BaseSampler(pushing.scene, self.base, own, others, _MARGIN)
+        robot_bodies = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
+        others = [b for b in pushing.scene.bodies if b not in robot_bodies]
+        self._bases = BaseSampler(pushing.scene, self.base, robot_bodies, others, _MARGIN)
         self._points = pushing.surface.at(state)
         score = pushing.choice.score(self._points)
         good = np.flatnonzero(score > score.max() - _CANDIDATES)

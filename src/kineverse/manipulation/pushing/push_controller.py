@@ -145,9 +145,9 @@ class Pushing:
         plain = Scene(model, rules=self.rules, leave_out=self.leave_out)
         self.pusher = match_bodies(plain.bodies, bodies, "bodies=")
         self.robot = self.pusher[0].split("/")[0] if robot is None else robot
-        own = tuple(b for b in plain.bodies if is_of_robot(b, self.robot))
+        robot_bodies = tuple(b for b in plain.bodies if is_of_robot(b, self.robot))
         moved = plain.bodies_moved_by([coordinate])
-        self.object_bodies = tuple(b for b in moved if b not in own)
+        self.object_bodies = tuple(b for b in moved if b not in robot_bodies)
         if not self.object_bodies:
             raise InvalidValueError(f"'{coordinate}' moves no body with a shape, so nothing can be pushed.")
         pushed = self.object_bodies
@@ -159,13 +159,13 @@ class Pushing:
             model,
             coordinate,
             pushed,
-            (*own, *self.leave_out),
+            (*robot_bodies, *self.leave_out),
             at,
             (at[coordinate], (at[coordinate] + target) / 2, target),
             self.tool.locate_tip(model),
         )
-        furniture = furniture_rules(plain.bodies, own)
-        self.overlapping = find_overlapping_links(plain, own, at)
+        furniture = furniture_rules(plain.bodies, robot_bodies)
+        self.overlapping = find_overlapping_links(plain, robot_bodies, at)
         self.scene = Scene(
             model, rules=(*furniture, *self.overlapping, *self.rules), leave_out=self.leave_out
         )
