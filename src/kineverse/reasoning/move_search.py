@@ -110,10 +110,10 @@ class MoveSearch:
     def _edges(self) -> list[Edge]:
         graph, edges = self.graph, list[Edge]()
         for k, own in enumerate(graph.steps):
-            for way, steps in zip((1, -1), own, strict=True):
+            for direction, steps in zip((1, -1), own, strict=True):
                 for cell, step in enumerate(steps):
                     if step is not None and 0 not in step.needs:
-                        edges.append((k, graph.bit(k, cell), graph.bit(k, cell + way), step))
+                        edges.append((k, graph.bit(k, cell), graph.bit(k, cell + direction), step))
         return edges
 
     # -- moves that never harm -----------------------------------------------------------------------------
@@ -151,7 +151,7 @@ class MoveSearch:
         These are cells that serve others at least as well as all that are farther away from the best one on
         the same side; on the way to the best cell every state passes them. So whatever can be reached with
         the coordinate farther away can also be reached from there. All other cells may have to be left
-        backwards before there is a way to the best one.
+        backwards before the best one can be reached.
         """
         graph, result = self.graph, list[frozenset[int]]()
         for k, best in enumerate(self._best):
@@ -282,9 +282,9 @@ class MoveSearch:
             state |= graph.field(k) & every & beyond
         return state
 
-    def _moves(self, state: int, k: int, ways: Sequence[int]) -> Iterator[tuple[Move, int]]:
-        for way in ways:
-            for cell, after in self.graph.sweep(state, k, way):
+    def _moves(self, state: int, k: int, directions: Sequence[int]) -> Iterator[tuple[Move, int]]:
+        for direction in directions:
+            for cell, after in self.graph.sweep(state, k, direction):
                 yield (k, cell), after
 
     def prune(self, moves: Sequence[Move]) -> tuple[Move, ...]:
@@ -332,15 +332,15 @@ def _blocking_rule(graph: CellGraph, k: int, wanted: int, reached: int) -> tuple
     """Return the rule that stops a coordinate on its way to a cell, and the mask that releases it."""
     target = wanted.bit_length() - 1 - graph.first[k]
     cell = graph.cell_of(graph.start, k)
-    way = 1 if target > cell else -1
+    direction = 1 if target > cell else -1
     while cell != target:
-        step = graph.step(k, cell, way)
+        step = graph.step(k, cell, direction)
         if step is None:
             return None
         for mask, rule in zip(step.needs, step.rules, strict=True):
             if not mask & reached:
                 return rule, mask
-        cell += way
+        cell += direction
     return None
 
 

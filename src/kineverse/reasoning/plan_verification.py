@@ -41,8 +41,8 @@ def plan_violations(model: ModelView, plan: UnlockingPlan, state: StateLike | No
 
     Each move is enclosed in intervals from its start to its target, which are halved until they decide.
     Within each, constraints on speeds have to admit a small speed of the one coordinate, but for 0.1 µm
-    around a threshold. Constraints on positions hold at the end of each move, and if they are violated on the
-    way, the violation decreases.
+    around a threshold. Constraints on positions hold at the end of each move, and if they are violated
+    meanwhile, the violation decreases.
 
     Parameters
     ----------
@@ -236,13 +236,13 @@ class _InvarianceCheck:
         for n, region in enumerate(known.regions):
             following = known.following[n] if known.following else ()
             for k, symbol in enumerate(known.coordinates):
-                for way in () if symbol in self.fixed else (1, -1):
-                    into = self._neighbour(region, k, way)
+                for direction in () if symbol in self.fixed else (1, -1):
+                    into = self._neighbour(region, k, direction)
                     if into is None or into in index:
                         continue
                     if any(_covers(known.regions[m], into) for m in following):
                         continue
-                    if not self._is_blocked(region, into, k, way):
+                    if not self._is_blocked(region, into, k, direction):
                         cell = known.cells[k][into[k][0]]
                         yield f"{symbol} may get to {cell.describe(str(symbol))}"
 
@@ -266,39 +266,42 @@ class _InvarianceCheck:
                     return False
         return True
 
-    def _neighbour(self, region: Region, k: int, way: int) -> Region | None:
+    def _neighbour(self, region: Region, k: int, direction: int) -> Region | None:
         """Return the positions next to a region in one direction, None at the end of the range."""
-        cell = region[k][way > 0] + way
+        cell = region[k][direction > 0] + direction
         rests = self.known.rests[k]
         while 0 <= cell < len(rests) and not rests[cell]:
-            cell += way
+            cell += direction
         return (*region[:k], (cell, cell), *region[k + 1 :]) if 0 <= cell < len(rests) else None
 
-    def _is_blocked(self, region: Region, into: Region, k: int, way: int) -> bool:
+    def _is_blocked(self, region: Region, into: Region, k: int, direction: int) -> bool:
         """Return whether constraints stop a coordinate at the end of a region, wherever the others are."""
-        symbol, end = self.known.coordinates[k], region[k][way > 0]
+        symbol, end = self.known.coordinates[k], region[k][direction > 0]
         here = self._box((*region[:k], (end, end), *region[k + 1 :]))
         there = self._box(into)
         boxes = [here, there] if there[symbol][0] < there[symbol][1] else [here]
-        if any(self.ranges.refuses(symbol.derivative(), way, box, self.start) for box in boxes):
+        if any(self.ranges.refuses(symbol.derivative(), direction, box, self.start) for box in boxes):
             return True
         return any(
-            self._is_left(name, k, way, here, there)
+            self._is_left(name, k, direction, here, there)
             for name in self.ranges.about(symbol)
             if not self.ranges.rows[name].order
         )
 
-    def _is_left(self, name: str, k: int, way: int, here: _Box, there: _Box) -> bool:
+    def _is_left(self, name: str, k: int, direction: int, here: _Box, there: _Box) -> bool:
         """Return whether a constraint on positions is violated by a move, or farther away with it."""
         symbol, row, ranges = self.known.coordinates[k], self.ranges.rows[name], self.ranges
         if symbol not in row.expression.symbols:
             return ranges.excess(name, there)[0] > NOTHING >= ranges.excess(name, here)[1]
-        least, most = ranges.excesses(name, there)[way > 0]
+        least, most = ranges.excesses(name, there)[direction > 0]
         if row.expression != symbol or least <= NOTHING:
             return False
         # Its own position may change the bound, unless that is constant next to the region.
         room = there[symbol][1] - there[symbol][0] + NOTHING
-        return symbol not in (row.upper if way > 0 else row.lower).symbols or most - least <= room < math.inf
+        return (
+            symbol not in (row.upper if direction > 0 else row.lower).symbols
+            or most - least <= room < math.inf
+        )
 
     def _box(self, region: Region) -> _Box:
         """Return the positions of a region, without those next to thresholds but with the start."""

@@ -88,7 +88,7 @@ class UnlockingPlan:
         Positions to reach, by coordinate.
     verdict
         ``"found"``, if :func:`.plan_violations` finds nothing wrong with the steps; ``"refuted"``, if
-        :func:`.refutation_gaps` finds no way out of ``invariant``; otherwise ``"undecided"``.
+        :func:`.refutation_gaps` finds no exit from ``invariant``; otherwise ``"undecided"``.
     steps
         The moves, empty unless found.
     shortest
@@ -297,12 +297,12 @@ def _make_steps(
     position, steps = dict(start), list[UnlockingStep]()
     for n, (k, cell) in enumerate(moves):
         symbol, side = graph.coordinates[k], graph.cells[k][cell]
-        way = 1 if cell > graph.cell_of(states[n], k) else -1
+        direction = 1 if cell > graph.cell_of(states[n], k) else -1
         ends = symbol in goals and goals[symbol] in side
-        target = goals[symbol] if ends else _inside(side, way)
+        target = goals[symbol] if ends else _inside(side, direction)
         last = following[n] == len(moves)
         releases = _released(graph, moves, states, n, following[n])
-        bound = side.lower if way > 0 else side.upper
+        bound = side.lower if direction > 0 else side.upper
         threshold = None if ends and last else float(bound)
         steps.append(UnlockingStep(symbol, position[symbol], target, threshold, releases))
         position[symbol] = target
@@ -332,10 +332,10 @@ def _released(
     return tuple(result)
 
 
-def _inside(side: Interval, way: int) -> float:
+def _inside(side: Interval, direction: int) -> float:
     """Return a position within a cell, a little beyond the end where it is entered."""
     lower, upper = float(side.lower), float(side.upper)
-    return (lower if way > 0 else upper) + way * min(_BEYOND, (upper - lower) / 2)
+    return (lower if direction > 0 else upper) + direction * min(_BEYOND, (upper - lower) / 2)
 
 
 def _check_goal(symbol: Symbol, value: object, limit: Interval) -> float:

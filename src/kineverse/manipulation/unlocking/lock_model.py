@@ -24,7 +24,7 @@ Option: TypeAlias = tuple[float, KeySide, float]
 """Condition that explains a refusal: its rank, the condition, and the tries that it takes to fulfil it."""
 
 SAME = 1e-3  # difference of positions that counts as none, as a share of a coordinate's range
-_WAYS: tuple[Side, Side] = (1, -1)
+_SIDES: tuple[Side, Side] = (1, -1)
 _SPEED = 1.0  # speed limit of a learned lock where the model has none [m/s] or [rad/s]
 _DOUBT = 5.0  # tries by which a condition counts as more costly after a plan was refuted because of it
 _MOST_CHOICES = 500
@@ -45,7 +45,9 @@ class LockModel:
         self.limits = Enclosure(tuple(low for low, _ in ends), tuple(high for _, high in ends))
         here = self.read(start)
         self.locks = {
-            KeySide(k, way): LockHypothesis(k, self.limits, here) for k in range(len(ends)) for way in _WAYS
+            KeySide(k, direction): LockHypothesis(k, self.limits, here)
+            for k in range(len(ends))
+            for direction in _SIDES
         }
         self.priority: list[int] = np.random.default_rng(seed).permutation(len(ends)).tolist()
         self._doubts = dict[tuple[KeySide, KeySide], float]()
@@ -149,7 +151,8 @@ class LockModel:
                     edit.remove(name)
                 if k in wanted:
                     upper, lower = (
-                        self._bound(KeySide(k, way), conditions[KeySide(k, way)]) for way in _WAYS
+                        self._bound(KeySide(k, direction), conditions[KeySide(k, direction)])
+                        for direction in _SIDES
                     )
                     edit.constrain(name, lower, self.coordinates[k].derivative(), upper, tag=name)
         self._written = wanted
