@@ -1,4 +1,4 @@
-"""Paths of a robot to where it begins a motion: the drive of a base on wheels, and the path of the rest."""
+"""Approaches: the drive of a base on wheels and the path of the rest, and what openings by a gripper share."""
 
 from __future__ import annotations
 
