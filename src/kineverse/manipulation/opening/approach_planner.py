@@ -1,4 +1,4 @@
-"""Approaches: the drive of a base on wheels and the path of the rest, and what openings by a gripper share."""
+"""Approaches: drive of a base on wheels, path of the rest, and what all openings by one gripper share."""
 
 from __future__ import annotations
 
