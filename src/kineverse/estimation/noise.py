@@ -1,4 +1,9 @@
-"""Noise models: errors of poses and their covariance, and outliers."""
+"""Noise models: errors of poses and their covariance, and outliers.
+
+A measured pose is ``(p + δp, Exp(δθ) R)`` for the true position p and orientation R. Both errors are written
+in the axes of the observing frame, linear part first, like the rows of ``model.jacobian(frame, relative_to,
+form="world_aligned")``. ROS uses the same convention in ``PoseWithCovariance``.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +39,8 @@ def pose_covariance(position: float, orientation: float) -> Array:
     for name, value in (("position", position), ("orientation", orientation)):
         if not (math.isfinite(value) and value > 0.0):
             raise InvalidValueError(
-                f"The standard deviation of the {name} is {value}. It has to be positive and finite; what is "
-                "not measured at all is left out."
+                f"The standard deviation of the {name} is {value}. It has to be positive and finite; leave "
+                "out what is not measured."
             )
     return np.diag([position**2] * 3 + [orientation**2] * 3)
 
@@ -126,10 +131,9 @@ class Outliers:
         return math.exp(inlier - total), -total
 
 
-def _as_number(given: Any) -> float:
-    """Return a float; NaN for what is none."""
+def _as_number(value: Any) -> float:
     try:
-        return float(given)
+        return float(value)
     except (TypeError, ValueError):
         return math.nan
 
@@ -139,14 +143,14 @@ def cauchy_weight(square: float, size: int) -> float:
     return (1 + size) / (1 + square)
 
 
-def as_outliers(given: Outliers | bool | None, has_gate: bool = False) -> Outliers | None:
+def as_outliers(argument: Outliers | bool | None, has_gate: bool = False) -> Outliers | None:
     """Convert an argument to an outlier model: True stands for the default, False and None for none."""
-    if isinstance(given, Outliers):
-        if given.gate is not None and not has_gate:
+    if isinstance(argument, Outliers):
+        if argument.gate is not None and not has_gate:
             raise InvalidValueError(
                 "Only a tracker has a gate of outliers. Here an outlier is defined by fraction and reach."
             )
-        return given
-    if given is None or isinstance(given, bool):
-        return Outliers() if given else None
-    raise InvalidValueError(f"Outliers are True, False or Outliers(fraction=, reach=), not {given!r}.")
+        return argument
+    if argument is None or isinstance(argument, bool):
+        return Outliers() if argument else None
+    raise InvalidValueError(f"Outliers are True, False or Outliers(fraction=, reach=), not {argument!r}.")

@@ -119,7 +119,7 @@ class NaturalSpline:
 class PathWidths:
     """Widths of poses along the principal directions of their positions and of their rotations."""
 
-    directions: tuple[Array, ...]  # (3, 3)
+    directions: tuple[Array, ...]  # (3, 3) each
     widths: tuple[Array, ...]  # twice the standard deviations along them, (3,) each, [m] and [rad]
 
     @staticmethod
@@ -160,14 +160,14 @@ class PathWidths:
 
 @dataclass(frozen=True, eq=False)
 class CurveMotion:
-    """Curve through poses at equidistant knots. Lengths are in a unit, see :mod:`.scale`."""
+    """Curve through poses at equidistant knots. Lengths are in a unit, see :mod:`.normalisation`."""
 
     rows: int  # 6 for poses, 3 for positions
-    spline: NaturalSpline  # knots
-    positions: Array  # (K, 3), (K, 4)
-    quaternions: Array
+    spline: NaturalSpline
+    positions: Array  # of the knots, (K, 3)
+    quaternions: Array  # (K, 4)
     across: Array  # twists by which the parameters move each knot, (K, m, m - 1)
-    widths: PathWidths  # widths of the prior
+    widths: PathWidths  # of the prior
     lever: float = LEVER  # length ℓ of a rotation by one radian
 
     name = CURVE
@@ -184,16 +184,8 @@ class CurveMotion:
         lever: float = LEVER,
     ) -> CurveMotion:
         """Return the curve through poses at the knots."""
-        quaternions = unit_vector(quaternions)
-        motion = CurveMotion(
-            rows,
-            spline,
-            positions,
-            quaternions,
-            np.zeros((spline.count, rows, 0)),
-            widths,
-            lever,
-        )
+        none = np.zeros((spline.count, rows, 0))
+        motion = CurveMotion(rows, spline, positions, unit_vector(quaternions), none, widths, lever)
         tangents = motion.linearise(spline.knots[:, None]).by_joints[:, :, 0] * motion.lengths
         *_, directions = np.linalg.svd(tangents[:, None, :])
         across = np.swapaxes(directions[:, 1:], 1, 2)
@@ -261,9 +253,8 @@ class CurveMotion:
         by[steps, :, steps] = -self.across[:-1]
         by[steps, :, steps + 1] = self.across[1:]
         whitening, bend = self.widths.whitening, min(1.0, _CURVATURE / (count - 1) ** 2)
-        residuals = np.concatenate(
-            [np.diff(self._differences, axis=0) / bend, self._differences.sum(0)[None]]
-        )
+        moved = self._differences
+        residuals = np.concatenate([np.diff(moved, axis=0) / bend, moved.sum(axis=0)[None]])
         derivatives = np.concatenate([np.diff(by, axis=0) / bend, by.sum(axis=0)[None]])
         by_parameters = np.einsum("ij,njke->nike", whitening, derivatives)
         return ParameterPrior((residuals @ whitening).ravel(), by_parameters.reshape(-1, self.size))
@@ -282,16 +273,14 @@ class CurveMotion:
         # Volume of mean poses per unit of the steps that move them.
         moves = np.concatenate([self.across[count // 2], self.linearise(mean[None, :]).by_joints[0]], axis=1)
         log += float(np.linalg.slogdet(moves)[1])
-        log += self.widths.log_density(count) + _LOG_KNOT * count - _log_sum_knots()
+        log += self.widths.log_density(count) + _LOG_KNOT * count
+        log -= math.log(sum(math.exp(_LOG_KNOT * knots) for knots in KNOTS))
         return log, np.zeros(self.size + 1)
 
     def named_parameters(self) -> dict[str, Array | float]:
         """Return the parameters by name."""
-        return {
-            "length": self.length,
-            "knots": self.spline.knots,
-            "poses": transform(quaternion(self.quaternions), self.positions),
-        }
+        poses = transform(quaternion(self.quaternions), self.positions)
+        return {"length": self.length, "knots": self.spline.knots, "poses": poses}
 
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of the parameters: each knot moves in several directions across the curve."""
@@ -334,10 +323,6 @@ class CurveMotion:
             return moved
         turns = quaternion(self.quaternions)
         return np.concatenate([moved, log_so3(turns[1:] @ np.swapaxes(turns[:-1], 1, 2))], axis=1)
-
-
-def _log_sum_knots() -> float:
-    return math.log(sum(math.exp(_LOG_KNOT * count) for count in KNOTS))
 
 
 def aligned_quaternions(rotations: Array) -> Array:

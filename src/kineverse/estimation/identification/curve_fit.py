@@ -1,7 +1,7 @@
 """Fit of a curve to observations: order along the path, spline by least squares, number of knots by evidence.
 
 The observations come in any order. Candidates for their order along the path are that of the recording, of
-the first principal component, of the length of the shortest way through near neighbours, and of the joint
+the first principal component, of the length of the shortest path through near neighbours, and of the joint
 values of other families. Each gives a coarse curve, and the nearest one continues: all observations are
 projected onto it, it is fitted again, and its knots are spread evenly. The most probable number of knots is
 chosen.
@@ -10,7 +10,7 @@ chosen.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ _SAMPLES = 24
 _DENSEST = 0.75
 # Log evidence that a curve may lack, and the part of it that twice as many knots must leave at most.
 _HOPELESS, _LEFT = 30.0, 0.6
-# Largest number of observations among which the shortest ways are searched, and by which the shape is found.
+# Largest number of observations among which the shortest paths are searched, and by which the shape is found.
 _MOST, _MOST_FITTED = 120, 240
 # Largest difference of poses that are equal.
 _EQUAL = 1e-9
@@ -42,8 +42,8 @@ _EQUAL = 1e-9
 
 def may_be_curve(observations: Observations) -> bool:
     """Return True if there are enough observations for a curve, and not all of them are equal."""
-    seen = observations.relative if observations.rows == 6 else observations.relative[:, :3, 3]
-    return len(seen) >= FEWEST_POSES and float(np.ptp(seen, axis=0).max()) > _EQUAL
+    poses = observations.relative if observations.rows == 6 else observations.relative[:, :3, 3]
+    return len(poses) >= FEWEST_POSES and float(np.ptp(poses, axis=0).max()) > _EQUAL
 
 
 def fit_curve(
@@ -61,15 +61,22 @@ def fit_curve(
         thinned = observations.select(some), covariance[some], [order[some] for order in orders]
         known = fit_curve(*thinned, log_evidence)
         assert known is not None  # there are enough observations
-        return project_onto_curve(observations, known.solution)
+        motion, covariance = _as_curve(known.solution), known.solution.covariance
+        deviations = np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0))
+        values = _nearest(observations, deviations, motion)
+        solution = levenberg_marquardt(observations, motion, values, steps=_STEPS)
+        return Scored(solution, stated_log_evidence(solution))
     score = log_evidence or stated_log_evidence
     deviations = np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0))
     possible = [count for count in KNOTS if count <= _DENSEST * len(observations)]
     middle = max(k for k, count in enumerate(possible) if count <= _COARSE)
-    candidates = [*_path_coordinates(observations, deviations), *orders]
+    points = _whitened(observations.relative, observations.relative, deviations)
+    *_, directions = np.linalg.svd(points, full_matrices=False)
+    in_time = np.arange(len(points), dtype=np.float64)
+    candidates = [in_time, points @ directions[0], _length_along_path(points), *orders]
     starts = [(_regressed(observations, along, possible[middle]), True) for along in candidates]
     # In the order of time, even knots would be poor where the motion pauses.
-    starts.append((_regressed(observations, candidates[0], possible[middle], even=False), False))
+    starts.append((_regressed(observations, in_time, possible[middle], even=False), False))
     begun = [(_refine(observations, deviations, motion, 1, even), even) for motion, even in starts]
     start, even = min(begun, key=lambda pair: pair[0].cost)
 
@@ -113,14 +120,6 @@ def continue_curve(observations: Observations, before: Solution[FamilyMember]) -
     return Scored(solution, stated_log_evidence(solution))
 
 
-def project_onto_curve(observations: Observations, before: Solution[FamilyMember]) -> Scored:
-    """Return the curve with the knots of an earlier one, for other observations of the same motion."""
-    motion, deviations = _as_curve(before), np.sqrt(np.einsum("nii->ni", before.covariance).mean(axis=0))
-    values = _nearest(observations, deviations, motion)
-    solution = levenberg_marquardt(observations, motion, values, steps=_STEPS)
-    return Scored(solution, stated_log_evidence(solution))
-
-
 def _as_curve(solution: Solution[FamilyMember]) -> CurveMotion:
     motion = solution.motion
     assert isinstance(motion, CurveMotion)
@@ -132,41 +131,31 @@ def stated_log_evidence(solution: Solution[FamilyMember]) -> float:
     return laplace_evidence(solution).log_evidence
 
 
-def _path_coordinates(observations: Observations, deviations: Array) -> Iterator[Array]:
-    """Yield candidate positions of the observations along the path, (N,)."""
-    points = _whitened(observations.relative, observations.relative, deviations)
-    yield np.arange(len(points), dtype=np.float64)
-    *_, directions = np.linalg.svd(points, full_matrices=False)
-    yield points @ directions[0]
-    yield _length_of_way(points)
-
-
 def _whitened(poses: Array, around: Array, deviations: Array) -> Array:
     """Return poses as points, (N, m): positions and rotations in standard deviations of their errors."""
     points = poses[:, :3, 3] - around[:, :3, 3].mean(axis=0)
     if len(deviations) == 6:
         mean = mean_rotation(around[:, :3, :3])
         points = np.concatenate([points, log_so3(poses[:, :3, :3] @ mean.T)], axis=1)
-    result: Array = points / deviations
-    return result
+    return np.asarray(points / deviations)
 
 
-def _length_of_way(points: Array) -> Array:
-    """Return the length of the shortest way through near neighbours from one end of a path to each point."""
+def _length_along_path(points: Array) -> Array:
+    """Return the length of the shortest path through near neighbours from one end to each point."""
     count = len(points)
     some = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
     distances = np.linalg.norm(points[:, None] - points[None, some], axis=2)
     among = distances[some]
-    # Long steps are dear, so the way passes through near neighbours. Steps within the noise are free.
-    ways = np.maximum(among - 1.0, 1e-3) ** 2
+    # Long steps cost more, so the path passes through near neighbours. Steps within the noise are free.
+    costs = np.maximum(among - 1.0, 1e-3) ** 2
     for k in range(len(some)):
-        np.minimum(ways, ways[:, k, None] + ways[None, k], out=ways)
-    first = int(np.argmax(ways[int(np.argmax(ways[0]))]))
-    reached = np.argsort(ways[first], kind="stable")
+        np.minimum(costs, costs[:, k, None] + costs[None, k], out=costs)
+    first = int(np.argmax(costs[int(np.argmax(costs[0]))]))
+    reached = np.argsort(costs[first], kind="stable")
     along = np.empty(len(some))
     along[reached] = np.arange(len(some))
     nearest = np.argsort(distances, axis=1)[:, :2]
-    result: Array = along[nearest].mean(axis=1)
+    result = np.asarray(along[nearest].mean(axis=1))
     result[some] = along
     return result
 
@@ -199,10 +188,7 @@ def _resampled(
     widths: PathWidths,
     lever: float = LEVER,
 ) -> CurveMotion:
-    """Return a curve with other knots from splines of positions and quaternions.
-
-    The joint value becomes the length along the curve if ``even``, else a multiple of that of the spline.
-    """
+    """Return a curve with other knots; the joint value becomes the length along it if ``even``."""
     at = np.linspace(spline.first, spline.last, _SAMPLES * count)
     weights = spline.weights(at).values
     places, turns = weights @ positions, weights @ quaternions
@@ -225,16 +211,8 @@ def _with_knots(
     first, last = ends or (motion.spline.first, motion.spline.last)
     part = NaturalSpline(first, (last - first) / (4 * count), 4 * count + 1)
     weights = motion.spline.weights(part.knots).values
-    return _resampled(
-        motion.rows,
-        part,
-        weights @ motion.positions,
-        weights @ motion.quaternions,
-        count,
-        even,
-        motion.widths,
-        motion.lever,
-    )
+    positions, quaternions = weights @ motion.positions, weights @ motion.quaternions
+    return _resampled(motion.rows, part, positions, quaternions, count, even, motion.widths, motion.lever)
 
 
 def _refine(
@@ -258,7 +236,7 @@ def _nearest(observations: Observations, deviations: Array, motion: CurveMotion)
     """Return the joint value of the nearest point of a curve for each observation, (N, 1)."""
     at = np.linspace(motion.spline.first, motion.spline.last, _SAMPLES * motion.spline.count)
     relative = observations.relative
-    seen = _whitened(relative, relative, deviations)
+    observed = _whitened(relative, relative, deviations)
     points = _whitened(motion.linearise(at[:, None]).pose, relative, deviations)
-    squares = np.sum(points**2, axis=1) - 2.0 * seen @ points.T
+    squares = np.sum(points**2, axis=1) - 2.0 * observed @ points.T
     return np.asarray(at[np.argmin(squares, axis=1)][:, None])

@@ -1,10 +1,10 @@
 """Comparison of the served joint with its alternatives.
 
-As in :mod:`..identification.marginal_likelihood`, the prior of joint values is a Gaussian of unknown
-mean and width, here truncated at the limits. So the amplitude of a motion is no evidence: a door that moved a
-little is not compared with one that moved all the way. Identified joints have an improper prior of their mean
-pose. Here the pose is uniform in a cube of 2 m and over all rotations, so that both densities have the same
-unit.
+As in :mod:`kineverse.estimation.identification.marginal_likelihood`, the prior of joint values is a Gaussian
+of unknown mean and width, here truncated at the limits. So the amplitude of a motion is no evidence: a door
+that moved a little is not compared with one that moved all the way. Identified joints have an improper prior
+of their mean pose. Here the pose is uniform in a cube of 2 m and over all rotations, so that both densities
+have the same unit.
 """
 
 from __future__ import annotations

@@ -36,11 +36,6 @@ class TrackLoss:
     refuted: npt.NDArray[np.int64]  # number of updates in a row that refute the estimate (groups,)
     is_lost: Groups  # True for each lost group (groups,)
 
-    @staticmethod
-    def none(count: int) -> TrackLoss:
-        """Return the state of groups of which none is lost."""
-        return TrackLoss(np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
-
     @cached_property
     def is_clear(self) -> bool:
         """True if no group is lost or refuted."""
@@ -53,10 +48,6 @@ class TrackLoss:
         """
         count = np.where(measured, np.where(refuted, self.refuted + 1, 0), self.refuted)
         return TrackLoss(count, (self.is_lost | (count >= lost_after)) & (refuted | ~measured))
-
-    def with_restarted(self, groups: Groups) -> TrackLoss:
-        """Return the state after a restart of some groups; they stay lost."""
-        return TrackLoss(np.where(groups, 0, self.refuted), self.is_lost)
 
 
 def find_measured(layout: Layout, reading: Measurements) -> Groups:
@@ -99,11 +90,11 @@ def chi_squared_quantile(dof: Array) -> Array:
 class TrackerState:
     """State of a tracker between two steps."""
 
-    mixture: GaussianSum  # belief
-    result: StepResult  # result of the last update
-    loss: TrackLoss  # groups that are lost
-    inputs: Array  # values of the inputs
-    stamp: float | None = None  # time [s]; None if the tracker was given none
+    mixture: GaussianSum
+    result: StepResult  # of the last update
+    loss: TrackLoss
+    inputs: Array
+    stamp: float | None = None  # time [s]; None if unknown
     reading: Measurements | None = None  # latest measurements of this time, of each observation
 
 
@@ -124,7 +115,7 @@ class Estimate:
     rounds
         Number of model evaluations; at 50 the iteration stopped without convergence.
     stamp
-        Time [s]; None if the tracker was given none.
+        Time [s]; None if unknown.
     """
 
     def __init__(self, now: TrackerState, update_step: UpdateStep) -> None:
@@ -179,7 +170,7 @@ class Estimate:
     def refuted_groups(self) -> tuple[tuple[Symbol, ...], ...]:
         """Groups of coordinates whose prediction the last update refuted, be it a move or an error.
 
-        After ten such updates in a row, or as many as the tracker was told, the group is lost.
+        After ``lost_after`` such updates in a row, the group is lost.
         """
         return self._groups_where((self._loss.refuted > 0).tolist())
 
@@ -201,10 +192,9 @@ class Estimate:
     def information(self) -> Array:
         """Inverse of the covariance."""
         result = self._belief.information.copy()
-        for number, group in enumerate(self._layout.groups):
-            if self._belief.records[number] is not None:
-                block = group.block
-                result[block] = inverse_spd(self.covariance[block])
+        for group, record in zip(self._layout.groups, self._belief.records, strict=True):
+            if record is not None:
+                result[group.block] = inverse_spd(self.covariance[group.block])
         return result
 
     @cached_property

@@ -21,7 +21,13 @@ from .gaussian_sum import Candidate, GaussianSum, MergeCriterion
 from .information_state import InformationState
 from .map_update import MapResult, MapSolver
 from .native import NativeInlierSolver, NativeMapSolver, native_library
-from .observability import StationaryPoints, UnobservableDirections, find_unexplained, move_origin
+from .observability import (
+    Components,
+    StationaryPoints,
+    UnobservableDirections,
+    find_unexplained,
+    move_origin,
+)
 from .process_model import ConstantVelocity, ProcessModel
 from .residuals import MeasurementReader, Measurements, Residuals
 from .state_space import Layout
@@ -58,16 +64,18 @@ class UpdateStep:
         self.reader = MeasurementReader(layout)
         self.solver = MapSolver(layout, self.residuals, self.process_model, limits)
         self.unobservable = UnobservableDirections(layout)
-        self.static_batch = StaticBatch(
-            layout, self.residuals, self.reader, self.solver, self.unobservable, self._map_update
+        components = Components(
+            layout,
+            self.residuals,
+            self.process_model,
+            self.reader,
+            self.solver.group_bounds,
+            self.unobservable,
         )
-        group_bounds = self.solver.group_bounds
-        parts = (layout, self.residuals, self.process_model, self.reader, group_bounds, self.unobservable)
-        self.ridge_covariance, self.inflation = RidgeCovariance(*parts), CovarianceInflation(*parts)
-        self.merge_criterion = MergeCriterion(
-            layout, self.residuals, self.reader, self.process_model, self.ridge_covariance
-        )
-        self.stationary_points = StationaryPoints(layout, self.process_model, self.unobservable, group_bounds)
+        self.static_batch = StaticBatch(components, self.solver, self._map_update)
+        self.ridge_covariance, self.inflation = RidgeCovariance(components), CovarianceInflation(components)
+        self.merge_criterion = MergeCriterion(components, self.ridge_covariance)
+        self.stationary_points = StationaryPoints(components)
         self.native = (
             NativeMapSolver(layout, limits, self.function, self.process_model)
             if NativeMapSolver.suits(layout)
@@ -142,7 +150,7 @@ class UpdateStep:
         inputs: Array,
         groups: list[int],
     ) -> list[Candidate]:
-        """Return candidates from restarts beside states where the measurement Jacobian vanishes."""
+        """Return candidates from restarts near states where the measurement Jacobian vanishes."""
         starts = self.stationary_points.restart_states(before, result.belief, groups, inputs)
         return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
 
@@ -187,29 +195,20 @@ class UpdateStep:
     ) -> list[Candidate]:
         """Return the candidate of a restart from a state; none if the restart fails."""
         try:
-            return [self._update_from(start, reading, inputs, groups)]
+            if self.outliers is not None:
+                start = self.solver.find_robust_start(start, reading, inputs, groups)
+            result = self.solver.update(start, reading, inputs, groups, self.outliers or "gaussian")
+            candidate = self._relinearised(start, result, reading, inputs, groups)
         except KineverseError:
             return []
-
-    def _update_from(
-        self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
-    ) -> Candidate:
-        if self.outliers is not None:
-            start = self.solver.find_robust_start(start, reading, inputs, groups)
-        result = self.solver.update(start, reading, inputs, groups, self.outliers or "gaussian")
-        candidate = self._relinearised(start, result, reading, inputs, groups)
-        if self.outliers is None:
+        kept = [n for n in groups if self.outliers is None and start.records[n] is not None]
+        if kept:
             # The stored measurements belong to another branch: the present residuals decide.
-            errors = self.residuals.errors(
-                candidate.predicted, reading, np.flatnonzero(reading.mask).tolist()
-            )
-            for number in groups:
-                if start.records[number] is not None:
-                    squares = (
-                        float(e @ e) for i, (e, _) in errors.items() if self.layout.group_of[i] == number
-                    )
-                    candidate.nis[number] = sum(squares)
-        return candidate
+            candidate.nis[kept] = 0.0
+            measured = [i for i, n in enumerate(self.layout.group_of) if n in kept and reading.mask[i]]
+            for i, (e, _) in self.residuals.errors(candidate.predicted, reading, measured).items():
+                candidate.nis[self.layout.group_of[i]] += e @ e
+        return [candidate]
 
     def _relinearised(
         self,
@@ -227,12 +226,10 @@ class UpdateStep:
         """Drop static records that were taken at other values of the inputs."""
 
         def changed(belief: InformationState) -> InformationState:
-            groups = [
-                number
-                for number, record in enumerate(belief.records)
-                if record is not None and not np.array_equal(record.inputs, inputs)
-            ]
-            return self._inflated(belief, groups)
+            records = enumerate(belief.records)
+            return self._inflated(
+                belief, [n for n, r in records if r and not np.array_equal(r.inputs, inputs)]
+            )
 
         return mixture.map(changed) if len(inputs) else mixture
 
@@ -292,21 +289,16 @@ class UpdateStep:
 
     def _constrained(self, belief: InformationState, inputs: Array) -> InformationState:
         """Return a predicted belief about the most probable point inside the limits."""
-        if self._is_at_mean(belief):
-            return belief
+        is_inside = (belief.x >= self.limits.lower).all() and (belief.x <= self.limits.upper).all()
+        if is_inside and not self.layout.limits:
+            if float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2:
+                return belief
         if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
             none = np.zeros(len(belief.vector))
             # C leaves out groups without motion; so little noise changes no number.
             if (result := self.native.predict(belief, none, none + np.finfo(float).tiny)) is not None:
                 return result
         return self.solver.constrain(belief, self.reader.empty(), inputs)
-
-    def _is_at_mean(self, belief: InformationState) -> bool:
-        """Return True if a belief is about its own mean and inside bounds of single coordinates."""
-        limits = self.limits
-        if self.layout.limits or (belief.x < limits.lower).any() or (belief.x > limits.upper).any():
-            return False
-        return float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2
 
     def is_possible(self, number: int, belief: InformationState, inputs: Array) -> bool:
         """Return True if a group is inside its limits at a state and its model is finite there."""
@@ -315,21 +307,15 @@ class UpdateStep:
         except KineverseError:
             return False
         group = self.layout.groups[number]
-        parts = [
-            out[where]
-            for i in group.observation_indices
-            for where in (self.layout.value_slices[i], self.layout.jacobian_slices[i])
-        ]
-        if not all(np.isfinite(each).all() for each in parts):
-            return False
-        return self.solver.rows(number, belief.x[group.x], out).violation < _OUTSIDE
+        for i in group.observation_indices:
+            for where in (self.layout.value_slices[i], self.layout.jacobian_slices[i]):
+                if not np.isfinite(out[where]).all():
+                    return False
+        return self.solver.group_bounds[number].rows(belief.x[group.x], out).violation < _OUTSIDE
 
     def _measured_groups(self, reading: Measurements) -> list[int]:
-        return [
-            n
-            for n, group in enumerate(self.layout.groups)
-            if reading.mask[list(group.observation_indices)].any()
-        ]
+        groups = enumerate(self.layout.groups)
+        return [n for n, group in groups if reading.mask[list(group.observation_indices)].any()]
 
     def _keep_turns(self, mixture: GaussianSum, predicted: Array) -> None:
         """Take periodic coordinates to the turn nearest to their prediction (n,); in place.
@@ -385,7 +371,7 @@ class UpdateStep:
         reading: Measurements,
         inputs: Array,
     ) -> StepResult:
-        """Return the result of a reading of some groups that start anew; they keep their evidence."""
+        """Return the result of a reading of some groups that restart; they keep their evidence."""
         mask = reading.mask & np.isin(self.layout.group_of, groups)
         evidence = {n: float(np.logaddexp.reduce(before.evidence(n))) for n in groups}
 
@@ -437,48 +423,37 @@ class UpdateStep:
         self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int], is_best: bool
     ) -> tuple[list[Candidate], int]:
         """Return candidates for one component: without outliers, with outliers, and all outliers."""
-        if self.outliers is None:
-            result = self._map_update(belief, reading, inputs, groups)
-            candidates = [self._relinearised(belief, result, reading, inputs, groups)]
-            if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
-                candidates += self._restart(belief, result, reading, inputs, unexplained)
-            if is_best and self.counted:
-                turned = find_unexplained(result)
-                candidates += self._try_other_turns(belief, result, reading, inputs, turned)
-            return candidates, result.rounds
-        robust_start = self.solver.find_robust_start(belief, reading, inputs, groups)
         candidates, rounds = [], 0
-        for start in (belief, robust_start):
-            result = self.solver.update(start, reading, inputs, groups, self.outliers)
+        if self.outliers is None:
+            starts = [belief]
+        else:
+            starts = [belief, self.solver.find_robust_start(belief, reading, inputs, groups)]
+        for start in starts:
+            if self.outliers is None:
+                result = self._map_update(start, reading, inputs, groups)
+            else:
+                result = self.solver.update(start, reading, inputs, groups, self.outliers)
             candidates.append(self._relinearised(start, result, reading, inputs, groups))
             rounds = max(rounds, result.rounds)
-        if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
-            candidates += self._restart(belief, result, reading, inputs, unexplained)
-        if is_best and self.counted:
-            turned = self._with_rejected(result, reading, groups)
-            candidates += self._try_other_turns(belief, result, reading, inputs, turned)
+        if is_best:
+            rejected = self._with_rejected(result, reading, groups)
+            unexplained = {*self.stationary_points.unexplained(belief, result), *rejected}
+            if again := [n for n in groups if n in unexplained]:
+                candidates += self._restart(belief, result, reading, inputs, again)
+            if self.counted:
+                turned = find_unexplained(result) if self.outliers is None else rejected
+                candidates += self._try_other_turns(belief, result, reading, inputs, turned)
+        if self.outliers is None:
+            return candidates, rounds
         all_outliers = belief.copy()
         none = np.zeros(len(self.layout.groups))
-        for number in groups:
-            measured = [i for i in self.layout.groups[number].observation_indices if reading.mask[i]]
-            log_outliers = sum(
-                self.outliers.log_density(self.layout.observations[i], float(reading.log_scale[i]))
-                for i in measured
-            )
-            all_outliers.evidence[number] += log_outliers
+        for i in np.flatnonzero(reading.mask).tolist():
+            if self.layout.group_of[i] in groups:
+                log = self.outliers.log_density(self.layout.observations[i], float(reading.log_scale[i]))
+                all_outliers.evidence[self.layout.group_of[i]] += log
         weights = np.zeros(len(self.layout.observations))
         candidates.append(self._candidate(all_outliers, weights, none, none, groups, inputs))
         return candidates, rounds
-
-    def _unexplained(
-        self, belief: InformationState, result: MapResult, reading: Measurements, groups: list[int]
-    ) -> list[int]:
-        """Return the groups with unexplained residuals or outliers."""
-        unexplained = {
-            *self.stationary_points.unexplained(belief, result),
-            *self._with_rejected(result, reading, groups),
-        }
-        return [n for n in groups if n in unexplained]
 
     def _with_rejected(self, result: MapResult, reading: Measurements, groups: list[int]) -> list[int]:
         """Return the groups of which an observation is rejected as an outlier."""
@@ -502,6 +477,6 @@ class UpdateStep:
 def _require_finite(*arrays: Array) -> None:
     if not all(np.isfinite(one).all() for one in arrays):
         raise InvalidValueError(
-            "The step leads to numbers that are not finite, as what was seen or the covariances are too "
-            "large or too small for floating point. The belief stays as it was."
+            "The step leads to numbers that are not finite: measurements or covariances are too large or too "
+            "small for floating point. The belief is unchanged."
         )

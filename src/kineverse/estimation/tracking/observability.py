@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from .bounds import GroupBounds
 from .information_state import InformationState
 from .map_update import MapResult
 from .process_model import ProcessModel
+from .residuals import MeasurementReader, Residuals
 from .state_space import CoordinateGroup, Layout
 
 # A direction is unobservable while its deviation exceeds this part of the initial one.
@@ -45,12 +47,24 @@ class UnobservableDirections:
         is_unobservable = values < _UNOBSERVABLE**-2
         return steps[is_unobservable], steps[~is_unobservable]
 
-    def is_unobservable(self, number: int, information: Array) -> bool:
-        """Return True if a group has unobservable directions."""
-        scale = self.deviations[self._groups[number].t]
+    def is_in(self, number: int, belief: InformationState) -> bool:
+        """Return True if a group has unobservable directions in a belief."""
+        group = self._groups[number]
+        information, scale = belief.information[group.block], self.deviations[group.t]
         if len(scale) == 1:
             return float(information[0, 0]) * float(scale[0]) ** 2 < _UNOBSERVABLE**-2
         return bool(np.linalg.eigvalsh(information * np.outer(scale, scale))[0] < _UNOBSERVABLE**-2)
+
+
+class Components(NamedTuple):
+    """Components of a tracker that its computations share."""
+
+    layout: Layout
+    residuals: Residuals
+    process_model: ProcessModel
+    reader: MeasurementReader
+    group_bounds: Sequence[GroupBounds]
+    unobservable: UnobservableDirections
 
 
 # Residuals are explained if their χ² is fewer deviations than this above its mean.
@@ -62,7 +76,7 @@ _MOST_DIRECTIONS = 2
 def find_unexplained(result: MapResult) -> list[int]:
     """Return the groups whose residuals exceed the noise."""
     beyond = result.nis > result.dof + _EXPLAINED * np.sqrt(2 * result.dof)
-    return [int(n) for n in np.flatnonzero(beyond)] if beyond.any() else []
+    return np.flatnonzero(beyond).tolist()
 
 
 def move_origin(
@@ -82,43 +96,35 @@ def move_origin(
 
 
 class StationaryPoints:
-    """Detection of states where the measurement Jacobian vanishes, and restarts beside them."""
+    """Detection of states where the measurement Jacobian vanishes, and restarts near them."""
 
-    def __init__(
-        self,
-        layout: Layout,
-        process_model: ProcessModel,
-        unobservable: UnobservableDirections,
-        group_bounds: Sequence[GroupBounds],
-    ) -> None:
-        self._layout, self._process_model, self._unobservable, self._group_bounds = (
-            layout,
-            process_model,
-            unobservable,
-            group_bounds,
-        )
+    def __init__(self, components: Components) -> None:
+        self._layout, _, self._process_model, _, self._group_bounds, self._unobservable = components
         # The cost of such a group is convex: a restart ends where the update did.
-        self._is_affine = [layout.is_affine(number) for number in range(len(layout.groups))]
+        self._is_affine = [self._layout.is_affine(number) for number in range(len(self._layout.groups))]
 
     def unexplained(self, before: InformationState, result: MapResult) -> list[int]:
         """Return the groups whose residuals exceed the noise and that have unobservable directions."""
-        return [n for n in find_unexplained(result) if self._may_have_moved(n, before, result.belief)]
-
-    def _may_have_moved(self, number: int, before: InformationState, after: InformationState) -> bool:
-        if self._is_affine[number]:
-            return False
-        t = self._layout.groups[number].t
-        is_kept = before.records[number] is not None
-        return is_kept or self._unobservable.is_unobservable(number, after.information[np.ix_(t, t)])
+        return [
+            n
+            for n in find_unexplained(result)
+            if not self._is_affine[n]
+            and (before.records[n] is not None or self._unobservable.is_in(n, result.belief))
+        ]
 
     def restart_states(
         self, before: InformationState, after: InformationState, groups: Sequence[int], inputs: Array
     ) -> list[InformationState]:
-        """Return prior belief about points on both sides of the estimate, along unobservable directions."""
+        """Return prior beliefs about points on both sides of the estimate, in unobservable directions."""
         beliefs: list[InformationState] = []
         for number in groups:
-            group, x = self._layout.groups[number], before.x[self._layout.groups[number].x]
-            directions, index = self._unobservable_directions(number, before, after), 0
+            group, record, index = self._layout.groups[number], before.records[number], 0
+            x = before.x[group.x]
+            # Unobservable now, or before the stored measurements.
+            directions, _ = self._unobservable.directions(number, after.information[group.block])
+            if not len(directions) and record is not None:
+                directions, _ = self._unobservable.directions(number, record.prior.matrix)
+            directions = directions[:_MOST_DIRECTIONS]
             for direction in (*directions, *-directions):
                 try:
                     there, _ = self._process_model.retract(number, x, direction, inputs)
@@ -133,14 +139,3 @@ class StationaryPoints:
                 move_origin(beliefs[index], number, group, there, step, transport)
                 index += 1
         return beliefs
-
-    def _unobservable_directions(
-        self, number: int, before: InformationState, after: InformationState
-    ) -> Array:
-        """Return the directions that are unobservable now, or were before the stored measurements."""
-        t = self._layout.groups[number].t
-        directions, _ = self._unobservable.directions(number, after.information[np.ix_(t, t)])
-        record = before.records[number]
-        if not len(directions) and record is not None:
-            directions, _ = self._unobservable.directions(number, record.prior.matrix)
-        return directions[:_MOST_DIRECTIONS]

@@ -21,8 +21,8 @@ from kineverse.lie import Array, pose_difference, retract
 from .information_state import InformationState, QuadraticCost
 from .map_update import MapResult, MapSolver
 from .measurements import MeasurementModel, wrap_difference
-from .observability import UnobservableDirections
-from .residuals import MeasurementReader, Measurements, Residuals, whitening
+from .observability import Components
+from .residuals import MeasurementReader, Measurements, whitening
 from .state_space import Layout
 
 UpdateFunction: TypeAlias = Callable[[InformationState, Measurements, Array, list[int]], MapResult]
@@ -42,19 +42,14 @@ class MeanMeasurement:
     def combine(self, other: MeanMeasurement, one: MeasurementModel) -> MeanMeasurement:
         """Return the mean of both, weighted by information."""
         information = self.information + other.information
-        apart = self._difference(other, one)
-        share = np.linalg.solve(information, other.information)
-        step = share @ apart
+        if one.is_pose:
+            apart = pose_difference(other.value.reshape(4, 4), self.value.reshape(4, 4))
+        else:
+            apart = wrap_difference(other.value - self.value, one.period)
+        step = np.linalg.solve(information, other.information) @ apart
         peak = self.peak + other.peak - float(apart @ self.information @ step) / 2
-        if not one.is_pose:
-            return MeanMeasurement(self.value + step, information, peak)
-        pose = retract(self.value.reshape(4, 4), step)
-        return MeanMeasurement(pose.reshape(-1), information, peak)
-
-    def _difference(self, other: MeanMeasurement, one: MeasurementModel) -> Array:
-        if not one.is_pose:
-            return wrap_difference(other.value - self.value, one.period)
-        return pose_difference(other.value.reshape(4, 4), self.value.reshape(4, 4))
+        value = retract(self.value.reshape(4, 4), step).reshape(-1) if one.is_pose else self.value + step
+        return MeanMeasurement(value, information, peak)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,19 +86,11 @@ class StaticRecord:
 class StaticBatch:
     """Batch relinearisation for the groups of a tracker."""
 
-    def __init__(
-        self,
-        layout: Layout,
-        residuals: Residuals,
-        reader: MeasurementReader,
-        solver: MapSolver,
-        unobservable: UnobservableDirections,
-        update: UpdateFunction,
-    ) -> None:
-        self._layout, self._residuals, self._reader = layout, residuals, reader
-        self._solver, self._unobservable, self._update = solver, unobservable, update
+    def __init__(self, components: Components, solver: MapSolver, update: UpdateFunction) -> None:
+        self._layout, self._residuals, _, self._reader, _, self._unobservable = components
+        self._solver, self._update = solver, update
         # In a group with one direction, linearisation at several estimates adds no false information.
-        self._groups = {number for number, group in enumerate(layout.groups) if len(group.t) > 1}
+        self._groups = {number for number, group in enumerate(self._layout.groups) if len(group.t) > 1}
 
     def relinearise(
         self,
@@ -122,25 +109,27 @@ class StaticBatch:
                 for i in group.observation_indices
                 if reading.mask[i] and (weights is None or weights[i] > _LEAST_WEIGHT)
             }
-            if not new or (old is None and not self._is_unobservable(number, after)):
+            if not new or (old is None and not self._unobservable.is_in(number, after)):
                 continue
-            if old is None:
-                evidence = float(before.evidence[number])
-                first = StaticRecord(before.group_cost(group.t), {}, inputs, evidence)
-                record = first.with_measurements(new, self._layout.observations)
-                if result.priors is not None or not group.by_speeds:
-                    after.records[number] = replace(
-                        record, prior=self._transport_prior(number, before, first.prior, result)
-                    )
-                    continue
-                old = first
+            is_first = old is None
+            old = old or StaticRecord(before.group_cost(group.t), {}, inputs, float(before.evidence[number]))
             record = old.with_measurements(new, self._layout.observations)
-            self._solve(number, before, after, record, all_inliers=weights is None)
+            if is_first and (result.priors is not None or not group.by_speeds):
+                prior = self._transport_prior(number, before, old.prior, result)
+                after.records[number] = replace(record, prior=prior)
+                continue
+            found = self._solve_batch(number, before, record)
+            after.x[group.x] = found.belief.x[group.x]
+            after.set_group_cost(group.t, found.belief.group_cost(group.t))
+            if weights is None:
+                after.evidence[number] = found.belief.evidence[number]
             # Observations still to come may show that the estimate is a mirror image: keep the record.
-            if len(record.means) == len(group.observation_indices) and not self._is_unobservable(
-                number, after
-            ):
+            is_complete = len(record.means) == len(group.observation_indices)
+            if is_complete and not self._unobservable.is_in(number, after):
                 after.records[number] = None
+            else:
+                prior = self._transport_prior(number, before, record.prior, found)
+                after.records[number] = replace(record, prior=prior)
 
     def add_noise(
         self, number: int, before: InformationState, after: InformationState, added_variance: Array
@@ -167,34 +156,11 @@ class StaticBatch:
         from_record = self._solve_batch(number, after, reduced).belief.evidence[number]
         after.records[number] = replace(reduced, evidence=float(before.evidence[number] - from_record))
 
-    def _is_unobservable(self, number: int, belief: InformationState) -> bool:
-        t = self._layout.groups[number].t
-        return self._unobservable.is_unobservable(number, belief.information[np.ix_(t, t)])
-
     def _mean_measurement(self, i: int, reading: Measurements, weight: float) -> MeanMeasurement:
         size = self._layout.observations[i].size
         white = reading.whitening[self._layout.whitening_slices[i]].reshape(size, size)
         value = reading.values[self._layout.measurement_slices[i]].copy()
         return MeanMeasurement(value, weight * (white.T @ white), -float(reading.log_scale[i]))
-
-    def _solve(
-        self,
-        number: int,
-        before: InformationState,
-        after: InformationState,
-        record: StaticRecord,
-        all_inliers: bool,
-    ) -> None:
-        """Find the MAP estimate of the record, starting at the previous estimate, and store it."""
-        group = self._layout.groups[number]
-        result = self._solve_batch(number, before, record)
-        after.x[group.x] = result.belief.x[group.x]
-        after.set_group_cost(group.t, result.belief.group_cost(group.t))
-        if all_inliers:
-            after.evidence[number] = result.belief.evidence[number]
-        after.records[number] = replace(
-            record, prior=self._transport_prior(number, before, record.prior, result)
-        )
 
     def _solve_batch(self, number: int, before: InformationState, record: StaticRecord) -> MapResult:
         """Return the MAP estimate from all stored measurements of a group."""

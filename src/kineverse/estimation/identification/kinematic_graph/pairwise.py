@@ -45,11 +45,11 @@ SURPRISE_DEVIATIONS = 4.0
 class PartPair:
     """Joint identified between two parts that were observed together."""
 
-    parent: str  # names of the parts
+    parent: str
     child: str
-    result: IdentificationResult  # identification result
+    result: IdentificationResult
     times: npt.NDArray[np.int_]  # indices of the observations of both parts
-    gain: float
+    gain: float  # log evidence of a connection against none
     is_consistent: bool  # True if the residuals are as large as the noise
 
     @property
@@ -63,10 +63,9 @@ class PartPair:
 def identify_pair(
     tracks: Mapping[str, PoseTrack], parent: str, child: str, families: FamilyChoice
 ) -> PartPair | None:
-    """Identify the joint between two parts.
+    """Identify the joint between two parts; None for two points, and without two common observations.
 
-    A part observed as a point becomes the child. The result is None for two points, and for parts that were
-    observed together fewer than two times.
+    A part observed as a point becomes the child.
     """
     if tracks[parent].is_point:
         parent, child = child, parent
@@ -77,11 +76,11 @@ def identify_pair(
     if len(times) < 2:
         return None
     observations = pair_tracks(a, b, times)
-    found = identify_observations(observations, families)
+    result = identify_observations(observations, families)
     weights = {str(getattr(f, "name", f)): w for f, w in _joint_weights(families).items()}
-    best = found.best
+    best = result.best
     log = best.log_evidence + math.log(weights[best.family] / best.probability / sum(weights.values()))
-    squares = chi_squared(observations, best)
+    squares = float(squared_errors(best.residuals, relative_covariance(observations, best)).sum())
     expected = max(best.residuals.size - best.joint_values.size - len(best.covariance), 1)
     explained = abs(squares - expected) < SURPRISE_DEVIATIONS * math.sqrt(2.0 * expected)
     if explained:
@@ -89,17 +88,11 @@ def identify_pair(
         log += 0.5 * (squares - expected)
     if a.covariances is not None:
         # The noise of the parent must not favour a connection to the world, which is exact.
-        log += _log_volume(relative_covariance(observations, best), best) - _log_volume(
-            child_covariance(observations), best
-        )
+        log += _log_volume(relative_covariance(observations, best), best)
+        log -= _log_volume(child_covariance(observations), best)
     rotation = 0.0 if b.is_point else _LOG_ROTATION
     log += LOG_ANYWHERE - _LOG_ROTATION + rotation - len(times) * (_LOG_ROOM + rotation)
-    return PartPair(parent, child, found, times, log, explained)
-
-
-def chi_squared(observations: Observations, fit: Fit) -> float:
-    """Return χ² of the residuals of a fit."""
-    return float(squared_errors(fit.residuals, relative_covariance(observations, fit)).sum())
+    return PartPair(parent, child, result, times, log, explained)
 
 
 def relative_covariance(observations: Observations, fit: Fit) -> Array:
@@ -137,12 +130,8 @@ def _log_volume(covariance: Array, fit: Fit) -> float:
 def identify_observations(
     observations: Observations, families: FamilyChoice, outliers: Outliers | None = None
 ) -> IdentificationResult:
-    """Identify the joint between two parts from their observations.
-
-    The result is not checked: pairs and models are compared by their evidence under one stated noise.
-    """
-    exact = observations.parent_covariance is None
-    if exact:
+    """Identify the joint between two parts by its evidence under one stated noise, without a check."""
+    if observations.parent_covariance is None:
         identities = np.tile(np.eye(4), (len(observations), 1, 1))
         observations = Observations(identities, observations.relative, None, observations.child_covariance)
     weights = _joint_weights(families)
@@ -155,8 +144,8 @@ def _joint_weights(families: FamilyChoice) -> dict[str | Family, float]:
     weights = family_weights(families)
     if families is not None and CURVE in weights:
         raise InvalidValueError(
-            f"Pairs of parts are compared by the joints that they may have, and {CURVE!r} is none. "
-            "kv.estimation.identify takes it for a single pair."
+            f"Pairs of parts are compared by their joints, and {CURVE!r} is none. kv.estimation.identify "
+            "takes it for a single pair."
         )
     return without_curve(weights)
 
@@ -168,12 +157,12 @@ def identify_pairs(
 ) -> dict[frozenset[str], PartPair]:
     """Identify the joints between all pairs of parts that were observed together."""
     names = list(combinations(tracks, 2))
-    found: dict[frozenset[str], PartPair] = {}
+    result: dict[frozenset[str], PartPair] = {}
     for done, (a, b) in enumerate(names):
         if progress is not None:
             progress(done, len(names))
-        if (known := identify_pair(tracks, a, b, families)) is not None:
-            found[frozenset((a, b))] = known
+        if (pair := identify_pair(tracks, a, b, families)) is not None:
+            result[frozenset((a, b))] = pair
     if progress is not None:
         progress(len(names), len(names))
-    return found
+    return result
