@@ -226,7 +226,7 @@ def test_a_free_point_is_a_sliding_point() -> None:
 
 def test_identify_graph_refuses_points_only(poses: dict[str, Array]) -> None:
     points = {part: poses[part][:, :3, 3] for part in ("cart", "door")}
-    with pytest.raises(kv.errors.InvalidValueError, match="Only positions were seen"):
+    with pytest.raises(kv.errors.InvalidValueError, match="Only positions were observed"):
         identify_graph(points, noise=NOISE, world=False)
     with pytest.raises(kv.errors.InvalidValueError, match="say as_point=True"):
         identify_graph(points, noise=NOISE).edges[0].fit.operation("cart", "world")

@@ -266,7 +266,7 @@ def test_bars_of_a_linkage_are_tested_together_and_replaced(served_linkage: kv.M
     report = check_plausibility(served, observations, noise=NOISE, families=SOME)
     assert [verdict.tag for verdict in report.implausible] == ["rocker"]
     assert report["rocker"].replacement is None
-    assert "by itself it explains what is seen" in report["rocker"].reason
+    assert "it explains the poses alone" in report["rocker"].reason
 
 
 def test_monitor_applies_consistency_tests() -> None:

@@ -56,7 +56,8 @@ class KnownJoint:
         # wheels, only their values matter.
         self._rates: CompiledFunction | None = None
         count = len(coordinates)
-        if any(x in rates for x in coordinates) and self._mobility() < count:
+        mobility = np.linalg.matrix_rank(self._twists(self.home[None, :])[1][0])
+        if any(x in rates for x in coordinates) and mobility < count:
             speeds = sorted({v for row in rows for v in row}, key=lambda s: s.sort_key)
             none = as_expression(0.0)
             self._rates = compile(array([[row.get(v, none) for v in speeds] for row in rows]), inputs)
@@ -75,12 +76,8 @@ class KnownJoint:
 
     def is_equal(self, other: KnownJoint) -> bool:
         """Return True if another joint has the same motion and limits."""
-        return (
-            self.pose == other.pose
-            and np.array_equal(self.lower, other.lower)
-            and np.array_equal(self.upper, other.upper)
-            and np.array_equal(self._others, other._others)
-        )
+        mine, theirs = ((joint.lower, joint.upper, joint._others) for joint in (self, other))
+        return self.pose == other.pose and all(map(np.array_equal, mine, theirs))
 
     def linearise(self, coordinates: Array) -> LinearisedPoses:
         """Evaluate poses at coordinates (N, n), and twists per unit of each joint value."""
@@ -113,17 +110,11 @@ class KnownJoint:
         if self._rates is not None:
             rates = self._rates.batch(self._points(coordinates))
             change = (rates @ change[:, :, None])[:, :, 0]
-        result: Array = coordinates + change
-        return result
+        return np.asarray(coordinates + change)
 
     def per_joint(self, coordinates: Array, slopes: Array) -> Array:
         """Convert slopes by coordinates (N, c, n) to slopes by joint values (N, c, k)."""
         return slopes if self._rates is None else slopes @ self._rates.batch(self._points(coordinates))
-
-    def _mobility(self) -> int:
-        """Return the number of degrees of freedom of the child at home."""
-        _, twists = self._twists(self.home[None, :])
-        return int(np.linalg.matrix_rank(twists[0]))
 
     def _points(self, coordinates: Array) -> Array:
         others = np.broadcast_to(self._others, (len(coordinates), len(self._others)))
@@ -152,12 +143,9 @@ class KnownJoint:
         return coordinates, solution
 
     def solve_unbounded(self, observations: Observations, inside: Array) -> Array:
-        """Find the most likely coordinates (N, n) without limits.
-
-        Where the pose is undefined beyond the limits, those inside stay.
-        """
+        """Find the most likely coordinates (N, n) without limits; those inside if the pose is undefined."""
         free = copy(self)
-        for name in ("_grid_poses", "_inner_limits"):
+        for name in ("_grid_poses", "inner_limits"):
             free.__dict__.pop(name, None)
         free.lower, free.upper = np.full(self.joints, -np.inf), np.full(self.joints, np.inf)
         try:
@@ -177,22 +165,21 @@ class KnownJoint:
         off = (3.0 - observed[:, :3, :3].reshape(-1, 9) @ flat) * (3.0 / sum(turns))
         p = observed[:, :3, 3]
         off += (squares - 2.0 * p @ positions) * (3.0 / (x + y + z))
-        nearest: Array = grid[np.argmin(off, axis=1)]
-        return nearest
+        return np.asarray(grid[np.argmin(off, axis=1)])
 
     @cached_property
     def _grid_poses(self) -> tuple[Array, Array, Array, Array]:
         """Initial values (M, n), their rotations (9, M), positions (3, M) and squared norms of these (M,)."""
         grid = self._grid()
         poses = self.linearise(grid).pose
-        positions = poses[:, :3, 3]
         flat = np.ascontiguousarray(poses[:, :3, :3].reshape(-1, 9).T)
-        return grid, flat, np.ascontiguousarray(positions.T), np.sum(positions**2, axis=1)
+        positions = np.ascontiguousarray(poses[:, :3, 3].T)
+        return grid, flat, positions, np.sum(positions**2, axis=0)
 
     def _grid(self) -> Array:
         if not self.joints:
             return self.home[None, :]
-        low, high = self.inner_limits()
+        low, high = self.inner_limits
         reach = np.where(self.is_angle, math.pi, 1.0)
         middle = self.home if self.is_plain else np.zeros(self.joints)
         from_low = np.where(np.isfinite(low), low, middle) + reach
@@ -206,12 +193,9 @@ class KnownJoint:
         start = np.zeros_like(self.home) if self.is_plain else self.home
         return self.retract(np.tile(start, (len(values), 1)), values)
 
-    def inner_limits(self) -> tuple[Array, Array]:
-        """Return the limits of joint values with a margin."""
-        return self._inner_limits
-
     @cached_property
-    def _inner_limits(self) -> tuple[Array, Array]:
+    def inner_limits(self) -> tuple[Array, Array]:
+        """Limits of joint values with a margin."""
         width = self.upper - self.lower
         margin = np.where(np.isfinite(width), _MARGIN * width, 0.0)
         return self.lower + margin, self.upper - margin
@@ -261,11 +245,8 @@ class KnownMotion:
 
     def retract_joints(self, values: Array, step: Array) -> Array:
         """Return joint values after a step: at most half a radian at once, and inside the limits."""
-        is_angle = self.served.is_angle
-        step = np.where(is_angle, np.clip(step, -0.5, 0.5), step)
-        low, high = self.served.inner_limits()
-        result: Array = np.clip(values + step, low, high)
-        return result
+        step = np.where(self.served.is_angle, np.clip(step, -0.5, 0.5), step)
+        return np.asarray(np.clip(values + step, *self.served.inner_limits))
 
     def prior(self) -> ParameterPrior:
         """Return the empty prior of no parameters."""

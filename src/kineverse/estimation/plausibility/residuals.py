@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.estimation.identification.least_squares import CLOSE, Solution
-from kineverse.estimation.identification.motion_model import LinearisedPoses
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.linear_algebra import invert_matrices, log_determinants
 from kineverse.lie import Array, log_so3, pose_difference, skew
@@ -28,7 +27,7 @@ _EYE_3, _EYE_6 = np.eye(3), np.eye(6)
 class PoseSolution(NamedTuple):
     """Most likely joint values of one observation inside the limits."""
 
-    values: Array  # joint values, (k,)
+    values: Array  # (k,)
     pose: Array  # pose of the joint there, (4, 4), and twists per unit of each joint value, (6, k)
     by_joints: Array
     residual: Array  # residual of the relative pose in the parent's axes, (6,), and its covariance, (6, 6)
@@ -42,9 +41,9 @@ def solve_observation(
     parent, child = observations.parent[0], observations.child[0]
     of_parent = None if observations.parent_covariance is None else observations.parent_covariance[0]
     of_child = observations.child_covariance[0]
-    low, high = served.inner_limits()
+    low, high = served.inner_limits
     values, true = np.clip(start, low, high), parent
-    turned, error, own = np.zeros((6, 6)), np.empty(6), np.empty(6)
+    turned, error, parent_error = np.zeros((6, 6)), np.empty(6), np.empty(6)
     covariance = weights = _EYE_6
     curbed = bool(np.any(served.is_angle))
     for count in range(_STEPS):
@@ -56,12 +55,12 @@ def solve_observation(
             turned[:3, :3] = turned[3:, 3:] = rotation
             covariance = turned @ of_child @ turned.T
             if of_parent is not None:
-                own[:3] = rotation @ (parent[:3, 3] - true[:3, 3])
-                own[3:] = _rotation_vector(rotation @ parent[:3, :3])
+                parent_error[:3] = rotation @ (parent[:3, 3] - true[:3, 3])
+                parent_error[3:] = _rotation_vector(rotation @ parent[:3, :3])
                 lever = _lever(pose)
                 lifted = turned @ of_parent @ turned.T @ lever.T
                 covariance += lever @ lifted
-                error -= lever @ own
+                error -= lever @ parent_error
             weights = np.linalg.inv(covariance)
         gain, left, there = 0.0, error, values
         if served.joints:
@@ -77,7 +76,7 @@ def solve_observation(
             gain += float(change @ curvature @ change)
             left = error - by_joints @ change
         if of_parent is not None and float(error @ weights @ error) < _GROSS:
-            blame = own + lifted @ (weights @ left)
+            blame = parent_error + lifted @ (weights @ left)
             gain += float(np.sum(blame**2 / np.diagonal(of_parent)))
             if gain >= CLOSE:
                 step = np.eye(4)
@@ -169,16 +168,18 @@ class KnownResiduals:
 
     coordinates: Array  # most likely coordinates inside the limits, (N, n)
     values: Array  # most likely joint values without limits, by linearisation, (N, k)
-    covariances: Array  # covariances of values, (N, k, k)
+    covariances: Array  # of the values, (N, k, k)
     orthogonal: Array  # ρ, the whitened residual orthogonal to the joint directions, (N, 6 - k)
-    whitened: Array  # same residual in the axes of the whitened pose, (N, 6)
-    displacement_jacobian: Array
-    bound_excess: Array
-    pose_residuals: Array  # (N, 6)
-    log_scale: Array  # (N,)
-    limit_excess: Array  # (N, c)
+    whitened: Array  # the same residual in the axes of the whitened pose, (N, 6)
+    displacement_jacobian: (
+        Array  # G, of ρ by a displacement of the joint and of the child on it, (N, 6 - k, 12)
+    )
+    bound_excess: Array  # values beyond their lower and upper limits, in standard deviations, (N, 2 k)
+    pose_residuals: Array  # in the parent's axes, (N, 6)
+    log_scale: Array  # log of the volume of the noise across the joint directions, (N,)
+    limit_excess: Array  # violation of limits on several coordinates, in standard deviations, (N, c)
     disagreement: Array  # difference from the estimates of the same coordinates by others, likewise, (N, e)
-    other_values: Array  # these estimates, (N, e). consistency sets the last three
+    other_values: Array  # these estimates, (N, e); consistency sets the last three
 
     def __len__(self) -> int:
         return len(self.orthogonal)
@@ -186,9 +187,8 @@ class KnownResiduals:
     @property
     def one_sided(self) -> Array:
         """All one-sided test quantities, in standard deviations, (N, 2 k + c + 2 e)."""
-        return np.concatenate(
-            [self.bound_excess, self.limit_excess, self.disagreement, -self.disagreement], axis=1
-        )
+        parts = (self.bound_excess, self.limit_excess, self.disagreement, -self.disagreement)
+        return np.concatenate(parts, axis=1)
 
     def select(self, rows: slice | npt.NDArray[np.int_]) -> Self:
         """Return the residuals of some of the observations."""
@@ -223,7 +223,9 @@ def compute_residuals(served: KnownJoint, observations: Observations) -> KnownRe
     step = (covariances @ transposed @ error[:, :, None])[:, :, 0]
     values = solution.values + step
     if not served.is_plain:
-        values = _displacements(solution.linear)
+        # From the first pose to each, to first order.
+        linear = solution.linear
+        values = pose_difference(linear.pose, linear.pose[0]) @ np.linalg.pinv(linear.by_joints[0]).T
     basis = np.linalg.qr(directions, mode="complete")[0]
     across = np.swapaxes(basis[:, :, joints:], 1, 2)
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
@@ -264,24 +266,11 @@ def _compute_one(served: KnownJoint, observations: Observations) -> KnownResidua
     across = complete_basis(directions)
     orthogonal = across.T @ error
     deviations = np.sqrt(np.diagonal(covariances))
-    excess = np.concatenate(
-        [(served.lower - unbounded) / deviations, (unbounded - served.upper) / deviations]
-    )
+    excess = np.concatenate([served.lower - unbounded, unbounded - served.upper]) / np.tile(deviations, 2)
+    displaced = across.T @ whitening @ displacement_jacobian(pose, served.middle)
+    parts = (values, unbounded, covariances, orthogonal, across @ orthogonal, displaced, excess, residual)
     none = np.zeros((1, 0))
-    return KnownResiduals(
-        values[None],
-        unbounded[None],
-        covariances[None],
-        orthogonal[None],
-        (across @ orthogonal)[None],
-        (across.T @ whitening @ displacement_jacobian(pose, served.middle))[None],
-        excess[None],
-        residual[None],
-        np.array([log_scale]),
-        none,
-        none,
-        none,
-    )
+    return KnownResiduals(*[*(part[None] for part in parts), np.array([log_scale]), none, none, none])
 
 
 def orthogonal_residuals(solution: Solution[Any]) -> Array:
@@ -297,12 +286,6 @@ def _whiten(solution: Solution[Any]) -> tuple[Array, Array, Array]:
     whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
     error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
     return whitening, error, whitening @ solution.linear.by_joints
-
-
-def _displacements(linear: LinearisedPoses) -> Array:
-    """Return the joint values from the first pose to each, to first order."""
-    values: Array = pose_difference(linear.pose, linear.pose[0]) @ np.linalg.pinv(linear.by_joints[0]).T
-    return values
 
 
 def _displacement_jacobian(pose: Array, middle: Array) -> Array:
