@@ -147,7 +147,7 @@ BAD = {
     "mixed": ("1 2 3\n1 2 3 0 0 0 1\n", "line 2: 7 cells, where line 1 has 3"),
     "mixed below a head": ("x,y,z\n\n1,2,3\n1,2\n", "line 4: 2 cells, where line 1 has 3"),
     "nine columns": ("1 2 3 4 5 6 7 8 9\n", "9 columns without names"),
-    "NaN": ("x,y,z\n1,2,3\n1,nan,3\n", "line 3: y is 'nan'.*Leave all cells of a part empty"),
+    "NaN": ("x,y,z\n1,2,3\n1,nan,3\n", "line 3: y is 'nan'.*All cells of a part that was not observed are empty"),
     "infinity": ("1 2 -inf\n", "line 1: z is '-inf'"),
     "huge": ("1 2 1e300\n", "line 1: z is '1e300'"),
     "words": ("x,y,z\n1,two,3\n", "line 2: y is 'two'"),
@@ -209,7 +209,7 @@ def test_unknown_parts_are_refused(tmp_path):
 def test_parts_never_observed_together_are_refused(tmp_path):
     rows = "0,table,1,2,3,0,0,0\n1,door,1,2,3,0,0,0\n"
     recording = read_recording(write_table(tmp_path, "time,part,x,y,z,rx,ry,rz\n" + rows))
-    with pytest.raises(FormatError, match="never seen at the same time"):
+    with pytest.raises(FormatError, match="never observed at the same time"):
         recording.pair("table", "door")
 
 

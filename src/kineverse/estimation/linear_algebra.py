@@ -41,14 +41,12 @@ def transposed(matrices: Array) -> Array:
 
 def multiply_vectors(matrices: Array, vectors: Array) -> Array:
     """Multiply matrices (..., m, n) by vectors (..., n)."""
-    result: Array = (matrices @ vectors[..., None])[..., 0]
-    return result
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def log_determinants(matrices: Array) -> Array:
     """Return the log determinants of positive definite matrices."""
-    result: Array = np.linalg.slogdet(matrices)[1]
-    return result
+    return np.asarray(np.linalg.slogdet(matrices)[1])
 
 
 def sum_log_determinants(matrices: Array) -> float:
@@ -76,5 +74,4 @@ def squared_errors(errors: Array, covariances: Array) -> Array:
     """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m)."""
     with singularity_named():
         weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
-        squares: Array = np.sum(errors * weighted, axis=1)
-        return squares
+        return np.asarray(np.sum(errors * weighted, axis=1))

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kineverse._checks import finite_number
 from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -86,11 +87,11 @@ class Outliers:
     gate: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < _as_number(self.fraction) < 1:
+        if not 0 < (finite_number(self.fraction) or 0.0) < 1:
             raise InvalidValueError(f"The fraction of outliers is between 0 and 1, not {self.fraction!r}.")
-        if not (math.isfinite(_as_number(self.reach)) and self.reach > 0):
+        if not (finite_number(self.reach) or 0.0) > 0:
             raise InvalidValueError(f"The reach of outliers is positive and finite, not {self.reach!r}.")
-        if self.gate is not None and not (math.isfinite(_as_number(self.gate)) and self.gate > 0):
+        if self.gate is not None and not (finite_number(self.gate) or 0.0) > 0:
             raise InvalidValueError(
                 f"The gate of outliers is a positive number of standard deviations, not {self.gate!r}."
             )
@@ -129,13 +130,6 @@ class Outliers:
         outlier = log_density + log_scale
         total = float(np.logaddexp(inlier, outlier))
         return math.exp(inlier - total), -total
-
-
-def _as_number(value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return math.nan
 
 
 def cauchy_weight(square: float, size: int) -> float:

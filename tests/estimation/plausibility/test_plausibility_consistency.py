@@ -82,7 +82,7 @@ def test_limit_set_by_another_coordinate_is_tested() -> None:
         if not explained:
             assert report["drawer"].implausible_since is not None
             assert report["drawer"].replacement is None
-            assert "together with what limits" in report["drawer"].reason
+            assert "together with the limits" in report["drawer"].reason
         # Without observations of the door the limit is unknown.
         alone = check_plausibility(model, {"drawer": observations["drawer"]}, noise=NOISE, families=SOME)
         assert alone["drawer"].explains

@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_tolerance, finite_number
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError
 from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
@@ -133,7 +134,8 @@ def check_plausibility(
         If ``strict``, and a joint does not explain the observations.
     """
     check_false_alarms(false_alarms)
-    check_decorrelation_time(decorrelation_time)
+    if decorrelation_time is not None:
+        as_tolerance(decorrelation_time, "The decorrelation time [s]")
     outlier_model = as_outliers(outliers)
     checked: object = model.model if isinstance(model, Tracker) else model
     checked = checked.model() if isinstance(checked, Snapshot) else checked
@@ -234,22 +236,9 @@ def pair_outliers(
     return replace(outliers, fraction=1.0 - (1.0 - outliers.fraction) ** 2)
 
 
-def check_decorrelation_time(time: float | None) -> None:
-    """Check a correlation time."""
-    if time is not None and not (math.isfinite(time) and time >= 0.0):
-        raise InvalidValueError(
-            "The decorrelation time is a number of seconds, 0 for independent errors, or None to measure it, "
-            f"not {time!r}."
-        )
-
-
 def check_time(at: object, last: float) -> float:
     """Return a time stamp as a number."""
-    try:
-        time = float(at)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        time = math.nan
-    if not math.isfinite(time):
+    if (time := finite_number(at)) is None:
         raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
     if time <= last:
         raise InvalidValueError(

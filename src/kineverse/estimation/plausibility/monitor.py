@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_tolerance
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
@@ -31,7 +32,6 @@ from kineverse.model.model import Model
 from .alternatives import JointObservations, judge_joint
 from .check import (
     FALSE_ALARMS,
-    check_decorrelation_time,
     check_false_alarms,
     check_time,
     find_exchanged_frames,
@@ -97,7 +97,8 @@ class PlausibilityMonitor:
         keep: int = 500,
     ) -> None:
         check_false_alarms(false_alarms)
-        check_decorrelation_time(decorrelation_time)
+        if decorrelation_time is not None:
+            as_tolerance(decorrelation_time, "The decorrelation time [s]")
         self.model = model
         self.frames = tuple(dict.fromkeys(frames))
         self.false_alarms = false_alarms

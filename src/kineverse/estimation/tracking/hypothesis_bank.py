@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from kineverse._checks import as_tolerance
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
 from .estimate import Estimate
@@ -58,9 +59,7 @@ class HypothesisBank:
             raise UnknownNameError(f"The prior does not fit. {suggest(strange, trackers, 'hypothesis')}")
         if not all(math.isfinite(w) and w > 0 for w in weights.values()):
             raise InvalidValueError(f"Probabilities are positive, not {weights!r}.")
-        if not (math.isfinite(forgetting) and forgetting >= 0):
-            raise InvalidValueError(f"Forgetting is a rate that is not negative, not {forgetting!r}.")
-        self._forgetting = forgetting
+        self._forgetting = as_tolerance(forgetting, "The rate of forgetting")
         self._logs = {name: math.log(w) for name, w in weights.items()}
         self._estimates = {name: tracker.estimate for name, tracker in self._trackers.items()}
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, ShapeError
 from kineverse.estimation.noise import pose_covariance
 from kineverse.expressions.expression import Expression, array
@@ -182,8 +183,7 @@ def wrap_difference(difference: Array, period: float) -> Array:
     """Wrap differences of periodic numbers to at most half a period."""
     if math.isinf(period):
         return difference
-    result: Array = difference - period * np.round(difference / period)
-    return result
+    return np.asarray(difference - period * np.round(difference / period))
 
 
 def require_covariance(covariance: npt.ArrayLike, size: int, label: str) -> Array:
@@ -211,14 +211,6 @@ def require_covariance(covariance: npt.ArrayLike, size: int, label: str) -> Arra
     return matrix
 
 
-def require_number(value: Any, label: str) -> float:
-    """Convert to float."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise InvalidValueError(f"{label} is a number, not {value!r:.80}.") from None
-
-
 def require_mapping(values: Any, label: str) -> Mapping[Any, Any]:
     """Check values by name."""
     if not isinstance(values, Mapping):
@@ -228,7 +220,7 @@ def require_mapping(values: Any, label: str) -> Mapping[Any, Any]:
 
 def require_positive(key: object, value: Any) -> float:
     """Check the standard deviation or variance of ``key``."""
-    number = require_number(value, f"The uncertainty of '{key}'")
-    if not (math.isfinite(number) and number > 0):
+    number = finite_number(value)
+    if number is None or number <= 0:
         raise InvalidValueError(f"The uncertainty of '{key}' is positive and finite, not {value!r}.")
     return number

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .information_state import InformationState
-from .measurements import require_number
 from .state_space import Layout
 
 if TYPE_CHECKING:
@@ -79,8 +78,7 @@ class RateFlow:
 
     def rates(self, q: Array, inputs: Array) -> Array:
         """Return R(q) (n, m)."""
-        result: Array = self._rates(np.concatenate([q, inputs]))
-        return result
+        return np.asarray(self._rates(np.concatenate([q, inputs])))
 
     def integrate(self, q: Array, speeds: Array, inputs: Array) -> tuple[Array, Array, Array]:
         """Return q after one unit of time, and its derivatives by the initial q (n, n) and the speeds (n, m).
@@ -238,17 +236,6 @@ def check_process(process: str) -> None:
     known = (*PROCESSES, "static")
     if process not in known:
         raise InvalidValueError(f"There is no process {process!r}. {suggest(str(process), known, 'process')}")
-
-
-def require_noise(key: object, value: Any) -> float:
-    """Check the process noise of ``key``."""
-    number = require_number(value, f"The process noise of '{key}'")
-    if not (math.isfinite(number) and number >= 0):
-        raise InvalidValueError(
-            f"The process noise of '{key}' is positive and finite, or 0 for a part that never moves, not "
-            f"{value!r}."
-        )
-    return number
 
 
 def default_process_noise(

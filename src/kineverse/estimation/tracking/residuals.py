@@ -221,8 +221,7 @@ class Residuals:
 
     def evaluate(self, x: Array, inputs: Array) -> Array:
         """Evaluate predicted values and Jacobians of all observations and limits at a state, not whitened."""
-        result: Array = self._function(np.concatenate([x, inputs]))
-        return result
+        return np.asarray(self._function(np.concatenate([x, inputs])))
 
     def errors(
         self, out: Array, reading: Measurements, indices: Sequence[int]

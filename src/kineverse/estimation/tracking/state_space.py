@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
 
@@ -132,8 +132,7 @@ def _evaluate_at(
     expression: Expression, point: Mapping[Symbol, float], default: Mapping[Symbol, float]
 ) -> Array:
     values = {s: point.get(s, default.get(s, s.value or 0.0)) for s in expression.symbols}
-    result: Array = expression(values)
-    return result
+    return np.asarray(expression(values))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,53 +179,40 @@ class Layout:
     limits: tuple[Constraint, ...]  # curved limits: all but bounds on a single free coordinate
     inputs: tuple[Symbol, ...]
     groups: tuple[CoordinateGroup, ...]  # in the order of their first observation
+    group_of: tuple[int, ...] = field(init=False)  # number of each observation's group
+    # Positions in the output: predicted values (rotation row by row, then position, or a vector), Jacobians
+    # (rows by columns of the group's tangent), and of curved limits the value, bounds and gradient.
+    value_slices: tuple[slice, ...] = field(init=False)
+    jacobian_slices: tuple[slice, ...] = field(init=False)
+    limit_slices: tuple[slice, ...] = field(init=False)
+    # Positions in a reading: of observations (4×4 row by row, or a vector), and of their whitening matrices.
+    measurement_slices: tuple[slice, ...] = field(init=False)
+    whitening_slices: tuple[slice, ...] = field(init=False)
 
-    @cached_property
-    def group_of(self) -> tuple[int, ...]:
-        """Number of each observation's group."""
-        result = {i: number for number, group in enumerate(self.groups) for i in group.observation_indices}
-        return tuple(result[i] for i in range(len(self.observations)))
+    def __post_init__(self) -> None:
+        number_of = {i: number for number, group in enumerate(self.groups) for i in group.observation_indices}
+        group_of = tuple(number_of[i] for i in range(len(self.observations)))
+        sizes = []
+        for one, number in zip(self.observations, group_of, strict=True):
+            sizes += [12 if one.is_pose else one.size, one.size * len(self.groups[number].tangent)]
+        count = len(sizes)
+        sizes += [3 + len(self._group_of_limit(number).tangent) for number in range(len(self.limits))]
+        slices = _consecutive_slices(sizes)
+        derived = {
+            "group_of": group_of,
+            "value_slices": slices[0:count:2],
+            "jacobian_slices": slices[1:count:2],
+            "limit_slices": slices[count:],
+            "measurement_slices": _consecutive_slices(16 if o.is_pose else o.size for o in self.observations),
+            "whitening_slices": _consecutive_slices(o.size**2 for o in self.observations),
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
 
     @cached_property
     def arguments(self) -> tuple[Symbol, ...]:
         """Arguments of the compiled function: coordinates, then inputs."""
         return (*self.tangent_space.coordinates, *self.inputs)
-
-    @cached_property
-    def value_slices(self) -> tuple[slice, ...]:
-        """Position of each predicted value in the output: rotation row by row, then position, or a vector."""
-        return self._slices[0]
-
-    @cached_property
-    def jacobian_slices(self) -> tuple[slice, ...]:
-        """Position of each observation's Jacobian in the output, rows by columns of its group's tangent."""
-        return self._slices[1]
-
-    @property
-    def limit_slices(self) -> tuple[slice, ...]:
-        """Position of each curved limit's value, bounds and gradient in the output."""
-        return self._slices[2]
-
-    @cached_property
-    def measurement_slices(self) -> tuple[slice, ...]:
-        """Position of each observation in a reading: 4×4 row by row, or a vector."""
-        return _consecutive_slices(16 if one.is_pose else one.size for one in self.observations)
-
-    @cached_property
-    def whitening_slices(self) -> tuple[slice, ...]:
-        """Position of each observation's whitening matrix in a reading."""
-        return _consecutive_slices(one.size**2 for one in self.observations)
-
-    @cached_property
-    def _slices(self) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
-        sizes = []
-        for one, number in zip(self.observations, self.group_of, strict=True):
-            sizes += [12 if one.is_pose else one.size, one.size * len(self.groups[number].tangent)]
-        count = len(sizes)
-        for number in range(len(self.limits)):
-            sizes.append(3 + len(self._group_of_limit(number).tangent))
-        slices = _consecutive_slices(sizes)
-        return slices[0:count:2], slices[1:count:2], slices[count:]
 
     def _group_of_limit(self, number: int) -> CoordinateGroup:
         return next(group for group in self.groups if number in group.limits)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_count, as_tolerance, finite_number
 from kineverse._runtime import CallLock, one_at_a_time
 from kineverse.errors import InvalidValueError
 from kineverse.estimation.noise import Outliers, as_outliers
@@ -31,7 +30,6 @@ from .measurements import (
     build_measurement_models,
     list_observed,
     require_mapping,
-    require_number,
 )
 from .native import native_library
 from .process_model import (
@@ -39,7 +37,6 @@ from .process_model import (
     Process,
     check_process,
     default_process_noise,
-    require_noise,
 )
 from .recursion import FixedLag, Recursion, Step
 from .residuals import Measurements
@@ -126,7 +123,8 @@ class Tracker:
             "keep": keep,
         }
         check_process(process)
-        _check_counts(lost_after, keep, lag)
+        lost_after, keep = as_count("lost_after", lost_after, 1), as_count("keep", keep, 1)
+        lag = as_tolerance(lag, "lag= [s]")
         keys = (inputs,) if isinstance(inputs, str | Symbol) else inputs
         if not isinstance(keys, Iterable):
             raise InvalidValueError(f"inputs= has names of coordinates, not {inputs!r:.80}.")
@@ -366,32 +364,31 @@ class Tracker:
         UnknownNameError
             For a speed with which no estimated coordinate moves.
         """
-        dt = require_number(dt, "The length of a step")
-        if not (math.isfinite(dt) and dt >= 0):
-            raise InvalidValueError(f"A step of {dt!r} s is impossible. Steps are finite and not negative.")
+        dt = as_tolerance(dt, "The length of a step [s]")
         speeds, noise = self._read_commands(commands), self._read_noise(process_noise)
         before = self._now
         known = self._recursion.read_inputs(before.inputs, inputs)
         self._now = self._recursion.predict(replace(before, inputs=known), dt, speeds, noise)
         if self._now.stamp is not None:
-            advance = partial(
-                self._recursion.advance, speeds=speeds, inputs=copy.copy(inputs), noise_now=noise
-            )
+            fixed = copy.copy(inputs)
+            advance = partial(self._recursion.advance, speeds=speeds, inputs=fixed, noise_now=noise)
             self._remember(before, self._now.stamp, partial(advance, stamp=self._now.stamp), advance)
         return self.estimate
 
     def _read_commands(self, commands: StateLike | None) -> dict[Symbol, float]:
         speeds = {}
         for key, value in require_mapping({} if commands is None else commands, "commands=").items():
-            speed = require_number(value, f"The commanded speed '{key}'")
-            if not math.isfinite(speed):
-                raise InvalidValueError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
+            if (speed := finite_number(value)) is None:
+                raise InvalidValueError(f"The commanded speed '{key}' is a finite number, not {value!r:.80}.")
             speeds[self._update_step.process_model.speed(key)] = speed
         return speeds
 
     def _read_noise(self, process_noise: StateLike | None) -> dict[Symbol, float]:
         noise = require_mapping({} if process_noise is None else process_noise, "process_noise=")
-        return {self._update_step.process_model.speed(k): require_noise(k, v) for k, v in noise.items()}
+        return {
+            self._update_step.process_model.speed(k): as_tolerance(v, f"The process noise of '{k}'")
+            for k, v in noise.items()
+        }
 
     @one_at_a_time
     def update(
@@ -530,15 +527,6 @@ class Tracker:
 
 
 def _require_time(at: Any) -> float:
-    time = require_number(at, "The time of an observation")
-    if not math.isfinite(time):
+    if (time := finite_number(at)) is None:
         raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
     return time
-
-
-def _check_counts(lost_after: int, keep: int, lag: float) -> None:
-    for name, count in (("lost_after", lost_after), ("keep", keep)):
-        if not isinstance(count, Integral) or count < 1:
-            raise InvalidValueError(f"{name}= is a number of updates, at least 1, not {count!r}.")
-    if not (math.isfinite(require_number(lag, "The lag")) and lag >= 0):
-        raise InvalidValueError(f"lag= is a finite number of seconds, not negative, not {lag!r}.")

@@ -109,8 +109,7 @@ def relative_covariance(observations: Observations, fit: Fit) -> Array:
 def child_covariance(observations: Observations) -> Array:
     """Return the covariances of the child's observed pose or position, in the parent's axes, (N, m, m)."""
     rotation = _parent_rotations(observations, observations.rows)
-    covariance: Array = rotation @ observations.child_covariance @ np.swapaxes(rotation, 1, 2)
-    return covariance
+    return np.asarray(rotation @ observations.child_covariance @ np.swapaxes(rotation, 1, 2))
 
 
 def _parent_rotations(observations: Observations, rows: int) -> Array:
