@@ -14,9 +14,8 @@ from kineverse.estimation import Plausibility, PlausibilityMonitor, check_plausi
 from kineverse.estimation.identification.observations import check_tracks, exact_track, pair_tracks
 from kineverse.estimation.plausibility.consistency import ConsistencyTests, TimedResiduals
 from kineverse.estimation.plausibility.e_process import SequentialTest
-from kineverse.estimation.plausibility.known_motion import KnownJoint
 from kineverse.estimation.plausibility.report import find_testable_joints
-from kineverse.estimation.plausibility.residuals import KnownResiduals, compute_residuals
+from kineverse.estimation.plausibility.residuals import KnownJoint, KnownResiduals, compute_residuals
 
 Array = npt.NDArray[np.float64]
 SOME = ("rigid", "prismatic", "revolute", "free")

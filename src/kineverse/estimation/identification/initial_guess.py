@@ -205,7 +205,6 @@ def _fit_pivot(flat: Array, angles: Array) -> Array:
 
 
 def _solve_ridge(matrix: Array, target: Array) -> Array:
-    """Return the least-squares solution x of A x = b, with a small ridge term."""
     normal = matrix.T @ matrix
     normal.flat[:: len(normal) + 1] += 1e-6
     return np.asarray(np.linalg.solve(normal, matrix.T @ target), dtype=np.float64)

@@ -185,7 +185,6 @@ def slide_child_origin(
 
 
 def _rotations(motion: GroupMotion, values: Array) -> Array:
-    """Return Exp(w), (N, 3, 3)."""
     twist = np.zeros((len(values), 6))
     twist[:, list(motion.parametrisation.joints)] = values
     return exp_so3(twist[:, WX:])
@@ -207,10 +206,7 @@ class SingleObservation(NamedTuple):
 def choose_mirrored_values(
     observations: Observations, solution: Solution[FamilyMember]
 ) -> Solution[FamilyMember]:
-    """Return the solution with the more probable of two mirrored joint values for each observation.
-
-    Only observations with precise positions have the ambiguity.
-    """
+    """Choose the more probable of two mirrored joint values for each observation with precise positions."""
     motion = solution.motion
     if (
         not isinstance(motion, GroupMotion)

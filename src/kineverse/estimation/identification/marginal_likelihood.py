@@ -43,10 +43,7 @@ class Evidence:
 
 
 def laplace_evidence(solution: Solution[FamilyMember], weight: float = 1.0) -> Evidence:
-    """Return the evidence of a family by the quadratic approximation around its most likely member.
-
-    Each observation's log likelihood counts with the weight, which is below 1 if errors are correlated.
-    """
+    """Return the evidence by the quadratic approximation, for a weight of each observation's likelihood."""
     motion, size = solution.motion, solution.motion.size
     per_observation = solve_per_observation(solution)
     values, covariances = per_observation.values, per_observation.covariances

@@ -25,8 +25,7 @@ import numpy as np
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
-from .curve import CURVE
-from .curve_fit import FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
+from .curve import CURVE, FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
 from .families import Family, FamilyMotion
 from .least_squares import Solution
 from .marginal_likelihood import Scored
@@ -203,7 +202,6 @@ def solve_curve(
 def _fit_to_noise(
     data: IdentificationData, observations: Observations, orders: Sequence[Array], competitor: float
 ) -> NoiseSolution:
-    """Return the most probable curve through observations, at the noise that suits it best."""
     latest: NoisePosterior | None = None
 
     def log_evidence(solution: Solution[FamilyMember]) -> float:
@@ -265,7 +263,6 @@ def _compare_refuted(
 
 
 def _reasons(data: IdentificationData, result: IdentificationResult, solutions: Solutions) -> Iterator[str]:
-    """Yield the reasons for which the best family is not sure."""
     name = _best_name(result, solutions)
     if result.lazy_fits[0].probability < SURE:
         return
@@ -322,10 +319,7 @@ def _is_smooth(values: Array) -> bool:
 def _best_scale(
     data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float], scales: Array
 ) -> tuple[str | Family, float, dict[str | Family, float]]:
-    """Return the best family, its size of the noise relative to the stated one, and the log evidences.
-
-    They are the evidences of all families with their prior, for a noise of unknown size.
-    """
+    """Return the best family for a noise of unknown size, its size, and the log evidences with priors."""
     prior, factors = -0.5 * (np.log(scales) / _SCALE_SPREAD) ** 2, np.column_stack([scales, scales])
     weight, at_scales = data.observation_weight, {}
     for name, one in solutions.items():
@@ -344,7 +338,6 @@ def _best_name(result: IdentificationResult, solutions: Solutions) -> str | Fami
 
 
 def _classify(data: IdentificationData, one: NoiseSolution) -> RowIndices:
-    """Return the indices of the inliers under a curve."""
     assert data.outliers is not None
     rows, solution = data.observations.rows, one.scored.solution
     observations = scale_noise(data.observations, one.noise.factors)

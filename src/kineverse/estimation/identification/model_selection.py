@@ -233,7 +233,6 @@ def solve_with_inliers(
 def _classify(
     data: IdentificationData, families: Iterable[str | Family], observations: Observations
 ) -> dict[str | Family, RowIndices]:
-    """Return the indices of the inliers under each family, for observations with some noise."""
     assert data.outliers is not None  # else there is nothing to classify
 
     def solve(some: Observations, name: str | Family) -> Scored:
@@ -246,7 +245,6 @@ def _classify(
 def _solve_inliers(
     data: IdentificationData, inliers: Mapping[str | Family, RowIndices]
 ) -> dict[str | Family, NoiseSolution]:
-    """Return the most likely member of each family by its inliers, at the most probable noise."""
 
     def solve(name: str | Family, statistics: MotionStatistics, some: Observations) -> Scored:
         scored = solver.maximum_likelihood(some, _starts(some, name, statistics, data.unit))
@@ -274,10 +272,7 @@ def score_solutions(
     weights: Mapping[str | Family, float],
     renew: bool = True,
 ) -> dict[str | Family, FamilySolution]:
-    """Return the solutions of families, scored against each other, from solutions of their inliers.
-
-    An unknown noise is estimated again if ``renew``.
-    """
+    """Score solutions of families against each other; an unknown noise is estimated again if ``renew``."""
     count = len(data.observations)
     log_priors = dict.fromkeys(solutions, 0.0)
     for name, one in solutions.items():

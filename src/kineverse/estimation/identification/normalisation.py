@@ -100,12 +100,7 @@ _PLACES = ("child.x", "child.y", "child.z")
 
 
 def fix_gauge(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
-    """Return the same motion in a unique parametrisation.
-
-    The largest component of the axis is positive and the mean of the joint values is 0. The origin of the
-    joint's frame is the point of the axis nearest to the child at 0. For a prismatic joint it is the origin
-    of the child.
-    """
+    """Return the same motion with a canonical axis and origin, and joint values with mean 0."""
     motion = solution.motion
     if not isinstance(motion, GroupMotion):
         return solution

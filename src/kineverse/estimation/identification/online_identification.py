@@ -113,7 +113,6 @@ def is_surprised(data: IdentificationData, one: FamilySolution, count: int) -> b
 
 
 def _nearest_observations(observations: Observations, known: int) -> RowIndices:
-    """Return the index of the nearest of the first ``known`` relative poses, for each of the others."""
     old, new = observations.relative[None, :known], observations.relative[known:, None]
     return np.asarray(np.argmin(np.sum((old - new) ** 2, axis=(2, 3)), axis=1))
 
@@ -295,7 +294,6 @@ class Identifier:
     def _update_families(
         self, data: IdentificationData
     ) -> tuple[dict[str | Family, FamilySolution], dict[str | Family, FamilySolution]]:
-        """Return the updated solutions, and the older ones of families whose update is deferred."""
         best = max(self._odds, key=self._odds.__getitem__)
         count = len(self._buffer)
         renew = not data.stated and count >= (1.0 + _MORE) * self._noise_count
@@ -364,6 +362,5 @@ def _deferred_fit(
     weights: Mapping[str | Family, float],
     probability: float,
 ) -> Fit:
-    """Return the fit of a family whose update was deferred, by all observations."""
     fit = weigh_families(data, warm_start(data, {name: one}, weights), weights).best
     return replace(fit, probability=probability)

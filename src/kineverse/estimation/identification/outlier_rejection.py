@@ -187,7 +187,6 @@ class _InlierSearch:
         return self._iterate(self.hypothesis(solution, weights))
 
     def _iterate(self, hypothesis: _InlierHypothesis) -> _InlierHypothesis:
-        """Alternate between solving by the inliers and classifying, until the inliers stay the same."""
         for _ in range(_ROUNDS):
             if not hypothesis.has_enough_inliers:
                 break

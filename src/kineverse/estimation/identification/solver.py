@@ -220,7 +220,6 @@ def _run(
     arguments: Sequence[int] = (),
     results: Sequence[Array] = (),
 ) -> None:
-    """Run a C stage with the problem, further arguments, work memory, solution and results."""
     address = ctypes.addressof(problem)
     memory = _memory.reserve(library.code.memory_of(address))
     stage(address, *arguments, *(array.ctypes.data for array in (memory, buffer.numbers, *results)))

@@ -38,10 +38,9 @@ from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .known_motion import KnownJoint
 from .replacement import build_replacement, extend_fit, follows_another
 from .report import JointVerdict, TestableJoint
-from .residuals import SIZES, KnownResiduals, compute_residuals, orthogonal_residuals
+from .residuals import SIZES, KnownJoint, KnownResiduals, compute_residuals, orthogonal_residuals
 
 
 def reject_outliers(residuals: KnownResiduals, outliers: Outliers | None) -> RowIndices:
@@ -66,11 +65,7 @@ _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
 def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool = False) -> float:
-    """Return the log density of the observed relative poses, with joint values integrated out.
-
-    Limits truncate the prior only for a single joint value. For several joint values, and for limits on
-    several coordinates, violations reduce the density by their distance.
-    """
+    """Return the log density of the observed relative poses, with joint values integrated out."""
     log = -float(np.sum(0.5 * np.sum(residuals.orthogonal**2, axis=1) + residuals.log_scale))
     log -= 0.5 * float(np.nansum(np.maximum(residuals.limit_excess, 0.0) ** 2))
     # The expected squared disagreement under a correct model is 1.
@@ -89,10 +84,7 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
 
 
 def log_displacement_gain(residuals: KnownResiduals) -> float:
-    """Return the log density ratio of a displaced joint, or child on it, to the served one.
-
-    ρ = G δ + noise with δ ~ N(0, s² I), with δ integrated out and averaged over several s.
-    """
+    """Return the log density ratio of ρ = G δ + noise, δ ~ N(0, s² I) for several s, to noise alone."""
     transposed = np.swapaxes(residuals.displacement_jacobian, 1, 2)
     information = np.sum(transposed @ residuals.displacement_jacobian, axis=0)
     pull = np.sum(transposed @ residuals.orthogonal[:, :, None], axis=0)[:, 0]
@@ -124,7 +116,6 @@ def _log_evidence_of_several(served: KnownJoint, residuals: KnownResiduals, widt
 
 
 def _log_density(served: KnownJoint) -> Array:
-    """Return the log density of the mean of each joint value, uniform within its limits."""
     width = served.upper - served.lower
     free = np.where(served.is_angle, 2.0 * math.pi, 20.0)
     return np.asarray(-np.log(np.where(np.isfinite(width), np.maximum(width, 1e-6), free)))
@@ -155,7 +146,6 @@ def _log_evidence_by_width(
 
 
 def _log_mass(mean: Array, deviation: Array, lower: float, upper: float) -> Array:
-    """Return the log probability of a Gaussian inside limits."""
     scale = math.sqrt(2.0) * deviation
     mass = 0.5 * (_erf((upper - mean) / scale) - _erf((lower - mean) / scale))
     return np.asarray(np.log(np.maximum(mass, 1e-300)))
@@ -197,11 +187,7 @@ class JointObservations:
         )
 
     def decorrelate(self, looks: float) -> JointObservations:
-        """Return evenly spaced observations with errors that may be taken as independent.
-
-        If ``looks`` observations are worth one with independent errors, N of them are worth N / ``looks``.
-        Some more are kept, because they show more of the motion, with accordingly larger covariances.
-        """
+        """Return evenly spaced observations with larger covariances, as independent ones."""
         count = len(self.times)
         kept = min(max(math.ceil(count / looks), _KEPT), count)
         factor = max(looks * kept / count, 1.0)
@@ -285,7 +271,6 @@ def _probabilities(data: JointObservations, alternative: IdentificationResult | 
 
 
 def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: float) -> str:
-    """Return the reason why a joint that fits is not certain."""
     correlated = f"errors are correlated, {count} observations are worth {count / looks:.1f}"
     if probabilities["served"] >= SURE and count > 1:
         return "" if count >= _LEAST_INDEPENDENT * looks else correlated

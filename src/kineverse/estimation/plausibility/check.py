@@ -31,9 +31,8 @@ from kineverse.model.model import Model, Snapshot
 from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
 from .e_process import SequentialTest
-from .known_motion import KnownJoint
 from .report import JointVerdict, Plausibility, TestableJoint, find_testable_joints
-from .residuals import compute_residuals
+from .residuals import KnownJoint, compute_residuals
 
 # Number of observations that are compared.
 _COMPARED = 50
@@ -63,7 +62,6 @@ def find_exchanged_frames(
 
 
 def _fits(served: KnownJoint, tracks: Mapping[str, PoseTrack], joint: TestableJoint, since: int) -> bool:
-    """Return True if a joint explains most observations from one on."""
     parent, child = tracks[joint.parent], tracks[joint.child]
     rows = np.flatnonzero(parent.seen & child.seen)
     rows = rows[rows >= since][:_COMPARED]
@@ -218,7 +216,6 @@ def undetermined_verdict(
 def _test(
     data: JointObservations, false_alarms: float, outliers: Outliers | None, correlation: CorrelationSettings
 ) -> int | None:
-    """Return the first observation that a joint does not explain; None if it is not rejected."""
     residuals = data.residuals
     looks = correlation.measure(residuals.whitened, residuals.orthogonal.shape[1], data.stamps)
     test = SequentialTest(false_alarms, outliers.fraction if outliers else 0.0)

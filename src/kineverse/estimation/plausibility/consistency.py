@@ -26,9 +26,8 @@ from kineverse.model.operation import ARTICULATIONS
 from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
-from .known_motion import KnownJoint, is_own_limit
 from .report import TestableJoint
-from .residuals import KnownResiduals
+from .residuals import KnownJoint, KnownResiduals, is_own_limit
 
 # Range of the linearity test in standard deviations, and the accepted relative nonlinearity.
 _RANGE, _NONLINEAR = 2.0, 0.5
@@ -183,7 +182,6 @@ class _Limits:
         return z
 
     def _evaluate(self, points: Array) -> Sequence[Array]:
-        """Return slacks and their slopes; NaN where the model has no value."""
         results = [np.full((len(points), len(self.slacks)), np.nan) for _ in range(1 + points.shape[1])]
         waiting = [np.flatnonzero(np.isfinite(points).all(axis=1))]
         while waiting:
@@ -247,11 +245,7 @@ def _disagreement(
 
 
 def _deviations(off: Array, one: Array, other: Array, shared: bool) -> Array:
-    """Return values in standard deviations; NaN where undefined.
-
-    If both estimates share an observed frame, their standard deviations are added, which bounds any
-    correlation.
-    """
+    """Return values in standard deviations, added up if a frame is shared; NaN where undefined."""
     with np.errstate(invalid="ignore", divide="ignore"):
         deviation = np.sqrt(one) + np.sqrt(other) if shared else np.sqrt(one + other)
         z: Array = off / deviation

@@ -108,10 +108,7 @@ class SequentialTest:
 
 
 class CorrelatedTest:
-    """Sequential test of one joint with errors that are correlated in time.
-
-    Where many observations are worth one, only some of them are tested, with the weight of all.
-    """
+    """Sequential test of one joint that skips correlated observations; others have the weight of all."""
 
     def __init__(
         self, false_alarms: float, outlier_fraction: float, correlation: CorrelationSettings

@@ -40,9 +40,8 @@ from .check import (
 )
 from .consistency import ConsistencyTests, TimedResiduals
 from .e_process import CorrelatedTest
-from .known_motion import KnownJoint
 from .report import JointVerdict, Plausibility, TestableJoint, TestableJoints, find_testable_joints
-from .residuals import KnownResiduals, compute_residuals
+from .residuals import KnownJoint, KnownResiduals, compute_residuals
 
 
 @dataclass
@@ -264,7 +263,6 @@ class PlausibilityMonitor:
         return pair_outliers(self._outliers, joint, self._relative_to)
 
     def _recent_tracks(self) -> dict[str, PoseTrack]:
-        """Return the recent poses by name of the frame, with gaps."""
         result = {}
         for name, any_track in {name: t for tracks in self._recent for name, t in tracks.items()}.items():
             gap = replace(any_track, seen=np.zeros(1, dtype=bool))

@@ -36,8 +36,8 @@ from kineverse.model.rates import to_plain
 from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol
 
-from .known_motion import KnownJoint
 from .report import TestableJoint
+from .residuals import KnownJoint
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,6 @@ def _records(writes: WrittenValues, joint: TestableJoint) -> dict[str, Articulat
 
 
 def _name(records: Mapping[str, Articulation], joint: TestableJoint, served: KnownJoint, joints: int) -> str:
-    """Return the name of the new joint: that of the old coordinate if each has exactly one of its own."""
     name = next(iter(records), joint.frame)
     if joints != 1 or len(served.coordinates) != 1:
         return name
@@ -243,10 +242,7 @@ def _turn_about_axis(served: KnownJoint, coordinates: Array, motion: GroupMotion
 def _align_values(
     motion: GroupMotion, values: Array, old: Array, same_kind: bool, geared: bool
 ) -> tuple[GroupMotion, Array, float]:
-    """Align joint values with the old ones: same direction and zero; also return the ratio of both.
-
-    The ratio is 1 for joints of the same kind, unless ``geared``: other joints observed the old values.
-    """
+    """Align joint values with the old ones; also return the ratio of both, 1 for the same kind."""
     new = values[:, 0]
     slope = float(np.mean((old - old.mean()) * (new - new.mean())))
     if slope < 0.0:

@@ -104,7 +104,6 @@ class _Finder:
         return self.model.history.writers(f"frames/{frame}")[-1]
 
     def _root(self, name: str) -> str:
-        """Return the root frame of a part."""
         while name != WORLD and not self._moves(name):
             name = self.model.frames[name].parent
         return name
@@ -116,7 +115,6 @@ class _Finder:
         )
 
     def _chain(self, name: str) -> list[str]:
-        """Return the frame and all its ancestors, the world last."""
         return [*ancestors(name, self.model.frames.__getitem__), WORLD]
 
 

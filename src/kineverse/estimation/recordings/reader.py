@@ -303,7 +303,6 @@ def _choose_columns(table: TextTable, names: Sequence[str] | None) -> Columns:
 
 
 def _rows_by_part(table: TextTable, columns: Columns, where: PartColumns) -> dict[str, Indices]:
-    """Return the rows in which each part was observed, by its name."""
     observed: dict[str, list[int]] = {}
     needed = (*where.position, *where.orientation)
     for row, cells in enumerate(table.cells):
@@ -334,7 +333,6 @@ def _build_track(table: TextTable, columns: Columns, where: PartColumns, rows: I
 
 
 def _parse_numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: Indices) -> Array:
-    """Return the cells of some columns as numbers, (N, len(places))."""
     texts = [[table.cells[row][k] for k in places] for row in rows]
     try:
         numbers = np.array(texts, dtype=np.float64).reshape(len(rows), len(places))

@@ -315,10 +315,7 @@ def _residuals_across_motion(fit: Fit) -> Array:
 
 
 def _is_noise(fit: Fit, best: Fit, time: float, best_time: float) -> bool:
-    """Return True if a fit with fewer joint values may be right, with residuals that are noise.
-
-    They are then no smoother than those of the best fit, while the motion is.
-    """
+    """Return True if a fit with fewer joint values has residuals as little smooth as the best ones."""
     if fit.motion.joints >= best.motion.joints or time > _AS_SMOOTH * best_time:
         return False
     values = best.joint_values[best.inliers]

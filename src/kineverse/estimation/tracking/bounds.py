@@ -35,10 +35,7 @@ class StateBounds:
 
 
 def collect_bounds(model: ModelView, tangent_space: TangentSpace, inputs: frozenset[Symbol]) -> StateBounds:
-    """Collect the position limits: constraints without speeds on estimated coordinates and inputs alone.
-
-    Locks, which bound speeds, and constraints on unobserved coordinates are left out.
-    """
+    """Collect the position limits: constraints without speeds on estimated coordinates and inputs alone."""
     index = {x: i for i, x in enumerate(tangent_space.coordinates)}
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
     names, curved = [], []

@@ -26,9 +26,8 @@ from kineverse.estimation.linear_algebra import inverse_spd, symmetric
 from kineverse.lie import Array
 
 from .information_state import InformationState
-from .observability import Components
+from .observability import Components, StaticRecord
 from .residuals import Measurements
-from .static_batch import StaticRecord
 
 # Step length and largest distance along the ridge, in deviations.
 _STRIDE, _FARTHEST = 0.5, 5.0
@@ -114,7 +113,6 @@ class RidgeCovariance(_CovarianceComputation):
     def _walk_ridge(
         self, posterior: _LocalPosterior, top: _ManifoldPoint, ray: Array
     ) -> Iterator[tuple[_ManifoldPoint, float]]:
-        """Yield points along the ridge, with their relative density after marginalising across it."""
         stride, point, density = _STRIDE * ray, top, 1.0
         deviation = before = np.zeros_like(ray)
         for count in range(1, math.ceil(_FARTHEST / _STRIDE)):
@@ -147,7 +145,6 @@ class RidgeCovariance(_CovarianceComputation):
         return best
 
     def _evaluate(self, posterior: _LocalPosterior, step: Array) -> _ManifoldPoint | None:
-        """Return the posterior at the end of a step; None if it is infeasible."""
         group, inputs = self._layout.groups[posterior.number], posterior.record.inputs
         here, there = posterior.belief.x[group.x], posterior.belief.x.copy()
         try:

@@ -42,10 +42,7 @@ class TrackLoss:
         return not (self.refuted.any() or self.is_lost.any())
 
     def after(self, measured: Groups, refuted: Groups, lost_after: int) -> TrackLoss:
-        """Return the state after an update with masks of measured and of refuted groups (groups,).
-
-        A group that is lost stays lost until measurements agree with it.
-        """
+        """Return the state after an update; a lost group stays lost until measurements agree with it."""
         count = np.where(measured, np.where(refuted, self.refuted + 1, 0), self.refuted)
         return TrackLoss(count, (self.is_lost | (count >= lost_after)) & (refuted | ~measured))
 
@@ -58,11 +55,7 @@ def find_measured(layout: Layout, reading: Measurements) -> Groups:
 
 
 def find_refuted(layout: Layout, reading: Measurements, result: StepResult, has_outliers: bool) -> Groups:
-    """Return True for each group whose estimate an update refutes (groups,).
-
-    With an outlier model, all measurements of the group are rejected. Without one, the normalised innovation
-    squared exceeds its quantile of one in a million.
-    """
+    """Return True for each group without an accepted measurement, or with an extreme NIS (groups,)."""
     if has_outliers and not result.outliers:
         return np.zeros(len(layout.groups), dtype=bool)
     if not has_outliers:
@@ -78,10 +71,7 @@ def find_refuted(layout: Layout, reading: Measurements, result: StepResult, has_
 
 
 def chi_squared_quantile(dof: Array) -> Array:
-    """Return the quantiles of χ² that are exceeded once in a million, for degrees of freedom (n,).
-
-    Wilson and Hilferty, The distribution of chi-square, 1931.
-    """
+    """Return the quantiles of χ² exceeded once in a million (n,) (Wilson and Hilferty 1931)."""
     variance = 2.0 / (9.0 * np.maximum(dof, 1.0))
     return np.asarray(dof * (1.0 - variance + _QUANTILE * np.sqrt(variance)) ** 3)
 

@@ -87,10 +87,7 @@ class GaussianSum:
         candidates: Sequence[Candidate],
         should_merge: Callable[[CoordinateGroup, Candidate, Candidate], bool],
     ) -> tuple[GaussianSum, list[Candidate | None]]:
-        """Prune and merge candidates to new components; also return the best candidate of each group.
-
-        Groups without candidates keep their components.
-        """
+        """Prune and merge candidates to new components; also return the best candidate of each group."""
         kept: list[list[InformationState]] = []
         best: list[Candidate | None] = []
         for number, group in enumerate(self._layout.groups):
@@ -119,7 +116,6 @@ class GaussianSum:
         return self._assemble([source.components(number) for number, source in enumerate(sources)])
 
     def _assemble(self, components: Sequence[Sequence[InformationState]]) -> GaussianSum:
-        """Return the sum of the components of each group, the best first."""
         beliefs, alive = [], []
         for k in range(max(map(len, components))):
             belief = self.best.copy()

@@ -23,6 +23,7 @@ from .map_update import MapResult, MapSolver
 from .native import NativeInlierSolver, NativeMapSolver, native_library
 from .observability import (
     Components,
+    StaticBatch,
     StationaryPoints,
     UnobservableDirections,
     find_unexplained,
@@ -31,7 +32,6 @@ from .observability import (
 from .process_model import ConstantVelocity, ProcessModel
 from .residuals import MeasurementReader, Measurements, Residuals
 from .state_space import Layout
-from .static_batch import StaticBatch
 
 
 @dataclass(slots=True, eq=False)
@@ -133,7 +133,6 @@ class UpdateStep:
     def _map_update(
         self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int] | None = None
     ) -> MapResult:
-        """Return the least-squares update of some groups; of all measured groups if None."""
         result = None
         if self.native is not None and self.native.is_ready:
             result = self.native.update(belief, reading, inputs)
@@ -150,7 +149,6 @@ class UpdateStep:
         inputs: Array,
         groups: list[int],
     ) -> list[Candidate]:
-        """Return candidates from restarts near states where the measurement Jacobian vanishes."""
         starts = self.stationary_points.restart_states(before, result.belief, groups, inputs)
         return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
 
@@ -162,10 +160,7 @@ class UpdateStep:
         inputs: Array,
         groups: list[int],
     ) -> list[Candidate]:
-        """Return candidates on other turns of counted coordinates.
-
-        The orientation of a pinion has a minimum on each turn. The place of its rack tells which is least.
-        """
+        """Return candidates on other turns of counted coordinates, such as a pinion on its rack."""
         candidates: list[Candidate] = []
         for x in self.counted:
             i = self.layout.tangent_space.coordinates.index(x)
@@ -193,7 +188,6 @@ class UpdateStep:
     def _restart_from(
         self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
     ) -> list[Candidate]:
-        """Return the candidate of a restart from a state; none if the restart fails."""
         try:
             if self.outliers is not None:
                 start = self.solver.find_robust_start(start, reading, inputs, groups)
@@ -223,7 +217,6 @@ class UpdateStep:
         return self._candidate(result.belief, result.weights, result.nis, result.dof, groups, inputs)
 
     def _forget_other_inputs(self, mixture: GaussianSum, inputs: Array) -> GaussianSum:
-        """Drop static records that were taken at other values of the inputs."""
 
         def changed(belief: InformationState) -> InformationState:
             records = enumerate(belief.records)
@@ -288,7 +281,6 @@ class UpdateStep:
         return result
 
     def _constrained(self, belief: InformationState, inputs: Array) -> InformationState:
-        """Return a predicted belief about the most probable point inside the limits."""
         is_inside = (belief.x >= self.limits.lower).all() and (belief.x <= self.limits.upper).all()
         if is_inside and not self.layout.limits:
             if float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2:
@@ -318,17 +310,13 @@ class UpdateStep:
         return [n for n, group in groups if reading.mask[list(group.observation_indices)].any()]
 
     def _keep_turns(self, mixture: GaussianSum, predicted: Array) -> None:
-        """Take periodic coordinates to the turn nearest to their prediction (n,); in place.
-
-        Integrators, controllers and gears count turns, though nothing that is observed tells them.
-        """
+        """Take periodic coordinates to the turn nearest to their prediction (n,), in place."""
         for x, period in self.periods.items():
             i = self.layout.tangent_space.coordinates.index(x)
             for belief in mixture.beliefs:
                 belief.x[i] -= period * round((belief.x[i] - predicted[i]) / period)
 
     def _update_mixture(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
-        """Update all components and keep the best candidates."""
         measured = self._measured_groups(reading)
         candidates, rounds = self._solve_inliers(mixture, reading, inputs, measured)
         solved = {number for candidate in candidates for number in candidate.groups}
@@ -389,10 +377,7 @@ class UpdateStep:
     def find_accepted(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array
     ) -> npt.NDArray[np.bool_]:
-        """Return True for each group of which a component accepts a measurement as an inlier (groups,).
-
-        About a broad prior that need not be the best component: all outliers are as probable at first.
-        """
+        """Return True for each group of which a component, best or not, accepts a measurement (groups,)."""
         result = np.zeros(len(self.layout.groups), dtype=bool)
         assert self.outliers is not None
         for component, belief in enumerate(mixture.beliefs):
@@ -409,7 +394,6 @@ class UpdateStep:
     def _solve_inliers(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]
     ) -> tuple[list[Candidate], int]:
-        """Return the candidates that C finds for unambiguous groups."""
         if self.inlier_solver is None or not self.is_native:
             return [], 0
         result, rounds = self.inlier_solver.solve(mixture, reading, inputs, groups)
@@ -456,7 +440,6 @@ class UpdateStep:
         return candidates, rounds
 
     def _with_rejected(self, result: MapResult, reading: Measurements, groups: list[int]) -> list[int]:
-        """Return the groups of which an observation is rejected as an outlier."""
         if result.weights is None:
             return []
         rejected = reading.mask & (result.weights < 0.5)

@@ -42,11 +42,7 @@ _SAMPLES = (0.125, 0.375, 0.625, 0.875)
 def find_turning_coordinates(
     update_step: UpdateStep, x: Array, inputs: Array
 ) -> tuple[dict[Symbol, float], frozenset[Symbol]]:
-    """Return unlimited coordinates of which full turns change no predicted observation, or only some.
-
-    The former have the angle after which nothing changes [rad]: several turns where gears are observed. The
-    latter are angles whose turn is observed elsewhere, such as that of a pinion by the place of its rack.
-    """
+    """Return coordinates with periods of all predictions [rad], and those whose turn some observe."""
     layout, limits = update_step.layout, update_step.limits
     periods: dict[Symbol, float] = {}
     counted = []
@@ -135,10 +131,7 @@ def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Arra
 
 
 def _find_ambiguous(update_step: UpdateStep, first: InformationState, inputs: Array) -> set[int]:
-    """Return the coordinates on which some prediction is not monotonic between their limits.
-
-    An example is the distance from a point, which is equal on both of its sides.
-    """
+    """Return coordinates on which a prediction, such as a distance, is not monotonic between their limits."""
     layout, limits = update_step.layout, update_step.limits
     width = limits.upper - limits.lower
     result: set[int] = set()
@@ -197,7 +190,6 @@ def _offsets(update_step: UpdateStep, first: InformationState, i: int, is_ambigu
 
 
 def _to_tangent(layout: Layout, number: int, change: Iterable[float]) -> Array:
-    """Return the tangent step that changes coordinates by some amounts."""
     group = layout.groups[number]
     step = np.zeros(len(group.tangent))
     for x, by in zip(group.coordinates, change, strict=True):

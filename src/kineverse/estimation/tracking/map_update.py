@@ -158,7 +158,6 @@ class MapSolver:
         iterate.damping = iterate.damping / 10 if iterate.damping > 1e-6 else 0.0
 
     def _robust_cost(self, i: int, square: float, reading: Measurements, loss: Loss) -> tuple[float, float]:
-        """Return weight and cost of a squared residual."""
         if loss == "gaussian" or not np.isfinite(square):
             return 1.0, square / 2
         if loss == "cauchy":
@@ -221,7 +220,6 @@ class MapSolver:
 
 
 def _is_better(iterate: _GroupIterate, cost: float, rows: BoundRows) -> bool:
-    """Return True if a trial is better than the best iterate: less infeasible, or of lower cost."""
     if iterate.rows is not None and iterate.rows.violation > _OUTSIDE:
         if rows.violation < iterate.rows.violation / 2:
             return True

@@ -69,10 +69,7 @@ native_library = SourceLibrary(
 
 
 class NativeMapSolver:
-    """Compiled counterpart of :class:`.map_update.MapSolver` for one tracker.
-
-    It owns its memory; a lock serialises threads.
-    """
+    """Compiled counterpart of :class:`.MapSolver` for one tracker, with its own memory and a lock."""
 
     def __init__(
         self, layout: Layout, limits: StateBounds, function: CompiledFunction, process_model: ProcessModel
@@ -255,11 +252,7 @@ class NativeInlierSolver:
         log_outlier: Array,
         groups: Sequence[int],
     ) -> tuple[MapResult, npt.NDArray[np.bool_]] | None:
-        """Reject the worst measurement of each group until none is an outlier; return the result and a mask.
-
-        One gross error drags the estimate away from the others, so that all seem to be outliers. None if the
-        solver fails.
-        """
+        """Reject the worst measurement of each group, which drags the estimate, until none is an outlier."""
         mask, left = reading.mask.copy(), list(groups)
         for _ in range(_MOST_TRIMMED):
             probable = self._inlier_probabilities(result, reading._replace(mask=mask), log_outlier) > 0.5

@@ -1,26 +1,30 @@
-"""Unobservable directions, and states where the measurement Jacobian vanishes.
+"""Batch relinearisation of measurements while the state is static.
 
-The cosine of an angle has zero slope at 0: a Gauss-Newton step does not move the angle, whatever is measured.
-An arm that is stretched out has the same property at its elbow. Where a residual remains unexplained and some
-direction is unobservable, the update therefore restarts on both sides.
+A filter sums information that was linearised at different estimates. An arm with seven joints can move while
+its end effector rests. The direction of this null motion differs a little between estimates, so the sum holds
+false information about an unobservable direction. While the state is static, measurements are instead
+averaged on SE(3), and the posterior follows from the prior and these means, linearised at one point. This is
+needed only while the group has unobservable directions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from kineverse.errors import KineverseError
-from kineverse.lie import Array
+from kineverse.estimation.linear_algebra import inverse_spd
+from kineverse.lie import Array, pose_difference, retract
 
 from .bounds import GroupBounds
-from .information_state import InformationState
-from .map_update import MapResult
+from .information_state import InformationState, QuadraticCost
+from .map_update import MapResult, MapSolver
+from .measurements import MeasurementModel, wrap_difference
 from .process_model import ProcessModel
-from .residuals import MeasurementReader, Residuals
+from .residuals import MeasurementReader, Measurements, Residuals, whitening
 from .state_space import CoordinateGroup, Layout
 
 # A direction is unobservable while its deviation exceeds this part of the initial one.
@@ -37,10 +41,7 @@ class UnobservableDirections:
         self.deviations: Array = np.ones(len(layout.tangent_space.tangent))
 
     def directions(self, number: int, information: Array) -> tuple[Array, Array]:
-        """Return steps of one deviation in the tangent of a group: unobservable (k, t), others (t - k, t).
-
-        They are orthogonal in the metric of the information (t, t).
-        """
+        """Return orthogonal steps of one deviation: unobservable (k, t), others (t - k, t)."""
         scale = self.deviations[self._groups[number].t]
         values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
         steps = (vectors * np.maximum(values, _LEAST) ** -0.5).T * scale
@@ -139,3 +140,160 @@ class StationaryPoints:
                 move_origin(beliefs[index], number, group, there, step, transport)
                 index += 1
         return beliefs
+
+
+UpdateFunction: TypeAlias = Callable[[InformationState, Measurements, Array, list[int]], MapResult]
+
+# Measurements with a smaller weight are ignored.
+_LEAST_WEIGHT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class MeanMeasurement:
+    """Information-weighted mean of measurements of one observation."""
+
+    value: Array  # pose 4×4 row by row, or vector
+    information: Array  # inverse covariance of the mean (d, d), in the axes of the observing frame
+    peak: float  # log density of all averaged measurements at their mean
+
+    def combine(self, other: MeanMeasurement, one: MeasurementModel) -> MeanMeasurement:
+        """Return the mean of both, weighted by information."""
+        information = self.information + other.information
+        if one.is_pose:
+            apart = pose_difference(other.value.reshape(4, 4), self.value.reshape(4, 4))
+        else:
+            apart = wrap_difference(other.value - self.value, one.period)
+        step = np.linalg.solve(information, other.information) @ apart
+        peak = self.peak + other.peak - float(apart @ self.information @ step) / 2
+        value = retract(self.value.reshape(4, 4), step).reshape(-1) if one.is_pose else self.value + step
+        return MeanMeasurement(value, information, peak)
+
+
+@dataclass(frozen=True, eq=False)
+class StaticRecord:
+    """Prior and averaged measurements of a group since it last moved."""
+
+    prior: QuadraticCost  # prior before the measurements, in the tangent space at the present estimate
+    means: Mapping[int, MeanMeasurement]  # averaged measurements, by number of the observation
+    inputs: Array  # values of the inputs during these measurements
+    evidence: float  # log evidence of the group before these measurements
+    count: int = 0  # number of updates
+    branch: object = field(default_factory=object)  # identity of the first update
+
+    def with_measurements(
+        self, new: Mapping[int, MeanMeasurement], observations: Sequence[MeasurementModel]
+    ) -> StaticRecord:
+        """Return the record with further measurements averaged in."""
+        means = dict(self.means)
+        for i, one in new.items():
+            means[i] = means[i].combine(one, observations[i]) if i in means else one
+        return replace(self, means=means, count=self.count + 1)
+
+    def as_measurements(self, layout: Layout, reader: MeasurementReader) -> Measurements:
+        """Return the averaged measurements as one reading."""
+        empty = reader.empty()
+        white, scale = empty.whitening.copy(), empty.log_scale.copy()
+        for i, mean in self.means.items():
+            empty.values[layout.measurement_slices[i]] = mean.value
+            empty.mask[i], scale[i] = True, -mean.peak
+            white[layout.whitening_slices[i]] = whitening(inverse_spd(mean.information)).reshape(-1)
+        return empty._replace(whitening=white, log_scale=scale)
+
+
+class StaticBatch:
+    """Batch relinearisation for the groups of a tracker."""
+
+    def __init__(self, components: Components, solver: MapSolver, update: UpdateFunction) -> None:
+        self._layout, self._residuals, _, self._reader, _, self._unobservable = components
+        self._solver, self._update = solver, update
+        # In a group with one direction, linearisation at several estimates adds no false information.
+        self._groups = {number for number, group in enumerate(self._layout.groups) if len(group.t) > 1}
+
+    def relinearise(
+        self,
+        before: InformationState,
+        result: MapResult,
+        reading: Measurements,
+        inputs: Array,
+        groups: Sequence[int] | None = None,
+    ) -> None:
+        """Recompute an update from all stored measurements where a group has unobservable directions."""
+        after, weights = result.belief, result.weights
+        for number in self._groups if groups is None else self._groups.intersection(groups):
+            group, old = self._layout.groups[number], before.records[number]
+            new = {
+                i: self._mean_measurement(i, reading, 1.0 if weights is None else float(weights[i]))
+                for i in group.observation_indices
+                if reading.mask[i] and (weights is None or weights[i] > _LEAST_WEIGHT)
+            }
+            if not new or (old is None and not self._unobservable.is_in(number, after)):
+                continue
+            is_first = old is None
+            old = old or StaticRecord(before.group_cost(group.t), {}, inputs, float(before.evidence[number]))
+            record = old.with_measurements(new, self._layout.observations)
+            if is_first and (result.priors is not None or not group.by_speeds):
+                prior = self._transport_prior(number, before, old.prior, result)
+                after.records[number] = replace(record, prior=prior)
+                continue
+            found = self._solve_batch(number, before, record)
+            after.x[group.x] = found.belief.x[group.x]
+            after.set_group_cost(group.t, found.belief.group_cost(group.t))
+            if weights is None:
+                after.evidence[number] = found.belief.evidence[number]
+            # Observations still to come may show that the estimate is a mirror image: keep the record.
+            is_complete = len(record.means) == len(group.observation_indices)
+            if is_complete and not self._unobservable.is_in(number, after):
+                after.records[number] = None
+            else:
+                prior = self._transport_prior(number, before, record.prior, found)
+                after.records[number] = replace(record, prior=prior)
+
+    def add_noise(
+        self, number: int, before: InformationState, after: InformationState, added_variance: Array
+    ) -> None:
+        """Add process noise to the record of a group that moves by noise alone."""
+        record, group = before.records[number], self._layout.groups[number]
+        assert record is not None
+        out = self._residuals.evaluate(after.x, record.inputs)
+        means = {}
+        for i, one in record.means.items():
+            size = self._layout.observations[i].size
+            slope = out[self._layout.jacobian_slices[i]].reshape(size, len(group.t))
+            # Errors from motion are fully correlated; scaled by their number they may count as independent.
+            noise = len(record.means) * (slope * added_variance) @ slope.T
+            information = inverse_spd(inverse_spd(one.information) + noise)
+            lost = np.linalg.slogdet(one.information)[1] - np.linalg.slogdet(information)[1]
+            means[i] = replace(one, information=information, peak=one.peak - float(lost) / 2)
+        covariance = inverse_spd(record.prior.matrix)
+        matrix = inverse_spd(covariance + np.diag(added_variance))
+        prior = QuadraticCost.from_density(matrix, matrix @ (covariance @ record.prior.vector))
+        step = after.x[group.x] - before.x[group.x]
+        reduced = replace(record, prior=prior.transported(step, None), means=means, evidence=0.0)
+        # The evidence of past measurements stays; the reduced information applies to future ones only.
+        from_record = self._solve_batch(number, after, reduced).belief.evidence[number]
+        after.records[number] = replace(reduced, evidence=float(before.evidence[number] - from_record))
+
+    def _mean_measurement(self, i: int, reading: Measurements, weight: float) -> MeanMeasurement:
+        size = self._layout.observations[i].size
+        white = reading.whitening[self._layout.whitening_slices[i]].reshape(size, size)
+        value = reading.values[self._layout.measurement_slices[i]].copy()
+        return MeanMeasurement(value, weight * (white.T @ white), -float(reading.log_scale[i]))
+
+    def _solve_batch(self, number: int, before: InformationState, record: StaticRecord) -> MapResult:
+        group = self._layout.groups[number]
+        first = before.copy()
+        first.set_group_cost(group.t, record.prior)
+        first.evidence[number] = record.evidence
+        reading = record.as_measurements(self._layout, self._reader)
+        # The C code does not return the transport of the tangent space.
+        update = self._solver.update if group.by_speeds else self._update
+        return update(first, reading, record.inputs, [number])
+
+    def _transport_prior(
+        self, number: int, before: InformationState, prior: QuadraticCost, result: MapResult
+    ) -> QuadraticCost:
+        if result.priors is not None:
+            return result.priors[number]
+        group = self._layout.groups[number]
+        step = result.belief.x[group.x] - before.x[group.x]
+        return prior.transported(step, None)

@@ -81,10 +81,7 @@ class RateFlow:
         return np.asarray(self._rates(np.concatenate([q, inputs])))
 
     def integrate(self, q: Array, speeds: Array, inputs: Array) -> tuple[Array, Array, Array]:
-        """Return q after one unit of time, and its derivatives by the initial q (n, n) and the speeds (n, m).
-
-        Classical Runge-Kutta steps of fourth order.
-        """
+        """Return q after one unit of time by Runge-Kutta steps, and its derivatives (n, n), (n, m)."""
         largest = float((self.is_varying * np.abs(self.rates(q, inputs))).sum(axis=0) @ np.abs(speeds))
         if not math.isfinite(largest) or largest > _MOST_STEPS * _LONGEST:
             names = ", ".join(map(str, self.coordinates))
@@ -161,10 +158,7 @@ class ProcessModel:
         return [number for number in numbers if not active.isdisjoint(self.speeds_of(number))]
 
     def retract(self, number: int, x: Array, step: Array, inputs: Array) -> tuple[Array, Array | None]:
-        """Return a group's coordinates after a tangent step, and the transport J of the tangent space.
-
-        A further step dξ at the start is J dξ in the tangent space at the end. None stands for the identity.
-        """
+        """Return coordinates after a tangent step, and its transport Jacobian; None for the identity."""
         motion = self._steps.get(number)
         if motion is None:
             return x + step, None
@@ -203,10 +197,7 @@ class ProcessModel:
     def transition(
         self, number: int, x: Array, displacement: Array, inputs: Array
     ) -> tuple[Array, Array, Array]:
-        """Return a group's coordinates after a displacement by its speeds, and its derivatives.
-
-        The derivatives by the start (t, t) and by the displacement (t, k) are in the tangent space.
-        """
+        """Return coordinates after a displacement, and its tangent Jacobians (t, t), (t, k)."""
         flow = self._flows.get(number)
         if flow is None:
             identity = self._identities[number]
@@ -357,7 +348,6 @@ class ConstantVelocity:
         commands: Mapping[Symbol, float],
         noise: Mapping[Symbol, float],
     ) -> None:
-        """Predict groups of equal sizes (g,), all at once."""
         groups = [self._layout.groups[n] for n in numbers]
         speeds = [self.at_state(n, belief, inputs) for n in numbers]
         t = np.array([group.t for group in groups])

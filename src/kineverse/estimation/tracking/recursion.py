@@ -108,10 +108,7 @@ class Recursion:
         speeds: Mapping[Symbol, float],
         noise_now: Mapping[Symbol, float] = NO_NOISE,
     ) -> TrackerState:
-        """Return the state after a time step [s] with commanded speeds.
-
-        Speeds that ``noise_now`` has get its process noise, and others the usual one.
-        """
+        """Return the state after a time step [s]; ``noise_now`` overrides the process noise."""
         if dt == 0.0:
             return state
         state = replace(state, stamp=None if state.stamp is None else state.stamp + dt, reading=None)
@@ -138,10 +135,7 @@ class Recursion:
         inputs: StateLike | None = None,
         noise_now: Mapping[Symbol, float] = NO_NOISE,
     ) -> TrackerState:
-        """Return the state predicted to a time, with other values of inputs if these are given.
-
-        A state without a time begins there.
-        """
+        """Return the state predicted to a time; a state without a time begins there."""
         if inputs is not None:
             state = replace(state, inputs=self.read_inputs(state.inputs, inputs))
         if state.stamp is None:

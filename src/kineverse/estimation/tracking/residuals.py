@@ -99,7 +99,6 @@ class MeasurementReader:
         return Measurements(values, observed, *self._whiten_all(covariances, observed))
 
     def _whiten_all(self, covariances: npt.ArrayLike, observed: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return whitening matrices and scales for covariances (m, 6, 6) of all poses."""
         checked = _numbers(covariances, "The covariances")
         if checked.shape != (len(observed), 6, 6):
             shape = (len(observed), 6, 6)

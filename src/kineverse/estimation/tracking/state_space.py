@@ -218,10 +218,7 @@ class Layout:
         return next(group for group in self.groups if number in group.limits)
 
     def is_affine(self, number: int) -> bool:
-        """Return True if all measurements of a group are affine functions of its coordinates.
-
-        Frames that are shifted only, by amounts that are affine, and vectors without a period.
-        """
+        """Return True if all measurements of a group are affine functions of its coordinates."""
         group = self.groups[number]
         if group.by_speeds or group.limits:
             return False
@@ -253,10 +250,7 @@ class Layout:
         return compile(np.concatenate(parts), self.arguments)
 
     def _jacobian(self, one: MeasurementModel, value: Expression, group: CoordinateGroup) -> Expression:
-        """Return the Jacobian of a value in the group's tangent directions, flattened row by row.
-
-        For a pose this is the geometric Jacobian: linear velocity of the origin, then angular velocity.
-        """
+        """Return the Jacobian (geometric for a pose) by the group's tangent, flattened row by row."""
         gradient = self.tangent_space.gradient(value)
         columns = []
         for speed in group.tangent:

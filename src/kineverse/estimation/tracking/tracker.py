@@ -251,7 +251,6 @@ class Tracker:
         return other
 
     def _repeat(self, other: Tracker) -> None:
-        """Update with the recent measurements of another tracker."""
         inputs = {str(s): k for k, s in enumerate(other._layout.inputs)}
         recent = list(other._recent)
         if all(stamp is not None for stamp, _, _ in recent):

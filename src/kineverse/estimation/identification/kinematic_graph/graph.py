@@ -31,10 +31,7 @@ NodeT = TypeVar("NodeT", bound=Hashable)
 def spanning_tree(
     nodes: Iterable[NodeT], gains: Mapping[frozenset[NodeT], float], leaves: Collection[NodeT] = ()
 ) -> list[frozenset[NodeT]]:
-    """Return the spanning tree, or forest, with the largest sum of gains; leaves have one connection at most.
-
-    It is the structure of largest likelihood if the density is a product over connections (Chow, Liu 1968).
-    """
+    """Return the spanning forest of largest gain (Chow and Liu 1968); leaves have one connection."""
     group = {node: {node} for node in nodes}
     chosen = []
     for connection in sorted(gains, key=lambda c: -gains[c]):
@@ -103,10 +100,7 @@ def replacement_probabilities(
     gains: Mapping[frozenset[NodeT], float],
     leaves: Collection[NodeT] = (),
 ) -> dict[frozenset[NodeT], float]:
-    """Return the probabilities of the connections that replace one, in trees without it, the largest first.
-
-    Their sum is at least the probability that the one is absent.
-    """
+    """Return the probabilities of the connections that replace one, the largest first."""
     one, other = split_tree(connection, tree)
     around = {c: gain for c, gain in gains.items() if c <= one | other}
     missing = 1.0 - edge_probabilities(one | other, around, leaves)[connection]
@@ -118,7 +112,6 @@ def replacement_probabilities(
 
 
 def _log_conductance(logs: Array, start: int, end: int) -> float:
-    """Return the log conductance between two nodes, from the log conductances of all connections."""
     order = [*(k for k in range(len(logs)) if k not in (start, end)), start, end]
     left = logs[np.ix_(order, order)]
     for _ in order[2:]:
@@ -471,7 +464,6 @@ def identify_graph(
 def _find_loops(
     between: Mapping[frozenset[str], PartPair], joints: Sequence[PartPair]
 ) -> dict[frozenset[str], KinematicEdge]:
-    """Return the joints that close loops of a tree, by their two parts."""
     tree = {frozenset((joint.parent, joint.child)): joint for joint in joints}
     candidates = []
     for connection, pair in between.items():

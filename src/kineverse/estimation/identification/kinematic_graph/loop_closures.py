@@ -304,11 +304,7 @@ class _Ends:
 def close_loops(
     loops: Iterable[ObservedLoop], joints: Sequence[PartPair]
 ) -> Iterator[tuple[ObservedLoop, LoopClosure | None]]:
-    """Yield the loops that remove mobility, the shortest first, with their closures.
-
-    The closure is None if a coordinate cannot be dependent, as that of a ball, and for joints that couple
-    components, such as screws.
-    """
+    """Yield the loops that remove mobility, the shortest first, with their closures, or None."""
     # Loops are selected by strength and then closed by length.
     selected = []
     dependents = DependentCoordinates()
@@ -449,7 +445,6 @@ def _tolerance(loop: ObservedLoop) -> float:
 
 
 def _rank(equations: Array, tolerance: float, whole: Array | None = None) -> int:
-    """Return the median rank of the equations, relative to the largest singular value of ``whole``."""
     values = np.linalg.svd(equations, compute_uv=False)
     most = values if whole is None else np.linalg.svd(whole, compute_uv=False)
     return int(np.median(np.sum(values > tolerance * np.median(most[:, 0]), axis=1)))

@@ -63,10 +63,7 @@ class PartPair:
 def identify_pair(
     tracks: Mapping[str, PoseTrack], parent: str, child: str, families: FamilyChoice
 ) -> PartPair | None:
-    """Identify the joint between two parts; None for two points, and without two common observations.
-
-    A part observed as a point becomes the child.
-    """
+    """Identify the joint between two parts, a point as the child; None without two common observations."""
     if tracks[parent].is_point:
         parent, child = child, parent
     a, b = tracks[parent], tracks[child]
@@ -139,7 +136,6 @@ def identify_observations(
 
 
 def _joint_weights(families: FamilyChoice) -> dict[str | Family, float]:
-    """Return the families and their weights, by default all but the curve."""
     weights = family_weights(families)
     if families is not None and CURVE in weights:
         raise InvalidValueError(
