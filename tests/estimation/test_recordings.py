@@ -169,7 +169,7 @@ BAD = {
     "a column twice": ("x,y,z,x\n1,2,3,4\n", "two columns 'x'"),
     "an odd unit": ("x [inch],y,z\n1,2,3\n", "the unit 'inch'. Known are m, cm, mm"),
     "parts and none": ("x,y,z,B.x,B.y,B.z\n1,2,3,4,5,6\n", "'B'.*others such as 'x' to none"),
-    "parts twice": ("part,B.x,B.y,B.z\nA,1,2,3\n", "a part is named in each row, and in"),
+    "parts twice": ("part,B.x,B.y,B.z\nA,1,2,3\n", "parts are named in rows and in"),
 }  # fmt: skip
 
 

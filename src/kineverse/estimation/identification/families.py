@@ -316,8 +316,7 @@ class Family:
         others = sorted(str(s) for s in self.transform.symbols if s not in known)
         if others:
             raise UnknownNameError(
-                f"The transform of the family '{self.name}' depends on {', '.join(others)}: neither a joint "
-                "nor a parameter of it."
+                f"The family '{self.name}' depends on {', '.join(others)}: neither a joint nor a parameter."
             )
         object.__setattr__(self, "parameters", {s: FamilyParameter(*u) for s, u in self.parameters.items()})
         for symbol, (low, high) in self.joints.items():
@@ -326,8 +325,7 @@ class Family:
         for symbol, unknown in self.unknowns.items():
             if not (unknown.deviation > 0.0 and unknown.lower <= unknown.start <= unknown.upper):
                 raise InvalidValueError(
-                    f"The parameter '{symbol}' has a positive deviation, and a start within its bounds; not "
-                    f"{unknown}."
+                    f"'{symbol}' has a positive deviation, and a start within its bounds, not {unknown}."
                 )
 
     @property

@@ -165,11 +165,8 @@ def solve_curve(
             if data.stated:
                 return NoiseSolution(continue_curve(some, known), STATED_NOISE)
             return adapt_noise(some, NoiseSolution(before.scored, before.noise), continue_curve)
-        orders = [
-            one.scored.solution.values[:, 0]
-            for one in solutions.values()
-            if one.scored.solution.motion.joints == 1 and np.array_equal(one.inliers, rows)
-        ]
+        others = [one.scored.solution for one in solutions.values() if np.array_equal(one.inliers, rows)]
+        orders = [other.values[:, 0] for other in others if other.motion.joints == 1]
         return _fit_to_noise(data, some, orders, competitor)
 
     solution = solve(everything)

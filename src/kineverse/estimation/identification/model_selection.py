@@ -304,10 +304,8 @@ def solve_families(
     """Return the most likely member of each family, for observations in a unit of length [m]."""
     solver.prepare()
     statistics = MotionStatistics(observations)
-    return {
-        name: solver.maximum_likelihood(observations, _starts(observations, name, statistics, unit))
-        for name in families
-    }
+    starts = {name: _starts(observations, name, statistics, unit) for name in families}
+    return {name: solver.maximum_likelihood(observations, each) for name, each in starts.items()}
 
 
 def _starts(
@@ -334,10 +332,8 @@ def weigh_families(
 ) -> IdentificationResult:
     """Return the fits of all families with their posterior probabilities."""
     solutions = {name: _weigh_observations(data, one) for name, one in solutions.items()}
-    logs = bound_log_evidences(
-        {name: one.log_evidence + one.log_prior for name, one in solutions.items()},
-        {name: one.scored.solution for name, one in solutions.items()},
-    )
+    evidences = {name: one.log_evidence + one.log_prior for name, one in solutions.items()}
+    logs = bound_log_evidences(evidences, {name: one.scored.solution for name, one in solutions.items()})
     total: Array = np.array([logs[name] + math.log(weights[name]) for name in solutions])
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
     lazy_fits = [

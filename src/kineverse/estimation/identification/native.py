@@ -27,16 +27,8 @@ if TYPE_CHECKING:
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm", *NO_UNDEFINED_FLAGS)
 _FAMILY = ("rows", "joints", "lefts", "rights", "pitches", "pitched", "reach", "slides")
 _SCALES = (
-    "reach_scale",
-    "pitch_scale",
-    "close",
-    "little",
-    "narrowest",
-    "settled",
-    "better",
-    "slid",
-    "weight",
-)
+    "reach_scale", "pitch_scale", "close", "little", "narrowest", "settled", "better", "slid", "weight"
+)  # fmt: skip
 _COUNTS = ("steps", "first_steps", "turns", "sliding_turns", "mirrored_turns", "mirrored_steps", "widths")
 # Largest number of parameters, and of all unknowns, of a family in C.
 _PARAMETERS, _UNKNOWNS = 12, 16

@@ -292,8 +292,6 @@ def pair_tracks(parent: PoseTrack, child: PoseTrack, rows: npt.NDArray[Any]) -> 
 def concatenate_tracks(parts: Sequence[PoseTrack]) -> PoseTrack:
     """Return tracks joined in time."""
     known = [part.covariances for part in parts if part.covariances is not None]
-    poses, seen = (
-        np.concatenate([part.poses for part in parts]),
-        np.concatenate([part.seen for part in parts]),
-    )
+    poses = np.concatenate([part.poses for part in parts])
+    seen = np.concatenate([part.seen for part in parts])
     return PoseTrack(poses, np.concatenate(known) if known else None, seen)

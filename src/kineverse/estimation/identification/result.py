@@ -162,13 +162,7 @@ class Fit:
         return math.sqrt(float(self.covariance[k, k]))
 
     def operation(
-        self,
-        name: str,
-        parent: str,
-        child: str | None = None,
-        *,
-        as_point: bool = False,
-        limits: bool = True,
+        self, name: str, parent: str, child: str | None = None, *, as_point: bool = False, limits: bool = True
     ) -> Operation:
         """Return the joint as an operation, with the observed range as its limits.
 

@@ -298,10 +298,7 @@ def _propose_replacement(
         return None, "no other joint explains the poses better; the errors are larger than stated"
     if not follows_another(model, data.joint) and _explains_alone(model, recent, alternative):
         # Another joint would not resolve the contradiction.
-        return (
-            None,
-            "it explains the poses alone, but not together with the limits or joints that it depends on",
-        )
+        return None, "it explains the poses alone, but not together with the limits or joints it depends on"
     try:
         used = np.searchsorted(data.times, recent.times)
         rows, fit = extend_fit(alternative.best, data.observations, used)

@@ -232,10 +232,8 @@ class PlausibilityMonitor:
         if self._last is None:
             return 0.0 if at is None else check_time(at, -math.inf)
         if (at is not None) != self._stamped:
-            raise InvalidValueError(
-                "Either all observations have a time (at=), or none: the first "
-                f"{'had one' if self._stamped else 'had none'}."
-            )
+            first = "had one" if self._stamped else "had none"
+            raise InvalidValueError(f"Either all observations have a time (at=), or none: the first {first}.")
         return self._last + 1.0 if at is None else check_time(at, self._last)
 
     def _add(self, tracks: Mapping[str, PoseTrack], at: float) -> None:

@@ -80,11 +80,8 @@ def find_joint_value(
 
 def follows_another(model: Model, joint: TestableJoint) -> bool:
     """Return True if an operation records an expression that its joint follows, as a mimic joint does."""
-    writes = model.history.entry(joint.tag).writes
-    return any(
-        kind == ARTICULATIONS and value.child == joint.frame and value.follows is not None
-        for (kind, _), value in writes.items()
-    )
+    records = _records(model.history.entry(joint.tag).writes, joint)
+    return any(record.follows is not None for record in records.values())
 
 
 def extend_fit(fit: Fit, observations: Observations, used: RowIndices) -> tuple[RowIndices, Fit]:

@@ -109,10 +109,8 @@ class _Finder:
         return name
 
     def _moves(self, name: str) -> bool:
-        return any(
-            isinstance(factor, Expression) and any(s.has_derivative for s in factor.symbols)
-            for factor in self.model.frames[name].factors
-        )
+        expressions = [f for f in self.model.frames[name].factors if isinstance(f, Expression)]
+        return any(symbol.has_derivative for factor in expressions for symbol in factor.symbols)
 
     def _chain(self, name: str) -> list[str]:
         return [*ancestors(name, self.model.frames.__getitem__), WORLD]

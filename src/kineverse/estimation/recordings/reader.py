@@ -95,13 +95,10 @@ def parse_columns(names: Sequence[str], where: str) -> Columns:
         raise FormatError(
             f"{where}: no column is a position; the columns are {_format_list(names)}. {COLUMN_HELP}"
         )
-    if row_part is not None and set(owners) != {""}:
-        raise FormatError(
-            f"{where}: a part is named in each row, and in the names of columns too "
-            f"('{next(filter(None, owners))}'); one or the other."
-        )
-    if "" in owners and len(owners) > 1:
-        named = next(filter(None, owners))
+    named = next(filter(None, owners), "")
+    if row_part is not None and named:
+        raise FormatError(f"{where}: parts are named in rows and in columns ('{named}'); one or the other.")
+    if "" in owners and named:
         raise FormatError(f"{where}: some columns belong to a part ('{named}'), others such as 'x' to none.")
     parts = {part: _parse_part(part, places, where, ignored) for part in owners}
     return Columns(tuple(names), parts, time, row_part, factors, tuple(ignored))

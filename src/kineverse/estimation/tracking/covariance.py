@@ -221,7 +221,7 @@ class CovarianceInflation(_CovarianceComputation):
         directions, _ = self._unobservable.directions(number, information)
         if len(directions):
             covariance = inverse_spd(information)
-            most, slopes = self._curvature(number, belief, directions, record, self._reader.empty())
+            most, slopes = self._curvature(number, belief, directions, self._reader.empty())
             # Predictions become as uncertain as they are curved.
             lacking = []
             for i, slope in slopes.items():
@@ -242,19 +242,16 @@ class CovarianceInflation(_CovarianceComputation):
         block = self._layout.groups[number].block
         directions, _ = self._unobservable.directions(number, belief.information[block])
         reading = record.as_measurements(self._layout, self._reader)
-        most, _ = self._curvature(number, belief, directions, record, reading)
+        most, _ = self._curvature(number, belief, directions, reading)
         return max(most.values()) < _LINEAR**2
 
     def _curvature(
-        self,
-        number: int,
-        belief: InformationState,
-        directions: Array,
-        record: StaticRecord,
-        noise: Measurements,
+        self, number: int, belief: InformationState, directions: Array, noise: Measurements
     ) -> tuple[dict[int, float], dict[int, Array]]:
         """Return the squared nonlinearity of each measurement, and its Jacobian, in deviations of noise."""
-        group, inputs = self._layout.groups[number], record.inputs
+        group, record = self._layout.groups[number], belief.records[number]
+        assert record is not None
+        inputs = record.inputs
         measured = list(record.means)
         here = self._residuals.evaluate(belief.x, inputs)
         as_predicted = noise._replace(values=self._reader.as_values(here))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -29,7 +29,7 @@ from .observability import (
     find_unexplained,
     move_origin,
 )
-from .process_model import ConstantVelocity, ProcessModel
+from .process_model import ConstantVelocity, ProcessModel, Speeds
 from .residuals import MeasurementReader, Measurements, Residuals
 from .state_space import Layout
 
@@ -64,14 +64,8 @@ class UpdateStep:
         self.reader = MeasurementReader(layout)
         self.solver = MapSolver(layout, self.residuals, self.process_model, limits)
         self.unobservable = UnobservableDirections(layout)
-        components = Components(
-            layout,
-            self.residuals,
-            self.process_model,
-            self.reader,
-            self.solver.group_bounds,
-            self.unobservable,
-        )
+        shared = layout, self.residuals, self.process_model, self.reader
+        components = Components(*shared, self.solver.group_bounds, self.unobservable)
         self.static_batch = StaticBatch(components, self.solver, self._map_update)
         self.ridge_covariance, self.inflation = RidgeCovariance(components), CovarianceInflation(components)
         self.merge_criterion = MergeCriterion(components, self.ridge_covariance)
@@ -121,7 +115,7 @@ class UpdateStep:
             unexplained = sorted({*unexplained, *turned})
         if not candidates:
             return StepResult(after, result.nis, result.dof, (), result.rounds)
-        first = self._candidate(result.belief, None, result.nis, result.dof, unexplained, inputs)
+        first = self._candidate(result, unexplained, inputs)
         after, best = after.select(
             [first, *candidates], partial(self.merge_criterion.should_merge, inputs, self.periods)
         )
@@ -143,18 +137,18 @@ class UpdateStep:
 
     def _restart(
         self,
-        before: InformationState,
+        old: InformationState,
         result: MapResult,
         reading: Measurements,
         inputs: Array,
         groups: list[int],
     ) -> list[Candidate]:
-        starts = self.stationary_points.restart_states(before, result.belief, groups, inputs)
+        starts = self.stationary_points.restart_states(old, result.belief, groups, inputs)
         return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
 
     def _try_other_turns(
         self,
-        before: InformationState,
+        old: InformationState,
         result: MapResult,
         reading: Measurements,
         inputs: Array,
@@ -171,17 +165,16 @@ class UpdateStep:
             place, off = result.belief.x.copy(), []
             for turn in (0.0, math.tau):
                 place[i] = result.belief.x[i] + turn
-                errors = self.residuals.errors(
-                    self.residuals.evaluate(place, inputs), reading, group.observation_indices
-                )
+                out = self.residuals.evaluate(place, inputs)
+                errors = self.residuals.errors(out, reading, group.observation_indices)
                 off.append(np.concatenate([error for error, _ in errors.values()]))
             change = off[1] - off[0]
             turns = round(-float(off[0] @ change) / max(float(change @ change), np.finfo(float).tiny))
             if turns:
                 place[i] = result.belief.x[i] + turns * math.tau
-                start = before.copy()
+                start = old.copy()
                 there = place[group.x]
-                move_origin(start, number, group, there, there - before.x[group.x], None)
+                move_origin(start, number, group, there, there - old.x[group.x], None)
                 candidates += self._restart_from(start, reading, inputs, [number])
         return candidates
 
@@ -206,18 +199,17 @@ class UpdateStep:
 
     def _relinearised(
         self,
-        before: InformationState,
+        old: InformationState,
         result: MapResult,
         reading: Measurements,
         inputs: Array,
         groups: list[int],
     ) -> Candidate:
-        self.static_batch.relinearise(before, result, reading, inputs, groups)
+        self.static_batch.relinearise(old, result, reading, inputs, groups)
         _require_finite(result.belief.numbers)
-        return self._candidate(result.belief, result.weights, result.nis, result.dof, groups, inputs)
+        return self._candidate(result, groups, inputs)
 
     def _forget_other_inputs(self, mixture: GaussianSum, inputs: Array) -> GaussianSum:
-
         def changed(belief: InformationState) -> InformationState:
             records = enumerate(belief.records)
             return self._inflated(
@@ -235,12 +227,7 @@ class UpdateStep:
         return wide
 
     def predict(
-        self,
-        belief: InformationState,
-        inputs: Array,
-        dt: float,
-        speeds: Mapping[Symbol, float],
-        noise: Mapping[Symbol, float],
+        self, belief: InformationState, inputs: Array, dt: float, speeds: Speeds, noise: Speeds
     ) -> InformationState:
         """Predict a belief by ``dt`` seconds; it stays about the most probable point inside the limits."""
         if self.velocity is not None:
@@ -339,11 +326,9 @@ class UpdateStep:
         )
         nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
         dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
-        rejected = [
-            i
-            for i, number in enumerate(self.layout.group_of)
-            if reading.mask[i] and (c := best[number]) and c.weights is not None and c.weights[i] < 0.5
-        ]
+        weights = [None if c is None else c.weights for c in best]
+        of_group = [(i, weights[n]) for i, n in enumerate(self.layout.group_of) if reading.mask[i]]
+        rejected = [i for i, w in of_group if w is not None and w[i] < 0.5]
         if rejected:
             out = self.residuals.evaluate(after.best.x, inputs)
             for i, (error, _) in self.residuals.errors(out, reading, rejected).items():
@@ -352,16 +337,11 @@ class UpdateStep:
         return StepResult(after, nis, dof, tuple(rejected), rounds)
 
     def restart(
-        self,
-        before: GaussianSum,
-        initial: GaussianSum,
-        groups: Sequence[int],
-        reading: Measurements,
-        inputs: Array,
+        self, old: GaussianSum, initial: GaussianSum, groups: list[int], reading: Measurements, inputs: Array
     ) -> StepResult:
         """Return the result of a reading of some groups that restart; they keep their evidence."""
         mask = reading.mask & np.isin(self.layout.group_of, groups)
-        evidence = {n: float(np.logaddexp.reduce(before.evidence(n))) for n in groups}
+        evidence = {n: float(np.logaddexp.reduce(old.evidence(n))) for n in groups}
 
         def with_evidence(belief: InformationState) -> InformationState:
             result = belief.copy()
@@ -369,9 +349,9 @@ class UpdateStep:
                 result.evidence[number] = log
             return result
 
-        start = before.replace_groups(initial.map(with_evidence), groups)
+        start = old.replace_groups(initial.map(with_evidence), groups)
         result = self.update(start, reading._replace(mask=mask), inputs)
-        self._keep_turns(result.mixture, before.best.x)
+        self._keep_turns(result.mixture, old.best.x)
         return result
 
     def find_accepted(
@@ -436,7 +416,7 @@ class UpdateStep:
                 log = self.outliers.log_density(self.layout.observations[i], float(reading.log_scale[i]))
                 all_outliers.evidence[self.layout.group_of[i]] += log
         weights = np.zeros(len(self.layout.observations))
-        candidates.append(self._candidate(all_outliers, weights, none, none, groups, inputs))
+        candidates.append(self._candidate(MapResult(all_outliers, none, none, 0, weights), groups, inputs))
         return candidates, rounds
 
     def _with_rejected(self, result: MapResult, reading: Measurements, groups: list[int]) -> list[int]:
@@ -445,21 +425,13 @@ class UpdateStep:
         rejected = reading.mask & (result.weights < 0.5)
         return [n for n in groups if rejected[list(self.layout.groups[n].observation_indices)].any()]
 
-    def _candidate(
-        self,
-        belief: InformationState,
-        weights: Array | None,
-        nis: Array,
-        dof: Array,
-        groups: list[int],
-        inputs: Array,
-    ) -> Candidate:
-        return Candidate(belief, self.residuals.evaluate(belief.x, inputs), weights, nis, dof, groups)
+    def _candidate(self, result: MapResult, groups: list[int], inputs: Array) -> Candidate:
+        predicted = self.residuals.evaluate(result.belief.x, inputs)
+        return Candidate(result.belief, predicted, result.weights, result.nis, result.dof, groups)
 
 
 def _require_finite(*arrays: Array) -> None:
     if not all(np.isfinite(one).all() for one in arrays):
         raise InvalidValueError(
-            "The step leads to numbers that are not finite: measurements or covariances are too large or too "
-            "small for floating point. The belief is unchanged."
+            "The step leads beyond floating point: measurements or covariances are too large or too small."
         )

@@ -209,12 +209,9 @@ class MapSolver:
             # Least cost without limits. In the linear case this is the innovation squared in S⁻¹.
             nis[number] = max(2 * posterior.minimum, 0.0)
             dof[number] = sum(self._layout.observations[i].size for i in measured if weights[i] >= 0.5)
-            after.evidence[number] += (
-                (iterate.prior.log_determinant - posterior.log_determinant) / 2
-                - (posterior.cost - iterate.constrained_minimum)
-                - iterate.excess
-                - float(reading.log_scale[measured].sum())
-            )
+            gained = (iterate.prior.log_determinant - posterior.log_determinant) / 2
+            gained -= posterior.cost - iterate.constrained_minimum + iterate.excess
+            after.evidence[number] += gained - float(reading.log_scale[measured].sum())
         priors = {number: iterate.prior for number, iterate in iterates.items()}
         return MapResult(after, nis, dof, rounds, None if loss == "gaussian" else weights, priors=priors)
 

@@ -205,8 +205,8 @@ def require_covariance(covariance: npt.ArrayLike, size: int, label: str) -> Arra
     least = float(np.linalg.eigvalsh(matrix)[0])
     if least <= 0:
         raise InvalidValueError(
-            f"The covariance of '{label}' is not positive: its least eigenvalue is {least:.3g}. Pass exactly "
-            "known values as inputs=, and leave out what is not measured."
+            f"The covariance of '{label}' is not positive: its least eigenvalue is {least:.3g}. Known "
+            "values are inputs=; leave out what is not measured."
         )
     return matrix
 

@@ -111,13 +111,8 @@ class NativeMapSolver:
             "work": np.zeros(sum(3 * len(g.t) + 3 * len(g.t) ** 2 + 2 * len(g.x) for g in layout.groups)),
             "squares": self._squares,
         }
-        self._problem = _Problem(
-            observations=len(layout.observations),
-            groups=count,
-            coordinates=size,
-            directions=directions,
-            known=len(layout.inputs),
-        )
+        counts = (len(layout.observations), count, size, directions, len(layout.inputs))
+        self._problem = _Problem(**dict(zip(_COUNTS, counts, strict=True)))
         for name, array in (*self._indices.items(), *self._numbers.items()):
             setattr(self._problem, name, array.ctypes.data)
         self._results = np.zeros((2, count))

@@ -106,12 +106,9 @@ class StationaryPoints:
 
     def unexplained(self, before: InformationState, result: MapResult) -> list[int]:
         """Return the groups whose residuals exceed the noise and that have unobservable directions."""
-        return [
-            n
-            for n in find_unexplained(result)
-            if not self._is_affine[n]
-            and (before.records[n] is not None or self._unobservable.is_in(n, result.belief))
-        ]
+        curved = [n for n in find_unexplained(result) if not self._is_affine[n]]
+        records, is_in = before.records, self._unobservable.is_in
+        return [n for n in curved if records[n] is not None or is_in(n, result.belief)]
 
     def restart_states(
         self, before: InformationState, after: InformationState, groups: Sequence[int], inputs: Array

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from .gaussian_sum_filter import UpdateStep
 
 
+Speeds: TypeAlias = Mapping[Symbol, float]
+
 # Largest displacement in one Runge-Kutta step; the error is below 1e-8.
 _LONGEST = 0.1
 _MOST_STEPS = 100_000
@@ -132,7 +134,7 @@ class ProcessModel:
         flow = self._flows.get(number)
         return self._layout.groups[number].tangent if flow is None else flow.speeds
 
-    def is_noise_only(self, number: int, speeds: Mapping[Symbol, float]) -> bool:
+    def is_noise_only(self, number: int, speeds: Speeds) -> bool:
         """Return True if a group moves by noise alone, in directions that are its coordinates."""
         group = self._layout.groups[number]
         return number not in self._flows and not any(speeds.get(v, 0.0) for v in group.tangent)
@@ -151,7 +153,7 @@ class ProcessModel:
         """True if some coordinates move by rates other than their own speeds."""
         return bool(self._flows)
 
-    def find_moving_groups(self, speeds: Mapping[Symbol, float], noise: Mapping[Symbol, float]) -> list[int]:
+    def find_moving_groups(self, speeds: Speeds, noise: Speeds) -> list[int]:
         """Return the numbers of the groups that move at given speeds or with noise."""
         active = {v for by in (speeds, noise) for v, value in by.items() if value}
         numbers = range(len(self._layout.groups))
@@ -171,12 +173,7 @@ class ProcessModel:
         return np.eye(len(x)) if motion is None else motion.rates(x, inputs)
 
     def predict(
-        self,
-        belief: InformationState,
-        inputs: Array,
-        dt: float,
-        speeds: Mapping[Symbol, float],
-        noise: Mapping[Symbol, float],
+        self, belief: InformationState, inputs: Array, dt: float, speeds: Speeds, noise: Speeds
     ) -> None:
         """Predict a belief by ``dt`` seconds, with speeds and variances per second; in place."""
         for number, group in enumerate(self._layout.groups):
@@ -296,18 +293,13 @@ class ConstantVelocity:
             by_size.setdefault(size, []).append(number)
         self._batches = list(by_size.values())
 
-    def initialise(
-        self, belief: InformationState, means: Mapping[Symbol, float], variances: Mapping[Symbol, float]
-    ) -> None:
+    def initialise(self, belief: InformationState, means: Speeds, variances: Speeds) -> None:
         """Set the speeds of all groups, those without a mean to 0, independent of the state; in place."""
         for number, group in enumerate(self._layout.groups):
             speeds = self._process_model.speeds_of(number)
-            belief.speeds[number] = ConditionalSpeeds(
-                belief.x[group.x].copy(),
-                np.array([means.get(v, 0.0) for v in speeds]),
-                np.zeros((len(speeds), len(group.t))),
-                np.diag([variances[v] for v in speeds]),
-            )
+            mean, gain = np.array([means.get(v, 0.0) for v in speeds]), np.zeros((len(speeds), len(group.t)))
+            covariance = np.diag([variances[v] for v in speeds])
+            belief.speeds[number] = ConditionalSpeeds(belief.x[group.x].copy(), mean, gain, covariance)
 
     def at_state(self, number: int, belief: InformationState, inputs: Array) -> ConditionalSpeeds:
         """Return the speeds of a group given a step in the tangent space at its present state."""
@@ -326,12 +318,7 @@ class ConstantVelocity:
         return symmetric(speeds.covariance + speeds.gain @ state @ speeds.gain.T)
 
     def predict(
-        self,
-        belief: InformationState,
-        inputs: Array,
-        dt: float,
-        commands: Mapping[Symbol, float],
-        noise: Mapping[Symbol, float],
+        self, belief: InformationState, inputs: Array, dt: float, commands: Speeds, noise: Speeds
     ) -> None:
         """Predict states and speeds by ``dt`` seconds; in place."""
         # Too long a step leads to numbers that are not finite, which the caller refuses.
@@ -345,8 +332,8 @@ class ConstantVelocity:
         belief: InformationState,
         inputs: Array,
         dt: float,
-        commands: Mapping[Symbol, float],
-        noise: Mapping[Symbol, float],
+        commands: Speeds,
+        noise: Speeds,
     ) -> None:
         groups = [self._layout.groups[n] for n in numbers]
         speeds = [self.at_state(n, belief, inputs) for n in numbers]

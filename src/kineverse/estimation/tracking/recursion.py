@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -13,13 +13,13 @@ import numpy as np
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
 from kineverse.state import State, StateLike
-from kineverse.symbols import Symbol
 
 from .bounds import SpeedLocks
 from .estimate import TrackerState, TrackLoss, find_measured, find_refuted
 from .gaussian_sum_filter import StepResult, UpdateStep
 from .information_state import InformationState
 from .initialization import InitialBelief
+from .process_model import Speeds
 from .residuals import Measurements
 
 
@@ -78,7 +78,7 @@ def _apply_late(
     return apply(predict(before, stamp))
 
 
-NO_NOISE: Mapping[Symbol, float] = MappingProxyType({})
+NO_NOISE: Speeds = MappingProxyType({})
 """Process noise of no speed."""
 
 
@@ -88,7 +88,7 @@ class Recursion:
 
     update_step: UpdateStep
     first: InitialBelief
-    noise: Mapping[Symbol, float]  # process noise by speed
+    noise: Speeds  # process noise by speed
     locks: SpeedLocks | None  # None if locks are ignored
     lost_after: int  # number of refuted updates in a row after which a group is lost
     restarts: bool  # True if lost groups restart
@@ -102,11 +102,7 @@ class Recursion:
         return TrackerState(mixture, result, loss, inputs, stamp)
 
     def predict(
-        self,
-        state: TrackerState,
-        dt: float,
-        speeds: Mapping[Symbol, float],
-        noise_now: Mapping[Symbol, float] = NO_NOISE,
+        self, state: TrackerState, dt: float, speeds: Speeds, noise_now: Speeds = NO_NOISE
     ) -> TrackerState:
         """Return the state after a time step [s]; ``noise_now`` overrides the process noise."""
         if dt == 0.0:
@@ -131,9 +127,9 @@ class Recursion:
         self,
         state: TrackerState,
         stamp: float,
-        speeds: Mapping[Symbol, float],
+        speeds: Speeds,
         inputs: StateLike | None = None,
-        noise_now: Mapping[Symbol, float] = NO_NOISE,
+        noise_now: Speeds = NO_NOISE,
     ) -> TrackerState:
         """Return the state predicted to a time; a state without a time begins there."""
         if inputs is not None:
@@ -147,9 +143,9 @@ class Recursion:
         state: TrackerState,
         reading: Measurements,
         stamp: float | None,
-        speeds: Mapping[Symbol, float],
+        speeds: Speeds,
         inputs: StateLike | None,
-        noise_now: Mapping[Symbol, float] = NO_NOISE,
+        noise_now: Speeds = NO_NOISE,
     ) -> TrackerState:
         """Return the state after a reading at a time, or at the present one."""
         step, values = self.update_step, self.read_inputs(state.inputs, inputs)

@@ -25,19 +25,9 @@ from .estimate import Estimate, RecentPoses, TrackerState, TrackLoss, collect_re
 from .gaussian_sum_filter import UpdateStep
 from .information_state import InformationState
 from .initialization import InitialValues, make_initial_belief
-from .measurements import (
-    ObservedLike,
-    build_measurement_models,
-    list_observed,
-    require_mapping,
-)
+from .measurements import ObservedLike, build_measurement_models, list_observed, require_mapping
 from .native import native_library
-from .process_model import (
-    INITIAL_SPEED_TIME,
-    Process,
-    check_process,
-    default_process_noise,
-)
+from .process_model import INITIAL_SPEED_TIME, Process, check_process, default_process_noise
 from .recursion import FixedLag, Recursion, Step
 from .residuals import Measurements
 
@@ -142,14 +132,8 @@ class Tracker:
         noise = {**default_process_noise(self._update_step, process, first.x, known), **noise}
         variances = {v: INITIAL_SPEED_TIME * q for v, q in noise.items()}
         first = replace(first, speed_variances={**variances, **first.speed_variances})
-        self._recursion = Recursion(
-            self._update_step,
-            first,
-            noise,
-            SpeedLocks(model, layout, self._update_step.process_model) if locks else None,
-            lost_after,
-            restart,
-        )
+        held = SpeedLocks(model, layout, self._update_step.process_model) if locks else None
+        self._recursion = Recursion(self._update_step, first, noise, held, lost_after, restart)
         self._now = self._recursion.start(values, getattr(start, "stamp", None))
         self._buffer = FixedLag(lag)
         self._lock = CallLock()
@@ -271,11 +255,7 @@ class Tracker:
 
     @one_at_a_time
     def reset(
-        self,
-        start: StateLike | None = None,
-        *,
-        uncertainty: StateLike | None = None,
-        at: float | None = None,
+        self, start: StateLike | None = None, *, uncertainty: StateLike | None = None, at: float | None = None
     ) -> Estimate:
         """Start again, or set the estimate of some coordinates.
 
@@ -316,13 +296,9 @@ class Tracker:
             first = first.with_values(self._update_step, values)
             changed = {*values.coordinates, *values.speeds, *values.speed_deviations}
             changed |= {tangent_space.tangent[k] for k in values.deviations}
-            groups = [
-                n
-                for n, group in enumerate(self._layout.groups)
-                if not changed.isdisjoint(
-                    (*group.coordinates, *group.tangent, *self._update_step.process_model.speeds_of(n))
-                )
-            ]
+            speeds_of = self._update_step.process_model.speeds_of
+            moving = [{*g.coordinates, *g.tangent, *speeds_of(n)} for n, g in enumerate(self._layout.groups)]
+            groups = [n for n, symbols in enumerate(moving) if changed & symbols]
         mixture = now.mixture.replace_groups(
             first.spread(self._update_step, np.nan_to_num(now.inputs)), groups
         )
@@ -383,11 +359,11 @@ class Tracker:
         return speeds
 
     def _read_noise(self, process_noise: StateLike | None) -> dict[Symbol, float]:
-        noise = require_mapping({} if process_noise is None else process_noise, "process_noise=")
-        return {
-            self._update_step.process_model.speed(k): as_tolerance(v, f"The process noise of '{k}'")
-            for k, v in noise.items()
-        }
+        result, noise = {}, {} if process_noise is None else process_noise
+        for key, value in require_mapping(noise, "process_noise=").items():
+            subject = f"The process noise of '{key}' (0 for a part that never moves)"
+            result[self._update_step.process_model.speed(key)] = as_tolerance(value, subject)
+        return result
 
     @one_at_a_time
     def update(

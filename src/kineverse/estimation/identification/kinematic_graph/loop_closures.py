@@ -181,11 +181,9 @@ def closes_loop(pair: PartPair, joints: Sequence[PartPair]) -> bool:
     rows = np.searchsorted(pair.times, chain.times)
     values = np.concatenate([chain.values, fit.joint_values[rows]], axis=1)
     deviations = np.concatenate([chain.deviations, fit.deviations[rows]], axis=1)
-    angles = [*chain.is_angle, *find_angles(fit)]
-    samples = [
-        _JointSamples(values[:, k], deviations[:, k], angle and bool(np.ptp(values[:, k]) > _WRAPPING))
-        for k, angle in enumerate(angles)
-    ]
+    is_wide = np.ptp(values, axis=0) > _WRAPPING
+    is_periodic = np.logical_and([*chain.is_angle, *find_angles(fit)], is_wide).tolist()
+    samples = [_JointSamples(*each) for each in zip(values.T, deviations.T, is_periodic, strict=True)]
     return any(_determine(samples, chosen) for chosen in combinations(range(len(samples)), count))
 
 
@@ -315,11 +313,10 @@ def close_loops(
         elif _can_move(loop) and (plan := _plan(loop, ends, dependents)) is not None:
             dependents.add(plan.motion, plan.columns, plan.slopes)
             selected.append((loop, ends))
-    observed = {
-        x: (joint.times, joint.result.best.joint_values[:, k])
-        for joint in joints
-        for k, x in enumerate(_coordinates(joint.result.best, joint.child) or ())
-    }
+    observed = {}
+    for joint in joints:
+        for k, x in enumerate(_coordinates(joint.result.best, joint.child) or ()):
+            observed[x] = joint.times, joint.result.best.joint_values[:, k]
     dependents = DependentCoordinates()
     for loop, ends in sorted(selected, key=lambda pair: len(pair[0].chain)):
         plan = _plan(loop, ends, dependents, dependents.leading)

@@ -146,9 +146,7 @@ def _joint_weights(families: FamilyChoice) -> dict[str | Family, float]:
 
 
 def identify_pairs(
-    tracks: Mapping[str, PoseTrack],
-    families: FamilyChoice,
-    progress: Callable[[int, int], object] | None,
+    tracks: Mapping[str, PoseTrack], families: FamilyChoice, progress: Callable[[int, int], object] | None
 ) -> dict[frozenset[str], PartPair]:
     """Identify the joints between all pairs of parts that were observed together."""
     names = list(combinations(tracks, 2))
