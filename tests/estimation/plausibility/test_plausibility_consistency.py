@@ -53,7 +53,7 @@ def add_consistency(model: kv.Model, observations: dict[str, Array]) -> dict[str
     judged = {joint: KnownJoint(model, joint.child, joint.parent) for joint in found.joints}
     each = {}
     for joint, served in judged.items():
-        times = np.flatnonzero(known[joint.parent].seen & known[joint.child].seen)
+        times = np.flatnonzero(known[joint.parent].observed & known[joint.child].observed)
         each[joint] = TimedResiduals(
             times, compute_residuals(served, pair_tracks(known[joint.parent], known[joint.child], times))
         )

@@ -365,7 +365,7 @@ _SAMPLES = 24
 _DENSEST = 0.75
 # Log evidence that a curve may lack, and the part of it that twice as many knots must leave at most.
 _HOPELESS, _LEFT = 30.0, 0.6
-# Largest number of observations among which the shortest paths are searched, and by which the shape is found.
+# Largest numbers of observations among which paths are searched, and to which a shape is fitted.
 _MOST, _MOST_FITTED = 120, 240
 # Largest difference of poses that are equal.
 _EQUAL = 1e-9

@@ -51,7 +51,7 @@ def convert_to_unit(observations: Observations, unit: float) -> Observations:
 
 
 def log_density(count: float, unit: float) -> float:
-    """Return the log ratio of densities of ``count`` poses, given a mean pose, in metres and in units."""
+    """Return the log ratio of densities of ``count`` poses about a mean pose, in metres and in units."""
     return 3.0 * (1 - count) * math.log(unit)
 
 

@@ -223,7 +223,7 @@ class PoseTrack:
 
     poses: Array  # (N, 4, 4). The rotations of a point are arbitrary
     covariances: Array | None  # (N, 6, 6), or (N, 3, 3) of a point; None for exact poses
-    seen: npt.NDArray[np.bool_]  # mask of the times with an observation, (N,)
+    observed: npt.NDArray[np.bool_]  # mask of the times with an observation, (N,)
 
     @property
     def is_point(self) -> bool:
@@ -268,13 +268,13 @@ def _track(name: str, observed: Any, noise: npt.ArrayLike | None, points: bool) 
     rows = 3 if is_point else 6
     if not len(poses):
         return PoseTrack(poses, np.zeros((0, rows, rows)), np.zeros(0, dtype=bool))
-    seen: npt.NDArray[np.bool_] = np.logical_not(np.isnan(poses).all(axis=(1, 2)))
-    poses[~seen] = np.eye(4)
+    mask: npt.NDArray[np.bool_] = np.logical_not(np.isnan(poses).all(axis=(1, 2)))
+    poses[~mask] = np.eye(4)
     check_rigid(poses, f"frame '{name}'")
     spread = np.array(covariance, dtype=np.float64)
-    if spread.ndim == 3 and len(spread) == len(seen):
-        spread[~seen] = np.eye(spread.shape[-1])
-    return PoseTrack(poses, covariances(spread, len(poses), rows, f"frame '{name}'"), seen)
+    if spread.ndim == 3 and len(spread) == len(mask):
+        spread[~mask] = np.eye(spread.shape[-1])
+    return PoseTrack(poses, covariances(spread, len(poses), rows, f"frame '{name}'"), mask)
 
 
 def exact_track(count: int) -> PoseTrack:
@@ -293,5 +293,5 @@ def concatenate_tracks(parts: Sequence[PoseTrack]) -> PoseTrack:
     """Return tracks joined in time."""
     known = [part.covariances for part in parts if part.covariances is not None]
     poses = np.concatenate([part.poses for part in parts])
-    seen = np.concatenate([part.seen for part in parts])
-    return PoseTrack(poses, np.concatenate(known) if known else None, seen)
+    observed = np.concatenate([part.observed for part in parts])
+    return PoseTrack(poses, np.concatenate(known) if known else None, observed)

@@ -63,7 +63,7 @@ def find_exchanged_frames(
 
 def _fits(served: KnownJoint, tracks: Mapping[str, PoseTrack], joint: TestableJoint, since: int) -> bool:
     parent, child = tracks[joint.parent], tracks[joint.child]
-    rows = np.flatnonzero(parent.seen & child.seen)
+    rows = np.flatnonzero(parent.observed & child.observed)
     rows = rows[rows >= since][:_COMPARED]
     if not len(rows):
         return False
@@ -107,8 +107,8 @@ def check_plausibility(
     noise
         Default covariance of a pose, (6, 6), see :mod:`kineverse.estimation.noise`.
     relative_to
-        Frame in which poses are given. Its pose is taken as exactly known. It is compared with other frames
-        where nothing else on its part is observed. None for an observer that is no part of the model.
+        Frame in which poses are expressed. Its pose is taken as exactly known. It is compared with other
+        frames where nothing else on its part is observed. None for an observer that is no part of the model.
     families
         Joint families of the alternatives, see :func:`~kineverse.estimation.identify`.
     false_alarms
@@ -159,7 +159,7 @@ def check_plausibility(
     served_joints: dict[TestableJoint, KnownJoint] = {}
     for joint in testable.joints:
         parent, child = tracks[joint.parent], tracks[joint.child]
-        rows = np.flatnonzero(parent.seen & child.seen)
+        rows = np.flatnonzero(parent.observed & child.observed)
         if not len(rows):
             never = f"'{joint.parent}' and '{joint.child}' were never observed together"
             reasons[joint] = undetermined_verdict(joint, 0, never)

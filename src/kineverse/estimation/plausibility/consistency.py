@@ -2,7 +2,7 @@
 
 A limit g(q) <= 0 may depend on several coordinates: a drawer opens only as far as the door next to it. At the
 estimated values it is violated by z = g / σ standard deviations, with σ² = ∇gᵀ C ∇g. One coordinate may also
-move several parts, as the fingers of a gripper or the bars of a linkage. Each part is observed on its own,
+move several parts, as the fingers of a gripper or the bars of a linkage. Each part is observed by itself,
 and the estimates of the coordinate differ by z standard deviations. If the model is right, z is at most
 standard normal, to first order. Where the uncertainty of g is unknown, as at a jump of a bound, z is NaN and
 is ignored.

@@ -243,7 +243,7 @@ class PlausibilityMonitor:
             if monitored.served is None or not {joint.parent, joint.child} <= tracks.keys():
                 continue
             parent, child = tracks[joint.parent], tracks[joint.child]
-            if parent.seen[0] and child.seen[0]:
+            if parent.observed[0] and child.observed[0]:
                 now = np.array([0])
                 known = compute_residuals(monitored.served, pair_tracks(parent, child, now))
                 residuals[joint] = TimedResiduals(now, known)
@@ -263,7 +263,7 @@ class PlausibilityMonitor:
     def _recent_tracks(self) -> dict[str, PoseTrack]:
         result = {}
         for name, any_track in {name: t for tracks in self._recent for name, t in tracks.items()}.items():
-            gap = replace(any_track, seen=np.zeros(1, dtype=bool))
+            gap = replace(any_track, observed=np.zeros(1, dtype=bool))
             result[name] = concatenate_tracks([tracks.get(name, gap) for tracks in self._recent])
         return result
 

@@ -198,7 +198,7 @@ class Plausibility:
     Attributes
     ----------
     verdicts
-        One for each pair of frames; a second frame on the same part is a pair of its own.
+        One for each pair of frames; a second frame on the same part is another pair.
     untested
         Observed frames that test no single operation, with the reason in words.
     false_alarms

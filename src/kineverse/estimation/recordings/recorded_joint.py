@@ -230,7 +230,7 @@ class _Comparison:
     ) -> Assumption:
         """Identify the joint from some rows, which stand for all distinct rows with a correlation time."""
         some = self.pair.select(rows)
-        found = identify(
+        result = identify(
             some.parent_poses,
             some.child_poses,
             noise=None if noise is None else noise.covariance,
@@ -239,13 +239,13 @@ class _Comparison:
             sequential=self.pair.is_timed,
             correlation_time=max(1.0, time * len(rows) / len(self.distinct)),
         )
-        return Assumption(noise or estimated_noise(found, self.pair), time, found)
+        return Assumption(noise or estimated_noise(result, self.pair), time, result)
 
     def fits_of_estimated_noise(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, Fit]:
         """Return the fits of families that have residuals to all distinct rows."""
         # If the stated noise is too small, most observations are outliers.
-        found = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
-        return {fit.family: fit for fit in found if fit.family not in ("free", CURVE)}
+        result = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
+        return {fit.family: fit for fit in result if fit.family not in ("free", CURVE)}
 
     def correlation_time(self, fit: Fit) -> float:
         """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
@@ -340,14 +340,14 @@ def residual_noise(fit: Fit) -> ObservationNoise:
     return ObservationNoise(position / root, orientation / root, True)
 
 
-def estimated_noise(found: IdentificationResult, pair: RecordedPair) -> ObservationNoise:
+def estimated_noise(result: IdentificationResult, pair: RecordedPair) -> ObservationNoise:
     """Return the noise that an identification without stated noise estimated."""
-    assert found.noise is not None  # it is estimated if it is not stated
-    position, orientation = found.noise
+    assert result.noise is not None  # it is estimated if it is not stated
+    position, orientation = result.noise
     return ObservationNoise(position, orientation if pair.has_orientation else None, False)
 
 
-def log_probability(found: IdentificationResult) -> float:
+def log_probability(result: IdentificationResult) -> float:
     """Return the log probability density of the observations, families weighed by their priors."""
-    best = found.best
+    best = result.best
     return best.log_evidence + math.log(WEIGHTS[best.family] / best.probability)

@@ -278,8 +278,8 @@ def collect_recent_poses(
                     measured[one.frame][row] = pose
                     weights.append(reading.whitening[layout.whitening_slices[i]].reshape(6, 6))
             white: Array = np.array(weights).reshape(-1, 6, 6)
-            given = np.linalg.inv(white.transpose(0, 2, 1) @ white)
-            mean = given.mean(axis=0) if weights else one.covariance
+            each = np.linalg.inv(white.transpose(0, 2, 1) @ white)
+            mean = each.mean(axis=0) if weights else one.covariance
             if one.is_stated or not np.allclose(mean, one.covariance, rtol=1e-9):
                 covariances[one.frame] = mean
     if observer in model.frames and len(times):
@@ -289,7 +289,7 @@ def collect_recent_poses(
             places = compile(place, layout.inputs).batch(inputs)
             turns = np.zeros((len(times), 6, 6))
             turns[:, :3, :3] = turns[:, 3:, 3:] = places[:, :3, :3]
-            measured = {name: places @ seen for name, seen in measured.items()}
+            measured = {name: places @ track for name, track in measured.items()}
             covariances = {name: turns @ one @ turns.mT for name, one in covariances.items()}
             observer = WORLD
     return RecentPoses(observer, measured, covariances, times if has_times else None)

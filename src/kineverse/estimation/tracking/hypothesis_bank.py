@@ -92,7 +92,7 @@ class HypothesisBank:
         self._trackers, self._estimates = moved, estimates
         self._forget(dt)
 
-    def update(self, seen: Mapping[str, Any], **options: Any) -> dict[str, float]:
+    def update(self, measurements: Mapping[str, Any], **options: Any) -> dict[str, float]:
         """Update all trackers with the same measurements and return the probabilities.
 
         See :meth:`.Tracker.update`. If one of them refuses the measurements, none changes.
@@ -100,7 +100,7 @@ class HypothesisBank:
         # Copies share compiled code. After an error the originals are unchanged.
         after = {name: tracker.copy() for name, tracker in self._trackers.items()}
         stamps = {name: tracker.estimate.stamp for name, tracker in after.items()}
-        estimates = {name: tracker.update(seen, **options) for name, tracker in after.items()}
+        estimates = {name: tracker.update(measurements, **options) for name, tracker in after.items()}
         first = next(iter(after))
         began, now = stamps[first], estimates[first].stamp
         if began is not None and now is not None:

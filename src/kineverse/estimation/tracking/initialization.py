@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Largest distance between initial values of an angle [rad].
 _SPACING = math.pi / 2
 _MOST_STARTS = 32
-# Initial points are at most this many deviations from the given one.
+# Initial points are at most this many deviations from the first.
 _FARTHEST = 5.5
 _SAME = 1e-9
 # Turns after which gears may stand as before: a gear of ratio p/q does so after q turns.
@@ -98,7 +98,7 @@ def _turns_some(layout: Layout, i: int, predicted: Array, is_same: npt.NDArray[n
 
 
 def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Array) -> GaussianSum:
-    """Return beliefs about several initial points, all with the same Gaussian, the given one first."""
+    """Return beliefs about several initial points with the same Gaussian, the initial state first."""
     layout = update_step.layout
     beliefs, alive = [first], [np.ones(len(layout.groups), dtype=bool)]
     ambiguous = _find_ambiguous(update_step, first, inputs)

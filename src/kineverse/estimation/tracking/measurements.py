@@ -60,7 +60,7 @@ class ObservedPosition(_Observed):
     Attributes
     ----------
     frame, point
-        The point (3,) [m] in coordinates of the frame; its origin if not given.
+        The point (3,) [m] in coordinates of the frame; its origin if None.
     relative_to
         Observing frame: the world, or a camera, which may move.
     covariance
@@ -119,7 +119,7 @@ class MeasurementModel:
 
 
 def list_observed(observed: Iterable[ObservedLike] | ObservedLike) -> list[ObservedLike]:
-    """Return observations as a list; a single one may be given alone."""
+    """Return observations as a list; a single one needs no list."""
     if isinstance(observed, (str, ObservedPose, ObservedPosition, ObservedExpression)):
         return [observed]
     return list(observed)

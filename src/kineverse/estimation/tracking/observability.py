@@ -232,17 +232,17 @@ class StaticBatch:
                 prior = self._transport_prior(number, before, old.prior, result)
                 after.records[number] = replace(record, prior=prior)
                 continue
-            found = self._solve_batch(number, before, record)
-            after.x[group.x] = found.belief.x[group.x]
-            after.set_group_cost(group.t, found.belief.group_cost(group.t))
+            batch = self._solve_batch(number, before, record)
+            after.x[group.x] = batch.belief.x[group.x]
+            after.set_group_cost(group.t, batch.belief.group_cost(group.t))
             if weights is None:
-                after.evidence[number] = found.belief.evidence[number]
+                after.evidence[number] = batch.belief.evidence[number]
             # Observations still to come may show that the estimate is a mirror image: keep the record.
             is_complete = len(record.means) == len(group.observation_indices)
             if is_complete and not self._unobservable.is_in(number, after):
                 after.records[number] = None
             else:
-                prior = self._transport_prior(number, before, record.prior, found)
+                prior = self._transport_prior(number, before, record.prior, batch)
                 after.records[number] = replace(record, prior=prior)
 
     def add_noise(

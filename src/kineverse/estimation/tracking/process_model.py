@@ -154,7 +154,7 @@ class ProcessModel:
         return bool(self._flows)
 
     def find_moving_groups(self, speeds: Speeds, noise: Speeds) -> list[int]:
-        """Return the numbers of the groups that move at given speeds or with noise."""
+        """Return the numbers of the groups that move at these speeds or with noise."""
         active = {v for by in (speeds, noise) for v, value in by.items() if value}
         numbers = range(len(self._layout.groups))
         return [number for number in numbers if not active.isdisjoint(self.speeds_of(number))]

@@ -50,7 +50,7 @@ class Tracker:
         :class:`.ObservedExpression`.
     start
         Initial values of some coordinates; others start in the middle of the limits, or at the default state.
-        Speeds, if these are estimated, start at 0 unless they are given.
+        Speeds, if these are estimated, start at 0 by default.
     uncertainty
         Initial standard deviations [m], [rad], by coordinate, or by speed for directions that are no
         coordinate's; by default half the width of the limits, π for angles, 10 m. Those of estimated speeds
@@ -368,7 +368,7 @@ class Tracker:
     @one_at_a_time
     def update(
         self,
-        seen: Mapping[str, Any],
+        measurements: Mapping[str, Any],
         *,
         at: float | None = None,
         commands: StateLike | None = None,
@@ -379,8 +379,8 @@ class Tracker:
 
         Parameters
         ----------
-        seen
-            Measurements by name of the observation: poses 4×4, vectors or numbers, or pairs of these and
+        measurements
+            By name of the observation: poses 4×4, vectors or numbers, or pairs of these and
             their covariance. Absent names are missing.
         at
             Time of the measurements [s]; the state is predicted to it first. Late ones are applied at their
@@ -398,13 +398,13 @@ class Tracker:
             For an invalid measurement, naming it, or if time goes backwards by more than the lag. The belief
             does not change then.
         """
-        return self._update(self._update_step.reader.read(seen), at, commands, inputs, process_noise)
+        return self._update(self._update_step.reader.read(measurements), at, commands, inputs, process_noise)
 
     @one_at_a_time
     def update_poses(
         self,
         poses: npt.ArrayLike,
-        seen: npt.ArrayLike | None = None,
+        mask: npt.ArrayLike | None = None,
         *,
         covariances: npt.ArrayLike | None = None,
         at: float | None = None,
@@ -418,7 +418,7 @@ class Tracker:
         ----------
         poses
             Poses of all frames; entries of missing ones are ignored.
-        seen
+        mask
             True for each measured pose (m,); all if None.
         covariances
             Covariances (m, 6, 6) of these poses; entries of missing ones are ignored. Those of the
@@ -426,7 +426,7 @@ class Tracker:
         at, commands, inputs, process_noise
             As in :meth:`update`.
         """
-        reading = self._update_step.reader.read_poses(poses, seen, covariances)
+        reading = self._update_step.reader.read_poses(poses, mask, covariances)
         return self._update(reading, at, commands, inputs, process_noise)
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -458,8 +458,8 @@ class Tracker:
         if native is None or not native.are_rigid(reading):
             self._update_step.reader.check_poses(reading)
         if at is None and (commands or process_noise):
-            what = "Commands" if commands else "process_noise="
-            raise InvalidValueError(f"{what} need the time they lasted: give at=, or call predict.")
+            subject = "Commands" if commands else "process_noise="
+            raise InvalidValueError(f"{subject} need the time they lasted: give at=, or call predict.")
         noise = self._read_noise(process_noise)
         stamp = None if at is None else _require_time(at)
         speeds, before = self._read_commands(commands), self._now

@@ -209,7 +209,7 @@ def find_rigid_bodies(
     result = []
     for parts in dict.fromkeys(group.values()):
         # The world represents its body, else the part that was observed most often, points last.
-        often = {p: (p == WORLD, not tracks[p].is_point, int(tracks[p].seen.sum())) for p in parts}
+        often = {p: (p == WORLD, not tracks[p].is_point, int(tracks[p].observed.sum())) for p in parts}
         ordered = sorted(parts, key=lambda p: (*(-n for n in often[p]), list(tracks).index(p)))
         places = _poses_in_first(ordered, pairs, {p for p in parts if tracks[p].is_point})
         result.append(RigidBody(tuple(ordered), places, surest[parts[0]]))

@@ -69,7 +69,7 @@ def identify_pair(
     a, b = tracks[parent], tracks[child]
     if a.is_point:
         return None
-    times = np.flatnonzero(a.seen & b.seen)
+    times = np.flatnonzero(a.observed & b.observed)
     if len(times) < 2:
         return None
     observations = pair_tracks(a, b, times)
