@@ -1,9 +1,9 @@
 """Compare the speed of two checkouts: python tools/bench_trees.py OLD NEW [--pairs 7] [--only NAME ...]
 
 Each round starts one process of either checkout, the order alternating. Each process measures the same
-workloads by public names alone. A ratio is the median over the rounds of old time / new time: above 1, the new
-checkout is faster. Both run in this Python's environment and keep caches of their own, filled by a round that
-does not count.
+workloads by public names alone. A ratio is the median over the rounds of old time / new time: above 1, the
+new checkout is faster. Both run in this Python's environment and keep caches of their own, filled by a round
+that does not count.
 """
 
 from __future__ import annotations

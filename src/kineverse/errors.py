@@ -11,6 +11,25 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+__all__ = [
+    "CompileError",
+    "DuplicateNameError",
+    "EditError",
+    "ExpressionError",
+    "FormatError",
+    "InfeasibleError",
+    "InvalidValueError",
+    "KineverseError",
+    "MissingDependencyError",
+    "ModelError",
+    "NoSolutionError",
+    "NotFiniteError",
+    "ShapeError",
+    "SimulationError",
+    "UnknownAttributeError",
+    "UnknownNameError",
+]
+
 
 class KineverseError(Exception):
     """Base of all errors of this package."""

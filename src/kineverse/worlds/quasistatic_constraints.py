@@ -21,7 +21,7 @@ from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
-from kineverse.model.velocity_rows import Recovery, VelocityRows, velocity_rows
+from kineverse.model.velocity_constraints.velocity_rows import Recovery, VelocityRows, velocity_rows
 from kineverse.symbols import Symbol
 
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps

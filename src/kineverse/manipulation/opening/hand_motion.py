@@ -269,7 +269,7 @@ class HandMotion:
             others = (s for s in self.model.degrees_of_freedom if s not in moving)
             still += [s for s in others if not is_of_robot(s.path, robot)]
         with self.session.timed("plan"):  # which lasts less in the interpreter than a compiler would take
-            return Controller(self.model, tasks, dt=self.session.dt, still=still, **options)
+            return Controller(self.model, tasks, dt=self.session.dt, fixed=still, **options)
 
     def find_controller(
         self, key: Hashable, make: Callable[[], tuple[Controller, Targets]]

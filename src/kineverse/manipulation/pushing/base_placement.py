@@ -192,7 +192,7 @@ class _Sampler:
         )  # fmt: skip
         clear = [
             InverseKinematics(
-                model, tasks, still=still, scene=pushing.scene, margin=_MARGIN, tolerance=tolerance
+                model, tasks, fixed=still, scene=pushing.scene, margin=_MARGIN, tolerance=tolerance
             )
             for tasks, tolerance in goals
         ]
@@ -202,7 +202,7 @@ class _Sampler:
             # Steps out of collisions take most of the time, and seldom lead a base out of one.
             arm = all({s.position for s in e.gradient()} - {*self.base} for e in (tip, axis))
             self._solvers = [
-                (InverseKinematics(model, tasks, still=[*still, *standing], tolerance=tolerance), last)
+                (InverseKinematics(model, tasks, fixed=[*still, *standing], tolerance=tolerance), last)
                 for standing in ((self.base, ()) if arm else ((),))
                 for (tasks, tolerance), last in zip(goals, clear, strict=True)
             ]
@@ -215,7 +215,7 @@ class _Sampler:
         good = np.flatnonzero(score > score.max() - _CANDIDATES)
         self.unreachable = 0
         if not self.base:
-            free = InverseKinematics(model, [nearby], still=still, tolerance=_NEARBY)
+            free = InverseKinematics(model, [nearby], fixed=still, tolerance=_NEARBY)
             near = self._select_reachable(free, good)
             good, self.unreachable = (near, 0) if len(near) else (good, len(good))
         weights = np.exp(2.0 * (score[good] - score.max()))

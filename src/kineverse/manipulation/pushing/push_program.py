@@ -138,7 +138,7 @@ class PushProgram:
             model,
             tasks,
             dt=dt,
-            still=fixed,
+            fixed=fixed,
             scene=scene,
             margin=_MARGIN,
             radius=_RADIUS,

@@ -184,4 +184,4 @@ def _make_controller(
     """Return a controller with rows for near bodies, in which the hand may touch the handle."""
     with motion.session.timed("plan"):
         scene = Scene(model, rules=motion.holding_rules)
-        return Controller(model, tasks, dt=motion.session.dt, still=still, scene=scene, margin=_MARGIN)
+        return Controller(model, tasks, dt=motion.session.dt, fixed=still, scene=scene, margin=_MARGIN)

@@ -94,7 +94,7 @@ class PartMover:
             )
             others = [s for s in self.model.degrees_of_freedom if s != symbol]
             self._controllers[symbol] = Controller(
-                self.model, [goal], dt=self.session.dt, still=others, smooth=1e-3, posture=0.0
+                self.model, [goal], dt=self.session.dt, fixed=others, smooth=1e-3, posture=0.0
             )
         return self._controllers[symbol]
 
