@@ -18,7 +18,13 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .path_checks import PathChecks
-from .path_rounding import PathSection, TimedSection, join_sections, parameterize_sections, section_times
+from .path_rounding import (
+    PathSection,
+    TimedSection,
+    join_sections,
+    parameterize_sections,
+    section_times,
+)
 from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.kinematic_limits import RAMP
 

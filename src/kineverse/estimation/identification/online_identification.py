@@ -25,7 +25,13 @@ from .kinematic_graph.pairwise import SURPRISE_DEVIATIONS
 from .least_squares import InitialGuess, Solution
 from .marginal_likelihood import Scored
 from .model_check import fit_of_curve, is_doubtful, solve_joints, weigh_and_check, without_curve
-from .model_selection import FamilySolution, IdentificationData, prepare_data, score_solutions, weigh_families
+from .model_selection import (
+    FamilySolution,
+    IdentificationData,
+    prepare_data,
+    score_solutions,
+    weigh_families,
+)
 from .motion_model import FamilyMember
 from .noise_estimation import NoiseSolution, scale_noise
 from .observations import Observations, check_observations

@@ -34,7 +34,13 @@ from .measurements import (
     require_number,
 )
 from .native import native_library
-from .process_model import INITIAL_SPEED_TIME, Process, check_process, default_process_noise, require_noise
+from .process_model import (
+    INITIAL_SPEED_TIME,
+    Process,
+    check_process,
+    default_process_noise,
+    require_noise,
+)
 from .recursion import FixedLag, Recursion, Step
 from .residuals import Measurements
 
