@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import FormatError, MissingDependencyError
-from kineverse.formats.export.mesh_paths import RemarkCallback, file_reference, find_file
 from kineverse.formats.poses import unit_quaternion
-from kineverse.formats.resource_paths import locate_mesh
+from kineverse.formats.resource_paths import RemarkCallback, file_reference, find_file, locate_mesh
 from kineverse.formats.xml_writer import Tag
 from kineverse.lie import transform
 from kineverse.model.body import (
