@@ -1,6 +1,10 @@
 """Templates of xacro (``robot.urdf.xacro``), expanded and read as the URDF or SDF that they are of.
 
-The ``xacro`` package expands them, in a process of its own, see :mod:`.xacro_process`.
+The ``xacro`` package expands them, in a process that does nothing else. It evaluates expressions of Python by
+``eval``, from which a lambda or a comprehension leads to all of Python. Here they are checked first:
+:func:`check_expression` allows arithmetic, comparisons, indices, literals, comprehensions and calls, but no
+attribute that begins with an underscore or leads to frames, code or types, and no lambda. Files are opened
+below the root of the description and in packages only.
 """
 
 from __future__ import annotations
