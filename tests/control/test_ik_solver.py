@@ -115,7 +115,7 @@ def test_still_coordinates_and_what_no_task_moves_keep_their_values() -> None:
     model = planar_arm(4)
     state = model.default_state().updated({"joint1": 0.7, "joint4": -0.2})
     point = model.fk("link4")[:2, 3]
-    result = inverse_kinematics(model, [Goal(point, [1.5, 1.5])], values=state, still=["joint1"])
+    result = inverse_kinematics(model, [Goal(point, [1.5, 1.5])], values=state, fixed=["joint1"])
     assert result.solved
     assert (result.best["joint1"], result.best["joint4"]) == (0.7, -0.2)
 
@@ -255,7 +255,7 @@ def test_same_seed_is_the_same_solution() -> None:
     model = kv.load("fetch")
     hand = model.fk("fetch/gripper_link")
     target = hand(random_state(model, np.random.default_rng(8)))
-    solver = InverseKinematics(model, [Goal(same_pose(hand, target))], still=["fetch/base"])
+    solver = InverseKinematics(model, [Goal(same_pose(hand, target))], fixed=["fetch/base"])
     one, two = (solver.solve(seed=4, solutions=3) for _ in range(2))
     assert one.solutions == two.solutions
     assert not set(map(str, solver.coordinates)) & {"fetch/base/x", "fetch/base/angle"}
@@ -436,9 +436,9 @@ def test_scene_of_another_model_and_a_margin_below_0_are_refused() -> None:
             InvalidValueError,
             "speeds",
         ),
-        (lambda m: solve(m, still=["jiont1"]), UnknownNameError, "joint1"),
-        (lambda m: solve(m, still=[3]), ExpressionError, "still"),
-        (lambda m: solve(m, still=["joint1"]), InvalidValueError, "stay still"),
+        (lambda m: solve(m, fixed=["jiont1"]), UnknownNameError, "joint1"),
+        (lambda m: solve(m, fixed=[3]), ExpressionError, "fixed"),
+        (lambda m: solve(m, fixed=["joint1"]), InvalidValueError, "fixed= keeps in place"),
         (lambda m: solve(m, values={"jiont1": 0.0}), UnknownNameError, "joint1"),
         (lambda m: solve(m, values={"joint1": math.inf}), NotFiniteError, "joint1"),
         (lambda m: solve(m, values={"joint1": math.nan}), InvalidValueError, "joint1"),

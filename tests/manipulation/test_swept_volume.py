@@ -166,7 +166,7 @@ def test_skills_say_what_is_in_the_way_and_move_nothing() -> None:
 
 
 def test_robots_at_random_cupboards_go_through_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert random_cupboards.main(["--count", "4", "--robots", "hsr"]) == 0, capsys.readouterr().out
+    assert random_cupboards.main(["--count", "2", "--robots", "hsr"]) == 0, capsys.readouterr().out
 
 
 @pytest.mark.long

@@ -15,6 +15,7 @@ from kineverse.grasping import Gripper
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import Judge
+from kineverse.worlds.run_metrics import LimitJudge
 
 DT = 0.02
 
@@ -175,3 +176,44 @@ def test_what_overlaps_at_the_begin_is_listed_and_not_counted():
     assert folds["penetrating"] == ("robot/link", "robot/tip")
     assert folds["penetration"] == pytest.approx(0.05, abs=1e-6)
     assert run(judge, [{"robot/x": -3.0, "robot/fold": 0.5}])["penetration"] == pytest.approx(0.3, abs=1e-6)
+
+
+# -- violations of limits in successive states, with speeds that are differences of states
+
+A, B = kv.position("a"), kv.position("b")
+
+
+def judged(*states, dt=0.5):
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.constrain("range", 0, A, 1)
+        edit.constrain("lock", -1, A.derivative(), 2 * (B > 0.5))
+    judge = LimitJudge(model)
+    assert judge.symbols == (A, B)
+    for n, state in enumerate(states):
+        judge.update(np.array(state), n * dt)
+    return judge
+
+
+def test_motion_within_limits_violates_nothing():
+    judge = judged((0.0, 0.0), (0.0, 1.0), (1.0, 1.0))
+    assert (judge.violation, judge.limit) == (0.0, "")
+
+
+def test_motion_through_a_lock_is_measured_by_its_speed():
+    judge = judged((0.0, 0.0), (0.2, 0.0))
+    assert judge.violation == pytest.approx(0.4)
+    assert judge.limit == "lock"
+
+
+def test_lock_that_opens_or_closes_within_a_step_may_have_been_open():
+    assert judged((0.0, 0.0), (0.5, 1.0)).limit == ""
+    assert judged((0.0, 1.0), (0.5, 0.0)).limit == ""
+
+
+def test_position_beyond_its_limit_is_the_largest_violation():
+    judge = judged((0.0, 1.0), (1.0, 1.0), (1.3, 1.0), (1.0, 1.0))
+    assert judge.violation == pytest.approx(0.3)
+    assert judge.limit == "range"
+    judge.reset()
+    assert (judge.violation, judge.limit) == (0.0, "")
