@@ -155,14 +155,14 @@ class ContentCache:
 
     def _files(self) -> list[tuple[float, int, str]]:
         """Return the time of the last use, the size and the key of each file; remove what was left behind."""
-        found, folder = [], self.folder
+        result, folder = [], self.folder
         for name, status in folder.entries():
             if name.endswith(self._ending):
-                found.append((status.st_mtime, status.st_size, name.removesuffix(self._ending)))
+                result.append((status.st_mtime, status.st_size, name.removesuffix(self._ending)))
             elif name.startswith(UNFINISHED) and time.time() - status.st_mtime > _STALE_SECONDS:
                 if not folder.remove(name):
                     shutil.rmtree(folder.path / name, ignore_errors=True)
-        return found
+        return result
 
 
 logger = logging.getLogger("kineverse.compile")

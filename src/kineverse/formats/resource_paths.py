@@ -361,7 +361,7 @@ def _manifest_name(folder: Path) -> str | None:
 @lru_cache(maxsize=64)
 def _packages_below(top: Path) -> dict[str, tuple[Path, ...]]:
     """Return the packages at and below a folder, by the name of the folder and that of the manifest."""
-    found: dict[str, tuple[Path, ...]] = {}
+    result: dict[str, tuple[Path, ...]] = {}
     ahead = deque([(top, 0)])
     for _ in range(MAX_FOLDERS):
         if not ahead:
@@ -375,12 +375,12 @@ def _packages_below(top: Path) -> dict[str, tuple[Path, ...]]:
         # A folder without manifest counts if it lies directly in a workspace.
         if is_package or depth <= 1:
             for name in {folder.name, _manifest_name(folder) or folder.name}:
-                found[name] = (*found.get(name, ()), folder)
+                result[name] = (*result.get(name, ()), folder)
         if is_package or depth == MAX_DEPTH or not entries.keys().isdisjoint(_IGNORED):
             continue
         below = sorted(name for name, is_folder in entries.items() if is_folder and not name.startswith("."))
         ahead.extend((folder / name, depth + 1) for name in below)
-    return found
+    return result
 
 
 def _installed() -> Iterator[Path]:

@@ -204,10 +204,10 @@ def _recompose(node: Composed, plain_part: Callable[[Expression], Expression]) -
 def collect_symbols(expression: Expression) -> set[Symbol]:
     """Return the symbols of an expression, those of overridden gradients included."""
     symbols, nodes = leaves(expression)
-    found = set(symbols)
+    result = set(symbols)
     for node in topological_order(nodes, _subjects, lambda _: False):
-        found.update(s for part in _subjects(node) for s in leaves(part)[0])
-    return found
+        result.update(s for part in _subjects(node) for s in leaves(part)[0])
+    return result
 
 
 def _subjects(node: Node) -> tuple[Expression, ...]:
