@@ -143,6 +143,14 @@ def test_commands_in_help_texts_parse(capsys):
         _parsed(line)
 
 
+@pytest.mark.parametrize("page", [page for page in PAGES if any(examples(page, "bash"))], ids=_name)
+def test_commands_in_shell_blocks_parse(page):
+    """Commands that take too long to run here, such as skills with physics."""
+    for block in examples(page, "bash"):
+        for line in re.findall(r"^kineverse .*", block.code.replace("\\\n", " "), re.MULTILINE):
+            _parsed(line)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_inline_commands_of_the_docs_parse(page, capsys):
     """Commands in the text, which need not be whole: command and options exist."""
@@ -168,6 +176,6 @@ def test_targets_extras_and_tests_that_pages_name_exist(page):
 
 
 def _parsed(command: str) -> None:
-    words = shlex.split(re.split(r"\s{3,}| [|>]", command)[0])[1:]
+    words = shlex.split(re.split(r"\s{3,}|\s+#\s| [|>]", command)[0])[1:]
     with suppress(SystemExit) if "--help" in words else nullcontext():
         make_parser({words[0]: load_command(words[0])}).parse_args(words)
