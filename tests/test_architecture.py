@@ -16,8 +16,11 @@ import kineverse as kv
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 LARGEST, SMALLEST, MOST_FILES = 650, 100, 26
-SMALL: set[str] = set()
-"""Modules below the smallest size that stay on their own, though only one other imports them."""
+LARGE = {"kineverse.expressions.expression"}
+"""Modules above the largest size: one class that behaves like an array."""
+
+SMALL = {"kineverse.shipped.robots"}
+"""Modules below the smallest size that one other imports, and that cannot be a part of it: its layer is lower."""
 
 
 def test_the_layers_are_those_of_the_contract() -> None:
@@ -55,7 +58,7 @@ def test_modules_and_folders_have_a_good_size() -> None:
         for imported in _imports(name, path, modules):
             importers[imported].add(name)
     lines = {name: len(path.read_text("utf-8").splitlines()) for name, path in modules.items()}
-    assert {name: n for name, n in lines.items() if n > LARGEST} == {}
+    assert {name for name, n in lines.items() if n > LARGEST} == LARGE
     small = {
         name: importers[name]
         for name, n in lines.items()
