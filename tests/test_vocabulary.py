@@ -122,12 +122,15 @@ def test_reference_sections_belong_to_exported_names() -> None:
 
 
 def exported_names() -> set[str]:
-    """Return the names in the face of any package, and those of the modules that are a face themselves."""
+    """Return the names in the face of any package or public module, and those of the bases of such classes."""
     source = SOURCES[""]
     packages = [init.parent.relative_to(source.parent).parts for init in source.rglob("__init__.py")]
     modules = [import_module(".".join(parts)) for parts in packages]
     modules += [import_module(f"kineverse.{path.stem}") for path in source.glob("[a-z]*.py")]
-    return {name for module in modules for name in getattr(module, "__all__", vars(module)) if name[0] != "_"}
+    faces = [(module, name) for module in modules for name in getattr(module, "__all__", vars(module))]
+    values = [getattr(module, name) for module, name in faces]
+    bases = {base.__name__ for value in values if isinstance(value, type) for base in value.__mro__}
+    return bases | {name for _, name in faces if name[0] != "_"}
 
 
 def unexported(body: list[ast.stmt], exported: set[str] | None) -> Iterator[Definition]:
