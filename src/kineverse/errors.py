@@ -195,8 +195,8 @@ def unknown_attribute_error(
 ) -> UnknownAttributeError:
     """Return the error for an unknown attribute, with similar names or the equivalent of a foreign name.
 
-    ``owner`` is the subject of the sentence, ``elsewhere`` maps names of other libraries to their equivalents,
-    and ``below`` names in the packages below the object to their full names.
+    ``owner`` is the subject of the sentence, ``elsewhere`` maps names of other libraries to ours, and
+    ``below`` names in the packages below the object to their full names.
     """
     below = below or {}
     problem = f"{owner} has no {name!r}."

@@ -325,7 +325,7 @@ def _is_number(value: object) -> bool:
 
 
 def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
-    """Return values as a state, and raise for symbols of a plain mapping that are unknown or have two values."""
+    """Return values as a state; a plain mapping with unknown symbols or two values for one is refused."""
     if isinstance(values, State):
         return values
     if not isinstance(values, Mapping):
