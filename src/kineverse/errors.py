@@ -156,7 +156,12 @@ def duplicate_value_error(symbol: object) -> DuplicateNameError:
 def summarize_error(error: Exception, advice: bool = True) -> str:
     """Return the first line of an error's message, without the places in which a file was looked for.
 
-    Without ``advice``, the sentence that says which variable to set is dropped as well.
+    Parameters
+    ----------
+    error
+        Any exception; without a message, the name of its type is returned.
+    advice
+        Whether to keep the sentence that says which variable to set.
     """
     text = str(error).strip()
     if not advice:
@@ -171,7 +176,16 @@ _LONGEST = 100
 def suggest(name: str, available: Iterable[str], what: str = "name", limit: int = 12) -> str:
     """Return the part of an error message that lists similar names, or the available ones.
 
-    ``what`` is the noun for the names, and ``limit`` the largest number of listed names.
+    Parameters
+    ----------
+    name
+        The unknown name.
+    available
+        The known names.
+    what
+        The noun for the names.
+    limit
+        The largest number of listed names.
     """
     names = sorted(set(available))
     if not names:
@@ -195,8 +209,18 @@ def unknown_attribute_error(
 ) -> UnknownAttributeError:
     """Return the error for an unknown attribute, with similar names or the equivalent of a foreign name.
 
-    ``owner`` is the subject of the sentence, ``elsewhere`` maps names of other libraries to ours, and
-    ``below`` names in the packages below the object to their full names.
+    Parameters
+    ----------
+    owner
+        The object, as the subject of a sentence.
+    name
+        The unknown attribute.
+    available
+        The known attributes.
+    elsewhere
+        From names in other libraries to their equivalents here.
+    below
+        From names in the packages below the object to their full names.
     """
     below = below or {}
     problem = f"{owner} has no {name!r}."
