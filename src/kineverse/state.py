@@ -325,22 +325,7 @@ def _is_number(value: object) -> bool:
 
 
 def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
-    """Return values as a state, and raise for unknown symbols in a plain mapping.
-
-    Parameters
-    ----------
-    values
-        A state, which may have more symbols, or a mapping from symbols or names to numbers, which may not.
-    known
-        The known symbols.
-
-    Raises
-    ------
-    UnknownNameError
-        For other symbols and names.
-    DuplicateNameError
-        If a symbol has two values, by symbol and by name, or a name is that of several symbols.
-    """
+    """Return values as a state; a plain mapping with unknown symbols or two values for one is refused."""
     if isinstance(values, State):
         return values
     if not isinstance(values, Mapping):
@@ -370,13 +355,7 @@ def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
 
 
 def check_meant(state: State, known: Iterable[Symbol]) -> None:
-    """Raise for a state without a value for any symbol of a model: it belongs to another model.
-
-    Raises
-    ------
-    UnknownNameError
-        With names similar to that of the first symbol.
-    """
+    """Raise for a state without a value for any symbol of a model: it belongs to another model."""
     symbols = list(known)
     if any(state.given(symbol) is not None for symbol in symbols):
         return
