@@ -106,16 +106,16 @@ model.registry.register_collection(
     "articulations",
     model.registry.ModelCollection(
         "kineverse.gallery:names",
-        "kineverse.gallery:operations",
         summary="one for each articulation",
+        find_document="kineverse.gallery:find_document",
     ),
 )
 model.registry.register_collection(
     "kitchens",
     model.registry.ModelCollection(
         "kineverse.gallery.kitchens:example_seeds",
-        "kineverse.gallery.kitchens:kitchen_operations",
         summary="one for each seed from 0 on",
+        build="kineverse.gallery.kitchens:kitchen_operations",
         accept="kineverse.gallery.kitchens:is_seed",
         prefix="kitchen",
     ),
@@ -124,8 +124,8 @@ model.registry.register_collection(
     "lockboxes",
     model.registry.ModelCollection(
         "kineverse.gallery.lockboxes:example_boxes",
-        "kineverse.gallery.lockboxes:lockbox_operations",
         summary="one for each seed from 0 on",
+        build="kineverse.gallery.lockboxes:lockbox_operations",
         accept="kineverse.gallery.lockboxes:has_lockbox",
         prefix="lockbox",
     ),
@@ -139,7 +139,7 @@ def __getattr__(name: str) -> object:
     if name in _LAZY:
         return importlib.import_module(f"kineverse.{name}")
     if name == "show":
-        return importlib.import_module("kineverse.view.show").show
+        return importlib.import_module("kineverse.view.page").show
     from kineverse._synonyms import MODULE_SYNONYMS
     from kineverse.errors import unknown_attribute_error
 

@@ -20,13 +20,7 @@ from .manipulate_output import PhaseLines, report_outcome
 from .manipulate_setup import ManipulationScene, make_scene
 from .manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
 from .output import show_activity
-from .view import (
-    add_page_options,
-    handle_interrupts,
-    page_options,
-    print_address,
-    print_mesh_problems,
-)
+from .view import add_page_options, handle_interrupts, page_options, print_address, print_mesh_problems
 
 if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief

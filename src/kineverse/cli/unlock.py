@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.reasoning import plan_unlocking
 
     model = load_model(arguments, arguments.model)
-    plan = plan_unlocking(model, goal, start, still=arguments.still, budget=arguments.budget)
+    plan = plan_unlocking(model, goal, start, fixed=arguments.still, budget=arguments.budget)
     if arguments.execute:
         return _execute(arguments, model, goal, start)
     _print(arguments, plan)
@@ -116,7 +116,7 @@ def _execute(
             about = {"model": arguments.model, "world": world.name}
             recorder = stack.enter_context(Recorder(arguments.record, model, about))
         done = execute_unlocking(
-            world, goal, still=arguments.still, budget=arguments.budget, on_step=recorder
+            world, goal, fixed=arguments.still, budget=arguments.budget, on_step=recorder
         )
         if recorder is not None:
             recorder.write_outcome(done.as_data())

@@ -8,9 +8,9 @@ from kineverse.errors import unknown_attribute_error
 from .articulation import Articulation
 from .basic_operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, Pose, Shape, Sphere
+from .changes import Change, Diff
 from .comparison import compare_models
 from .constraint import Constraint
-from .diff import Change, Diff
 from .edit import Edit
 from .frame import WORLD, Frame
 from .frame_dependence import count_moved_bodies, moved_frames

@@ -1,4 +1,4 @@
-"""SRDF, the Semantic Robot Description Format of MoveIt, which stands beside a URDF."""
+"""SRDF, the Semantic Robot Description Format of MoveIt, which accompanies a URDF."""
 
 from .description import EndEffector, Srdf, SrdfGroup, VirtualJoint
 from .reader import parse_srdf, read_srdf

@@ -1,4 +1,4 @@
-"""Mechanisms whose parts lock each other: execution of plans, exploration of locks that nobody described."""
+"""Mechanisms whose parts lock each other: execution of plans, exploration of unknown locks."""
 
 from .lock_exploration import LearnedLock, LockExploration, LockTry, explore_locks
 from .plan_execution import ExecutedMove, PartMover, UnlockingExecution, execute_unlocking

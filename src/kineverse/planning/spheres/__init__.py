@@ -5,12 +5,10 @@ convex solids. Covers contain what they cover, provably, and say how far they st
 """
 
 from .object_covers import cover_objects
-from .quality import CoverQuality, measure_cover
 from .sphere_cover import SphereCover, cover_solid, cover_solids, default_protrusion
 from .sphere_tree import SphereTree, enclosing_ball, make_sphere_tree
 
 __all__ = [
-    "CoverQuality",
     "SphereCover",
     "SphereTree",
     "cover_objects",
@@ -19,5 +17,4 @@ __all__ = [
     "default_protrusion",
     "enclosing_ball",
     "make_sphere_tree",
-    "measure_cover",
 ]

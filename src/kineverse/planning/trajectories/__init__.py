@@ -1,10 +1,9 @@
 """Trajectories: paths with times, within limits of speed and acceleration."""
 
 from .blends import BlendedPath, round_corners
-from .follower import TrajectoryFollower
 from .kinematic_limits import MotionLimits, motion_limits
 from .time_parameterization import time_parameterize
-from .trajectory import Trajectory
+from .trajectory import Trajectory, TrajectoryFollower
 
 __all__ = [
     "BlendedPath",
