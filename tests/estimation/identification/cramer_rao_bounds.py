@@ -1,9 +1,9 @@
 """Cramér-Rao bounds of joint parameters by finite differences, independent of the estimator.
 
 Seen are both poses. Unknown are the axis and its place, the child's pose, and for each observation the parent's true
-pose (6) and the joint value (1), last. With joint values as unknowns of their own this is the Cramér-Rao bound. Where
+pose (6) and the joint value (1), last. With joint values as further unknowns this is the Cramér-Rao bound. Where
 a motion is short beside the noise nobody reaches it, as there are as many unknowns as observations: the bound of joint
-values that are drawn from a Gaussian of known width is what can be reached then.
+values drawn from a Gaussian of known width is attainable then.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ LENGTH = 1.4
 
 
 def garage() -> Family:
-    """A door that slides up along one edge and in along the other, of a length nobody has measured."""
+    """Return a door of unknown length that slides up along one edge and in along the other."""
     a, length = kv.position("a"), kv.parameter("length", 2.0)
     door = kv.translation(0, 0, length * np.cos(a)) @ kv.rotation_y(a)
     return Family("garage", door, {a: (0.0, 1.5)}, {length: FamilyParameter(2.0, 0.5, 0.5, 4.0)})

@@ -28,7 +28,7 @@ LEFT = transform(Rotation.from_rotvec([0.3, -0.4, 0.2]), (0.3, 0.1, 0.5))
 
 
 def seen_turning(turns: float, lead: float, count: int, seed: int = 0, start: float = 0.0) -> Array:
-    """Return poses of what goes round so often and moves by so much with every turn [m]."""
+    """Return poses of a screw with some revolutions and a pitch [m]."""
     turn = kv.position("turn")
     along = kv.translation(0, 0, lead / math.tau * turn)
     pose = kv.compile([along @ kv.rotation_z(turn) @ kv.translation(0.1, 0.0, 0.0)])
@@ -48,7 +48,7 @@ def test_revolutions_of_a_crank_are_counted(turns: float) -> None:
     assert np.ptp(fit.range) == pytest.approx(turns * math.tau, abs=0.1)
     assert fit.largest_turn == pytest.approx(turns * math.tau / (len(data) - 1), abs=0.1)
     np.testing.assert_allclose(fit.poses, data, atol=0.12)
-    # Nobody knows about turns without the order.
+    # Without the order, turns are unknown.
     assert np.ptp(found_of(data).best.range) < math.tau
     model = kv.Model()
     with model.edit() as edit:
@@ -149,7 +149,7 @@ def test_evidence_of_an_unconverged_solution_is_reduced() -> None:
     assert evidence_excess(early) > 1.0
     late = levenberg_marquardt(problem, motion, data.values, None, joint_prior)
     assert evidence_excess(late) == 0.0
-    # At the end of all steps the quadratic keeps what it promises.
+    # At the last step the quadratic approximation holds.
     assert evidence_excess(replace(late, converged=False)) < 0.1
 
 

@@ -332,7 +332,7 @@ def test_edge_probabilities_agree_with_the_sum_over_all_trees(count: int, spread
 
 
 def test_small_edge_probabilities_are_accurate() -> None:
-    # A determinant of the Laplacian would have lost them: what is left of 1 is 1e-130.
+    # A determinant of the Laplacian would lose them: the rest of 1 is 1e-130.
     gains = {frozenset("ab"): 300.0, frozenset("bc"): 300.0, frozenset("ac"): 0.0}
     result = edge_probabilities("abc", gains)
     assert result[frozenset("ac")] == pytest.approx(2.0 * np.exp(-300.0), rel=1e-12)

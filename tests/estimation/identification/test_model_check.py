@@ -32,7 +32,7 @@ def test_noise_stated_at_half_its_size_is_a_misfit(family: str, rows: int) -> No
     assert identified.best.family == family
     assert identified.misfit == pytest.approx(2.0, rel=0.3)
     assert "times the stated noise: either the noise is larger" in str(identified)
-    # What is known of the joint is that of the larger noise.
+    # The deviations are those for the larger noise.
     right = identify(data.parent, child, noise=data.covariance)[family]
     assert identified.best.deviation("axis.x") == pytest.approx(right.deviation("axis.x"), rel=0.3)
 
@@ -113,7 +113,7 @@ def test_tail_probabilities_agree_with_scipy(freedom: float) -> None:
 @pytest.mark.parametrize("lever", [0.0, 0.5])
 @pytest.mark.parametrize("turn", [0.2, 2.0])
 def test_an_exact_hinge_is_a_hinge_and_no_curve(lever: float, turn: float) -> None:
-    """Whatever the noise is taken for, exact poses of a joint are that joint, also about its own origin."""
+    """Exact poses of a joint are that joint for any assumed noise, also about the origin of its frame."""
     hinge = kv.rotation_z(kv.position("q")) @ kv.translation(lever, 0, 0)
     poses = np.stack([hinge({"q": q}) for q in np.linspace(0, turn, 12)])
     for noise in (None, pose_covariance(1e-4, 1e-3), pose_covariance(0.005, 0.02)):

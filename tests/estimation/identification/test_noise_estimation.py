@@ -145,7 +145,7 @@ def test_the_report_counts_right_answers_and_sure_errors() -> None:
 RANDOM = np.random.default_rng(0)
 ANYWHERE = transform(Rotation.random(24, random_state=RANDOM).as_matrix(), RANDOM.uniform(-1.0, 1.0, (24, 3)))
 EQUAL = np.tile(ANYWHERE[0], (10, 1, 1))
-# Observations that tell nothing: parent and child.
+# Observations without information: parent and child.
 NOTHING = {
     "two poses": (None, ANYWHERE[:2]),
     "two positions": (None, ANYWHERE[:2, :3, 3]),
@@ -171,15 +171,15 @@ LONG = ("outliers of both", "outliers among positions")
 
 
 @pytest.mark.parametrize(
-    "what", [pytest.param(what, marks=pytest.mark.long if what in LONG else ()) for what in NOTHING]
+    "case", [pytest.param(case, marks=pytest.mark.long if case in LONG else ()) for case in NOTHING]
 )
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "stated"])
 @pytest.mark.sampled(2)
-def test_observations_that_tell_nothing_have_no_sure_answer(what: str, noise) -> None:
-    parent, child = NOTHING[what]
+def test_observations_without_information_have_no_sure_answer(case: str, noise) -> None:
+    parent, child = NOTHING[case]
     for outliers in (None, True):
-        if what.startswith("outliers") and noise is not None and outliers is None:
-            continue  # with a stated noise and no outliers such a part moves freely
+        if case.startswith("outliers") and noise is not None and outliers is None:
+            continue  # with a stated noise and no outliers such a part is free
         for identified in (
             identify(parent, child, noise=noise, outliers=outliers),
             found_online(parent, child, noise, outliers),

@@ -20,7 +20,7 @@ from kineverse.estimation import (
 )
 from kineverse.lie import skew
 
-# Wider than half a metre, so that there is no metre in what is believed of it.
+# Wider than half a metre, so that all priors scale with the data.
 LARGE = 3.0
 
 
@@ -157,8 +157,8 @@ def test_noise_beyond_what_numbers_hold_is_no_bare_error() -> None:
 # By how much differences of log evidence may change when frames are moved by half a metre: levers are within a
 # metre of the child's origin, beforehand, and errors of orientations are small to first order only.
 CHANGE = 1.0
-# What is less probable than the best by this has no part in the verdict. A slider may be a hinge several metres
-# away, and there it matters more what a metre is measured from.
+# Log evidence behind the best beyond which a family does not count. A slider may be a hinge several metres away,
+# and there the choice of the origin matters more.
 CHANCE = 10.0
 
 # Families and how far the child's origin is off the axis.
@@ -175,7 +175,7 @@ def somewhere(random: np.random.Generator) -> Array:
 
 
 def moved(poses: Array, covariance: Array, frame: Array) -> tuple[Array, Array]:
-    """Return poses of another frame in the same part, and what their errors are."""
+    """Return poses of another frame in the same part, and their covariances."""
     by = np.tile(np.eye(6), (len(poses), 1, 1))
     by[:, :3, 3:] = -skew(poses[:, :3, :3] @ frame[:3, 3])
     return poses @ frame, by @ covariance @ np.swapaxes(by, 1, 2)
@@ -204,7 +204,7 @@ def test_evidence_does_not_depend_on_the_frames_of_the_parts(family: str, radius
 
 
 def test_a_hinge_through_the_childs_origin_is_not_taken_for_planar() -> None:
-    """As every joint of a description has it: what slides by nothing in a plane has to say about which point."""
+    """Joints of robot descriptions have such frames; a planar joint would rotate about an unknown point."""
     data = recording("revolute", count=40, position=0.01, orientation=0.02, seed=1, radius=0.0)
     identified = identify(data.parent, data.child, noise=data.covariance)
     assert identified.best.family == "revolute"

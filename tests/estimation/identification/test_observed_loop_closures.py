@@ -44,7 +44,7 @@ def data(model: kv.Model, frames: list[str], values: Array, seed: int) -> dict[s
 
 
 def left(model: kv.Model, poses: dict[str, Array]) -> float:
-    """Return χ² over its degrees of freedom, if free coordinates are what explains an observation best.
+    """Return χ² over its degrees of freedom, with the free coordinates that explain each observation best.
 
     Of every fourth observation; of 180 degrees of freedom in a ring of four, so chance makes it .7 to 1.3 in
     more than 99 % of all cases.
@@ -110,7 +110,7 @@ def four_bar() -> kv.Model:
 
 
 def slider_crank() -> kv.Model:
-    """Return a crank, a rod, and what it pushes along a rail."""
+    """Return a crank, a rod, and a slider on a rail."""
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("stand", "world", kv.translation(0.3, -0.2, 0.5) @ kv.rpy(-0.4, 0.6, 0.8))
@@ -126,7 +126,7 @@ def slider_crank() -> kv.Model:
 
 
 def two_cylinders() -> kv.Model:
-    """Return a crank with two rods, each of which pushes something along a rail of its own."""
+    """Return a crank with two rods, each with a slider on another rail."""
     model = kv.Model()
     with model.edit() as edit:
         bar(edit, "crank", "world", 0.0, 0.2, 0.05)
@@ -153,7 +153,7 @@ def test_a_four_bar_is_closed_and_saved(tmp_path: Path) -> None:
     poses = data(truth, ["crank", "coupler", "rocker"], values, 1)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
     assert connected(graph) == ring("world", "crank", "coupler", "rocker")
-    # What closes the loop stands beside the tree, and leaves no doubt about it.
+    # The joint that closes the loop is listed next to the tree, and leaves no doubt about it.
     assert all(edge.probability > 0.99 and not edge.alternatives for edge in graph.edges)
     model = kv.Model()
     with model.edit() as edit:

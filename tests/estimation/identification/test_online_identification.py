@@ -37,7 +37,7 @@ def test_identifier_result_agrees_with_identify_at_every_step(family: str, count
         assert identified.best.family == whole.best.family
         assert identified.best.log_evidence == pytest.approx(whole.best.log_evidence, abs=0.05)
         for fit in identified:
-            # What is improbable may be as probable as it was an eighth of the poses ago.
+            # Improbable families keep their odds until an eighth of the poses is new.
             assert fit.probability == pytest.approx(whole[fit.family].probability, abs=0.02)
             assert len(fit.joint_values) == k
             if fit.probability > 1e-4:

@@ -100,7 +100,7 @@ def test_outliers_are_listed_and_ignored(hinge) -> None:
     np.testing.assert_allclose(fit.range, without.range, atol=1e-3)
     np.testing.assert_allclose(fit.rms, without.rms, rtol=1e-3)
     np.testing.assert_allclose(fit.covariance, without.covariance, rtol=0.02, atol=1e-9)
-    # What is wrong has the nearest place on the joint.
+    # An outlier has the nearest pose of the joint.
     assert fit.joint_values.shape == fit.deviations.shape == (20, 1)
     assert np.linalg.norm(fit.residuals[wrong], axis=1).min() > 0.2
     assert np.linalg.norm(fit.residuals[fit.inliers], axis=1).max() < 0.2
@@ -116,7 +116,7 @@ def test_evidence_includes_the_density_of_the_outliers(hinge) -> None:
         math.log(usual.fraction) + usual.log_uniform_density
     )
     assert fit.log_evidence == pytest.approx(without["revolute"].log_evidence + joint_prior, abs=0.01)
-    # What moves freely explains everything, and what does not move cannot call almost everything wrong.
+    # A free joint explains everything; a rigid one with outliers almost everywhere is not allowed.
     assert identified["free"].outliers == identified["rigid"].outliers == ()
     assert identified["free"].log_evidence < fit.log_evidence - 100
     every_pose_an_inlier = identify(data.parent, child, noise=data.covariance)

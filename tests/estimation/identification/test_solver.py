@@ -25,7 +25,7 @@ from kineverse.estimation.identification.native import library
 from kineverse.estimation.identification.observations import Observations, check_observations
 from kineverse.estimation.identification.solver import solver
 
-HOW = ("both noisy", "parent known", "positions", "each with its own noise")
+HOW = ("both noisy", "parent known", "positions", "each with another noise")
 MOVING = [family for family in JOINTS if family not in ("rigid", "free")]
 
 
@@ -143,8 +143,8 @@ def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> No
     ).solution
     start = InitialGuess(before.motion, np.concatenate([before.values, slow.solution.values[10:]]))
     parent = np.concatenate([before.parent, data.parent[10:]])
-    given = data, start, parent, before.joint_prior, 10
-    same(marginal_likelihood.continue_from(*given), solver.continue_from(*given), atol=0.02)
+    arguments = data, start, parent, before.joint_prior, 10
+    same(marginal_likelihood.continue_from(*arguments), solver.continue_from(*arguments), atol=0.02)
 
 
 @pytest.mark.compiler

@@ -139,7 +139,7 @@ def test_linear_model_equals_a_constant_velocity_kalman_filter():
 
 @pytest.mark.parametrize("wheels", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_speeds_of_a_base_and_of_a_free_body_are_consistent(wheels):
-    """Rates carry the body, speeds change at random, and errors have the covariance that is told."""
+    """Rates carry the body, speeds change at random, and errors have the stated covariance."""
     model = make_body(wheels=wheels)
     speeds = sorted(model.speeds, key=lambda s: s.sort_key)
     q = dict.fromkeys(speeds, 4.0 if wheels else 0.05)

@@ -53,7 +53,7 @@ def test_quantiles_are_those_of_chi_squared():
     ],
 )
 def test_a_group_that_jumped_is_lost_and_then_found(process, outliers):
-    """A door is opened while nothing looks, without time passing; the drawer beside it is not lost."""
+    """A door is opened unobserved, without time passing; the drawer next to it is not lost."""
     tracker = Tracker(MODEL, ["hinge", "handle", "drawer"], process=process, outliers=outliers, lost_after=5)
     observer = NoisyObserver(MODEL, ["hinge", "handle", "drawer"])
     for k in range(30):

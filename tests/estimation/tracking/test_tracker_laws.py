@@ -224,7 +224,7 @@ def test_limits_on_several_coordinates_hold():
 
 
 def test_limits_that_depend_on_coordinates_hold():
-    """A door limits the drawer beside it, and a bolt holds the door near zero."""
+    """A door limits the drawer next to it, and a bolt holds the door near zero."""
     model = make_slides()
     a, b = kv.position("a"), kv.position("b")
     with model.edit() as edit:

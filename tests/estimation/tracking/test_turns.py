@@ -44,7 +44,7 @@ def test_estimate_follows_a_joint_over_three_turns_and_back(is_compiled, process
         truth = 0.3 + 10.0 * (1.0 - np.cos(0.05 * k))
         result = tracker.update(observer({"q": truth}), at=DT * k).state["q"]
         assert result == pytest.approx(truth, abs=0.2)
-        # The rack, which nobody sees, does not jump.
+        # The rack, which is not observed, does not jump.
         assert abs(result - before) < 0.8
         before, most = result, max(most, result)
     assert most > 6 * np.pi
@@ -63,7 +63,7 @@ def test_start_beyond_half_a_turn_stays_on_its_turn():
 @pytest.mark.parametrize("truth", [1.0, -2.5, 20.0])
 @pytest.mark.parametrize("outliers", [None, True])
 def test_a_turn_that_is_observed_is_found(truth, start, outliers):
-    """The place of the rack tells the turn of the pinion, also from a start that is turns away."""
+    """The place of the rack determines the turn of the pinion, also from a start that is turns away."""
     frames = ["pinion", "rack"]
     tracker = Tracker(MODEL, frames, start={"q": start}, outliers=outliers)
     observer = NoisyObserver(MODEL, frames)
@@ -87,7 +87,7 @@ def test_estimate_after_loss_has_the_turn_nearest_to_the_prediction():
 
 
 @pytest.mark.parametrize(("ratio", "turns"), [(-1.5, 2), (1 / 3, 3)])
-def test_turns_that_no_gear_tells_are_those_nearest_to_the_prediction_after_loss(ratio, turns):
+def test_turns_that_no_gear_determines_are_those_nearest_to_the_prediction_after_loss(ratio, turns):
     """A gear next to its driver stands as before after several turns."""
     model = make_pinion()
     with model.edit() as edit:
@@ -148,7 +148,7 @@ def test_heading_of_a_base_that_drives_in_circles_counts_turns(joint, process):
 
 
 def test_controller_fed_by_a_tracker_arrives_beyond_half_a_turn():
-    """It would turn for ever towards a value that the tracker never tells."""
+    """Otherwise it would turn for ever towards a value that the tracker never reports."""
     q = MODEL.symbol("q")
     controller = Controller(MODEL, [Goal(q, 4.0, speed=1.0)], dt=DT)
     tracker, observer = Tracker(MODEL, ["pinion"], start={q: 0.0}), NoisyObserver(MODEL, ["pinion"])
