@@ -140,7 +140,7 @@ def test_half_installed_extra_is_one_line(run, monkeypatch, error, expected):
     def fail(arguments):
         raise error
 
-    monkeypatch.setattr(COMMANDS["info"], "run", fail)
+    monkeypatch.setattr(load_command("info"), "run", fail)
     status, out, err = run("info", "kitchen")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert expected in err
@@ -150,7 +150,7 @@ def test_extra_whose_requirement_is_missing_is_named(run, tmp_path, monkeypatch)
     (tmp_path / "daqp.py").write_text("import nowhere_at_all\n", encoding="utf-8")
     monkeypatch.delitem(sys.modules, "daqp", raising=False)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(COMMANDS["info"], "run", lambda arguments: __import__("daqp"))
+    monkeypatch.setattr(load_command("info"), "run", lambda arguments: __import__("daqp"))
     status, _, err = run("info", "kitchen")
     assert (status, err.count("\n")) == (2, 1)
     assert "The extra 'control' is not installed completely (No module named 'nowhere_at_all')" in err
@@ -160,6 +160,6 @@ def test_import_error_of_this_package_is_no_message(monkeypatch):
     def fail(arguments):
         raise ImportError("cannot import name", name="kineverse.model")
 
-    monkeypatch.setattr(COMMANDS["info"], "run", fail)
+    monkeypatch.setattr(load_command("info"), "run", fail)
     with pytest.raises(ImportError):
         MAIN.main(["info", "kitchen"])

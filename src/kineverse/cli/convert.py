@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.model.registry import SaveResult
 
-HELP = """write a model to a file, in the format of its suffix
-
+HELP = """\
 IN is any model that can be loaded. OUT is a document (.kv.json), which holds the whole model, URDF (.urdf)
 or MJCF (.xml). A motion that the format cannot represent is refused by name, and nothing is written; with
 --tolerance, such motions are approximated, and a guaranteed bound on the errors of frames is printed.

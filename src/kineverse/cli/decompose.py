@@ -29,8 +29,7 @@ from .output import colorize, format_cells, join_lines, show_activity, show_prog
 if TYPE_CHECKING:
     from kineverse.geometry.decomposition import CacheEntry, Decomposition, DecompositionOutcome
 
-HELP = """decompose meshes into convex hulls, for fast distances with penetration depth
-
+HELP = """\
 Of a model, the meshes of collision shapes are decomposed; of bodies without collision shapes, the visual
 meshes. The hulls are stored in the user's cache by the content of the mesh and the settings; cached meshes
 are not decomposed again. Each mesh takes seconds to minutes; after Ctrl-C, finished meshes stay cached.

@@ -10,8 +10,7 @@ from . import demo_living, demo_robot
 from .arguments import require
 from .view import add_page_options
 
-HELP = """let a robot open and close the doors and drawers of a kitchen
-
+HELP = """\
 A robot that ships opens and closes the doors and drawers of the kitchen that ships, one after another, live
 in the browser until Ctrl-C: the robot and the true kitchen, what it believes of it from noisy poses, and what
 its controller wants. Each object is reported on the terminal, and all of them in a table at the end. With

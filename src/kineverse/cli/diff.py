@@ -11,8 +11,7 @@ from kineverse.errors import InvalidValueError
 from .arguments import add_model_options, load_model
 from .output import colorize, show_activity
 
-HELP = """print the differences of two models: operations, frames, constraints, bodies
-
+HELP = """\
 Models are compared name by name, whatever their formats. Numbers and formulas that agree within the tolerance
 at sampled states count as equal. Operations are compared if most of them have a counterpart with the same
 tag. Meshes are compared by name, not by the content of the files.

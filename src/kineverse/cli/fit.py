@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from kineverse.estimation.recordings import ObservationNoise, RecordedJoint, RecordedPair
 
 
-HELP = """identify the joint of a part from a table of its poses
-
+HELP = """\
 The table is text, with a head that names its columns: time, part, x, y, z and qx, qy, qz, qw (or roll,
 pitch, yaw, or rx, ry, rz, a rotation vector), in m, rad and s unless a unit follows as in "x [mm]". There is
 a part in each row, or all parts are in one row, and then columns are called door.x. Without a head, 3 columns

@@ -18,8 +18,7 @@ from .arguments import (
     print_notes,
 )
 
-HELP = """print the pose of a frame at given positions
-
+HELP = """\
 Positions that are not set have their defaults: 0, or the nearest value within the limits.
 
 examples:

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
     from .summary import ModelSummary
 
-HELP = """print the contents of a model: frames, degrees of freedom, constraints, size
-
+HELP = """\
 examples:
   kineverse info kitchen
   kineverse info my_robot.urdf --frames

@@ -64,39 +64,34 @@ class ManipulationCommand(NamedTuple):
         return _run(arguments, self.skill)
 
 
-COMMANDS = {
-    "open": ManipulationCommand(
-        "open",
-        f"""open a door or drawer with a robot that grasps its handle
-
+OPEN = ManipulationCommand(
+    "open",
+    f"""\
 The object is at its default value at first, unless --from says otherwise, and is opened to the limit that
 is farthest from shut, or to --to.
 {_COMMON}  kineverse open kitchen --robot fetch --what kitchen/fridge_door
   kineverse open kitchens/17 --robot hsr --what kitchen/oven_door --world mujoco --json
   kineverse open shelf.urdf --robot arm.urdf --base omni --what drawer --to 20cm
   kineverse open kitchen --robot hsr --what kitchen/fridge_door --unknown --noise 3mm,0.5deg,30Hz""",
-    ),
-    "close": ManipulationCommand(
-        "close",
-        f"""close a door or drawer with a robot that grasps its handle
-
+)
+CLOSE = ManipulationCommand(
+    "close",
+    f"""\
 The object is open by .4 (rad, m) or to its limit at first, unless --from says otherwise. It is shut at the
 limit nearest to its default value.
 {_COMMON}  kineverse close kitchen --robot fetch --what kitchen/fridge_door
   kineverse close kitchen --robot hsr --what kitchen/oven_door --from 60deg --record run.mcap
   kineverse close kitchen --robot hsr --what kitchen/fridge_door --set kitchen/oven_door=90deg""",
-    ),
-    "push": ManipulationCommand(
-        "push",
-        f"""push a door or drawer shut with a robot
-
+)
+PUSH = ManipulationCommand(
+    "push",
+    f"""\
 The object is open by .4 (rad, m) or to its limit at first, unless --from says otherwise. It is shut at the
 limit nearest to its default value. A robot without a place starts where it stands, or from a place that is
 searched if the push does not go through from there. --hand may name any body of the robot, which then pushes.
 {_COMMON}  kineverse push kitchen --robot hsr --what kitchen/sink_left_upper_drawer
   kineverse push kitchen --robot pr2@-0.6,-1.4,0 --what kitchen/fridge_door --view""",
-    ),
-}
+)
 
 
 class _Once(argparse.Action):

@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from kineverse.planning import Path, Planner
 
 
-HELP = """find a path without collisions
-
+HELP = """\
 A goal is values of coordinates (NAME=VALUE), poses of frames, or a state of an SRDF. FRAME@FRAME brings a
 frame to another one, in all directions or some (FRAME@FRAME:xyz, :xyz,rx,ry), FRAME@FRAME+X,Y,Z to a place
 beside it, FRAME@X,Y,Z to a position in the world; ROLL,PITCH,YAW may follow. A start is the same, or a file
@@ -137,7 +136,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", action="store_true", help="play the trajectory in the browser")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument(
-        "--verbose", action="store_true", default=argparse.SUPPRESS, help="print the positions on the way"
+        "-v",
+        "--verbose",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help="print the positions on the way",
     )
     add_model_options(parser)
     add_page_options(parser)

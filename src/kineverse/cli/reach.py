@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.control import Goal
 
-HELP = """find positions in which a frame has a pose: inverse kinematics
-
+HELP = """\
 The pose is given by 3 numbers [m] for a position alone, by 6 for position and roll, pitch, yaw [rad], or by
 the name of a frame. All limits are respected. Without a solution the nearest positions are printed, with the
 reason, and the exit status is 1. This needs the extra 'control'.

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from kineverse.geometry.objects import CollisionObject
     from kineverse.planning.spheres import SphereCover
 
-HELP = """cover collision shapes by spheres, and show how far these stick out
-
+HELP = """\
 Every point of a shape lies in a sphere; the shapes of a link are covered together. Meshes are covered as the
 convex hulls that distances are computed to. The spheres are stored in the user's cache by the content of the
 shapes and the settings.

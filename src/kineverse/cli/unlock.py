@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from kineverse.model.model import Model
     from kineverse.reasoning import UnlockingPlan
 
-HELP = """find the order in which locked parts have to move
-
+HELP = """\
 The interlocks of the model are derived from its constraints. Each step is printed with its reason. If the
 goal cannot be reached, the locks that prevent it are printed, and the exit status is 1; it is 3 if that stays
 undecided. Both answers are checked by evaluating the constraints.

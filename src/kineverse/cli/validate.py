@@ -13,8 +13,7 @@ from .output import colorize, format_table, show_progress, truncate_lines
 if TYPE_CHECKING:
     from .file_validation import ValidationResult
 
-HELP = """read files strictly, and list their mistakes and problems
-
+HELP = """\
 All mistakes that kv.load tolerates with a remark are listed, and a file with mistakes counts as unreadable. A
 file that can be read is checked for limits that are violated at the default state, poses that are not finite
 there, loops that do not close there or within the limits, bodies with an impossible inertia, and missing mesh

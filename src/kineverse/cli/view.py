@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from kineverse.planning import Trajectory
     from kineverse.worlds import RunRecording
 
-HELP = """show a model in the browser, with a slider for everything that moves
-
+HELP = """\
 The page is served to this computer only, until Ctrl-C; with --host also to others, who need the address with
 its token. With --picture, a picture of the state is written instead. This needs no browser, and no extra
 except for meshes and --near.

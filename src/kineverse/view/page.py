@@ -97,6 +97,25 @@ def show(
     return page
 
 
+def view(
+    model: ModelView,
+    state: StateLike | None = None,
+    *,
+    port: int | None = None,
+    label: str | None = None,
+    camera: Camera | None = None,
+    host: str = "127.0.0.1",
+    degrees: bool = False,
+) -> Viewer:
+    """Show a model on a web page and return at once; :func:`kineverse.show` waits, and opens the browser.
+
+    Parameters, result and errors are those of :class:`kineverse.view.viewer.Viewer`.
+    """
+    from .viewer import Viewer
+
+    return Viewer(model, state, port=port, label=label, camera=camera, host=host, degrees=degrees)
+
+
 def in_notebook() -> bool:
     """Return True in a kernel of IPython, whose front end shows results of cells as HTML."""
     return getattr(_ipython(), "kernel", None) is not None
