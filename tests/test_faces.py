@@ -125,7 +125,9 @@ def test_a_face_imports_nothing_before_it_is_used() -> None:
 
 
 IN_PROCESS = "import io, contextlib; from kineverse.cli import main; out = io.StringIO()\n"
-QUIETLY = IN_PROCESS + "with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out): main({words!r})"
+QUIETLY = (
+    IN_PROCESS + "with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out): main({words!r})"
+)
 
 
 def test_help_imports_neither_numpy_nor_casadi() -> None:

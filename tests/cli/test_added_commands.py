@@ -7,9 +7,8 @@ import sys
 
 import pytest
 
+from kineverse.cli import command_line as MAIN
 from kineverse.cli.command_line import COMMANDS, find_added_commands, load_command
-
-MAIN = sys.modules["kineverse.cli.main"]
 
 GREETING = """HELP = "greet somebody"
 def add_arguments(parser):
@@ -44,7 +43,7 @@ def add_command(tmp_path, monkeypatch):
 @pytest.fixture
 def without_added_commands(monkeypatch):
     """Have no distribution add a command."""
-    monkeypatch.setattr(MAIN, "entry_points", lambda group: ())
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: ())
 
 
 def test_command_of_another_distribution_runs(run, add_command):
@@ -88,7 +87,7 @@ def test_command_of_this_package_is_not_replaced(run, add_command):
 
 def test_entry_points_are_looked_up_for_unknown_names_and_for_help_only(run, monkeypatch):
     looked_up = []
-    monkeypatch.setattr(MAIN, "entry_points", lambda group: looked_up.append(group) or ())
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: looked_up.append(group) or ())
     assert run("info", "kitchen")[0] == 0
     assert run("fk", "--help")[0] == 0
     assert looked_up == []

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
+
+if TYPE_CHECKING:
+    from kineverse.geometry.results import DistanceResult
 
 SATURATED = 1e-9
 """Multiplier from which a bound counts as active."""

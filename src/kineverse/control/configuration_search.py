@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from kineverse.errors import NoSolutionError
 from kineverse.lie import Array
 
-from .clearance import Clearance
 from .command import SATURATED
 from .position_program import PositionProgram
 from .quadratic_program import make_solver
+
+if TYPE_CHECKING:
+    from .clearance import Clearance
 
 STEPS, _CLEARING_STEPS, _LAST_STEPS = 40, 60, 200
 _PATIENCE = 5

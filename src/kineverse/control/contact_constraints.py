@@ -23,7 +23,7 @@ from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.symbols import Symbol
 
-from .velocity_program import INWARDS, RECOVERY_WEIGHT
+from .velocity_program import INWARDS, RECOVERY_WEIGHT, check_slots
 
 _SOURCE = r"""
 #include <stdint.h>
@@ -243,12 +243,6 @@ class ContactSlots:
         used = min(len(self.found), self.count)
         if used:
             self._rows.write(self.found, used, gain=self.gain, recovery=recovery, weight=weight)
-
-
-def check_slots(count: object) -> None:
-    """Raise InvalidValueError for a number of contact slots that is no natural number."""
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise InvalidValueError(f"contacts= is a number of rows, 0 or more, not {count!r}.")
 
 
 def _contiguous(array: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,22 +20,25 @@ from kineverse.errors import (
     suggest,
 )
 from kineverse.expressions.expression import ExpressionLike
-from kineverse.geometry import Scene
-from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol, parameter
 
 from .command import Command, StepTimes, TaskErrors
-from .contact_constraints import ContactSlots, check_slots
 from .control_loop import LoopReport, run_control_loop
 from .formulation import Formulation
 from .infeasibility import Diagnosis
 from .quadratic_program import make_solver
 from .regularization import Costs, acceleration_limits, check_weight, find_posture, joint_weights
 from .tasks import Target, Task
-from .velocity_program import RECOVERY_WEIGHT, VelocityProgram, arrange_inputs
+from .velocity_program import RECOVERY_WEIGHT, VelocityProgram, arrange_inputs, check_slots
+
+if TYPE_CHECKING:
+    from kineverse.geometry import Scene
+    from kineverse.geometry.results import DistanceResults
+
+    from .contact_constraints import ContactSlots
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
@@ -156,6 +159,8 @@ class Controller:
         self._queried = False
         self._default_radius = radius is None
         if scene is not None and contacts:
+            from .contact_constraints import ContactSlots  # for start-up time
+
             self._contacts = ContactSlots(
                 scene,
                 self.speeds,

@@ -13,23 +13,27 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kineverse._checks import as_count, as_tolerance
 from kineverse.errors import NotFiniteError
-from kineverse.geometry import Scene
-from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import TOLERANCE
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-from .clearance import Clearance
 from .configuration_search import PROGRESS, STEPS, ConfigurationSearch, SearchEnd
 from .position_program import PositionProgram
 from .tasks import Task
+
+if TYPE_CHECKING:
+    from kineverse.geometry import Scene
+    from kineverse.geometry.results import DistanceResult
+
+    from .clearance import Clearance
 
 _DIFFERENT = 1e-3
 """Least difference of a coordinate of two solutions [m], [rad]."""
@@ -103,9 +107,11 @@ class InverseKinematics:
         self.model = model
         self._program = program = PositionProgram(model, tasks, still, as_tolerance(tolerance))
         self.tasks, self.coordinates = program.tasks, program.coordinates
-        self._clearance = (
-            None if scene is None else Clearance(scene, program, as_tolerance(margin, "The margin"))
-        )
+        self._clearance: Clearance | None = None
+        if scene is not None:
+            from .clearance import Clearance  # for start-up time: without a scene there is no geometry
+
+            self._clearance = Clearance(scene, program, as_tolerance(margin, "The margin"))
         self._search = ConfigurationSearch(program, self._clearance)
         others = () if self._clearance is None else self._clearance.inputs
         extra = sorted({*others} - {*program.inputs}, key=lambda s: s.sort_key)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,11 +14,13 @@ from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError,
 from kineverse.model.model_view import ModelView
 
 from .command import Command, name_contact
-from .contact_constraints import ContactSlots
 from .formulation import Formulation
 from .qp import Vector
 from .quadratic_program import make_solver
 from .velocity_program import VelocityProgram
+
+if TYPE_CHECKING:
+    from .contact_constraints import ContactSlots
 
 
 class Conflict(NamedTuple):

@@ -28,6 +28,7 @@ import numpy as np
 
 from kineverse.compilation import CompiledFunction, compile
 from kineverse.compilation.function import WantedTier
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
 from kineverse.expressions.functions import norm
 from kineverse.lie import Array
@@ -211,3 +212,9 @@ def _way_back(violation: Expression, gain: float, largest: Expression) -> tuple[
     outside = binary(ca.OP_NE, violation, 0)
     sign = binary(ca.OP_LT, 0, violation) - binary(ca.OP_LT, violation, 0)
     return RECOVERY_WEIGHT * largest * outside, -gain * (violation + INWARDS * sign)
+
+
+def check_slots(count: object) -> None:
+    """Raise InvalidValueError for a number of contact slots that is no natural number."""
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise InvalidValueError(f"contacts= is a number of rows, 0 or more, not {count!r}.")
