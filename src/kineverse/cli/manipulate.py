@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import numpy as np
+
 from kineverse.errors import InvalidValueError, MissingDependencyError
 from kineverse.expressions.printing import format_number
 
 from .arguments import add_model_options, add_set_option, needs_mujoco, print_notes, require
-from .manipulate_output import PhaseLines, report_outcome
-from .manipulate_setup import ManipulationScene, make_scene
-from .manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
-from .output import show_activity
+from .manipulate_skills import (
+    ManipulationScene,
+    grasp_object,
+    is_shut,
+    make_scene,
+    open_as_unknown,
+    push_object,
+    skip_skill,
+)
+from .output import format_table, join_lines, show_activity
 from .view import (
     add_page_options,
     handle_interrupts,
+    list_mesh_problems,
     page_options,
     print_address,
     print_mesh_problems,
@@ -192,7 +202,7 @@ def _run(arguments: argparse.Namespace, skill: str) -> int:
             outcome = _view(arguments, skill, scene, world, stack)
         else:
             outcome = _act(arguments, skill, scene, world, [], arguments.record)
-            report_outcome(arguments, skill, scene, world, outcome)
+            _report_outcome(arguments, skill, scene, world, outcome)
     if outcome is None:
         raise KeyboardInterrupt  # before there was a result
     return DONE if outcome else NOT_DONE
@@ -264,7 +274,7 @@ def _act(
     belief: Belief | None = None
     error = EstimateError(scene.coordinate)
     with ExitStack() as stack:
-        watchers = [PhaseLines(scene), *watchers]
+        watchers = [_PhaseLines(scene), *watchers]
         if arguments.noise is not None and not arguments.unknown:
             tracked = TrackedBelief(scene.model, scene.robot, Sensors.parse(arguments.noise))
             print_notes(tracked.remarks)
@@ -345,9 +355,105 @@ def _view(
         live = LiveRun(page)
         outcome = _act(arguments, skill, scene, world, [live], record)
         live.remove()
-        report_outcome(arguments, skill, scene, world, outcome)
+        _report_outcome(arguments, skill, scene, world, outcome)
         sys.stdout.flush()
         if record is not None and outcome.steps:
             play_recording(page, read_run_recording(record), loop=True)
         page.wait()
     return outcome
+
+
+class _PhaseLines:
+    """Lines on standard error, one for each phase that begins."""
+
+    def __init__(self, scene: ManipulationScene) -> None:
+        self._scene, self._phase = scene, ""
+
+    def __call__(self, session: RecordedStep) -> None:
+        """Print the phase if it is another one."""
+        if session.phase != self._phase:
+            self._phase, scene = session.phase, self._scene
+            value = f"{session.world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()
+            print(f"{session.world.time:7.2f} s  {self._phase:<12}  {value}", file=sys.stderr, flush=True)
+
+
+def _report_outcome(
+    arguments: argparse.Namespace, skill: str, scene: ManipulationScene, world: World, outcome: Outcome
+) -> None:
+    """Print the result of a skill, and write a picture if wanted."""
+    if arguments.picture is not None:
+        from kineverse.view import save_picture
+
+        save_picture(arguments.picture, scene.model, {str(s): v for s, v in world.state.items()})
+        print_mesh_problems(list_mesh_problems(scene.model))
+        print(f"picture: {arguments.picture}", file=sys.stderr)
+    if arguments.json:
+        answer = {
+            "claimed": outcome.claimed,
+            "done": outcome.done,
+            "value": outcome.value,
+            "reason": outcome.reason,
+            "world": outcome.world,
+            "seconds": outcome.seconds,
+            "steps": outcome.steps,
+            "skill": skill,
+            "robot": scene.robot,
+            "what": str(scene.coordinate),
+            "start": scene.start[scene.coordinate],
+            "target": None if arguments.unknown and arguments.to is None else scene.target,
+            "hand": None if scene.gripper is None else scene.gripper.hand,
+            "measures": outcome.measures,
+            "remarks": world.remarks,
+        }
+        print(json.dumps(_plain(answer), allow_nan=False))
+        return
+    at = f"{format_number(outcome.value, 4)} {scene.unit}".rstrip()
+    if not outcome:
+        verdict = f"not done, at {at}. {outcome.reason}"
+    else:
+        state = "shut" if is_shut(scene) else "done"
+        verdict = f"{state} at {at}, after {format_number(outcome.seconds, 4)} s in the {world.name} world"
+    print(f"{scene.coordinate}: {join_lines(verdict)}")
+    if "family" in outcome.measures:
+        if outcome:
+            print(outcome.reason)
+        print(f"learned joint: {_describe_joint(outcome.measures)}")
+    if outcome.steps:
+        rows = [("steps", str(outcome.steps))]
+        rows += [(name, _format_measure(value)) for name, value in _plain(outcome.measures).items()]
+        print(format_table(("measure", "value"), rows))
+    if arguments.record is not None:
+        print(f"recording: {arguments.record}")
+
+
+def _describe_joint(measures: Mapping[str, Any]) -> str:
+    """Return a learned joint in words: family, axis, and a point on it."""
+    words = str(measures["family"])
+    for key, link in (("axis", "axis"), ("point", "through")):
+        if key in measures:
+            words += f", {link} [{', '.join(f'{v:.3f}' for v in np.ravel(measures[key]))}]"
+    certain = f"certain after {100 * measures['decided_way']:.1f} cm"
+    return f"{words} in {measures['parent']}, {certain} and {math.degrees(measures['decided_turn']):.1f}°"
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: what is not finite is null, and what is unknown is its text."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
+
+
+def _format_measure(value: Any) -> str:
+    if isinstance(value, float):
+        return format_number(value, 4)
+    if isinstance(value, list) and all(isinstance(one, str) for one in value):
+        return ", ".join(filter(None, value)) or "-"
+    if isinstance(value, (list, dict)):
+        return f"{len(value)}, see --json"
+    return "-" if value is None else str(value)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     )
     from .outcome import Outcome as Outcome, SkillError as SkillError
     from .pushing import push as push
+    from .robot_placement import PlacedRobot as PlacedRobot, place_robot as place_robot
     from .session import Session as Session
     from .tracked_belief import TrackedBelief as TrackedBelief
     from .unknown_objects import open_unknown as open_unknown
@@ -38,6 +39,7 @@ lazy_face(
         ".opening": "BasePlacement PlacementSearch open_object",
         ".outcome": "Outcome SkillError",
         ".pushing": "push",
+        ".robot_placement": "PlacedRobot place_robot",
         ".session": "Session",
         ".tracked_belief": "TrackedBelief",
         ".unknown_objects": "open_unknown",
