@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from kineverse.cli import command_line as MAIN
+from kineverse.cli import command_line
 from kineverse.cli.command_line import COMMANDS, find_added_commands, load_command
 
 GREETING = """HELP = "greet somebody"
@@ -161,4 +161,4 @@ def test_import_error_of_this_package_is_no_message(monkeypatch):
 
     monkeypatch.setattr(load_command("info"), "run", fail)
     with pytest.raises(ImportError):
-        MAIN.main(["info", "kitchen"])
+        command_line.main(["info", "kitchen"])

@@ -13,6 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
+from kineverse.geometry.decomposition import (
+    DecompositionSettings,
+    ResourceLimits,
+    clear,
+    decompose_all,
+    folder,
+    list_entries,
+)
 from kineverse.model.body import Mesh
 
 from .arguments import (
@@ -96,7 +104,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.names:
         raise UnknownNameError("Name a model or a mesh file; see kineverse decompose --help.")
     require("kineverse decompose", {"decomposition": True, "mjcf": any(map(needs_mujoco, arguments.names))})
-    from kineverse.geometry.decomposition import decompose_all
 
     settings, limits, jobs = _settings(arguments)
     tasks, unread = _tasks(arguments)
@@ -116,7 +123,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
-    from kineverse.geometry.decomposition import DecompositionSettings, ResourceLimits
 
     options: dict[str, Any] = {}
     if arguments.error is not None:
@@ -239,7 +245,6 @@ def _outcome_to_json(task: MeshTask, outcome: DecompositionOutcome) -> dict[str,
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-    from kineverse.geometry.decomposition import clear, folder, list_entries
 
     def describe(entry: CacheEntry) -> tuple[dict[str, Any], tuple[str, ...]]:
         made = entry.decomposition.made

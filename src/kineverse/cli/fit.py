@@ -4,16 +4,35 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from kineverse.errors import InvalidValueError
+from kineverse.estimation.identification.curve import CURVE
+from kineverse.estimation.identification.joint_operations import joint_operation
+from kineverse.estimation.recordings import ObservationNoise, identify_recorded_joint, read_recording
+from kineverse.estimation.recordings.recorded_joint import MAX_ROTATION_STEP
+from kineverse.expressions.printing import format_number
+from kineverse.gallery import shapes
+from kineverse.lie import Array
+from kineverse.model.basic_operations import SetBody
+from kineverse.model.body import Body
+from kineverse.model.frame import WORLD
+from kineverse.model.model import Model
+from kineverse.model.operation import Operation
+from kineverse.spatial import translation
 
 from .arguments import parse_length, parse_value, require
-from .output import show_activity
+from .output import format_table, show_activity
 
 if TYPE_CHECKING:
-    from kineverse.estimation.recordings import ObservationNoise, RecordedJoint, RecordedPair
+    from kineverse.estimation import Fit, IdentificationResult
+    from kineverse.estimation.recordings import Assumption, RecordedJoint, RecordedPair
 
 
 HELP = """\
@@ -75,10 +94,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the table, identify the joint, and print, draw and save it."""
-    from kineverse.estimation.recordings import identify_recorded_joint, read_recording
-
-    from .fit_output import fit_to_json, format_fit
-
     if arguments.document and not arguments.document.endswith(".kv.json"):
         raise InvalidValueError(
             f"--document {arguments.document!r}: the joint is written as a document, whose name ends in "
@@ -129,8 +144,6 @@ def parse_noise(text: str) -> tuple[float, float | None]:
 
 def check_noise(stated: tuple[float, float | None], pair: RecordedPair) -> ObservationNoise:
     """Return the stated noise of the observations of a pair."""
-    from kineverse.estimation.recordings import ObservationNoise
-
     position, orientation = stated
     if orientation is None and pair.has_orientation:
         raise InvalidValueError("--noise: poses have two, of positions and orientations: 3mm,1deg")
@@ -143,13 +156,297 @@ def write_results(
     """Write the requested picture and document, and return their paths."""
     fit = learned.fit
     if arguments.picture:
-        from kineverse.view.plots import SIZE, Figure, draw_fit
+        from kineverse.view.plots import SIZE, Figure, draw_fit  # for start-up time
 
         title = f"{pair.child} in {pair.parent}: {learned.found}"
         picture = Figure(lambda c: draw_fit(c, fit, pair.relative, title), SIZE)
         picture.save(arguments.picture)
     if arguments.document:
-        from .fit_output import make_joint_model
-
         make_joint_model(pair.select(fit.inliers), fit).save(arguments.document)
     return {"picture": arguments.picture, "document": arguments.document}
+
+
+_LEAST_PROBABILITY = 1e-4
+"""Less probable families are named without numbers."""
+
+_MOST_LISTED = 10
+"""Number of outliers listed."""
+
+
+def format_fit(source: str, pair: RecordedPair, learned: RecordedJoint) -> str:
+    """Return the joint as text, with its uncertainty and the alternatives."""
+    found, best, count = learned.found, learned.fit, len(pair.child_poses)
+    verdict = f"{best.family}, {_format_percent(best.probability)}"
+    if learned.is_ambiguous:
+        verdict = f"{format_doubt(learned)}\nThe most probable one: {verdict}"
+    what = "poses" if pair.child_poses.ndim == 3 else "positions"
+    lines = [
+        f"{pair.child} in {pair.parent}: {count} {what} ({source})",
+        *_format_correlation(learned, count),
+        f"noise: {_format_noise(learned.noise)}",
+        "",
+        verdict,
+        *(f"  {name:10}{value}" for name, value in _format_parameters(best)),
+        *_format_outliers(best.outliers, count, what),
+        *_revolution_warning(best, pair),
+        "",
+        *_format_ranking(found),
+    ]
+    return "\n".join(lines)
+
+
+def fit_to_json(pair: RecordedPair, learned: RecordedJoint) -> dict[str, Any]:
+    """Return the identified joints as JSON data."""
+    found, noise = learned.found, learned.noise
+    return {
+        "parent": pair.parent,
+        "child": pair.child,
+        "count": len(pair.child_poses),
+        "judged": learned.judged,
+        "orientations": pair.child_poses.ndim == 3,
+        "noise": {"position": noise.position, "orientation": noise.orientation, "given": noise.given},
+        "correlation_time": learned.correlation_time,
+        "repeated": learned.repeated,
+        "told": not learned.is_ambiguous,
+        "family": found.best.family,
+        "says": format_doubt(learned) if learned.is_ambiguous else str(found),
+        "objections": [
+            {
+                "family": other.found.best.family,
+                "probability": other.found.best.probability,
+                "noise": {"position": other.noise.position, "orientation": other.noise.orientation},
+                "correlation_time": other.correlation_time,
+            }
+            for other in learned.objections
+        ],
+        "outliers": list(learned.fit.outliers),
+        "fits": [_fit_to_json(fit) for fit in (learned.fit, *found.fits[1:])],
+    }
+
+
+def format_doubt(learned: RecordedJoint) -> str:
+    """Return the reason why a joint is ambiguous: the result itself, or what it depends on."""
+    found = learned.found
+    if not learned.objections:
+        return "no joint explains these poses" if learned.is_free else str(found)
+    answers = [] if found.is_ambiguous else [f"{found.best.family} if {_format_assumption(learned, learned)}"]
+    for other in learned.objections:
+        result = other.found
+        answer = "nothing is sure" if result.is_ambiguous else result.best.family
+        answers.append(f"{answer} if {_format_assumption(other, learned)}")
+    first = f"{found}; " if found.is_ambiguous else "cannot tell: "
+    return first + ", ".join(answers)
+
+
+def _format_assumption(assumed: RecordedJoint | Assumption, made: RecordedJoint) -> str:
+    """Return the noise, or the correlation time if that is what differs from the assumption made."""
+    if assumed.correlation_time != made.correlation_time:
+        return f"errors are alike over {format_number(assumed.correlation_time, 2)} rows"
+    return f"the noise is {_format_deviations(assumed.noise)}"
+
+
+def _format_correlation(learned: RecordedJoint, count: int) -> list[str]:
+    """Return lines on repeated rows and on correlated errors."""
+    lines = []
+    if learned.repeated:
+        do = "row repeats" if learned.repeated == 1 else "rows repeat"
+        lines.append(f"{learned.repeated} {do} the one before in every digit, and count as not there")
+    if learned.judged < count - learned.repeated:
+        time = format_number(learned.correlation_time, 2)
+        lines.append(
+            f"errors are alike over {time} rows, so these are worth {learned.judged} independent ones "
+            f"(--thin {count} takes all as independent)"
+        )
+    return lines
+
+
+def _format_noise(noise: ObservationNoise) -> str:
+    return f"{_format_deviations(noise)}, {'as given' if noise.given else 'estimated'}"
+
+
+def _format_deviations(noise: ObservationNoise) -> str:
+    position = f"{format_number(1e3 * noise.position, 3)} mm"
+    if noise.orientation is None:
+        return position
+    return f"{position} and {format_number(math.degrees(noise.orientation), 3)} deg"
+
+
+def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
+    """Return the names and texts of the parameters of a joint, with standard deviations."""
+    parts = []
+    for name in ("axis", "normal"):
+        if name in fit.parameters:
+            spread = _standard_deviation(fit, "axis.x", "axis.y")
+            parts.append(
+                (name, f"{_format_vector(fit, name)}   ± {format_number(math.degrees(spread), 2)} deg")
+            )
+    for name in ("point", "centre"):
+        if name in fit.parameters:
+            spread = _standard_deviation(fit, "point.x", "point.y", "point.z")
+            parts.append((name, f"{_format_vector(fit, name)} m   ± {format_number(1e3 * spread, 2)} mm"))
+    if "pitch" in fit.parameters:
+        pitch, spread = 1e3 * float(fit.parameters["pitch"]), 1e3 * fit.deviation("pitch")
+        parts.append(("pitch", f"{format_number(pitch)} mm per revolution   ± {format_number(spread, 2)} mm"))
+    for low, high, spread, turns in joint_ranges(fit):
+        scale, unit = (math.degrees(1.0), "deg") if turns else (1e3, "mm")
+        ends = f"{format_number(scale * low)} … {format_number(scale * high)} {unit}"
+        parts.append(("seen", f"{ends}   ± {format_number(scale * spread, 2)} {unit} at each end"))
+    rms = f"{format_number(1e3 * fit.rms[0], 3)} mm"
+    if fit.residuals.shape[1] > 3:
+        rms += f", {format_number(math.degrees(fit.rms[1]), 3)} deg"
+    return [*parts, ("left over", f"{rms} rms")]
+
+
+def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str]:
+    """Return a line with the indices of outliers, from 0; none if there are no outliers."""
+    if not outliers:
+        return []
+    numbers = ", ".join(map(str, outliers[:_MOST_LISTED]))
+    more = ", …" if len(outliers) > _MOST_LISTED else ""
+    do = "does" if len(outliers) == 1 else "do"
+    return [f"  {len(outliers)} of {count} {what} {do} not fit: {numbers}{more} (counted from 0)"]
+
+
+def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
+    """Return a warning if revolutions may be miscounted."""
+    if not pair.is_timed or fit.largest_turn < MAX_ROTATION_STEP:
+        return []
+    most = format_number(math.degrees(fit.largest_turn), 3)
+    return [f"  from one to the next it turns by up to {most} deg: it may be more turns, or fewer"]
+
+
+def joint_ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:
+    """Return for each joint value its range, the standard deviation of the ends, and if it is an angle."""
+    ranges = []
+    for k, kind in enumerate(fit.motion.kinds):
+        values, deviations = fit.joint_values[fit.inliers, k], fit.deviations[fit.inliers, k]
+        ends = [int(np.argmin(values)), int(np.argmax(values))]
+        spread = float(deviations[ends].max())
+        ranges.append((float(values[ends[0]]), float(values[ends[1]]), spread, bool(kind)))
+    return ranges
+
+
+def _format_ranking(found: IdentificationResult) -> list[str]:
+    shown = [found[name] for name, p in found.probabilities.items() if p >= _LEAST_PROBABILITY]
+    rows: list[tuple[str, ...]] = []
+    for fit in shown:
+        angle = format_number(math.degrees(fit.rms[1]), 3) if fit.residuals.shape[1] > 3 else "-"
+        position = format_number(1e3 * fit.rms[0], 3)
+        rows.append(
+            (
+                fit.family,
+                _format_percent(fit.probability),
+                format_number(fit.log_evidence, 6),
+                position,
+                angle,
+                fit.reason,
+            )
+        )
+    head: tuple[str, ...] = ("joint", "probability", "log evidence", "left [mm]", "left [deg]", "not known")
+    if not any(fit.reason for fit in shown):
+        head, rows = head[:-1], [row[:-1] for row in rows]
+    lines = [format_table(head, rows, "<>>>>")]
+    rest = [name for name, p in found.probabilities.items() if p < _LEAST_PROBABILITY]
+    return [*lines, f"not: {', '.join(rest)}"] if rest else lines
+
+
+def _fit_to_json(fit: Fit) -> dict[str, Any]:
+    return {
+        "family": fit.family,
+        "probability": fit.probability,
+        "log_evidence": fit.log_evidence,
+        "told": fit.is_determined,
+        "reason": fit.reason,
+        "parameters": {name: np.asarray(value).tolist() for name, value in fit.parameters.items()},
+        "deviations": {name: fit.deviation(name) for name in fit.coordinates},
+        "frame": fit.frame.tolist(),
+        "ranges": [
+            {"lower": low, "upper": high, "deviation": spread, "unit": "rad" if turns else "m"}
+            for low, high, spread, turns in joint_ranges(fit)
+        ],
+        "rms": {"position": fit.rms[0], "orientation": fit.rms[1] if fit.residuals.shape[1] > 3 else None},
+    }
+
+
+def _standard_deviation(fit: Fit, *coordinates: str) -> float:
+    """Return the root of the summed variances of coordinates; those that the fit lacks are skipped."""
+    return math.hypot(*(fit.deviation(name) for name in coordinates if name in fit.coordinates))
+
+
+def _format_vector(fit: Fit, name: str) -> str:
+    return " ".join(f"{x:.4f}" for x in np.asarray(fit.parameters[name]))
+
+
+def _format_percent(probability: float) -> str:
+    """Return a probability in percent; below 1 it is at most 99.99 %."""
+    percent = 100.0 * probability
+    return f"{min(percent, 99.99):.4g} %" if probability < 1.0 else "100 %"
+
+
+MOST_DOTS = 60
+"""Largest number of observed poses drawn in the model."""
+
+
+def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
+    """Return a model with the joint, and shapes of its axis, the child and the observed positions.
+
+    If only positions are observed, the child's axes are those of its parent at joint value 0.
+    """
+    if fit.family == "free" and fit.motion.rows == 3:
+        raise InvalidValueError(
+            f"'{pair.child}' moves freely: there is no joint to write. Without --document."
+        )
+    model = Model()
+    positions = pair.relative[:, :3, 3] if pair.relative.ndim == 3 else pair.relative
+    size = max(float(np.ptp(positions, axis=0).max()), 0.01)
+    with model.edit() as edit:
+        if pair.parent != WORLD:
+            edit.add_frame(pair.parent, WORLD, translation(0, 0, 0))
+        edit.apply(make_joint_operation(fit, pair.parent, pair.child), tag=pair.child)
+        edit.apply(SetBody(pair.parent, Body(_parent_shapes(fit, positions, size))))
+        edit.apply(SetBody(pair.child, Body(_child_shapes(fit, size))))
+    return model
+
+
+def make_joint_operation(fit: Fit, parent: str, child: str) -> Operation:
+    """Return the joint as an operation; for positions alone see :func:`make_joint_model`."""
+    if fit.motion.rows == 6 or fit.family == CURVE:
+        return fit.operation(name=child, parent=parent, child=child, as_point=True)
+    right = fit.motion.right.copy()
+    right[:3, :3] = fit.motion.left[:3, :3].T
+    limits = [(float(low), float(high)) for low, high in fit.range]
+    return joint_operation(replace(fit.motion, right=right), limits, child, parent, child)
+
+
+def _parent_shapes(fit: Fit, positions: Array, size: float) -> shapes.Shapes:
+    """Return the axis, and dots at observed positions, in the parent's frame."""
+    indices = np.unique(np.linspace(0, len(positions) - 1, MOST_DOTS).round().astype(int))
+    parts: shapes.Shapes = ()
+    for point in positions[indices]:
+        parts += shapes.sphere(0.008 * size, point, shapes.ORANGE)
+    if "axis" in fit.parameters:
+        axis = np.asarray(fit.parameters["axis"])
+        middle = _closest_point_on_axis(fit, positions.mean(axis=0))
+        parts += shapes.rod(middle - 0.5 * size * axis, middle + 0.5 * size * axis, 0.012 * size, shapes.RED)
+    return parts
+
+
+def _child_shapes(fit: Fit, size: float) -> shapes.Shapes:
+    """Return a box for the child, and a rod from it to its axis if there is one, in the child's frame."""
+    parts = shapes.box(np.full(3, 0.06 * size), color=shapes.BLUE)
+    if "point" in fit.parameters:
+        reference = np.asarray(fit.parameters["reference"])
+        rotation = reference[:3, :3] if fit.motion.rows == 6 else np.eye(3)
+        arm = rotation.T @ (_closest_point_on_axis(fit, reference[:3, 3]) - reference[:3, 3])
+        if np.linalg.norm(arm) > 0.01 * size:
+            parts += shapes.rod(np.zeros(3), arm, 0.012 * size, shapes.BLUE)
+    return parts
+
+
+def _closest_point_on_axis(fit: Fit, position: Array) -> Array:
+    """Return the point of the axis closest to a position; the position itself if there is no axis."""
+    if "point" not in fit.parameters:
+        return position
+    axis, point = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
+    foot: Array = point + (axis @ (position - point)) * axis
+    return foot

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 
+import numpy as np
+
+import kineverse as kv
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 from kineverse.lie import to_quaternion
+from kineverse.view.poses import complete, roll_pitch_yaw
 
 from .arguments import (
     add_model_options,
@@ -41,11 +45,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate the pose and print it."""
     # Parsed before the model is loaded, so that a typing error is reported at once.
     assigned = parse_assignments(arguments.assignments)
-
-    import numpy as np
-
-    import kineverse as kv
-    from kineverse.view.poses import complete, roll_pitch_yaw
 
     model = load_model(arguments, arguments.model)
     expression = model.fk(arguments.frame, arguments.relative_to)

@@ -17,6 +17,8 @@ import numpy as np
 
 from kineverse.errors import InvalidValueError, MissingDependencyError
 from kineverse.expressions.printing import format_number
+from kineverse.manipulation.belief import EstimateError
+from kineverse.manipulation.swept_volume import find_obstacle
 
 from .arguments import add_model_options, add_set_option, needs_mujoco, print_notes, require
 from .manipulate_skills import (
@@ -181,7 +183,7 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
 
 
 def _run(arguments: argparse.Namespace, skill: str) -> int:
-    from kineverse.planning.bindings import request_planner
+    from kineverse.planning.bindings import request_planner  # for start-up time
 
     _check(arguments, skill)
     request_planner()
@@ -227,22 +229,22 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
     if arguments.grasp is not None and arguments.world != "mujoco":
         raise InvalidValueError("--grasp is for --world mujoco; the kinematic world has no friction.")
     if arguments.noise is not None:
-        from kineverse.worlds import Sensors
+        from kineverse.worlds import Sensors  # for start-up time
 
         Sensors.parse(arguments.noise)  # says at once what cannot be read
     if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name
+        from kineverse.view.pictures import check_png_name  # for start-up time
 
         check_png_name(arguments.picture)
     if arguments.record is not None:
-        from kineverse.worlds.recorder import check_recording_name
+        from kineverse.worlds.recorder import check_recording_name  # for start-up time
 
         check_recording_name(arguments.record)
 
 
 def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:
     """Return the world, at the start."""
-    from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
+    from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors  # for start-up time
 
     world: World
     sensors = None if arguments.noise is None else Sensors.parse(arguments.noise)
@@ -266,10 +268,9 @@ def _act(
     record: str | None,
 ) -> Outcome:
     """Run the skill, with a recording if wanted, and return its outcome."""
-    from kineverse.manipulation.belief import EstimateError
-    from kineverse.manipulation.tracked_belief import TrackedBelief
-    from kineverse.worlds import Recorder, Sensors
-    from kineverse.worlds.sensor_sampler import find_robot_base
+    from kineverse.manipulation.tracked_belief import TrackedBelief  # for start-up time
+    from kineverse.worlds import Recorder, Sensors  # for start-up time
+    from kineverse.worlds.sensor_sampler import find_robot_base  # for start-up time
 
     belief: Belief | None = None
     error = EstimateError(scene.coordinate)
@@ -316,8 +317,6 @@ def _act(
 
 def _find_obstacle(scene: ManipulationScene) -> Obstacle | None:
     """Return what is in the way of the object at the start of a scene; None if nothing is."""
-    from kineverse.manipulation.swept_volume import find_obstacle
-
     return find_obstacle(scene.model, scene.coordinate, scene.start, scene.target, robot=scene.robot)
 
 
@@ -329,11 +328,11 @@ def _view(
     stack: ExitStack,
 ) -> Outcome | None:
     """Run the skill on a page, then play it there until Ctrl-C; return None if it was interrupted before."""
-    from kineverse.view.page import read_title
-    from kineverse.view.run_overlay import LiveRun, play_recording
-    from kineverse.view.viewer import Viewer
-    from kineverse.worlds import read_run_recording
-    from kineverse.worlds.recorder import import_mcap
+    from kineverse.view.page import read_title  # for start-up time
+    from kineverse.view.run_overlay import LiveRun, play_recording  # for start-up time
+    from kineverse.view.viewer import Viewer  # for start-up time
+    from kineverse.worlds import read_run_recording  # for start-up time
+    from kineverse.worlds.recorder import import_mcap  # for start-up time
 
     record = arguments.record
     if record is None:
@@ -382,7 +381,7 @@ def _report_outcome(
 ) -> None:
     """Print the result of a skill, and write a picture if wanted."""
     if arguments.picture is not None:
-        from kineverse.view import save_picture
+        from kineverse.view import save_picture  # for start-up time
 
         save_picture(arguments.picture, scene.model, {str(s): v for s, v in world.state.items()})
         print_mesh_problems(list_mesh_problems(scene.model))

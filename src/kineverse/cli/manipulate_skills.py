@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.geometry import Scene
 from kineverse.geometry.exclusions import remove_unusable_shapes
 from kineverse.grasping import Gripper, Handle, find_gripper, find_handle
 from kineverse.manipulation import Outcome, PlacedRobot, Session, place_robot
@@ -234,7 +235,7 @@ def grasp_object(
         return skip_skill(scene, world, False, found)
     gripper, _ = found
 
-    from kineverse.manipulation.opening.grasped_opening import open_object
+    from kineverse.manipulation.opening.grasped_opening import open_object  # for start-up time
 
     outcome: Outcome = open_object(
         Session(world, belief=belief, on_step=look, on_search=_SearchLines()),
@@ -274,10 +275,13 @@ def open_as_unknown(
         return skip_skill(scene, world, False, found)
     gripper, handle = found
 
-    from kineverse.manipulation import open_unknown
-    from kineverse.manipulation.unknown_objects import forget_joint
-    from kineverse.manipulation.unknown_objects.unknown_opening import OPEN_TURN, OPEN_WAY
-    from kineverse.worlds import Sensors
+    from kineverse.manipulation import open_unknown  # for start-up time
+    from kineverse.manipulation.unknown_objects import forget_joint  # for start-up time
+    from kineverse.manipulation.unknown_objects.unknown_opening import (  # for start-up time
+        OPEN_TURN,
+        OPEN_WAY,
+    )
+    from kineverse.worlds import Sensors  # for start-up time
 
     model, coordinate, start = scene.model, scene.coordinate, scene.start
     part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
@@ -312,9 +316,9 @@ def push_object(
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Push the object, from where the robot stands or from a place that is searched."""
-    from kineverse.manipulation.pushing.base_placement import find_push_start, roll_out
-    from kineverse.manipulation.pushing.push_controller import Pushing
-    from kineverse.manipulation.pushing.push_skill import push
+    from kineverse.manipulation.pushing.base_placement import find_push_start, roll_out  # for start-up time
+    from kineverse.manipulation.pushing.push_controller import Pushing  # for start-up time
+    from kineverse.manipulation.pushing.push_skill import push  # for start-up time
 
     if not scene.pusher:
         return skip_skill(scene, world, False, scene.why)
@@ -361,8 +365,6 @@ def _find_gripper_and_handle(
     arguments: argparse.Namespace, scene: ManipulationScene
 ) -> tuple[Gripper, Handle] | str:
     """Return the gripper, and the handle that is named or the best one, which is printed; or why not."""
-    from kineverse.geometry import Scene
-
     if scene.gripper is None:
         return scene.why
     try:

@@ -12,8 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kineverse.control import Hold
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
+from kineverse.formats import read_srdf
+from kineverse.geometry import Rule
+from kineverse.planning import Planner
+from kineverse.planning.trajectories.trajectory_file import check_trajectory_name
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
 from .output import format_table, show_activity
@@ -39,8 +44,7 @@ from .view import (
 
 if TYPE_CHECKING:
     import kineverse as kv
-    from kineverse.control import Hold
-    from kineverse.planning import Path, Planner
+    from kineverse.planning import Path
 
 
 HELP = """\
@@ -174,17 +178,15 @@ def run(arguments: argparse.Namespace) -> int:
     holds = [parse_frame_target(word, "--along") for word in arguments.along]
     margin = parse_length(arguments.margin)
     if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name
+        from kineverse.view.pictures import check_png_name  # for start-up time
 
         check_png_name(arguments.picture)
     if arguments.save is not None:
-        from kineverse.planning.trajectories.trajectory_file import check_trajectory_name
-
         check_trajectory_name(arguments.save)
     if not arguments.seconds > 0 or math.isinf(arguments.seconds):
         raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
 
-    from kineverse.planning.bindings import planning_functions
+    from kineverse.planning.bindings import planning_functions  # for start-up time
 
     with show_activity("compiling the planner"):
         planning_functions()
@@ -210,10 +212,6 @@ def _prepare(
     arguments: argparse.Namespace, start: Request, goal: Request, holds: list[FrameTarget], margin: float
 ) -> _Problem:
     """Load the model and build the planner."""
-    from kineverse.formats import read_srdf
-    from kineverse.geometry import Rule
-    from kineverse.planning import Planner
-
     with show_activity(f"reading {arguments.model}"):
         model = load_model(arguments, arguments.model)
         standing: dict[kv.Symbol, float] = {}
@@ -265,8 +263,6 @@ def _srdf_prefix(model: kv.Model, robot: str) -> str:
 
 def _plan(problem: _Problem, seconds: float, seed: int, optimize: bool) -> Path:
     """Return the path from the first of some starts from which there is one."""
-    from kineverse.control import Hold
-
     planner, start, goal = problem.planner, problem.start, problem.goal
     symbol = problem.model.symbol
     starts: list[Any] = [None]
@@ -326,7 +322,7 @@ def _moved_frame(problem: _Problem) -> str:
 
 def _trace(problem: _Problem, path: Path) -> Any:
     """Return the way of the moved frame as a drawable."""
-    from kineverse.view.drawables import draw_frame_path
+    from kineverse.view.drawables import draw_frame_path  # for start-up time
 
     states = [path.at(fraction) for fraction in np.linspace(0.0, 1.0, 60)]
     return draw_frame_path(problem.model, _moved_frame(problem), states)
@@ -334,8 +330,8 @@ def _trace(problem: _Problem, path: Path) -> Any:
 
 def _write_picture(file: str, problem: _Problem, path: Path) -> None:
     """Write a picture of some configurations on the way."""
-    from kineverse.view import save_picture
-    from kineverse.view.drawables import draw_ghosts
+    from kineverse.view import save_picture  # for start-up time
+    from kineverse.view.drawables import draw_ghosts  # for start-up time
 
     model, planner = problem.model, problem.planner
     overlay = [_trace(problem, path)]
@@ -349,8 +345,8 @@ def _write_picture(file: str, problem: _Problem, path: Path) -> None:
 
 def _view(arguments: argparse.Namespace, problem: _Problem, path: Path) -> None:
     """Play the path in the browser; without one, show how far the search came."""
-    from kineverse.view.page import read_title
-    from kineverse.view.viewer import Viewer
+    from kineverse.view.page import read_title  # for start-up time
+    from kineverse.view.viewer import Viewer  # for start-up time
 
     label, model = read_title(arguments.model), problem.model
     state = path.at(0.0 if path.found else 1.0)

@@ -8,15 +8,15 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import kineverse as kv
+from kineverse.control import Hold
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
+from kineverse.manipulation import place_robot
+from kineverse.planning.manifold import hold_frames
+from kineverse.planning.planning_space import free_coordinates
 
 from .arguments import parse_assignments, parse_value
-
-if TYPE_CHECKING:
-    import kineverse as kv
-    from kineverse.control import Hold
 
 _ALL = "xyz rx ry rz"
 
@@ -102,8 +102,6 @@ def add_robot_option(parser: argparse.ArgumentParser) -> None:
 
 def include_robot(arguments: argparse.Namespace, model: kv.Model) -> tuple[str, dict[kv.Symbol, float]]:
     """Put the robot of ``--robot`` into a model; return its prefix and the place of its base by symbol."""
-    from kineverse.manipulation import place_robot  # for start-up time: few commands have a robot
-
     source, place = parse_robot(arguments.robot)
     robot = place_robot(
         model,
@@ -133,10 +131,6 @@ def parse_robot(text: str) -> tuple[str, tuple[float, ...] | None]:
 
 def make_hold(model: kv.Model, given: FrameTarget) -> Hold:
     """Return the hold that a target stands for."""
-    import kineverse as kv
-    from kineverse.control import Hold
-    from kineverse.planning.manifold import hold_frames
-
     offset = None
     if given.numbers:
         offset = kv.translation(*given.numbers[:3]) @ kv.rpy(*(given.numbers[3:] or (0.0, 0.0, 0.0)))
@@ -154,8 +148,6 @@ def make_grip(
 
     Without a state it is None where the start says nothing.
     """
-    from kineverse.planning.manifold import hold_frames
-
     same = find_same_grip(given, start)
     if same is not None:
         return make_hold(model, replace(same, mask=given.mask))
@@ -188,8 +180,6 @@ def choose_coordinates(
 
     These are the named ones, and the free ones that frames depend on, but for some that stay still.
     """
-    from kineverse.planning.planning_space import free_coordinates
-
     frames = {t.frame for t in targets} | {frame for t in holds for frame in (t.frame, t.target)}
     needed = {s for frame in frames for s in model.symbols_of(frame)}
     found = [s for s in free_coordinates(model) if s in needed and s not in {*still}]

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+import kineverse as kv
+from kineverse.control import Goal, InverseKinematics, same_pose, same_position
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_assignments, parse_value, require
 from .plan_arguments import add_robot_option, include_robot
 from .view import list_mesh_problems, print_mesh_problems
-
-if TYPE_CHECKING:
-    import kineverse as kv
-    from kineverse.control import Goal
 
 HELP = """\
 The pose is given by 3 numbers [m] for a position alone, by 6 for position and roll, pitch, yaw [rad], or by
@@ -82,13 +82,12 @@ def run(arguments: argparse.Namespace) -> int:
     assigned = parse_assignments(arguments.assignments, "--from")
     numbers = parse_pose(arguments.pose)
     if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name
+        from kineverse.view.pictures import check_png_name  # for start-up time
 
         check_png_name(arguments.picture)
 
-    from kineverse.control import InverseKinematics
-    from kineverse.geometry import Scene
-    from kineverse.view import save_picture
+    from kineverse.geometry import Scene  # for start-up time
+    from kineverse.view import save_picture  # for start-up time
 
     model = load_model(arguments, arguments.model)
     standing: dict[kv.Symbol, float] = {}
@@ -143,11 +142,6 @@ def make_goal(
     model: kv.Model, arguments: argparse.Namespace, numbers: list[float] | None
 ) -> tuple[Goal, list[kv.Symbol]]:
     """Return the goal, and the coordinates that move nothing but the target."""
-    import numpy as np
-
-    import kineverse as kv
-    from kineverse.control import Goal, same_pose, same_position
-
     if numbers is None:
         (frame,) = arguments.pose
         hand, target = model.fk(arguments.frame), model.fk(frame)

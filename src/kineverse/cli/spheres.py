@@ -12,6 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
+from kineverse.geometry.objects import CollisionObjects
+from kineverse.geometry.shapes import import_coal
+from kineverse.planning.spheres import cover_objects
+from kineverse.planning.spheres.object_covers import (
+    CachedCover,
+    are_covered,
+    clear_covers,
+    cover_folder,
+    list_covers,
+)
+from kineverse.planning.spheres.sphere_cover import MOST, check_cover_settings
+from kineverse.planning.spheres.union_volume import union_volume
 
 from .arguments import (
     add_cache_options,
@@ -87,14 +99,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
         raise UnknownNameError("Name a model, before --links; see kineverse spheres --help.")
     require("kineverse spheres", {"geometry": True, "mjcf": needs_mujoco(arguments.model)})
-    from kineverse.planning.spheres.sphere_cover import MOST, check_cover_settings
 
     protrusion = None if arguments.protrusion is None else parse_length(arguments.protrusion)
     most = MOST if arguments.most is None else arguments.most
     check_cover_settings(protrusion, most)
     state = parse_assignments(arguments.assignments)
     if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name
+        from kineverse.view.pictures import check_png_name  # for start-up time
 
         check_png_name(arguments.picture)
     with show_activity(f"reading {arguments.model}"):
@@ -118,9 +129,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _objects(model: kv.Model, arguments: argparse.Namespace) -> dict[str, Sequence[CollisionObject]]:
     """Return the collision objects of each of the wanted links."""
-    from kineverse.geometry.objects import CollisionObjects
-    from kineverse.geometry.shapes import import_coal
-
     import_coal()
     source = CollisionObjects((), ("*",) if arguments.decomposed else (), ())
     source.synchronize(model)
@@ -138,9 +146,6 @@ def _objects(model: kv.Model, arguments: argparse.Namespace) -> dict[str, Sequen
 
 def _cover(link: LinkCover, protrusion: float | None, most: int, force: bool) -> None:
     """Add the cover of a link, or the reason why there is none."""
-    from kineverse.planning.spheres import cover_objects
-    from kineverse.planning.spheres.object_covers import are_covered
-
     try:
         cached = not force and are_covered(link.items, protrusion, most)
         begin = time.perf_counter()
@@ -165,7 +170,6 @@ def _format_links(links: Sequence[LinkCover]) -> list[str]:
 
 
 def _format_row(name: str, links: Sequence[tuple[LinkCover, SphereCover]]) -> tuple[str, ...]:
-    from kineverse.planning.spheres.union_volume import union_volume
 
     seconds = sum(link.seconds for link, _ in links)
     volumes = [union_volume(cover.centres, cover.radii) for _, cover in links]
@@ -201,13 +205,13 @@ def _cover_to_json(cover: SphereCover) -> dict[str, Any]:
 
 
 def _drawables(links: Iterable[LinkCover]) -> Iterator[Any]:
-    from kineverse.view.drawables import draw_cover
+    from kineverse.view.drawables import draw_cover  # for start-up time
 
     return (draw_cover(link.link, link.cover) for link in links if link.cover is not None)
 
 
 def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: Iterable[LinkCover]) -> None:
-    from kineverse.view.pictures import save_picture
+    from kineverse.view.pictures import save_picture  # for start-up time
 
     save_picture(path, model, state, overlay=list(_drawables(links)))
     print(f"picture: {path}", file=sys.stderr)
@@ -216,8 +220,8 @@ def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: I
 def _view(
     arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], links: Iterable[LinkCover]
 ) -> None:
-    from kineverse.view.page import read_title
-    from kineverse.view.viewer import Viewer
+    from kineverse.view.page import read_title  # for start-up time
+    from kineverse.view.viewer import Viewer  # for start-up time
 
     label = read_title(arguments.model)
     with handle_interrupts(), Viewer(model, state, label=label, **page_options(arguments)) as page:
@@ -227,7 +231,6 @@ def _view(
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-    from kineverse.planning.spheres.object_covers import CachedCover, clear_covers, cover_folder, list_covers
 
     def describe(one: CachedCover) -> tuple[dict[str, Any], tuple[str, ...]]:
         spheres, protrusion, excess = len(one.cover), one.cover.protrusion, one.cover.excess

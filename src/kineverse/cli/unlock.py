@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kineverse.errors import InvalidValueError, KineverseError
+from kineverse.reasoning import plan_unlocking
 
 from .arguments import add_model_options, load_model, parse_assignments
 
@@ -90,8 +91,6 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.jam or arguments.record) and not arguments.execute:
         raise InvalidValueError("--jam and --record are about the world of --execute.")
 
-    from kineverse.reasoning import plan_unlocking
-
     model = load_model(arguments, arguments.model)
     plan = plan_unlocking(model, goal, start, still=arguments.still, budget=arguments.budget)
     if arguments.execute:
@@ -104,8 +103,8 @@ def _execute(
     arguments: argparse.Namespace, model: Model, goal: Mapping[str, float], start: Mapping[str, float]
 ) -> int:
     """Execute the plan in a world, print what moved, and record it if wanted."""
-    from kineverse.manipulation import execute_unlocking
-    from kineverse.worlds import MechanismWorld, Recorder
+    from kineverse.manipulation import execute_unlocking  # for start-up time
+    from kineverse.worlds import MechanismWorld, Recorder  # for start-up time
 
     world = MechanismWorld(model, arguments.jam)
     world.reset(start)

@@ -12,6 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from kineverse.errors import InvalidValueError
+from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
+from kineverse.planning import Trajectory
+from kineverse.view import meshes, save_picture
+from kineverse.view.poses import complete
+from kineverse.worlds import RunRecording, read_run_recording
 
 from .arguments import (
     add_model_options,
@@ -30,8 +35,6 @@ from .plan_arguments import add_robot_option, include_robot
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
-    from kineverse.planning import Trajectory
-    from kineverse.worlds import RunRecording
 
 HELP = """\
 The page is served to this computer only, until Ctrl-C; with --host also to others, who need the address with
@@ -124,9 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
         "view": arguments.picture is None and arguments.plot is None,
     }
     require("kineverse view", extras)
-    from kineverse.view import meshes
-    from kineverse.view.page import read_title
-    from kineverse.view.poses import complete
+    from kineverse.view.page import read_title  # for start-up time
 
     label = read_title(arguments.model)
     recording = _read_recording(arguments)
@@ -151,7 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
         meshes.load_mesh(mesh)  # cached for the drawing
     if arguments.picture is not None:
         return _write_picture(arguments, model, assigned, near, motion)
-    from kineverse.view.viewer import Viewer
+    from kineverse.view.viewer import Viewer  # for start-up time
 
     options = page_options(arguments)
     with (
@@ -170,7 +171,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"kineverse: note: not finite at this state, and hidden: {names}", file=sys.stderr)
         speed = {"speed": arguments.speed, "loop": arguments.loop}
         if recording is not None:
-            from kineverse.view.run_overlay import play_recording
+            from kineverse.view.run_overlay import play_recording  # for start-up time
 
             play_recording(page, recording, time=arguments.time, **speed)
         elif trajectory is not None:
@@ -195,7 +196,6 @@ def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:
         )
     if not name.endswith(".mcap"):
         return None
-    from kineverse.worlds import read_run_recording
 
     for option in ("play", "robot", "assignments"):
         if getattr(arguments, option):
@@ -214,8 +214,6 @@ def _read_trajectory(arguments: argparse.Namespace, model: ModelView) -> Traject
     """Return the trajectory that is to be played, if there is one."""
     if arguments.play is None:
         return None
-    from kineverse.planning import Trajectory
-    from kineverse.view.poses import complete
 
     trajectory = Trajectory.load(arguments.play)
     complete(model, dict(trajectory.at(0.0)))  # raises for coordinates that the model does not have
@@ -225,8 +223,8 @@ def _read_trajectory(arguments: argparse.Namespace, model: ModelView) -> Traject
 def _write_plot(arguments: argparse.Namespace, recording: RunRecording | None) -> int:
     if recording is None:
         raise InvalidValueError("--plot is for recordings (.mcap); a model does not change over time")
-    from kineverse.view.plots import Figure
-    from kineverse.worlds.recording_plot import plot_recording
+    from kineverse.view.plots import Figure  # for start-up time
+    from kineverse.worlds.recording_plot import plot_recording  # for start-up time
 
     Figure(lambda canvas: plot_recording(recording, canvas), (11.0, 7.0)).save(Path(arguments.plot))
     print(f"plot: {arguments.plot}")
@@ -241,10 +239,7 @@ def _write_picture(
     motion: RunRecording | Trajectory | None,
 ) -> int:
     """Write a picture of the state, and print what it cannot show."""
-    from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
-    from kineverse.view import save_picture
-    from kineverse.view.run_overlay import RecordedScene
-    from kineverse.worlds import RunRecording
+    from kineverse.view.run_overlay import RecordedScene  # for start-up time
 
     options: dict[str, Any] = {"collisions": arguments.collisions, "near": near}
     options["decomposed"] = arguments.decomposed
@@ -277,15 +272,13 @@ def print_address(page: _Page, browser: bool) -> None:
     """Print the address of a page, and open it if there is a display."""
     print(f"{page.address}   (Ctrl-C ends)", flush=True)
     if browser:
-        from kineverse.view.page import open_page
+        from kineverse.view.page import open_page  # for start-up time
 
         open_page(page.address)
 
 
 def list_mesh_problems(model: ModelView) -> list[str]:
     """Return a line for each visual mesh that cannot be read."""
-    from kineverse.view import meshes
-
     loaded = {mesh.uri: meshes.load_mesh(mesh) for mesh in meshes.list_visual_meshes(model)}
     return [f"{uri}: {mesh.problem}" for uri, mesh in loaded.items() if mesh.problem]
 
