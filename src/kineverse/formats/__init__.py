@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from .loader import load as load
     from .locate import locate_model as locate_model, shipped_models as shipped_models
     from .srdf import read_srdf as read_srdf
+    from .validate import ValidationResult as ValidationResult, validate_file as validate_file
 
 lazy_face(
     __name__,
@@ -20,5 +21,6 @@ lazy_face(
         ".loader": "load",
         ".locate": "locate_model shipped_models",
         ".srdf": "read_srdf",
+        ".validate": "ValidationResult validate_file",
     },
 )

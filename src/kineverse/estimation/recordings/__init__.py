@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .joint_model import make_joint_model as make_joint_model
     from kineverse.estimation.correlation import (
         correlation_time as correlation_time,
         effective_sample_size as effective_sample_size,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 lazy_face(
     __name__,
     {
+        ".joint_model": "make_joint_model",
         ".reader": "read_recording",
         ".recorded_joint": "Assumption ObservationNoise RecordedJoint identify_recorded_joint",
         ".recording": "RecordedPair RecordedTrack Recording spaced_indices",
