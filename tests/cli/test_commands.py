@@ -41,7 +41,7 @@ def test_help_names_all_commands_and_gives_examples(run):
 
 
 def test_help_imports_nothing_heavy():
-    heavy = ("viser", "trimesh", "tqdm", "scipy", "PIL", "websockets")
+    heavy = ("viser", "trimesh", "rich", "scipy", "PIL", "websockets")
     code = (
         "import sys; from kineverse.cli import main; main(['--help']); "
         f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"

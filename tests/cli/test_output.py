@@ -53,3 +53,21 @@ def test_progress_is_shown_on_a_terminal_and_not_in_a_pipe(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal)
     assert list(show_progress([1, 2, 3], "working", "steps")) == [1, 2, 3]
     assert "working" in terminal.getvalue()
+
+
+def test_table_on_a_terminal_is_drawn_and_its_cells_are_escaped(monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    rows = [("a\x1b]0;title\x07", "1"), ("b", "a reason of many words, which goes on below")]
+    text = format_table(("name", "value"), rows)
+    assert "\x1b[1m" in text
+    assert "───" in text
+    assert "\\x1b]0;title\\x07" in text
+    assert "which goes" in text
+    assert len(text.splitlines()) > 4
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert "\x1b" not in format_table(("name", "value"), [("a", "1")])
+    assert format_table(("name",), [("a",)]).splitlines()[1] == "----"
