@@ -20,9 +20,8 @@ from kineverse.manipulation.robot_sources import find_robot
 
 from . import demo_living
 from .arguments import require
-from .demo_living import check_picture_path
 from .output import format_table, join_lines, shorten_text, show_activity
-from .view import add_page_options, handle_interrupts, page_options, print_address
+from .pages import add_page_options, check_picture_path, handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
     from kineverse.manipulation import OpenCloseReport, Outcome, Session
@@ -68,9 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run ``kineverse demo``."""
-    from kineverse.view.pictures import check_png_name  # for start-up time
-
-    check_png_name(arguments.picture)
+    check_picture_path(arguments.picture if arguments.headless else None)
     other = "--living" if arguments.living else "--sliders" if arguments.sliders else ""
     if other:
         _refuse(arguments, ROBOT_OPTIONS, f"is for the robot, not for {other}")
@@ -153,8 +150,6 @@ class RobotDemo:
         noise = NOISE if arguments.noise is None else arguments.noise
         self._sensors = None if noise == "none" else Sensors.parse(noise)
         self._robot = find_robot(arguments.robot or ROBOT)
-        if arguments.headless:
-            check_picture_path(arguments.picture)
         request_planner()
         with show_activity(f"reading the {KITCHEN} and the {self._robot.name}"):
             self.model = self._robot.load()

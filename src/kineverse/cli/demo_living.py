@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from kineverse.view.poses import FramePoses, complete
 from kineverse.view.sliders import Ranges, choose_slider_range, infer_units
 
 from .output import format_table, show_progress
-from .view import handle_interrupts, page_options, print_address
+from .pages import check_file_path, handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
     from living_kitchen.track import TrackingQuality
@@ -133,7 +132,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     steps = _count_steps(SECONDS if arguments.seconds is None else arguments.seconds)
     simulation = Simulation(mechanism=arguments.stranger or _STRANGER)
     # First, so that an unwritable path is reported before the work.
-    check_picture_path(arguments.picture)
+    check_file_path(arguments.picture)
     qualities: list[TrackingQuality] = []
     for _ in show_progress(range(steps), "living", "step"):
         simulation.step(STEP)
@@ -144,14 +143,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
     save(arguments.picture, simulation)
     print(f"picture: {arguments.picture}")
     return 0
-
-
-def check_picture_path(path: str) -> None:
-    """Check that a file can be written, without leaving an empty one if the run is interrupted."""
-    new = not os.path.lexists(path)
-    open(path, "ab").close()
-    if new:
-        os.remove(path)
 
 
 def _count_steps(seconds: float) -> int:

@@ -31,8 +31,9 @@ from .manipulate_skills import (
     skip_skill,
 )
 from .output import format_table, join_lines, show_activity
-from .view import (
+from .pages import (
     add_page_options,
+    check_picture_path,
     handle_interrupts,
     list_mesh_problems,
     page_options,
@@ -232,10 +233,7 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
         from kineverse.worlds import Sensors  # for start-up time
 
         Sensors.parse(arguments.noise)  # says at once what cannot be read
-    if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name  # for start-up time
-
-        check_png_name(arguments.picture)
+    check_picture_path(arguments.picture)
     if arguments.record is not None:
         from kineverse.worlds.recorder import check_recording_name  # for start-up time
 
@@ -419,7 +417,10 @@ def _report_outcome(
         print(f"learned joint: {_describe_joint(outcome.measures)}")
     if outcome.steps:
         rows = [("steps", str(outcome.steps))]
-        rows += [(name, _format_measure(value)) for name, value in _plain(outcome.measures).items()]
+        rows += [
+            (name, _format_measure(value, _MEASURE_UNITS.get(name, scene.unit if name in _OF_OBJECT else "")))
+            for name, value in _plain(outcome.measures).items()
+        ]
         print(format_table(("measure", "value"), rows))
     if arguments.record is not None:
         print(f"recording: {arguments.record}")
@@ -448,9 +449,23 @@ def _plain(value: Any) -> Any:
     return value if value is None or isinstance(value, (bool, int, str)) else str(value)
 
 
-def _format_measure(value: Any) -> str:
+_MEASURE_UNITS = {
+    **dict.fromkeys(("penetration", "grasp_error", "distance", "hand_distance", "way", "decided_way"), "m"),
+    **dict.fromkeys(("grasp_rotation", "turn", "decided_turn"), "rad"),
+    **dict.fromkeys(("opened_seconds", "pull_seconds", "decided_seconds"), "s"),
+    "jitter": "rad/s, m/s",
+    "peak_force": "N",
+    "reversals": "1/s",
+}
+"""Units of figures; others are numbers, or have the unit of what they are about."""
+
+_OF_OBJECT = ("penetration_from", "tolerance")
+"""Figures in the unit of the object's coordinate."""
+
+
+def _format_measure(value: Any, unit: str) -> str:
     if isinstance(value, float):
-        return format_number(value, 4)
+        return f"{format_number(value, 4)} {unit}".rstrip()
     if isinstance(value, list) and all(isinstance(one, str) for one in value):
         return ", ".join(filter(None, value)) or "-"
     if isinstance(value, (list, dict)):

@@ -22,6 +22,15 @@ from kineverse.planning.trajectories.trajectory_file import check_trajectory_nam
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
 from .output import format_table, show_activity
+from .pages import (
+    add_page_options,
+    check_picture_path,
+    handle_interrupts,
+    list_mesh_problems,
+    page_options,
+    print_address,
+    print_mesh_problems,
+)
 from .plan_arguments import (
     FrameTarget,
     Request,
@@ -32,14 +41,6 @@ from .plan_arguments import (
     make_hold,
     parse_frame_target,
     parse_request,
-)
-from .view import (
-    add_page_options,
-    handle_interrupts,
-    list_mesh_problems,
-    page_options,
-    print_address,
-    print_mesh_problems,
 )
 
 if TYPE_CHECKING:
@@ -177,10 +178,7 @@ def run(arguments: argparse.Namespace) -> int:
     goal = parse_request(arguments.to, "--to")
     holds = [parse_frame_target(word, "--along") for word in arguments.along]
     margin = parse_length(arguments.margin)
-    if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name  # for start-up time
-
-        check_png_name(arguments.picture)
+    check_picture_path(arguments.picture)
     if arguments.save is not None:
         check_trajectory_name(arguments.save)
     if not arguments.seconds > 0 or math.isinf(arguments.seconds):

@@ -14,8 +14,8 @@ from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_assignments, parse_value, require
+from .pages import check_picture_path, list_mesh_problems, print_mesh_problems
 from .plan_arguments import add_robot_option, include_robot
-from .view import list_mesh_problems, print_mesh_problems
 
 HELP = """\
 The pose is given by 3 numbers [m] for a position alone, by 6 for position and roll, pitch, yaw [rad], or by
@@ -81,10 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     assigned = parse_assignments(arguments.assignments, "--from")
     numbers = parse_pose(arguments.pose)
-    if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name  # for start-up time
-
-        check_png_name(arguments.picture)
+    check_picture_path(arguments.picture)
 
     from kineverse.geometry import Scene  # for start-up time
     from kineverse.view import save_picture  # for start-up time

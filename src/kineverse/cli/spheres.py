@@ -37,7 +37,7 @@ from .arguments import (
     require,
 )
 from .output import colorize, format_cells, join_lines, show_activity, show_progress
-from .view import add_page_options, handle_interrupts, page_options, print_address
+from .pages import add_page_options, check_picture_path, handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -104,10 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
     most = MOST if arguments.most is None else arguments.most
     check_cover_settings(protrusion, most)
     state = parse_assignments(arguments.assignments)
-    if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name  # for start-up time
-
-        check_png_name(arguments.picture)
+    check_picture_path(arguments.picture)
     with show_activity(f"reading {arguments.model}"):
         model = load_model(arguments, arguments.model)
     for name in state:

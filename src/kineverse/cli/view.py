@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
@@ -31,6 +28,15 @@ from .arguments import (
 )
 from .info import is_gallery_list, print_articulations, print_models
 from .output import show_progress
+from .pages import (
+    add_page_options,
+    check_picture_path,
+    handle_interrupts,
+    list_mesh_problems,
+    page_options,
+    print_address,
+    print_mesh_problems,
+)
 from .plan_arguments import add_robot_option, include_robot
 
 if TYPE_CHECKING:
@@ -93,22 +99,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_page_options(parser)
 
 
-def add_page_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of a command that opens a page."""
-    parser.add_argument("--port", type=int, metavar="N", help="port of the page (8080, or any free one)")
-    parser.add_argument(
-        "--host",
-        metavar="ADDRESS",
-        help="serve other computers: listen on this address (0.0.0.0: all)",
-    )
-    parser.add_argument("--no-browser", action="store_true", help="only print the address")
-
-
-def page_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the page options as keyword arguments of a page."""
-    return {"port": arguments.port, **({"host": arguments.host} if arguments.host else {})}
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted."""
     assigned = parse_assignments(arguments.assignments)
@@ -127,6 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
         "view": arguments.picture is None and arguments.plot is None,
     }
     require("kineverse view", extras)
+    check_picture_path(arguments.picture)
     from kineverse.view.page import read_title  # for start-up time
 
     label = read_title(arguments.model)
@@ -259,48 +250,3 @@ def _write_picture(
         print(f"kineverse: note: no distances to {', '.join(left_out)}", file=sys.stderr)
     print(f"picture: {arguments.picture}")
     return 0
-
-
-class _Page(Protocol):
-    @property
-    def address(self) -> str:
-        """URL with the token of the page."""
-        ...  # pragma: no cover
-
-
-def print_address(page: _Page, browser: bool) -> None:
-    """Print the address of a page, and open it if there is a display."""
-    print(f"{page.address}   (Ctrl-C ends)", flush=True)
-    if browser:
-        from kineverse.view.page import open_page  # for start-up time
-
-        open_page(page.address)
-
-
-def list_mesh_problems(model: ModelView) -> list[str]:
-    """Return a line for each visual mesh that cannot be read."""
-    loaded = {mesh.uri: meshes.load_mesh(mesh) for mesh in meshes.list_visual_meshes(model)}
-    return [f"{uri}: {mesh.problem}" for uri, mesh in loaded.items() if mesh.problem]
-
-
-def print_mesh_problems(problems: list[str]) -> None:
-    """Print a line on standard error if meshes are missing."""
-    if problems:
-        more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
-        print(f"kineverse: shown as placeholders: {problems[0]}{more}", file=sys.stderr)
-
-
-@contextmanager
-def handle_interrupts() -> Iterator[None]:
-    """Leave the context on Ctrl-C or SIGTERM, without an exception."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
-    finally:
-        signal.signal(signal.SIGTERM, before)
