@@ -17,8 +17,8 @@ from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.model.registry import SaveResult, writable_suffixes
 
 from .arguments import add_model_options, load_model
-from .diff import format_contents, format_count, format_pose_difference
-from .output import show_activity, truncate_lines
+from .diff import format_pose_difference
+from .output import format_contents, format_count, show_activity, truncate_lines
 
 if TYPE_CHECKING:
     import kineverse as kv

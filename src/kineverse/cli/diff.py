@@ -24,12 +24,11 @@ from kineverse.model.comparison import (
 )
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
-from kineverse.model.model_view import ModelView
 from kineverse.model.operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
 from kineverse.view.poses import roll_pitch_yaw
 
 from .arguments import add_model_options, load_model
-from .output import colorize, shorten_text, show_activity, truncate_lines
+from .output import colorize, format_contents, format_count, shorten_text, show_activity, truncate_lines
 
 HELP = """\
 Models are compared name by name, whatever their formats. Numbers and formulas that agree within the tolerance
@@ -119,19 +118,6 @@ def run(arguments: argparse.Namespace) -> int:
 LONGEST = 60
 _NEGLIGIBLE = 1e-9
 """Threshold below which a distance is printed as zero beside a larger one [m], [rad]."""
-
-
-def format_contents(model: ModelView) -> str:
-    """Return the numbers of frames, degrees of freedom and constraints of a model."""
-    counts = (model.frames, "frame"), (model.degrees_of_freedom, "DoF"), (model.constraints, "constraint")
-    return ", ".join(format_count(len(items), noun) for items, noun in counts)
-
-
-def format_count(count: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless it is 1."""
-    if count != 1 and noun != "DoF":
-        noun = f"{noun[:-1]}ies" if noun.endswith("dy") else f"{noun}s"
-    return f"{count} {noun}"
 
 
 def format_value(given: Any) -> str:

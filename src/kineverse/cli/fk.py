@@ -50,9 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
     expression = model.fk(arguments.frame, arguments.relative_to)
     values = complete(model, assigned)
     pose = np.asarray(expression(kv.State(values)), dtype=float)
+    notes = find_limit_notes(model, values, arguments.assignments)
     used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
     if not np.isfinite(pose).all():
-        print_notes(find_limit_notes(model, values, arguments.assignments))
+        print_notes(notes)
         where = ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()) or "all values"
         raise InvalidValueError(
             f"The pose of '{arguments.frame}' in '{arguments.relative_to}' is not finite at {where}; "
@@ -86,5 +87,5 @@ def run(arguments: argparse.Namespace) -> int:
             )
         if used:
             print("  at " + ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()))
-    print_notes(find_limit_notes(model, values, arguments.assignments))
+    print_notes(notes)
     return 0

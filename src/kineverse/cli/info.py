@@ -32,7 +32,7 @@ from kineverse.view.rasterizer import TriangleSoup
 from kineverse.view.sliders import infer_units
 
 from .arguments import add_model_options, load_model
-from .output import format_table, truncate_lines
+from .output import format_count, format_table, truncate_lines
 
 HELP = """\
 examples:
@@ -42,8 +42,8 @@ examples:
   kineverse info articulations        list of the gallery"""
 
 
-SHOWN = 10
-"""Number of reader warnings printed."""
+SHOWN, MISSING = 10, 3
+"""Number of reader warnings, and of meshes that cannot be read, printed."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,13 +78,14 @@ def run(arguments: argparse.Namespace) -> int:
 def format_sections(summary: ModelSummary, frames: bool = False, constraints: bool = False) -> list[str]:
     """Return the paragraphs of the report."""
     extent = " x ".join(f"{edge:.2f}" for edge in summary.extent)
-    frames_, freedoms, conditions = map(len, (summary.frames, summary.freedoms, summary.constraints))
+    counted = (summary.frames, "frame"), (summary.freedoms, "DoF"), (summary.constraints, "constraint")
     lines = [
         summary.name,
-        f"  {frames_} frames, {freedoms} DoF, {conditions} constraints",
-        f"  {extent} m, {summary.mass:.4g} kg, {summary.shapes} shape{'' if summary.shapes == 1 else 's'}"
+        f"  {', '.join(format_count(len(items), noun) for items, noun in counted)}",
+        f"  {extent} m, {summary.mass:.4g} kg, {format_count(summary.shapes, 'shape')}"
         + (f", {len(summary.problems)} of them not loaded" if summary.problems else ""),
     ]
+    lines += truncate_lines([f"  {frame}: {why}" for frame, why in summary.problems.items()], MISSING, "  ")
     if summary.unplaced:
         lines.append(f"  not finite at the default state: {', '.join(summary.unplaced)}")
     if summary.touched_as_seen:
@@ -133,7 +134,7 @@ def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
     """Return the summary as JSON data; missing limits are null."""
 
     def finite(value: float) -> float | None:
-        return value if abs(value) < float("inf") else None
+        return value + 0.0 if abs(value) < float("inf") else None
 
     return {
         "model": summary.name,
@@ -162,7 +163,7 @@ def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
         ],
         **summary.interlocks.as_data(),
         **({"sha256": summary.sha256} if summary.sha256 else {}),
-        "not_loaded": summary.problems,
+        "not_loaded": list(summary.problems),
         "not_finite": summary.unplaced,
         "touched_as_seen": summary.touched_as_seen,
         "touching": None
@@ -285,7 +286,7 @@ class ModelSummary:
     extent: list[float]
     mass: float  # mass of all bodies [kg]
     shapes: int  # number of visual shapes
-    problems: list[str]  # frames of shapes that cannot be loaded
+    problems: dict[str, str]  # frames of shapes that cannot be loaded
     unplaced: list[str]  # frames whose poses at the default state are not finite; the box leaves them out
     interlocks: Interlocks  # interlocks between coordinates
     touched_as_seen: list[str]  # bodies without collision shapes
@@ -321,7 +322,7 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
         extent=(high - low).tolist(),
         mass=float(sum(masses)),
         shapes=len(drawables),
-        problems=sorted(part.frame for part in drawables if part.problem),
+        problems=dict(sorted((part.frame, part.problem) for part in drawables if part.problem)),
         unplaced=unplaced,
         interlocks=interlocks(model),
         touched_as_seen=bodies_with_visual_collision(model),
@@ -354,6 +355,6 @@ def _summarize_constraint(name: str, constraint: Constraint) -> ConstraintSummar
 def _format_bound(expression: object) -> str:
     text = repr(expression)
     try:
-        return f"{float(text):.4g}"
+        return f"{float(text) + 0.0:.4g}"  # no minus before a zero
     except ValueError:
         return text

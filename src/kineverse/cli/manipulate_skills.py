@@ -23,7 +23,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.view.sliders import infer_units
 
-from .arguments import load_model, parse_assignments, parse_value, print_notes
+from .arguments import check_unit, load_model, parse_assignments, parse_value, print_notes
 from .output import join_lines, print_line, show_activity
 from .plan_arguments import parse_robot
 
@@ -87,7 +87,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     default = default.updated(others)
     unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
     for option, text in (("--from", arguments.start), ("--to", arguments.to)):
-        _check_unit(option, text, coordinate, unit)
+        check_unit(option, text, coordinate, unit)
     shut = find_shut_value(model, coordinate)
     lower, upper = model.limits(coordinate)
     if begin is None:
@@ -154,17 +154,6 @@ def _open_from(shut: float, lower: float, upper: float) -> float:
     if upper - shut >= shut - lower:
         return min(shut + OPENING, upper)
     return max(shut - OPENING, lower)
-
-
-def _check_unit(option: str, text: str | None, coordinate: Symbol, unit: str) -> None:
-    """Check that a value has a unit of lengths or of angles as its coordinate has; it may have none."""
-    written = (text or "").strip()
-    stated = "m" if written.endswith("m") else "rad" if written.endswith(("deg", "°", "rad")) else unit
-    if unit and stated != unit:
-        raise InvalidValueError(
-            f"{option} {written}: '{coordinate}' is in {unit}; write "
-            f"{'30deg or 0.5' if unit == 'rad' else '12cm or 0.12'}, for instance."
-        )
 
 
 def _find_free_start(model: Model, robot: PlacedRobot, state: State) -> State:

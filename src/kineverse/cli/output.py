@@ -18,6 +18,8 @@ from kineverse.errors import FormatError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from kineverse.model.model_view import ModelView
+
 # Control characters other than tab and line feed, and those that turn the direction of writing.
 _UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 # What this program itself writes to terminals: colours, and the end of a line.
@@ -225,6 +227,19 @@ def format_markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def format_cells(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table of names and, aligned to the right, of what is known about them."""
     return format_table(head, rows, "<" + ">" * (len(head) - 1))
+
+
+def format_contents(model: ModelView) -> str:
+    """Return the numbers of frames, degrees of freedom and constraints of a model."""
+    counts = (model.frames, "frame"), (model.degrees_of_freedom, "DoF"), (model.constraints, "constraint")
+    return ", ".join(format_count(len(items), noun) for items, noun in counts)
+
+
+def format_count(count: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless it is 1."""
+    if count != 1 and noun != "DoF":
+        noun = f"{noun[:-1]}ies" if noun.endswith("dy") else f"{noun}s"
+    return f"{count} {noun}"
 
 
 def join_lines(message: object) -> str:

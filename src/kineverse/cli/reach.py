@@ -13,7 +13,17 @@ from kineverse.control import Goal, InverseKinematics, same_pose, same_position
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 
-from .arguments import add_model_options, load_model, needs_mujoco, parse_assignments, parse_value, require
+from .arguments import (
+    add_model_options,
+    find_turn_notes,
+    load_model,
+    match_coordinates,
+    needs_mujoco,
+    parse_assignments,
+    parse_value,
+    print_notes,
+    require,
+)
 from .pages import check_picture_path, list_mesh_problems, print_mesh_problems
 from .plan_arguments import add_robot_option, include_robot
 
@@ -55,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME",
-        help="coordinates or articulations that stay still",
+        help="coordinates, articulations or patterns ('kitchen/*') that stay still",
     )
     parser.add_argument("--starts", type=int, default=16, metavar="N", help="largest number of starts (16)")
     parser.add_argument(
@@ -81,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     assigned = parse_assignments(arguments.assignments, "--from")
     numbers = parse_pose(arguments.pose)
+    print_notes(find_turn_notes(arguments.pose[3:]))
     check_picture_path(arguments.picture)
 
     from kineverse.geometry import Scene  # for start-up time
@@ -94,7 +105,9 @@ def run(arguments: argparse.Namespace) -> int:
     goal, still = make_goal(model, arguments, numbers)
     still += [s for s in standing if s not in still]
     scene = Scene(model) if arguments.collisions else None
-    solver = InverseKinematics(model, [goal], scene=scene, still=[*arguments.still, *still])
+    solver = InverseKinematics(
+        model, [goal], scene=scene, still=[*match_coordinates(model, arguments.still, "--still"), *still]
+    )
     result = solver.solve(assigned, starts=arguments.starts)
     positions = {str(s): result.best[s] for s in solver.coordinates}
     if arguments.picture is not None:

@@ -10,9 +10,8 @@ from kineverse.formats import ValidationResult, validate_file
 from kineverse.geometry.shapes import import_coal
 
 from .arguments import add_model_options
-from .diff import format_contents, format_count
 from .info import find_penetrations
-from .output import colorize, format_table, show_progress, truncate_lines
+from .output import colorize, format_contents, format_count, format_table, show_progress, truncate_lines
 
 HELP = """\
 All mistakes that kv.load tolerates with a remark are listed, and a file with mistakes counts as unreadable. A
