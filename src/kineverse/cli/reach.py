@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
     goal, still = make_goal(model, arguments, numbers)
     still += [s for s in standing if s not in still]
     scene = Scene(model) if arguments.collisions else None
-    fixed = [*match_coordinates(model, arguments.still, "--still"), *still]
+    fixed: list[kv.Symbol | str] = [*match_coordinates(model, arguments.still, "--still"), *still]
     solver = InverseKinematics(model, [goal], scene=scene, still=fixed)
     result = solver.solve(assigned, starts=arguments.starts)
     positions = {str(s): result.best[s] for s in solver.coordinates}
