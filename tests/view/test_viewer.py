@@ -89,7 +89,7 @@ def test_angles_are_shown_in_degrees_on_demand_also_after_edits(page):
 def test_limits_that_are_zero_but_for_rounding_are_labelled_zero():
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.Prismatic("slide", "world", "box", axis=(1, 0, 0), lower=-8.8e-20, upper=0.69))
+        edit.apply(kv.Prismatic(name="slide", parent="world", child="box", lower=-8.8e-20, upper=0.69))
     with view(model, port=0) as page:
         assert sliders(page)["slide"][0] == "slide [m]   0 to 0.69"
         page._panel._beyond.value = True
