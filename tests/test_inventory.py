@@ -68,7 +68,7 @@ def test_what_moves_is_no_loss(capsys):
     after = {"tests": {"tests/b.py::test_x[1]": {"assertions": 3}, "tests/a.py::test_y": {"assertions": 1}}}
     assert compare(before, after, 5) == 1
     out = capsys.readouterr().out
-    assert "moved tests/a.py::test_x[1] -> tests/b.py" in out
+    assert "moved tests/a.py -> tests/b.py: 1" in out
     assert "changed tests/a.py::test_y  assertions: 2 -> 1" in out
     del before["tests"]["tests/a.py::test_y"], after["tests"]["tests/a.py::test_y"]
     assert compare(before, after, 5) == 0

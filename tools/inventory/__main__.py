@@ -21,26 +21,26 @@ from inventory.bounded import ROOT, import_path, run
 from inventory.compare import compare
 from inventory.sections import SECTIONS, entries
 
-MINUTES = 60
+MINUTES = 180
 
 
 def write(file: Path, sections: list[str], data: Path | None) -> None:
     """Add sections to a file; each is made by a process of its own."""
-    made = json.loads(file.read_text("utf-8")) if file.is_file() else {}
     for name in sections:
         begin = time.monotonic()
         words = [sys.executable, __file__, "--section", name, *(["--data", str(data)] if data else [])]
-        status, out, err = run(words, 60 * MINUTES, cwd=ROOT)
-        if status == 0:
-            made[name] = json.loads(out)
+        ended = run(words, 60 * MINUTES, ROOT)
+        made = json.loads(file.read_text("utf-8")) if file.is_file() else {}
+        if ended.status == 0:
+            made[name] = json.loads(ended.out)
             said = f"{len(made[name])} entries"
         else:
-            said = f"failed: {(err.strip().splitlines() or ['too long'])[-1]}"
+            said = f"failed: {(ended.err.strip().splitlines() or ['too long'])[-1]}"
             made[name] = {"": said}
         sys.stdout.write(f"{name:10} {said}, {time.monotonic() - begin:.0f} s\n")
         sys.stdout.flush()
         ordered = {name: made[name] for name in SECTIONS if name in made}
-        file.write_text(json.dumps(ordered, indent=1, sort_keys=True, ensure_ascii=False) + "\n", "utf-8")
+        file.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + "\n", "utf-8")
 
 
 def main() -> int:

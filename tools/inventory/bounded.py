@@ -5,15 +5,21 @@ from __future__ import annotations
 import multiprocessing
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+TOO_LONG = 124
+CACHE = "KINEVERSE_CACHE_DIR"
+"""Variable with the folder of compiled functions."""
 _MODEL_VARIABLES = ("KINEVERSE_MODEL_PATH", "KINEVERSE_PACKAGE_PATH", "KINEVERSE_ROOT", "ROS_PACKAGE_PATH")
 
 
@@ -30,10 +36,19 @@ def environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
     return {**kept, **quiet, "PYTHONPATH": path, **(changes or {})}
 
 
-def run(
-    words: Sequence[str], seconds: float, cwd: Path, changes: Mapping[str, str] | None = None
-) -> tuple[int, str, str]:
-    """Run a program; return its status, 124 if it had to be ended, and what it printed."""
+@dataclass(frozen=True)
+class Ended:
+    """Status of a program, what it printed, and how long a core was busy with it [s]."""
+
+    status: int
+    out: str
+    err: str
+    seconds: float
+
+
+def run(words: Sequence[str], seconds: int, cwd: Path, changes: Mapping[str, str] | None = None) -> Ended:
+    """Run a program for some seconds of a core, or six times as many on the clock."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with subprocess.Popen(
         list(words),
         cwd=cwd,
@@ -44,20 +59,25 @@ def run(
         encoding="utf-8",
         errors="replace",
         start_new_session=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds)),
     ) as process:
         try:
-            out, err = process.communicate(timeout=seconds)
+            out, err = process.communicate(timeout=6 * seconds)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)  # with its children
             process.communicate()
-            return 124, "", f"ended after {seconds:g} s"
-    return process.returncode, out, err
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    worked = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    if process.returncode < 0:
+        return Ended(TOO_LONG, "", f"ended after {seconds} s or by a signal", worked)
+    return Ended(process.returncode, out, err, round(worked, 1))
 
 
 def neutral(text: str, *folders: Path) -> str:
     """Return a text without the places of this checkout, of Python, and of some folders."""
     places = {str(folder): "TMP" for folder in folders}
-    places |= {str(Path(sys.executable).parent): "BIN", str(ROOT): "ROOT"}
+    places |= {sysconfig.get_path("purelib"): "SITE", str(Path(sys.executable).parent): "BIN"}
+    places |= {str(ROOT): "ROOT"}
     for place, name in places.items():
         text = text.replace(place, name)
     return re.sub(r" at 0x[0-9a-f]+", "", text)
@@ -79,17 +99,20 @@ def each(function: Callable[[Any], Any], items: Iterable[Any], seconds: float) -
             here.recv()  # it has imported what it needs
         here.send(item)
         try:
-            result = here.recv() if here.poll(seconds) else None
+            yield here.recv() if here.poll(seconds) else _end(worker, "too long")
         except EOFError:
-            result = "the process ended"
-        if result is None or not worker.is_alive():
-            worker.kill()
-            worker = None
-        yield "too long" if result is None else result
+            yield _end(worker, "the process ended")
+        worker = worker if worker.is_alive() else None
     if worker is not None:
         here.close()
         worker.join(5)
         worker.kill()
+
+
+def _end(worker: Any, reason: str) -> str:
+    worker.kill()
+    worker.join()
+    return reason
 
 
 def _serve(pipe: Connection, function: Callable[[Any], Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -34,6 +35,8 @@ def compare(before: Mapping[str, Entries], after: Mapping[str, Entries], most: i
         sys.stdout.write(f"{section}: {len(equal)} equal{counts}{pace}\n")
         for kind, texts in kinds.items():
             listed = [text for key, text in texts.items() if key.rpartition(".")[0] not in texts]
+            if kind == "moved":
+                listed = [f"{place}: {count}" for place, count in Counter(listed).items()]
             for text in listed[:most]:
                 cut = text if most is None or len(text) < _WIDTH else f"{text[:_WIDTH]} …"
                 sys.stdout.write(f"  {kind} {cut}\n")
@@ -65,7 +68,7 @@ def compare_entries(before: Entries, after: Entries) -> dict[str, dict[str, str]
         new.discard(there)
         found = [*changes(before[key], after[there])]
         if there != key:
-            kinds["moved"][key] = f"{key} -> {there.partition(':')[0]}"
+            kinds["moved"][key] = f"{key.partition(':')[0]} -> {there.partition(':')[0]}"
         if found:
             kinds["changed"][key] = f"{key}  {'; '.join(found)}"
         elif there == key:
@@ -101,8 +104,8 @@ def _wordings(before: Any, after: Any) -> Iterator[bool]:
 def _equal(a: Any, b: Any) -> bool:
     if isinstance(a, list) and isinstance(b, list):
         return len(a) == len(b) and all(map(_equal, a, b))
-    numbers = all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in (a, b))
-    if numbers and math.isfinite(a) and math.isfinite(b):
+    numbers = all(isinstance(x, (int, float)) for x in (a, b))
+    if numbers and float in (type(a), type(b)) and math.isfinite(a) and math.isfinite(b):
         return abs(a - b) <= TOLERANCE * max(1.0, abs(a), abs(b))
     return bool(a == b) or (numbers and math.isnan(a) and math.isnan(b))
 

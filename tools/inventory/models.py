@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import tempfile
 import zlib
 from collections.abc import Sequence
 from functools import partial
@@ -15,6 +16,7 @@ import numpy as np
 from inventory.bounded import each
 
 STATES = 100
+WRITTEN = (".urdf", ".xml", ".kv.json", ".kv.msgpack")
 SUFFIXES = (".urdf", ".sdf", ".world", ".xml", ".xacro", ".mjcf", ".json")
 
 
@@ -29,9 +31,9 @@ def shipped(data: Path | None) -> dict[str, Any]:
 
 
 def poses(data: Path | None) -> dict[str, Any]:
-    """Return counts and digests of all models that come with the package."""
+    """Return counts and digests of all models that come with the package, and of files made of them."""
     names = _shipped_names()
-    return dict(zip(names, each(describe_model, names, 120), strict=True))
+    return dict(zip(names, each(_describe_and_save, names, 120), strict=True))
 
 
 def verdicts(data: Path | None) -> dict[str, Any]:
@@ -72,6 +74,21 @@ def describe_model(source: Any) -> dict[str, Any]:
         "velocities": digest([model.jacobian(moved)] if moved else [], model),
         "constraint_values": digest(constraints, model),
     }
+
+
+def _describe_and_save(name: str) -> dict[str, Any]:
+    import kineverse as kv
+
+    saved: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix in WRITTEN:
+            file = Path(folder) / f"model{suffix}"
+            try:
+                kv.load(name).save(file)
+                saved[suffix] = zlib.crc32(file.read_bytes())
+            except kv.KineverseError as error:
+                saved[suffix] = f"{type(error).__name__}: {error}".replace(folder, "TMP")
+    return {**describe_model(name), "saved": saved}
 
 
 def digest(expressions: Sequence[Any], model: Any) -> list[float]:

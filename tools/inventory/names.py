@@ -71,7 +71,11 @@ def names(data: Path | None) -> dict[str, Any]:
 
 def describe(face: str, public: list[str] | None = None) -> Iterator[tuple[str, Any]]:
     """Yield the names of a module with their descriptions."""
-    module = importlib.import_module(face)
+    try:
+        module = importlib.import_module(face)
+    except ImportError as error:
+        yield f"{face}:", {"kind": "missing", "error": str(error)}
+        return
     for name in sorted(_public(module) if public is None else public):
         try:
             value = getattr(module, name)
@@ -79,6 +83,9 @@ def describe(face: str, public: list[str] | None = None) -> Iterator[tuple[str, 
             below = hasattr(module, "__path__") and importlib.util.find_spec(f"{face}.{name}")
             kind = "module" if below else "missing"
             yield f"{face}:{name}", {"kind": kind}
+            continue
+        except Exception as error:  # a lazy name
+            yield f"{face}:{name}", {"kind": "missing", "error": f"{type(error).__name__}: {error}"}
             continue
         if inspect.isclass(value):
             bases = [b.__name__ for b in value.__mro__[1:-1] if not b.__name__.startswith("_")]

@@ -45,8 +45,8 @@ demo --living --headless --seconds 2
 bench --list
 bench call --quick
 reproduce --list
+reproduce fig3
 reproduce fig3 --quick
-reproduce lockbox --quick
 opne kitchen
 info nosuch
 info kitchen --nosuch

@@ -43,12 +43,12 @@ def size(data: Path | None) -> dict[str, Any]:
             found |= {f"{folder}: {key}": value for key, value in _rooms(ROOT / folder).items()}
     with tempfile.TemporaryDirectory() as place:
         for name, program in _PROGRAMS.items():
-            _, _, err = run([sys.executable, "-c", _COUNT + program], 300, Path(place))
-            found[f"modules imported by {name}"] = json.loads(err.strip().splitlines()[-1])
+            ended = run([sys.executable, "-c", _COUNT + program], 300, Path(place))
+            found[f"modules imported by {name}"] = json.loads(ended.err.strip().splitlines()[-1])
     return found
 
 
-def _rooms(folder: Path) -> Iterator[tuple[str, Any]] | dict[str, Any]:
+def _rooms(folder: Path) -> dict[str, Any]:
     """Return modules that are small and imported by one other alone, large ones, and crowded folders."""
     files = {_module(f): f for f in sorted(folder.rglob("*.py"))}
     importers: dict[str, set[str]] = {name: set() for name in files}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import tempfile
 import time
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from inventory.bounded import each, run
+from inventory.bounded import CACHE, each, run
 
 KITCHENS, ROBOTS, SKILLS = range(6), ("fetch", "hsr", "pr2"), ("close", "open", "push")
 OUT_OF_REACH = ("wall", "upper", "top")
@@ -41,20 +42,20 @@ def _skills() -> Iterator[tuple[str, Any]]:
 
 
 def _outcome(words: list[str], folder: Path) -> dict[str, Any]:
-    begin = time.monotonic()
-    status, out, err = run([sys.executable, "-m", "kineverse", *words], 240, folder)
-    seconds = round(time.monotonic() - begin, 1)
-    if status not in (0, 1):
-        return {"status": status, "reason": (err.strip().splitlines() or [""])[-1], "seconds": seconds}
-    said = json.loads(out)
+    changes = {CACHE: str(folder / "cache")}
+    ended = run([sys.executable, "-m", "kineverse", *words], 240, folder, changes)
+    if ended.status not in (0, 1):
+        reason = (ended.err.strip().splitlines() or [""])[-1]
+        return {"status": ended.status, "reason": reason, "seconds": ended.seconds}
+    said = json.loads(ended.out)
     return {
-        "status": status,
+        "status": ended.status,
         "done": said["done"],
-        "value": round(said["value"], 3),
-        "reason": said["reason"],
+        "value": None if said["value"] is None else round(said["value"], 3),
+        "reason": re.sub(r"\b\d+\.\d+\b", "#", said["reason"]),
         "keys": sorted(said),
         "measures": sorted(said["measures"]),
-        "seconds": seconds,
+        "seconds": ended.seconds,
     }
 
 

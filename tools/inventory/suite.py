@@ -38,11 +38,11 @@ def tests(data: Path | None) -> dict[str, Any]:
             "inventory.suite",
             *below,
         ]
-        status, out, err = run([sys.executable, "-m", "pytest", *options], 1200, ROOT, changes)
+        ended = run([sys.executable, "-m", "pytest", *options], 1200, ROOT, changes)
         if not file.is_file():
-            raise RuntimeError(f"pytest collects nothing ({status}): {out[-2000:]} {err[-2000:]}")
+            raise RuntimeError(f"pytest collects nothing: {ended.out[-2000:]} {ended.err[-2000:]}")
         found: dict[str, Any] = json.loads(file.read_text("utf-8"))
-        return found if status == 0 else {**found, "": f"status {status}"}
+        return found if ended.status == 0 else {**found, "": f"status {ended.status}"}
 
 
 def pytest_collection_finish(session: Any) -> None:

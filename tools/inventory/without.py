@@ -8,17 +8,14 @@ import re
 import sys
 import sysconfig
 import tempfile
-import time
 import tomllib
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from inventory.bounded import ROOT, import_path, neutral, run
+from inventory.bounded import CACHE, ROOT, Ended, import_path, neutral, run
 from inventory.programs import COMMANDS, PROGRAMS
-
-_USUAL = "all extras"
 
 
 def without(data: Path | None) -> dict[str, Any]:
@@ -28,17 +25,16 @@ def without(data: Path | None) -> dict[str, Any]:
 
 
 def _outcomes(place: Path) -> Iterator[tuple[str, Any]]:
-    core, empty = place / "core", place / "empty"
+    core = place / "core"
     core.mkdir()
-    empty.mkdir()
     _link_core(core)
-    alone = [sys.executable, "-S"]
-    path = os.pathsep.join([*import_path(), str(core)])
+    compiler = {CACHE: str(place / "compiled")}
+    none = {CACHE: str(place / "interpreted"), "PATH": str(place / "none"), "CC": ""}
+    alone = {"PYTHONPATH": os.pathsep.join([*import_path(), str(core)])}
     circumstances: dict[str, tuple[list[str], dict[str, str]]] = {
-        _USUAL: ([sys.executable], {}),
-        "no compiler": ([sys.executable], {"PATH": str(empty), "CC": ""}),
-        "core alone": (alone, {"PYTHONPATH": path}),
-        "core alone, no compiler": (alone, {"PYTHONPATH": path, "PATH": str(empty), "CC": ""}),
+        "all extras": ([sys.executable], compiler),
+        "no compiler": ([sys.executable], none),
+        "core alone": ([sys.executable, "-S"], compiler | alone),
     }
     programs: dict[str, list[str]] = {
         f"kineverse {line}": ["-m", "kineverse", *line.split()] for line in COMMANDS
@@ -49,24 +45,21 @@ def _outcomes(place: Path) -> Iterator[tuple[str, Any]]:
     for circumstance, (python, changes) in circumstances.items():
         for name, words in programs.items():
             with tempfile.TemporaryDirectory(dir=place) as here:
-                begin = time.monotonic()
-                status, out, err = run([*python, *words], 120, Path(here), changes)
-                entry = _entry(status, neutral(out, Path(here), place), neutral(err, Path(here), place))
+                ended = run([*python, *words], 120, Path(here), changes)
                 key = neutral(f"{circumstance} | {name}").replace(":", "")
-                yield key, {**entry, "seconds": round(time.monotonic() - begin, 1)}
+                yield key, {**_entry(ended, Path(here), place), "seconds": ended.seconds}
 
 
-def _entry(status: int, out: str, err: str) -> dict[str, Any]:
-    lines = (err.strip() or out.strip()).splitlines() or [""]
-    entry: dict[str, Any] = {"outcome": "ok" if status == 0 else f"{status} {_last(lines)}"}
-    if out.startswith("{"):
-        entry["keys"] = sorted(json.loads(out))
+def _entry(ended: Ended, *folders: Path) -> dict[str, Any]:
+    entry: dict[str, Any] = {"outcome": "ok"}
+    said = ended.err if ended.out.startswith("{") else ended.err.strip() or ended.out
+    if ended.status != 0:
+        last = (neutral(said.strip(), *folders).splitlines() or [""])[-1]
+        last = re.sub(r"\d+\.\d+ (?=m?s\b)", "", last)  # times differ
+        entry["outcome"] = f"{ended.status} {last}".strip()
+    if ended.out.startswith("{"):
+        entry["keys"] = sorted(json.loads(ended.out))
     return entry
-
-
-def _last(lines: list[str]) -> str:
-    """Return the last line, with numbers that differ from run to run left out."""
-    return re.sub(r"\d+\.\d+ (?=m?s\b)", "", lines[-1])
 
 
 def _link_core(folder: Path) -> None:
