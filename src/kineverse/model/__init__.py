@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         Shape as Shape,
         Sphere as Sphere,
     )
-    from .comparison import compare_models as compare_models
+    from .comparison import BehaviourComparison as BehaviourComparison, compare_models as compare_models
     from .constraint import Constraint as Constraint
     from .diff import Change as Change, Diff as Diff
     from .edit import Edit as Edit
@@ -50,7 +50,7 @@ lazy_face(
         ".articulation": "Articulation",
         ".basic_operations": "AddFrame Attach Constrain Override SetData SetRate",
         ".body": "Body Box Capsule Cone Cylinder Ellipsoid Inertia Mesh Pose Shape Sphere",
-        ".comparison": "compare_models",
+        ".comparison": "BehaviourComparison compare_models",
         ".constraint": "Constraint",
         ".diff": "Change Diff",
         ".edit": "Edit",
