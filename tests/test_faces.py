@@ -144,3 +144,14 @@ def test_a_controller_without_a_scene_imports_no_geometry() -> None:
     _, geometry, coal = imported(program, "kineverse.geometry.scene", "coal")
     assert not geometry
     assert not coal
+
+
+@pytest.mark.compiler
+def test_a_skill_imports_what_it_needs() -> None:
+    for module in ("coal", "daqp"):
+        pytest.importorskip(module)
+    words = ["push", "kitchen", "--robot", "hsr", "--what", "kitchen/sink_left_upper_drawer"]
+    unneeded = ("mujoco_world", "recorder")
+    count, *others = imported(QUIETLY.format(words=words), *(f"kineverse.worlds.{name}" for name in unneeded))
+    assert count <= 350
+    assert others == [0, 0]

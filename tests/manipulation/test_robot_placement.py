@@ -91,7 +91,7 @@ def test_wrong_robot_is_refused_and_the_model_stays(robot, options, message):
 def test_furniture_is_no_robot(tmp_path):
     box = tmp_path / "box.urdf"
     box.write_text('<robot name="box"><link name="box"/></robot>', encoding="utf-8")
-    with pytest.raises(kv.errors.InvalidValueError, match="Nothing of .* moves, so it is no robot"):
+    with pytest.raises(kv.errors.InvalidValueError, match=r"Nothing of .* moves, so it is no robot"):
         place_robot(kv.load("shelf_door"), box)
 
 

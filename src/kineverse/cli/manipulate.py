@@ -19,6 +19,8 @@ from kineverse.errors import InvalidValueError, MissingDependencyError
 from kineverse.expressions.printing import format_number
 from kineverse.manipulation.belief import EstimateError
 from kineverse.manipulation.swept_volume import find_obstacle
+from kineverse.worlds import KinematicWorld, Sensors
+from kineverse.worlds.sensor_sampler import find_robot_base
 
 from .arguments import add_model_options, add_set_option, needs_mujoco, print_notes, require
 from .manipulate_skills import (
@@ -230,8 +232,6 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
     if arguments.grasp is not None and arguments.world != "mujoco":
         raise InvalidValueError("--grasp is for --world mujoco; the kinematic world has no friction.")
     if arguments.noise is not None:
-        from kineverse.worlds import Sensors  # for start-up time
-
         Sensors.parse(arguments.noise)  # says at once what cannot be read
     check_picture_path(arguments.picture)
     if arguments.record is not None:
@@ -242,11 +242,11 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
 
 def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:
     """Return the world, at the start."""
-    from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors  # for start-up time
-
     world: World
     sensors = None if arguments.noise is None else Sensors.parse(arguments.noise)
     if arguments.world == "mujoco":
+        from kineverse.worlds import MujocoWorld  # for start-up time
+
         grasp: Literal["friction", "tie"] = arguments.grasp or "friction"
         world = MujocoWorld(
             scene.model, scene.robot, scene.gripper, grasp=grasp, sensors=sensors, seed=arguments.seed
@@ -266,15 +266,13 @@ def _act(
     record: str | None,
 ) -> Outcome:
     """Run the skill, with a recording if wanted, and return its outcome."""
-    from kineverse.manipulation.tracked_belief import TrackedBelief  # for start-up time
-    from kineverse.worlds import Recorder, Sensors  # for start-up time
-    from kineverse.worlds.sensor_sampler import find_robot_base  # for start-up time
-
     belief: Belief | None = None
     error = EstimateError(scene.coordinate)
     with ExitStack() as stack:
         watchers = [_PhaseLines(scene), *watchers]
         if arguments.noise is not None and not arguments.unknown:
+            from kineverse.manipulation import TrackedBelief  # for start-up time
+
             tracked = TrackedBelief(scene.model, scene.robot, Sensors.parse(arguments.noise))
             print_notes(tracked.remarks)
             if tracked.sensors.position > 0.0 and tracked.sensors.orientation == 0.0:
@@ -286,6 +284,8 @@ def _act(
             about = {"skill": skill, "robot": scene.robot, "what": str(scene.coordinate), "world": world.name}
             if arguments.noise is not None:
                 about["noise"] = arguments.noise
+            from kineverse.worlds import Recorder  # for start-up time
+
             recorder = stack.enter_context(Recorder(record, scene.model, about))
             watchers.append(recorder)
 

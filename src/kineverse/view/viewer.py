@@ -406,7 +406,7 @@ class Viewer:
                 return
             # An empty mapping would lack values; an empty state is that of a model without symbols.
             violated = self._shown.violations(State(values))
-            lone = {v.name: find_lone_symbol(self._shown.constraints.get(v.name)) for v in violated}
+            lone = {v.name: _find_lone_symbol(self._shown.constraints.get(v.name)) for v in violated}
             scales = {name: self._panel.scale(symbol) for name, symbol in lone.items() if symbol}
             self._panel.show(format_violations(violated, violated.unchecked, scales))
         except KineverseError as error:
@@ -427,10 +427,12 @@ class Viewer:
                 logger.exception("the layer of the trajectory could not be updated")
 
 
-def find_lone_symbol(constraint: Constraint | None) -> str:
+def _find_lone_symbol(constraint: Constraint | None) -> str:
     """Return the name of the symbol that a constraint bounds; empty if it bounds anything else."""
-    symbols = () if constraint is None else constraint.expression.symbols
-    return str(symbols[0]) if len(symbols) == 1 and bool(constraint.expression == symbols[0]) else ""
+    if constraint is None or len(constraint.expression.symbols) != 1:
+        return ""
+    (symbol,) = constraint.expression.symbols
+    return str(symbol) if bool(constraint.expression == symbol) else ""
 
 
 def _describe(thing: object) -> str:
