@@ -78,7 +78,7 @@ if TYPE_CHECKING:
 
 def _list_names_below() -> dict[str, str]:
     """Return the public names of all packages and modules of the face, with their full names."""
-    import importlib
+    import importlib  # for start-up time
 
     below: dict[str, str] = {}
     for package in _PACKAGES:

@@ -39,7 +39,7 @@ def lazy_face(
             return value
         if not name.startswith("_") and importlib.util.find_spec(f".{name}", package):
             return importlib.import_module(f".{name}", package)
-        from kineverse._synonyms import MODULE_SYNONYMS
+        from kineverse._synonyms import MODULE_SYNONYMS  # for start-up time, like all of this
         from kineverse.errors import unknown_attribute_error
 
         further = {} if below is None or name.startswith("_") else below()

@@ -16,7 +16,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import kineverse as kv
 from kineverse._extras import install_command
+from kineverse.compilation.toolchain import NO_COMPILER, toolchain
 from kineverse.errors import (
     CompileError,
     DuplicateNameError,
@@ -26,11 +28,12 @@ from kineverse.errors import (
     suggest,
 )
 from kineverse.expressions.printing import format_number
+from kineverse.formats.file_formats import is_mjcf
+from kineverse.view.sliders import infer_units
 
 from .output import format_cells, print_line
 
 if TYPE_CHECKING:
-    import kineverse as kv
     from kineverse.model.model_view import ModelView
 
 
@@ -176,8 +179,6 @@ def add_model_options(
 
 def load_model(arguments: argparse.Namespace, source: str, prefix: str | None = None) -> kv.Model:
     """Load a model with the options of the command line."""
-    import kineverse as kv
-
     return kv.load(source, prefix, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
 
 
@@ -190,9 +191,6 @@ def find_limit_notes(model: ModelView, values: Mapping[str, float], texts: Itera
 
     A value in a unit of lengths is refused for an angle, and the other way round.
     """
-    import kineverse as kv
-    from kineverse.view.sliders import infer_units
-
     given = {text.rpartition("=")[0].strip(): text for text in texts}
     kinds = infer_units(model, values, given) if given else {}
     reported, lines = set(), []
@@ -301,8 +299,6 @@ _HEAD = 1 << 16  # of a file, in which its root element begins [byte]
 
 def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> None:
     """Raise if something is missing, and name all of it with how to install it."""
-    from kineverse.compilation.toolchain import NO_COMPILER, toolchain
-
     missing = [extra for extra, needed in extras.items() if needed and not _is_installed(extra)]
     sentences = []
     if missing:
@@ -318,8 +314,6 @@ def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> No
 
 def needs_mujoco(model: str) -> bool:
     """Return True for the path of a file that only MuJoCo reads."""
-    from kineverse.formats.file_formats import is_mjcf
-
     try:
         with open(model, "rb") as file:
             return is_mjcf(model, file.read(_HEAD))

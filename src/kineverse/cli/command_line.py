@@ -311,7 +311,7 @@ def _list_summaries() -> dict[str, str]:
 
 def _suggest_command(name: str, added: Iterable[str]) -> str:
     """Return advice on a command that does not exist."""
-    from kineverse.formats.locate import shipped_models
+    from kineverse.formats.locate import shipped_models  # for start-up time
 
     if name in shipped_models() or os.path.exists(name):
         return f"It is a model or file: 'kineverse info {name}' says what it consists of."

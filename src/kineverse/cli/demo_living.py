@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
             "--living is an example of the source checkout (examples/living_kitchen), which is not here. "
             "Leave it out, or take --sliders."
         )
-    from living_kitchen.simulation import Simulation
+    from living_kitchen.simulation import Simulation  # an example of the checkout
 
     if arguments.headless:
         return _simulate(arguments)
@@ -124,9 +124,9 @@ def _find_example() -> bool:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     """Run the simulation without a browser, print its results, and write a picture of its end."""
-    from living_kitchen.picture import save
+    from living_kitchen.picture import save  # an example of the checkout
     from living_kitchen.report import tabulate_identification, tabulate_tracking
-    from living_kitchen.simulation import Simulation
+    from living_kitchen.simulation import Simulation  # an example of the checkout
     from living_kitchen.track import average
 
     steps = _count_steps(SECONDS if arguments.seconds is None else arguments.seconds)

@@ -202,7 +202,7 @@ def format_table(
 
 def _render_table(console: Console, cells: Sequence[Sequence[str]], sides: Sequence[str]) -> str:
     """Return a table for a terminal, whose long cells go on in the next line."""
-    from rich.box import SIMPLE_HEAD
+    from rich.box import SIMPLE_HEAD  # for start-up time
     from rich.table import Table
     from rich.text import Text
 
@@ -271,6 +271,7 @@ def show_progress(
     if console is None:
         yield from items
         return
+    # For start-up time.
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
