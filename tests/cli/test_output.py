@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import argparse
 import io
 import math
 import sys
 
 import pytest
 
-from kineverse.cli.output import format_table, shorten_text, show_progress
+from kineverse.cli.command_line import make_parser
+from kineverse.cli.output import format_table, name_options, shorten_text, show_progress
 from kineverse.expressions.printing import format_number
 
 
@@ -71,3 +73,11 @@ def test_table_on_a_terminal_is_drawn_and_its_cells_are_escaped(monkeypatch):
     monkeypatch.setenv("NO_COLOR", "1")
     assert "\x1b" not in format_table(("name", "value"), [("a", "1")])
     assert format_table(("name",), [("a",)]).splitlines()[1] == "----"
+
+
+def test_messages_name_options_in_place_of_arguments():
+    arguments = argparse.Namespace(command=make_parser("plan")._subparsers._group_actions[0].choices["plan"])
+    text = "The time is up. Give more seconds=, or margin=. logic= is 'and'; leave_out='a', a=3."
+    assert name_options(text, arguments) == (
+        "The time is up. Give more --seconds, or --margin. logic= is 'and'; leave_out='a', a=3."
+    )

@@ -25,7 +25,7 @@ from kineverse.errors import (
     suggest,
 )
 
-from .output import join_lines, safe_streams
+from .output import join_lines, name_options, safe_streams
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -148,8 +148,12 @@ def _run(words: Sequence[str]) -> int:
             make_parser().print_help()
             return 0
         arguments = _parse_arguments(words)
-        with _log_warnings_to(sys.stderr, arguments.verbose):
-            status: int = arguments.run(arguments)
+        try:
+            with _log_warnings_to(sys.stderr, arguments.verbose):
+                status: int = arguments.run(arguments)
+        except KineverseError as error:
+            print(f"kineverse: {name_options(format_error(error), arguments)}", file=sys.stderr)
+            return ERROR
     except SystemExit as stop:  # argparse would end the process.
         return stop.code if isinstance(stop.code, int) else ERROR
     except BrokenPipeError:

@@ -32,7 +32,7 @@ from .manipulate_skills import (
     push_object,
     skip_skill,
 )
-from .output import format_table, join_lines, show_activity
+from .output import format_table, join_lines, name_options, show_activity
 from .pages import (
     add_page_options,
     check_picture_path,
@@ -410,7 +410,7 @@ def _report_outcome(
     else:
         state = "shut" if is_shut(scene) else "done"
         verdict = f"{state} at {at}, after {format_number(outcome.seconds, 4)} s in the {world.name} world"
-    print(f"{scene.coordinate}: {join_lines(verdict)}")
+    print(f"{scene.coordinate}: {name_options(join_lines(verdict), arguments)}")
     if "family" in outcome.measures:
         if outcome:
             print(outcome.reason)

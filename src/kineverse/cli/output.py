@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import codecs
 import contextlib
 import os
@@ -245,6 +246,13 @@ def format_count(count: int, noun: str) -> str:
 def join_lines(message: object) -> str:
     """Return a message, such as an exception, on one line."""
     return " ".join(str(message).split())
+
+
+def name_options(text: str, arguments: argparse.Namespace) -> str:
+    """Return a message of the library with options of the command in place of arguments: ``--seconds``."""
+    parser: argparse.ArgumentParser = arguments.command
+    options = {one[2:].replace("-", "_"): one for one in parser._option_string_actions if one[:2] == "--"}
+    return re.sub(r"\b([a-z_]+)=(?![\w'\"({\[<])", lambda found: options.get(found[1], found[0]), text)
 
 
 def shorten_text(text: str, width: int) -> str:

@@ -21,7 +21,7 @@ from kineverse.planning import Planner
 from kineverse.planning.trajectories.trajectory_file import check_trajectory_name
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
-from .output import format_table, show_activity
+from .output import format_table, name_options, show_activity
 from .pages import (
     add_page_options,
     check_picture_path,
@@ -365,7 +365,7 @@ def print_path(arguments: argparse.Namespace, path: Path, preparation: float) ->
     """Print what was found."""
     goal = " ".join(arguments.to)
     if not path.found:
-        print(f"{goal}: not found. {path.why}")
+        print(f"{goal}: not found. {name_options(path.why, arguments)}")
         if not arguments.move:
             print(f"  moves      {_list_moving(path)}; --move names others")
         return

@@ -24,6 +24,7 @@ from .arguments import (
     print_notes,
     require,
 )
+from .output import name_options
 from .pages import check_picture_path, list_mesh_problems, print_mesh_problems
 from .plan_arguments import add_robot_option, include_robot
 
@@ -125,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
         }
         print(json.dumps(answer, allow_nan=False))
     else:
-        verdict = "reached" if result.solved else f"not reached. {result.why}"
+        verdict = "reached" if result.solved else f"not reached. {name_options(result.why, arguments)}"
         print(f"{arguments.frame}: {verdict}")
         width = max(map(len, positions))
         for name, value in positions.items():
