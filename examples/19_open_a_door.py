@@ -22,7 +22,7 @@ door = model.symbol("kitchen/fridge_door")
 hand = model.fk(f"{robot}/{HANDS[robot]}")
 handle = model.fk("kitchen/fridge_door_handle") @ kv.rpy(np.pi / 2, 0, np.pi)
 grasp = Hold(same_pose(hand, handle), name="grasp")
-found = inverse_kinematics(model, [grasp], still=[door])
+found = inverse_kinematics(model, [grasp], fixed=[door])
 if not found.solved:
     sys.exit(found.why)
 state = found.best

@@ -13,7 +13,6 @@ import pytest
 
 import kineverse as kv
 from kineverse._runtime import no_collection
-from kineverse._synonyms import RENAMED
 
 ROOT = Path(__file__).parents[1]
 SOURCES = {"": ROOT / "src" / "kineverse", "studies.": ROOT / "studies" / "kineverse_studies"}
@@ -151,15 +150,6 @@ def test_the_face_is_small() -> None:
 def test_a_name_that_lives_below_is_answered_with_its_place(name: str, place: str) -> None:
     with pytest.raises(AttributeError, match=re.escape(place)):
         getattr(kv, name)
-
-
-@pytest.mark.parametrize(("name", "place"), RENAMED.items())
-def test_an_earlier_name_is_answered_with_its_place(name: str, place: str) -> None:
-    with pytest.raises(AttributeError, match=re.escape(place)):
-        getattr(kv, name)
-    value: object = kv
-    for part in place.split(".")[1:]:
-        value = getattr(value, part)
 
 
 def test_dir_lists_the_face() -> None:

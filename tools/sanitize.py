@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("compile", "geometry", "planning", "estimation", "control")
+PACKAGES = ("compilation", "geometry", "planning", "estimation", "control")
 REPORTED = 86
 """Status of a process that ends with a report; one about undefined behaviour may be printed."""
 WARNINGS = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-function")  # shared headers have functions for others

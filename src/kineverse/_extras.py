@@ -11,8 +11,7 @@ from pathlib import Path
 
 DISTRIBUTION = "kineverse-articulation"
 
-STUDIES = "kineverse-studies"
-"""Distribution with benchmarks and experiments, ``studies/`` in a checkout."""
+STUDIES = "kineverse-studies"  # distribution with benchmarks and experiments, studies/ in a checkout
 
 _EXTRA = re.compile(r"""(?:\s*and\s*)?extra\s*==\s*["'](?P<name>[^"']+)["']""")
 

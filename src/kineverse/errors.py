@@ -11,6 +11,25 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+__all__ = [
+    "CompileError",
+    "DuplicateNameError",
+    "EditError",
+    "ExpressionError",
+    "FormatError",
+    "InfeasibleError",
+    "InvalidValueError",
+    "KineverseError",
+    "MissingDependencyError",
+    "ModelError",
+    "NoSolutionError",
+    "NotFiniteError",
+    "ShapeError",
+    "SimulationError",
+    "UnknownAttributeError",
+    "UnknownNameError",
+]
+
 
 class KineverseError(Exception):
     """Base of all errors of this package."""
@@ -18,6 +37,18 @@ class KineverseError(Exception):
     def __str__(self) -> str:
         # KeyError prints the repr of its argument; the message is printed as it is.
         return str(self.args[0]) if len(self.args) == 1 else super().__str__()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Constructors of subclasses take other arguments than the text, so a pickle does without them.
+        return _restore_error, (type(self), self.args, self.__dict__)
+
+
+def _restore_error(
+    kind: type[KineverseError], args: tuple[Any, ...], attributes: dict[str, Any]
+) -> KineverseError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(attributes)
+    return error
 
 
 class UnknownNameError(KineverseError, KeyError):

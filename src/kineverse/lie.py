@@ -18,10 +18,45 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+__all__ = [
+    "Array",
+    "adjoint",
+    "axis_angle",
+    "exp_se3",
+    "exp_so3",
+    "inverse",
+    "inverse_right_jacobian",
+    "log_se3",
+    "log_so3",
+    "mean_rotation",
+    "normalize",
+    "orthonormalize",
+    "pose_difference",
+    "position_of",
+    "quaternion",
+    "retract",
+    "right_jacobian",
+    "rotation_along_z",
+    "rotation_angle",
+    "rotation_of",
+    "rotation_x",
+    "rotation_y",
+    "rotation_z",
+    "round_exact",
+    "rpy",
+    "skew",
+    "smallest_rotation_from_z",
+    "snap",
+    "to_quaternion",
+    "to_rpy",
+    "transform",
+    "translation",
+    "unit_vector",
+]
+
 Array: TypeAlias = npt.NDArray[np.float64]
 
-EXACT_TOLERANCE = 1e-15
-"""Distance to 0, 1 or -1 below which an entry of a rotation is exactly that."""
+EXACT_TOLERANCE = 1e-15  # distance to 0, 1 or -1 below which an entry of a rotation is exactly that
 
 # -- rotations -----------------------------------------------------------------------------------------------
 

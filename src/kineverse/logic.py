@@ -36,6 +36,8 @@ from kineverse.expressions.functions import absolute, tanh
 from kineverse.expressions.node import Node
 from kineverse.symbols import Symbol
 
+__all__ = ["CONTRAST", "less", "logic_and", "logic_not", "logic_or"]
+
 CONTRAST = 1e10
 
 

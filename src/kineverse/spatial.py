@@ -32,6 +32,39 @@ from kineverse.expressions.functions import arctan2, cos, norm, sin, sqrt, where
 from kineverse.expressions.layout import SX
 from kineverse.lie import normalize
 
+__all__ = [
+    "Direction",
+    "OneAxisTransform",
+    "VectorLike",
+    "adjoint",
+    "as_one_axis_transform",
+    "as_transform",
+    "axis_angle",
+    "exp_se3",
+    "exp_so3",
+    "inverse",
+    "log_se3",
+    "log_so3",
+    "point",
+    "position_of",
+    "quaternion",
+    "rotation_about",
+    "rotation_angle",
+    "rotation_of",
+    "rotation_x",
+    "rotation_y",
+    "rotation_z",
+    "rpy",
+    "skew",
+    "to_quaternion",
+    "to_rpy",
+    "transform",
+    "translation",
+    "translation_along",
+    "unit_vector",
+    "vector",
+]
+
 Direction = tuple[float, float, float]
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -52,8 +85,7 @@ _TRANSFORM_SPARSITIES = {
 }
 _TRANSLATION_SPARSITY = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 3, 3])
 _UNIT_ENTRY = ca.SX(1)
-_UNIT_TOLERANCE = 1e-9
-"""Largest difference of the length of a direction from 1."""
+_UNIT_TOLERANCE = 1e-9  # largest difference of the length of a direction from 1
 
 
 class OneAxisTransform(Expression):
@@ -191,7 +223,6 @@ def _as_translation(transform: Expression) -> Expression:
 
 
 def _split_factor(part: SX) -> tuple[float, SX]:
-    """Return a scalar as a constant factor and the rest."""
     if part.op() == ca.OP_NEG:
         factor, rest = _split_factor(part.dep(0))
         return -factor, rest
@@ -338,8 +369,8 @@ def quaternion(
     q = array(list(_components("A quaternion", ("x", "y", "z", "w"), (x, y, z, w))))
     listener = access_listener(q)
     if listener is not None:
-        anew: Expression = listener.ask("quaternion", q)
-        return anew
+        result: Expression = listener.ask("quaternion", q)
+        return result
     if not q.symbols:
         largest = float(np.abs(q()).max())
         if not 0 < largest < math.inf:
@@ -527,8 +558,8 @@ def unit_vector(v: VectorLike, what: str = "The vector") -> Expression:
     expression = _as_vector3(v, what)
     listener = access_listener(expression)
     if listener is not None:
-        anew: Expression = listener.ask("unit", expression)
-        return anew
+        result: Expression = listener.ask("unit", expression)
+        return result
     if not expression.symbols:
         number = normalize(expression())
         if number is None:

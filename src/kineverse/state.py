@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -25,6 +26,8 @@ from kineverse.errors import (
 from kineverse.expressions.printing import html_table
 from kineverse.lie import Array
 from kineverse.symbols import Symbol, parse_symbol_name
+
+__all__ = ["State", "StateLike"]
 
 StateLike: TypeAlias = "State | Mapping[Symbol, float] | Mapping[str, float] | Mapping[Symbol | str, float]"
 """A state, or a plain mapping from symbols or their names to numbers."""
@@ -125,7 +128,7 @@ class State(Mapping[Symbol, float]):
             return self._values[self._known(key)]
         except KeyError:
             raise UnknownNameError(
-                f"The state says nothing about '{key}'. {suggest(str(key), self._by_name, 'symbol')}"
+                f"The state has no value of '{key}'. {suggest(str(key), self._by_name, 'symbol')}"
             ) from None
 
     def _known(self, key: object) -> Symbol:
@@ -243,7 +246,7 @@ class State(Mapping[Symbol, float]):
 
     def _unknown(self, key: object) -> KineverseError:
         symbol = _symbol(key)
-        about = f"The state says nothing about '{symbol}', so there is nothing to update."
+        about = f"The state has no value of '{symbol}', so there is nothing to update."
         if str(symbol) in self._by_name:
             return UnknownNameError(
                 f"{about} It knows another symbol of that name, of another role or value; "
@@ -263,7 +266,7 @@ class State(Mapping[Symbol, float]):
         return hash((frozenset(self._values.items()), self.stamp, self.source))
 
     def __reduce__(self) -> Any:
-        return _restore, (self._values, self.stamp, self.source)
+        return partial(State, stamp=self.stamp, source=self.source), (self._values,)
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{s}: {v:g}" for s, v in list(self._values.items())[:8])
@@ -319,10 +322,6 @@ def _is_number(value: object) -> bool:
         return not math.isnan(real_number(value))
     except (TypeError, ValueError, OverflowError):
         return False
-
-
-def _restore(values: dict[Symbol, float], stamp: float | None, source: str) -> State:
-    return State(values, stamp=stamp, source=source)
 
 
 def as_state(values: StateLike, known: Iterable[Symbol]) -> State:

@@ -18,6 +18,19 @@ from kineverse._checks import real_number
 from kineverse.errors import ExpressionError, InvalidValueError
 from kineverse.expressions.expression import NO_NODES, SYMBOLS, Expression
 
+__all__ = [
+    "ORDER_NAMES",
+    "ROLES",
+    "Role",
+    "Symbol",
+    "parameter",
+    "parse_symbol_name",
+    "position",
+    "symbol",
+    "symbol_name",
+    "velocity",
+]
+
 Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
 
 ROLES: tuple[Role, ...] = get_args(Role)

@@ -248,7 +248,7 @@ BROKEN: list[tuple[type[Any], dict[str, Any], str]] = [
     (kv.articulations.RackAndPinion, {"driver": "motor", "radius": -0.1}, "not -0.1"),
     (kv.articulations.RackAndPinion, {"driver": "motor", "radius": nan}, "not nan"),
     (kv.articulations.RackAndPinion, {"driver": "motor", "radius": 1, "offset": nan}, "offset of the rack and pinion 'j'"),
-    (kv.articulations.Cam, {**CAM, "angles": (0, 1, 1, 4, 5)}, "profile of the cam 'j' is none. Knots increase: knot 2 is 1"),
+    (kv.articulations.Cam, {**CAM, "angles": (0, 1, 1, 4, 5)}, "profile of the cam 'j' is invalid. Knots increase: knot 2 is 1"),
     (kv.articulations.Cam, {**CAM, "angles": (0, 1)}, "profile of the cam 'j' .* not 5 for 2"),
     (kv.articulations.Cam, {**CAM, "values": (0, 1, 2, 3, 4)}, "profile of the cam 'j' .*last value 4 is not its first, 0"),
     (kv.articulations.Cam, {**CAM, "values": (0, 1, nan, 3, 0)}, "profile of the cam 'j' .*number 2 is nan"),

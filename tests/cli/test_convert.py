@@ -110,7 +110,7 @@ def test_leave_out_removes_the_named_constraints_only(run, tmp_path, monkeypatch
     status, out, err = run("door.kv.json", "default.urdf")
     assert status == 0
     assert err.splitlines() == [
-        "default.urdf leaves out 1 thing that it cannot say; --strict refuses instead:",
+        "default.urdf leaves out 1 thing that it cannot express; --strict refuses instead:",
         "  lock has bounds that depend on bolt",
     ]
     assert kv.load("default.urdf").snapshot() == kv.load("door.urdf").snapshot()

@@ -249,7 +249,7 @@ def test_thin_reduces_the_number_of_poses(door, capsys):
         ("0 0 0\n0 0 1\n", ["--thin", "1"], "takes at least two"),
         ("part,x,y,z\na,0,0,0\nb,0,0,1\n", [], "which part moves?"),
         ("part,x,y,z\na,0,0,0\nb,0,0,1\n", ["--child", "c"], "has no part 'c'"),
-        ("0 0 0\n0 0 1\n", ["--columns", "x,y"], "2 names were given"),
+        ("0 0 0\n0 0 1\n", ["--columns", "x,y"], "there are 2 names"),
         ("0 0 0\n0 0 1\n", ["--document", "a.urdf"], "whose name ends in .kv.json"),
     ],
 )

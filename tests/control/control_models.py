@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import scipy.linalg
+import scipy.sparse
 
 import kineverse as kv
 from kineverse.control import Command, Controller
@@ -54,3 +58,32 @@ def follow(controller: Controller, state: kv.State, seconds: float) -> tuple[kv.
         commands.append(controller.step(state))
         state = controller.model.integrate(state, commands[-1].speeds, controller.dt)
     return state, commands
+
+
+def solve_by_osqp(problem: Any, soft: Any, weight: float, linear: float) -> tuple[Any, Any]:
+    """Return minimiser and multipliers of a quadratic program; penalties of soft rows are of slacks."""
+    import osqp
+
+    (H, f, A, lower, upper), rows = problem, np.flatnonzero(soft)
+    n, m, k = len(f), len(A), len(rows)
+    # The unknowns are [x; above; below], the rows [[x; A x] - above + below; above; below].
+    C = np.zeros((n + m + 2 * k, n + 2 * k))
+    C[: n + m, :n] = np.vstack([np.eye(n), A])
+    C[rows, n + np.arange(k)], C[rows, n + k + np.arange(k)] = -1.0, 1.0
+    C[n + m :, n:] = np.eye(2 * k)
+    cost = scipy.linalg.block_diag(H, weight * np.eye(2 * k))
+    solver = osqp.OSQP()
+    solver.setup(
+        scipy.sparse.csc_matrix(np.triu(cost)),
+        np.concatenate([f, np.full(2 * k, linear)]),
+        scipy.sparse.csc_matrix(C),
+        np.concatenate([lower, np.zeros(2 * k)]),
+        np.concatenate([upper, np.full(2 * k, np.inf)]),
+        verbose=False,
+        eps_abs=1e-9,
+        eps_rel=1e-9,
+        max_iter=100_000,
+        polishing=True,
+    )
+    found = solver.solve(raise_error=True)
+    return found.x[:n], found.y[: n + m]

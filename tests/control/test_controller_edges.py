@@ -269,7 +269,7 @@ def test_posture_does_not_keep_a_goal_from_being_reached() -> None:
         model,
         [Goal(same_pose(pose, goal.expression), name="reach")],
         dt=DT,
-        still=["fetch/l_wheel_joint", "fetch/r_wheel_joint", "fetch/torso_lift_joint"],
+        fixed=["fetch/l_wheel_joint", "fetch/r_wheel_joint", "fetch/torso_lift_joint"],
     )
     joints = [s.position for s in controller.speeds]
     limits = [np.clip(model.limits(s), -2.5, 2.5) for s in joints]

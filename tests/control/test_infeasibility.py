@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from control_models import solve_by_osqp
 from scipy.optimize import linprog
 
 from kineverse.control.infeasibility import ConflictingBound, find_irreducible_conflict, find_least_violation
-from kineverse.control.quadratic_program import make_solver
 from kineverse.errors import InvalidValueError, ShapeError
 
 System = tuple[Any, Any, Any]
@@ -119,8 +119,7 @@ def test_the_least_violation_is_optimal() -> None:
         A, lower, upper = random_system(rng, 4, 9)
         hard = np.arange(13) < 4
         best = find_least_violation(A, lower, upper, hard=hard)
-        oracle = make_solver("osqp", 4, 9, soft=~hard, soft_weight=1e6)
-        x = oracle.solve(np.eye(4), np.zeros(4), A, lower, upper).x
+        x, _ = solve_by_osqp((np.eye(4), np.zeros(4), A, lower, upper), ~hard, 1e6, 0.0)
         values = np.concatenate([x, A @ x])
         cost = np.sum(np.maximum(np.maximum(lower - values, values - upper), 0.0) ** 2)
         assert best.hard_rows_hold

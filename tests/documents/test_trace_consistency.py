@@ -160,7 +160,10 @@ def homeless(content: dict[str, Any]) -> None:
         (fewer_writes, r"\('custom'\), trace: it writes other things than the operation"),
         (frozen_too, r"\('custom'\), trace: an operation with a trace is not frozen"),
         (gone, r"\('custom'\), trace: it cannot be followed: it needs more than there is"),
-        (not_written, r"\('frame car'\), parameters: 'frames/elsewhere' is said to be written, and is not"),
+        (
+            not_written,
+            r"\('frame car'\), parameters: 'frames/elsewhere' is not among the values that it writes",
+        ),
         (homeless, r"writes articulations/hinge: .* has 2 homes for 1 coordinates"),
     ],
 )

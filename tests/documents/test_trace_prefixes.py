@@ -6,7 +6,7 @@ import gc
 
 import numpy as np
 import pytest
-from trace_models import KNOB, LIFT, Custom, build, reloaded
+from trace_models import KNOB, LIFT, Custom, build, build_scene, reloaded
 
 import kineverse as kv
 from kineverse.formats.document import OpaqueOperation, read_operations, to_json
@@ -79,14 +79,14 @@ def test_a_trace_is_made_once_for_each_run() -> None:
 
 
 def test_an_open_loop_is_refused_and_closed_anew() -> None:
-    model = kv.load("articulations/four_bar", prefix="")
+    model = build_scene("four_bar")
     read = reloaded(model)
     longer = kv.model.AddFrame(
         "board",
         kv.model.Frame.from_transform("world", kv.translation(0, 0, 0.01) @ model.fk("board")),
     )
     before = read.snapshot()
-    advice = r"'loop four_bar'.*CloseLoop\(\.\.\.\) made anew"
+    advice = r"'loop four_bar'.*new CloseLoop\(\.\.\.\)"
     with pytest.raises(kv.errors.EditError, match=advice), read.edit() as edit:
         edit.replace("frame board", longer)
     assert read.snapshot() == before

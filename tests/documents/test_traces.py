@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from trace_models import KNOB, LIFT, WHEEL, Custom, agree, build, changed, reloaded
+from trace_models import KNOB, LIFT, WHEEL, Custom, agree, build, build_scene, changed, reloaded
 
 import kineverse as kv
 from hypothesis_profiles import attempts
@@ -198,7 +198,7 @@ def test_a_frozen_one_is_replaced_in_the_same_edit() -> None:
 
 
 def test_a_loop_from_a_document_is_made_anew_from_its_parameters() -> None:
-    model = kv.load("articulations/four_bar", prefix="")
+    model = build_scene("four_bar")
     read = reloaded(model)
     (tag,) = (t for t in read.history.tags if t.startswith("loop"))
     loop = read.history.operation(tag)

@@ -147,7 +147,7 @@ BAD = {
     "mixed": ("1 2 3\n1 2 3 0 0 0 1\n", "line 2: 7 cells, where line 1 has 3"),
     "mixed below a head": ("x,y,z\n\n1,2,3\n1,2\n", "line 4: 2 cells, where line 1 has 3"),
     "nine columns": ("1 2 3 4 5 6 7 8 9\n", "9 columns without names"),
-    "NaN": ("x,y,z\n1,2,3\n1,nan,3\n", "line 3: y is 'nan'.*Leave all cells of a part empty"),
+    "NaN": ("x,y,z\n1,2,3\n1,nan,3\n", "line 3: y is 'nan'.*All cells of a part that was not observed are empty"),
     "infinity": ("1 2 -inf\n", "line 1: z is '-inf'"),
     "huge": ("1 2 1e300\n", "line 1: z is '1e300'"),
     "words": ("x,y,z\n1,two,3\n", "line 2: y is 'two'"),
@@ -160,16 +160,16 @@ BAD = {
     "out of order": (LONG + "0.2,A,1,2,3\n0.2,B,1,2,3\n0.1,A,1,2,3\n", r"line 4: 0\.1 s is earlier than line 2"),
     "twice": (LONG + "0.2,A,1,2,3\n0.2,A,1,2,3\n", r"line 3: 0\.2 s is the same time as line 2"),
     "no name": (LONG + "0,,1,2,3\n", "line 2: the name of the part is missing"),
-    "nothing seen": ("A.x,A.y,A.z\n,,\n", "nothing was seen"),
+    "nothing seen": ("A.x,A.y,A.z\n,,\n", "nothing was observed"),
     "no position": ("qx,qy,qz,qw\n0,0,0,1\n", "an orientation, but no position"),
     "nothing known": ("speed,force\n1,2\n", "no column is a position"),
     "a lacking column": ("x,y,z,q_x,qy,qz,qw\n1,2,3,0,0,0,1\n", "no column qx. Not understood: 'q_x'"),
     "a part lacks z": ("A.x,A.y,B.x,B.y,B.z\n1,2,3,4,5\n", "line 1: the part 'A' has no column z"),
     "two orientations": ("x,y,z,rx,ry,rz,roll,pitch,yaw\n1,2,3,4,5,6,7,8,9\n", "orientation twice"),
-    "a column twice": ("x,y,z,x\n1,2,3,4\n", "'x' is there twice"),
+    "a column twice": ("x,y,z,x\n1,2,3,4\n", "two columns 'x'"),
     "an odd unit": ("x [inch],y,z\n1,2,3\n", "the unit 'inch'. Known are m, cm, mm"),
     "parts and none": ("x,y,z,B.x,B.y,B.z\n1,2,3,4,5,6\n", "'B'.*others such as 'x' to none"),
-    "parts twice": ("part,B.x,B.y,B.z\nA,1,2,3\n", "a part is named in each row, and in"),
+    "parts twice": ("part,B.x,B.y,B.z\nA,1,2,3\n", "parts are named in rows and in"),
 }  # fmt: skip
 
 
@@ -184,7 +184,7 @@ def test_malformed_table_is_refused_with_its_line(case, tmp_path):
 
 @pytest.mark.parametrize(
     ("columns", "says"),
-    [("x,y", "2 names were given"), ("x,y,y", "'y' is there twice"), ("x,y,time", "has no column z")],
+    [("x,y", "there are 2 names"), ("x,y,y", "two columns 'y'"), ("x,y,time", "has no column z")],
 )
 def test_invalid_column_names_are_refused(columns, says, tmp_path):
     with pytest.raises(FormatError, match=says):
@@ -209,7 +209,7 @@ def test_unknown_parts_are_refused(tmp_path):
 def test_parts_never_observed_together_are_refused(tmp_path):
     rows = "0,table,1,2,3,0,0,0\n1,door,1,2,3,0,0,0\n"
     recording = read_recording(write_table(tmp_path, "time,part,x,y,z,rx,ry,rz\n" + rows))
-    with pytest.raises(FormatError, match="never seen at the same time"):
+    with pytest.raises(FormatError, match="never observed at the same time"):
         recording.pair("table", "door")
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import gradient_checks as lc
 import numpy as np
+import pytest
 import random_programs as lp
 from hypothesis import assume
 from hypothesis import strategies as st
 
+import kineverse as kv
 from kineverse.expressions import array
 
 WORDS = lp.Vocabulary("law")
@@ -54,3 +56,31 @@ def _steps(program):
     kinks = {"floor", "ceil", "mod", "sign", "absolute", "copysign", "minimum", "maximum", "rint", "trunc"}
     kinks |= {"floor_divide", "fmod"}
     return program[0] in kinks or any(_steps(p) for p in program[2:] if isinstance(p, tuple))
+
+
+DOOR, BOLT = kv.position("door"), kv.position("bolt")
+GRADIENT = (2 * DOOR + BOLT).gradient()
+
+
+def test_entries_by_symbol_and_by_name():
+    assert GRADIENT["door:velocity"] is GRADIENT[DOOR.derivative()]
+    assert "door:velocity" in GRADIENT
+    assert DOOR.derivative() in GRADIENT
+    assert GRADIENT.get("door:velocity") == kv.array(2.0)
+    assert (GRADIENT.get("dor"), GRADIENT.get(DOOR), GRADIENT.get("dor", 1)) == (None, None, 1)
+
+
+@pytest.mark.parametrize("key", ["door", DOOR, "dor:velocity", kv.velocity("dor")], ids=str)
+def test_other_keys_are_refused(key):
+    assert key not in GRADIENT
+    with pytest.raises(kv.errors.UnknownNameError) as error:
+        GRADIENT[key]
+    assert str(error.value).startswith(
+        f"The gradient has no entry for '{key}'; its keys are speeds. Did you mean 'door:velocity'"
+    )
+    assert isinstance(error.value, KeyError)
+
+
+def test_gradient_of_a_constant_is_empty():
+    with pytest.raises(kv.errors.UnknownNameError, match=r"no entry for 'door:velocity'.*no speed at all"):
+        kv.array(1.0).gradient()["door:velocity"]

@@ -96,7 +96,7 @@ def test_an_empty_state():
         assert nothing == State()
         assert nothing.stamp is None
         assert nothing.source == ""
-        with pytest.raises(UnknownNameError, match=r"says nothing about 'x'\. There is no symbol at all"):
+        with pytest.raises(UnknownNameError, match=r"has no value of 'x'\. There is no symbol at all"):
             nothing["x"]
 
 
@@ -154,7 +154,7 @@ def test_updated_with_unknown_names_is_refused():
     with pytest.raises(UnknownNameError) as error:
         state.updated({"fridge_door": 1.0})
     assert str(error.value) == (
-        "The state says nothing about 'fridge_door', so there is nothing to update. "
+        "The state has no value of 'fridge_door', so there is nothing to update. "
         "Did you mean 'kitchen/fridge_door'? extended({'fridge_door': ...}) adds what is new."
     )
     assert state.updated({"length": 5})[kv.parameter("length", 2.0)] == 5
@@ -345,7 +345,7 @@ def test_unknown_names_come_with_suggestions():
         (a, "Did you mean .*'arm/a:velocity'"),
         ("x", r"Available: arm/a:velocity, kitchen/fridge_door, kitchen/oven_door\."),
     ]:
-        with pytest.raises(UnknownNameError, match=f"says nothing about '{key}'. {suggestion}") as error:
+        with pytest.raises(UnknownNameError, match=f"has no value of '{key}'. {suggestion}") as error:
             state[key]
         assert isinstance(error.value, KeyError)
 

@@ -155,7 +155,7 @@ def test_unsupported_constraints_are_left_out_and_motions_refused(ending: str, t
     saved = model.save(tmp_path / f"m.{ending}")
     assert set(saved.left_out) >= {"lock", "jerky", "curved", "drive"}
     name = ending.replace("xml", "mjcf").upper()
-    assert f"'jerky' is left out, which {name} cannot say: it limits accelerations" in saved.remarks
+    assert f"'jerky' is left out, which {name} cannot express: it limits accelerations" in saved.remarks
     assert any(r.startswith("that 'drive' moves by speeds that are not its own") for r in saved.remarks)
     again = kv.load(tmp_path / f"m.{ending}")
     assert again.degrees_of_freedom == model.degrees_of_freedom
@@ -168,7 +168,7 @@ def test_unsupported_constraints_are_left_out_and_motions_refused(ending: str, t
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="odd", parent="door", child="odd", position=np.sin(3 * q)))
     with pytest.raises(
-        kv.errors.FormatError, match=r"cannot say one thing of this model\. 'odd' turns by no"
+        kv.errors.FormatError, match=r"cannot express one thing of this model\. 'odd' turns by no"
     ):
         model.save(tmp_path / f"motion.{ending}")
     assert not (tmp_path / f"motion.{ending}").exists()

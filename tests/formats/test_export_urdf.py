@@ -231,7 +231,7 @@ def test_error_names_all_unsupported_features(tmp_path: Path) -> None:
     with pytest.raises(kv.errors.FormatError) as info:
         model.save(tmp_path / "m.urdf", strict=True)
     message = str(info.value)
-    assert "URDF cannot say 7 things" in message
+    assert "URDF cannot express 7 things" in message
     assert "and 1 more" in message
     for part in ("'curve' turns by", "it moves with a", "'given' moves with a gradient", "'sum'", "'lock'"):
         assert part in message

@@ -161,7 +161,7 @@ def test_two_pins_on_one_axis_are_a_hinge(tmp_path):
     once, _ = load(tmp_path, scene(BARS, PIN.format("0")), "once.xml")
     twice, remarks = load(tmp_path, scene(BARS, PIN.format("0") + PIN.format(".1").replace("pin", "again")))
     assert remarks == [
-        "x.xml: the equality 'again' is left out: it says nothing new, what it ties coincides whatever moves."
+        "x.xml: the equality 'again' is left out: it adds nothing, since what it connects coincides in every state."
     ]
     assert twice.degrees_of_freedom == once.degrees_of_freedom == (kv.position("crank"),)
     pose = twice.fk("rocker")({"crank": 0.2})
@@ -203,7 +203,7 @@ def test_loop_that_never_closes_is_a_warning(tmp_path):
     weld = '<weld name="w" body1="a" body2="b" relpose=".5 0 0 1 0 0 0"/>'
     model, remarks = load(tmp_path, scene(rigid, weld))
     assert remarks == [
-        "x.xml: the equality 'w' is left out, and never holds: nothing moves what it ties, and 0.5 is left between its ends."
+        "x.xml: the equality 'w' is left out, and never holds: nothing moves what it connects, and 0.5 is left between its ends."
     ]
     assert not model.constraints or "w" not in "".join(model.constraints)
     with pytest.raises(kv.errors.FormatError, match="'w' cannot move"):

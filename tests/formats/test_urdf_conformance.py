@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from urdf_outcomes import COUNT, expected_outcome
 
 import kineverse as kv
 from kineverse.formats.reader_warnings import Fault, collect_warnings
-from kineverse.formats.urdf import read_urdf
+from kineverse.formats.urdf import parse_urdf, read_urdf
 from published_data import published_files, published_path, relative_name
 
 pytestmark = pytest.mark.data
@@ -85,3 +86,29 @@ def test_documentation_lists_every_disagreement():
     assert len(disagreed) == 41
     # Long names are listed by their last part.
     assert [name for name in disagreed if name not in text and name.rpartition("__")[2] not in text] == []
+
+
+TEXT = (Path(__file__).parents[2] / "docs" / "urdf.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, flags=re.DOTALL)
+
+
+def test_examples_run():
+    assert blocks("python")
+    for code in blocks("python"):
+        exec(compile(code, "docs/urdf.md", "exec"), {})
+
+
+def test_documented_messages_are_those_of_the_reader():
+    (lamp,) = re.findall(r'parse_urdf\("""(.*?)"""\)', blocks("python")[0], flags=re.DOTALL)
+    (messages,) = blocks("text")
+    mistakes = [
+        lamp.replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', 1),
+        lamp.replace('<mimic joint="shoulder"', '<mimic joint="sholder"'),
+    ]
+    for text, message in zip(mistakes, messages.splitlines(), strict=True):
+        with pytest.raises(kv.errors.FormatError) as info:
+            parse_urdf(text, source="lamp.urdf", strict=True)
+        assert str(info.value) == message

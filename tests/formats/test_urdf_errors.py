@@ -69,7 +69,7 @@ CASES = {
     "no parent": (robot('<joint name="j" type="fixed"><child link="l0"/></joint>'), "has no <parent"),
     "empty child": (
         robot('<joint name="j" type="fixed"><parent link="a"/><child/></joint>'),
-        "<child> does not say which link",
+        "<child> does not name a link",
     ),
     "no limit": (pair(""), J + "is revolute but has no <limit>"),
     "no limit of a slider": (pair("", "prismatic"), J + "is prismatic but has no <limit>"),
@@ -112,7 +112,7 @@ CASES = {
         pair(LIMIT + '<safety_controller k_velocity="1" soft_lower_limit="3" soft_upper_limit="4"/>'),
         J + "<safety_controller> has soft limits [3.0, 4.0] outside of the limits [-1.0, 2.0]",
     ),
-    "mimics nothing": (pair(LIMIT + "<mimic/>"), J + "<mimic> does not say which joint"),
+    "mimics nothing": (pair(LIMIT + "<mimic/>"), J + "<mimic> does not name a joint"),
     "mimics nobody": (
         pair(LIMIT + '<mimic joint="jj"/>'),
         MIMIC + 'it mimics "jj", and there is no joint of that name',

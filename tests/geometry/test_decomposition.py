@@ -321,7 +321,7 @@ WRONG = {
     ),
     "a crash": (
         "import os; os.kill(os.getpid(), 11)",
-        "SIGSEGV. Simplify or mend the mesh, or allow more memory",
+        "SIGSEGV. Simplify or repair the mesh, or allow more memory",
     ),
     "not finite": ("mesh.vertices[0] = float('nan')\n" + ONE_HULL, "not where the mesh is"),
     "elsewhere": ("mesh.vertices += 1\n" + ONE_HULL, "not where the mesh is"),

@@ -132,7 +132,7 @@ def test_error_for_many_missing_meshes_lists_a_few_in_short_lines(tmp_path):
     with pytest.raises(kv.KineverseError) as caught:
         scene.pairs_within(0.1)
     first, *lines = str(caught.value).splitlines()
-    assert first.startswith("20 shapes cannot be used. Mend the model, or leave such bodies out")
+    assert first.startswith("20 shapes cannot be used. Correct the model, or leave such bodies out")
     assert len(lines) == 13
     assert lines[-1] == "  and 8 more"
     assert all("Looked" not in line and len(line) < 200 for line in lines)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import kineverse as kv
-from kineverse import gallery
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from scenes import build_scene
 
 Z, Y, X = (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
@@ -26,11 +31,7 @@ def bar(
 
 def scene(name: str) -> kv.Model:
     """Return a scene of the gallery, without a prefix."""
-    model = kv.Model()
-    with model.edit() as edit:
-        for operation in gallery.operations(name):
-            edit.apply(operation)
-    return model
+    return build_scene(name)
 
 
 def four_bar(

@@ -145,7 +145,7 @@ def test_bars_that_are_too_short_or_too_long(lengths, text):
 def test_the_error_names_the_place_at_which_a_loop_stops(options):
     """Closed at 0, until crank and coupler are stretched: 0.81 + 1 - 1.8 cos q = 1.2²."""
     stop = math.acos((0.9**2 + 1 - 1.2**2) / 1.8)
-    text = rf"'four-bar' does not close on the way to .*crank = -?{str(stop)[:5]}"
+    text = rf"'four-bar' does not close between home and .*crank = -?{str(stop)[:5]}"
     refused(kv.errors.NoSolutionError, text, lambda: four_bar(0.9, 0.6, 0.6, 1.0, **options))
 
 

@@ -123,8 +123,7 @@ def test_open_ends_when_the_object_moves_away(world):
 
 
 @pytest.mark.parametrize(
-    ("fault", "says"),
-    [("unobserved", "was observed last at"), ("moves away", "Out of time")],
+    ("fault", "says"), [("unobserved", "was observed last at"), ("moves away", "Out of time")]
 )
 def test_push_ends_when_readings_end_or_the_object_moves_away(fault, says):
     world = FaultyWorld(room(), "robot")

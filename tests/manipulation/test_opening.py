@@ -162,7 +162,7 @@ def test_placement_keeps_the_grasp_along_the_way(at_the_door):
     found = search.find(state, grasps, 1.2)
     assert found, found.why
     hand, bar = model.fk(gripper.hand), model.fk(handle.frame)
-    for value, row in zip(found.values, found.way, strict=True):
+    for value, row in zip(found.values, found.path, strict=True):
         at = state.updated(dict(zip(found.coordinates, row.tolist(), strict=True))).updated({DOOR: value})
         np.testing.assert_allclose(hand(at), bar(at) @ found.grasp.pose, atol=1e-3)
 
@@ -201,7 +201,7 @@ def test_placement_says_how_far_it_leads_and_how_the_hand_goes_away(at_the_door)
     seen = []
     found = search.find(state, grasps, 1.2, accept=lambda p: seen.append(p) or len(seen) > 1)
     assert found is seen[1]
-    assert "no way to the handle" in found.why
+    assert "no path to the handle" in found.why
     end = dict(zip(found.coordinates, found.retreat[-1].tolist(), strict=True))
     at = state.updated(end).updated({DOOR: found.values[-1]})
     expected = model.fk(handle.frame)(at) @ found.grasp.approach
@@ -221,11 +221,11 @@ def test_a_way_is_made_back_where_it_leads_to_the_target(at_the_door):
     assert back is not None
     assert back.values[[0, -1]].tolist() == [1.01, 0.0]
     bar, hand = search.model.fk(handle.frame), search.model.fk(search.gripper.hand)
-    for value, row in zip(back.values, back.way, strict=True):
+    for value, row in zip(back.values, back.path, strict=True):
         at = ended.updated({door: value} | dict(zip(back.coordinates, row, strict=True)))
         np.testing.assert_allclose(hand(at), bar(at) @ placement.grasp.pose, atol=1e-3)
     np.testing.assert_allclose(back.approach, placement.retreat[-1], atol=0.05)
-    np.testing.assert_allclose(back.line[-1], back.way[0], atol=1e-3)
+    np.testing.assert_allclose(back.line[-1], back.path[0], atol=1e-3)
     assert search.retrace(ended, placement, 0.5).values[-1] == 0.5
     assert search.retrace(ended, placement, 0.0, accept=lambda found: False) is None
     with pytest.raises(InvalidValueError, match="hand_palm_link"):
@@ -276,7 +276,7 @@ def test_fingers_that_close_and_open_keep_the_margin(at_the_door):
     found = search.find(start(search.model), grasps, 1.2)
     handle, hand = grasps[0].handle.frame, search.gripper.bodies
     watch = search.scene.watch(hand, [b for b in search.others if b != handle], 0.05)
-    for row, value in ((found.way[0], found.values[0]), (found.way[-1], found.values[-1])):
+    for row, value in ((found.path[0], found.values[0]), (found.path[-1], found.values[-1])):
         at = start(search.model).updated(dict(zip(found.coordinates, row.tolist(), strict=True)))
         for gap in np.linspace(found.grasp.thickness, search.gripper.width, 15):
             search.scene.update(at.updated({**search.gripper.values_at(gap), DOOR: value}))
@@ -339,7 +339,8 @@ def test_hand_believes_that_a_locked_door_is_open_where_it_is():
     search = SimpleNamespace(model=model, moving=())
     state = model.default_state().updated({door: 0.5, "microwave/oven/button": 0.006})
     hand = SimpleNamespace(hand="world")
-    motion = HandMotion(SimpleNamespace(state=state), hand, handle, search, None, None, 0.0)
+    opener = SimpleNamespace(gripper=hand, search=search, approaches=None, controllers={})
+    motion = HandMotion(SimpleNamespace(state=state), opener, handle, None, 0.0)
     assert motion.state[door] == 0.5
 
 

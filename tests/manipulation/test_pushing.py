@@ -8,6 +8,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import kineverse as kv
 from kineverse.articulations import OmniBase
@@ -16,7 +18,7 @@ from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.geometry import Scene
 from kineverse.grasping import find_gripper
 from kineverse.manipulation.outcome import Outcome
-from kineverse.manipulation.pushing import base_placement, push_program
+from kineverse.manipulation.pushing import base_placement, push_program, vectors
 from kineverse.manipulation.pushing.base_placement import RollOut, find_push_start, roll_out
 from kineverse.manipulation.pushing.contact_pair import ContactRates, PushPair
 from kineverse.manipulation.pushing.contact_points import PushSurface, find_push_tool
@@ -467,3 +469,36 @@ def test_locked_door_that_is_open_can_be_pushed_shut() -> None:
     Pushing(model, "door", PUSHER, start, target=0.4)
     with pytest.raises(InvalidValueError, match=r"between 0 and 1\.5"):
         Pushing(model, "door", PUSHER, start, target=1.6)
+
+
+# -- vectors of three in plain Python
+
+NUMBER = st.floats(-10.0, 10.0)
+VECTOR = st.tuples(NUMBER, NUMBER, NUMBER)
+POSE = st.lists(st.lists(NUMBER, min_size=4, max_size=4), min_size=3, max_size=3)
+
+
+@given(VECTOR, VECTOR, NUMBER)
+def test_sums_and_products_are_those_of_numpy(a, b, factor):
+    x, y = np.array(a), np.array(b)
+    np.testing.assert_allclose(vectors.add(a, b, factor), x + factor * y, atol=1e-12)
+    np.testing.assert_allclose(vectors.subtract(a, b), x - y)
+    np.testing.assert_allclose(vectors.scale(factor, a), factor * x)
+    np.testing.assert_allclose(vectors.inner_product(a, b), x @ y, atol=1e-12)
+    np.testing.assert_allclose(vectors.cross_product(a, b), np.cross(x, y), atol=1e-12)
+    np.testing.assert_allclose(vectors.length(a), np.linalg.norm(x))
+
+
+@given(POSE, VECTOR)
+def test_poses_place_and_rotate(rows, a):
+    R, t = np.array(rows)[:, :3], np.array(rows)[:, 3]
+    np.testing.assert_allclose(vectors.rotate(rows, a), R @ a, atol=1e-11)
+    np.testing.assert_allclose(vectors.rotate_back(rows, a), R.T @ a, atol=1e-11)
+    np.testing.assert_allclose(vectors.transform_point(rows, a), R @ a + t, atol=1e-11)
+
+
+@given(VECTOR, VECTOR, VECTOR)
+def test_points_move_with_the_twist_of_their_body(linear, angular, point):
+    twist = (*linear, *angular)
+    moved = vectors.move_point(twist, point)
+    np.testing.assert_allclose(moved, np.array(linear) + np.cross(angular, point), atol=1e-11)

@@ -89,7 +89,7 @@ def test_family_is_known_before_8_cm_with_outliers(path, family):
         found = learning.learned
         assert found is not None
         assert found.family == family
-        assert found.way < 0.08
+        assert found.distance < 0.08
 
 
 def test_mean_of_poses_leaves_a_first_outlier_out():
@@ -227,7 +227,8 @@ def test_end_of_an_arm_is_not_the_stop_of_a_part(monkeypatch, why, kind, error):
 def test_robot_alone_moves_on_lines_relative_to_a_part_that_floats(truth, floating, search):
     session = Session(KinematicWorld(truth, "hsr"))
     unknown, gripper = floating, search.contacts.gripper
-    motion = HandMotion(session, gripper, unknown.handle, search, None, None, 1.0)
+    opener = SimpleNamespace(gripper=gripper, search=search, approaches=None, controllers={})
+    motion = HandMotion(session, opener, unknown.handle, None, 1.0)
     goal = Goal(same_pose(unknown.model.fk(HANDLE), unknown.model.fk(gripper.hand)), name="hand")
     assert {s.path.partition("/")[0] for s in motion.controller([goal]).speeds} == {"hsr"}
 

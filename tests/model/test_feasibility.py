@@ -18,7 +18,7 @@ from scipy.optimize import linprog
 
 import kineverse as kv
 from hypothesis_profiles import attempts
-from kineverse.model.velocity_rows import VelocityRows
+from kineverse.model.velocity_constraints.velocity_rows import VelocityRows
 
 q = [kv.position(f"q{i}") for i in range(4)]
 v = [s.derivative() for s in q]

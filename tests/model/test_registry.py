@@ -56,9 +56,8 @@ def test_each_written_suffix_can_be_read():
 
 def test_every_entry_can_be_imported():
     entries = [*registry._SCHEMES.values(), *registry._SHORTHANDS.values(), *registry._SERVICES.values()]
-    entries += [
-        c for one in registry._COLLECTIONS.values() for c in (one.list_names, one.build, one.accept) if c
-    ]
+    for one in registry._COLLECTIONS.values():
+        entries += filter(None, (one.list_names, one.build, one.find_document, one.accept))
     entries += [registry._FORMATS]
     entries += [text for one in registry.list_formats() for text in (one.read, one.write) if text]
     for entry in entries:

@@ -21,7 +21,7 @@ from scipy.spatial import HalfspaceIntersection
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.errors import InvalidValueError
-from kineverse.model.velocity_rows import VelocityRows
+from kineverse.model.velocity_constraints.velocity_rows import VelocityRows
 
 a, b, c = (kv.position(n) for n in "abc")
 va, vb, vc = (s.derivative() for s in (a, b, c))

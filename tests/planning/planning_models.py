@@ -22,7 +22,7 @@ from kineverse.model.body import (
     Sphere,
 )
 from kineverse.planning import Planner
-from kineverse.planning.path import densify
+from kineverse.planning.state_validity import densify
 
 SOLIDS = (
     Box((0.2, 0.3, 0.1)),

@@ -8,7 +8,6 @@ from planning_models import body, contacts, is_free
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
-from kineverse import gallery
 from kineverse.geometry import Scene
 from kineverse.model.body import Box, Capsule, Cylinder, Sphere
 from kineverse.planning import Planner
@@ -153,10 +152,7 @@ def test_hold_against_the_world_does_not_open_walls(flying, other):
 
 
 def test_latch_is_not_slipped_through():
-    model = kv.Model()
-    with model.edit() as edit:
-        for operation in gallery.operations("microwave"):
-            edit.apply(operation)
+    model = kv.load("articulations/microwave", prefix="")
     planner = Planner(model)
     closed, open_ = {"oven/door": 0.0, "oven/button": 0.0}, {"oven/door": 1.0, "oven/button": 0.0}
     ajar = {"oven/door": 0.002, "oven/button": 0.0}

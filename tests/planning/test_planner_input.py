@@ -184,7 +184,7 @@ def test_gap_that_is_filled_is_named():
         edit.add_frame("plate", "world", np.eye(4), body(Box((0.2, 4.0, 1.0))))
         edit.constrain("low", -1.8, y, 1.8)
     planner = Planner(model, [x, y])
-    assert "every way leads through 'q00'" in planner.plan([-1, 0], [1, 0], seconds=0.05).why
+    assert "every path leads through 'q00'" in planner.plan([-1, 0], [1, 0], seconds=0.05).why
     assert "every way" not in planner.plan([-1, 0], [-1, 1], seconds=0.05).why
 
 

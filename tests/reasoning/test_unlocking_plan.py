@@ -186,7 +186,7 @@ def test_circle_is_named_where_another_way_is_stuck():
             edit.constrain(f"{q} range", 0, q, 1)
         edit.constrain("latch", -1, door.derivative(), (outer > 0.5) | (lever > 0.5))
         edit.constrain("lever lock", -1, lever.derivative(), door > 0.5)
-    plan = plan_unlocking(model, {door: 1}, still=[outer])
+    plan = plan_unlocking(model, {door: 1}, fixed=[outer])
     assert plan.is_circle
     assert [lock.constraints for lock in plan.blocking] == [("latch",), ("lever lock",)]
     assert [str(step.coordinate) for step in plan_unlocking(model, {door: 1}).steps] == ["outer", "door"]
@@ -195,9 +195,9 @@ def test_circle_is_named_where_another_way_is_stuck():
 def test_plan_without_what_does_not_move():
     model = three_sliders(a=(B > 0.5) | (C > 0.5))
     first = plan_unlocking(model, {A: 1}).steps[0].coordinate
-    second = plan_unlocking(model, {A: 1}, still=[first]).steps[0].coordinate
+    second = plan_unlocking(model, {A: 1}, fixed=[first]).steps[0].coordinate
     assert {first, second} == {B, C}
-    refuted = plan_unlocking(model, {A: 1}, still=[B, C])
+    refuted = plan_unlocking(model, {A: 1}, fixed=[B, C])
     assert refuted.verdict == "refuted"
     assert str(refuted).startswith("a = 1: cannot be reached without b and c")
 
@@ -309,8 +309,8 @@ def test_start_on_a_threshold_is_neither_used_nor_refuted():
     model = three_sliders(a=B > 0.5)
     plan = plan_unlocking(model, {A: 1}, {B: 0.5})
     assert [str(step.coordinate) for step in plan.steps] == ["b", "a"]
-    assert plan_unlocking(model, {A: 1}, {B: 0.5}, still=[B]).verdict == "undecided"
-    assert plan_unlocking(model, {A: 1}, {B: 0.499}, still=[B]).verdict == "refuted"
+    assert plan_unlocking(model, {A: 1}, {B: 0.5}, fixed=[B]).verdict == "undecided"
+    assert plan_unlocking(model, {A: 1}, {B: 0.499}, fixed=[B]).verdict == "refuted"
 
 
 def test_wrong_interlocks_are_not_believed():
@@ -411,7 +411,7 @@ def test_a_parameter_has_no_other_value_at_the_start(value):
         ({"a": 2}, {}, InvalidValueError, "beyond its limits"),
         ({"a": float("nan")}, {}, InvalidValueError, "finite number"),
         ({"a": 1}, {"budget": 0}, InvalidValueError, "positive time"),
-        ({"a": 1}, {"still": ["z"]}, UnknownNameError, "'z' is no degree of freedom"),
+        ({"a": 1}, {"fixed": ["z"]}, UnknownNameError, "'z' is no degree of freedom"),
         ({"a": 1}, {"state": {"z": 1}}, UnknownNameError, "z"),
     ],
 )

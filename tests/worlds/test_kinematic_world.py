@@ -9,7 +9,6 @@ import pytest
 from pusher import BALL, angle_of_door, gripper, pusher, solid
 
 import kineverse as kv
-from kineverse import gallery
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.formats import load
 from kineverse.grasping import Gripper
@@ -381,8 +380,7 @@ def test_mechanisms_of_all_kinds_keep_their_limits(scene):
     x, y, z = (kv.position(f"robot/{name}") for name in "xyz")
     with model.edit() as edit:
         edit.add_frame("robot/ball", "world", kv.translation(x, y, z), solid(Sphere(BALL)))
-        for operation in gallery.operations(scene, "thing"):
-            edit.apply(operation)
+        edit.include(f"articulations/{scene}", prefix="thing")
     world, judge = KinematicWorld(model, "robot"), Judge(model, "robot")
     rng, moved = np.random.default_rng(0), 0
     objects = [s for s in model.symbols if s.path.startswith("thing")]

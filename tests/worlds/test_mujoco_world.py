@@ -446,7 +446,7 @@ def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(UnknownNameError, match=r"below 'fetsch'.*Did you mean 'fetch'"):
         MujocoWorld(model, "fetsch", hand)
     world = world_with_bar()
-    with pytest.raises(UnknownNameError, match=r"no speed 'fetch/torso_lift'.*torso_lift_joint"):
+    with pytest.raises(UnknownNameError, match=r"no free speed 'fetch/torso_lift'.*torso_lift_joint"):
         world.apply({"fetch/torso_lift": 0.1}, 0.1)
     for value in (math.nan, math.inf):
         with pytest.raises(InvalidValueError, match="must be finite"):

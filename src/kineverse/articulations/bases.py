@@ -46,7 +46,7 @@ class Base(Joint):
         return {
             self.child: Frame.from_transform(
                 self.parent, (self.origin, translation(x, y, 0), rotation_z(angle))
-            ),
+            )
         }
 
     def check_wheels(self, paths: object, count: int) -> None:
@@ -80,7 +80,7 @@ class Base(Joint):
     def speed_norm_limit(
         self, field: str, components: tuple[Expression, Expression]
     ) -> dict[str, Constraint]:
-        """Return the constraint |velocity| <= limit, if the field has a limit."""
+        """Return the constraint ``|velocity| <= limit``, if the field has a limit."""
         most = self.speed_bound(field)
         return (
             {}
@@ -98,7 +98,7 @@ class OmniBase(Base, document_kind="OmniBase"):
     speed
         Limit of the speed √(ẋ² + ẏ²) [m/s]; None for no limit.
     turn
-        Limit of the angular speed |θ̇| [rad/s]; None for no limit.
+        Limit of the angular speed ``|θ̇|`` [rad/s]; None for no limit.
     """
 
     speed: float | None = 1.0
@@ -131,9 +131,9 @@ class DifferentialDrive(Base, document_kind="DifferentialDrive"):
     wheel_speed
         Limit of the wheels' speeds [rad/s]; None for no limit.
     speed
-        Limit of the speed √(ẋ² + ẏ²) = r/2 |ω_l + ω_r| [m/s]; None for no limit.
+        Limit of the speed √(ẋ² + ẏ²) = ``r/2 |ω_l + ω_r|`` [m/s]; None for no limit.
     turn
-        Limit of the angular speed |θ̇| [rad/s]; None for no limit.
+        Limit of the angular speed ``|θ̇|`` [rad/s]; None for no limit.
 
     Raises
     ------
@@ -200,11 +200,11 @@ class Ackermann(Base, document_kind="Ackermann"):
     wheelbase
         L, the distance between the axles [m].
     steering
-        Limit of |δ| in (0, π/2) [rad]; the smallest turning radius is L/tan(steering).
+        Limit of ``|δ|`` in (0, π/2) [rad]; the smallest turning radius is L/tan(steering).
     steering_speed
-        Limit of |δ̇| [rad/s]; None for no limit.
+        Limit of ``|δ̇|`` [rad/s]; None for no limit.
     speed
-        Limit of the speed |v| = √(ẋ² + ẏ²) [m/s]; None for no limit.
+        Limit of the speed ``|v| = √(ẋ² + ẏ²)`` [m/s]; None for no limit.
 
     Raises
     ------
@@ -283,7 +283,7 @@ class Mecanum(Base, document_kind="Mecanum"):
     speed
         Limit of the speed √(ẋ² + ẏ²) [m/s]; None for no limit.
     turn
-        Limit of the angular speed |θ̇| [rad/s]; None for no limit.
+        Limit of the angular speed ``|θ̇|`` [rad/s]; None for no limit.
 
     Raises
     ------
@@ -340,6 +340,5 @@ _CORNERS = ("front_left", "front_right", "rear_left", "rear_right")
 
 
 def _total(row: Mapping[Symbol, float]) -> Expression:
-    """Return the linear combination of speeds with the factors of a row."""
     terms = [factor * wheel for wheel, factor in row.items()]
     return sum(terms[1:], terms[0])

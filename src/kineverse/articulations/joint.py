@@ -170,7 +170,7 @@ class OneAxisMotion(Joint):
     lower, upper
         Limits of q [m] or [rad], numbers or expressions; None leaves that side open.
     velocity
-        Limit of |q̇| [m/s] or [rad/s]; None for no limit.
+        Limit of ``|q̇|`` [m/s] or [rad/s]; None for no limit.
     """
 
     axis: AxisLike = (1.0, 0.0, 0.0)

@@ -34,8 +34,7 @@ class Limits:
         return limit_constraints(name, q, self.lower, self.upper, self.velocity)
 
 
-FREE = Limits()
-"""No limits."""
+FREE = Limits()  # no limits
 
 
 def check_limits(given: object, what: str) -> None:

@@ -48,7 +48,7 @@ def speed_lock(
     max_speed
         Limit of the speed while the lock is open [m/s] or [rad/s].
     blocks
-        The directions that are locked. With ``"forward"``, the way back is free:
+        The directions that are locked. With ``"forward"``, the opposite direction is free:
         -max_speed <= q̇ <= c·max_speed.
 
     Raises
@@ -80,7 +80,7 @@ def position_lock(
 ) -> BoundedExpression:
     """Return the lock of a position: q stays within [lower, upper] unless the lock is open.
 
-    Surprise first: a position that is *outside* already is free, and free to return. A bolt that springs out
+    Note that a position that is *outside* already is free, and free to return. A bolt that springs out
     while the door stands open holds nothing; it holds the door once that is shut. With c = open_if, the
     bounds are
 
@@ -134,10 +134,7 @@ def position_lock(
 
 
 def tabulated_limit(
-    driver: Expression,
-    points: Mapping[float, float] | Iterable[tuple[float, float]],
-    *,
-    smooth: bool = False,
+    driver: Expression, points: Mapping[float, float] | Iterable[tuple[float, float]], *, smooth: bool = False
 ) -> Expression:
     """Return a bound interpolated in a table of the driver, for ``lower=`` or ``upper=`` of any constraint.
 

@@ -43,7 +43,7 @@ class Planar(Joint, document_kind="Planar"):
     lower, upper
         Limits of both x and y [m]; None leaves that side open.
     velocity
-        Limit of both |ẋ| and |ẏ| [m/s]; None for no limit.
+        Limit of both ``|ẋ|`` and ``|ẏ|`` [m/s]; None for no limit.
     """
 
     axis: AxisLike = (0.0, 0.0, 1.0)
@@ -142,13 +142,13 @@ class Ball(Joint, document_kind="Ball"):
     The limits are smooth at rest (swing-twist decomposition). With the quaternion q = (v, w), its component
     p = v·a along the axis a and its component v - pa perpendicular to it:
 
-    - the swing angle γ between the axis and its direction at rest has 1 - cos γ = 2|v - pa|²/|q|², which the
-      cone bounds by 1 - cos(cone);
-    - the twist angle τ about the axis has tan(τ/2) = p/w, so |τ| <= twist is
-      (p² cos²(twist/2) - w² sin²(twist/2))/|q|² <= 0.
+    - the swing angle γ between the axis and its direction at rest has ``1 - cos γ = 2|v - pa|²/|q|²``, which
+      the cone bounds by 1 - cos(cone);
+    - the twist angle τ about the axis has tan(τ/2) = p/w, so ``|τ| <= twist`` is
+      ``(p² cos²(twist/2) - w² sin²(twist/2))/|q|² <= 0``.
 
     Both grow with the square of the angle near rest. A velocity row enforces them to first order, so a step
-    of Δt violates them by (|ω|Δt)²/2 at most.
+    of Δt violates them by ``(|ω|Δt)²/2`` at most.
 
     Attributes
     ----------
@@ -157,9 +157,9 @@ class Ball(Joint, document_kind="Ball"):
     cone
         The largest angle between the axis and its direction at rest, in (0, π] [rad]; None for no limit.
     twist
-        Limit of |τ| in (0, π] [rad]; None for no limit.
+        Limit of ``|τ|`` in (0, π] [rad]; None for no limit.
     velocity
-        Limit of |ω| [rad/s]; None for no limit.
+        Limit of ``|ω|`` [rad/s]; None for no limit.
 
     Raises
     ------

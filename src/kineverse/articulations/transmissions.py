@@ -205,7 +205,7 @@ class Cam(Transmission, document_kind="Cam"):
         try:
             spline(0.0, self.angles, self.values, self.periodic)
         except InvalidValueError as error:
-            raise InvalidValueError(f"The profile of the cam '{self.name}' is none. {error}") from None
+            raise InvalidValueError(f"The profile of the cam '{self.name}' is invalid. {error}") from None
         for what in ("angles", "values"):
             object.__setattr__(self, what, tuple(map(float, getattr(self, what))))
 

@@ -17,13 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TextIO, cast
 
 from kineverse._extras import STUDIES, install_command, install_studies
 from kineverse._version import __version__
-from kineverse.errors import (
-    FormatError,
-    KineverseError,
-    MissingDependencyError,
-    UnknownNameError,
-    suggest,
-)
+from kineverse.errors import FormatError, KineverseError, MissingDependencyError, UnknownNameError, suggest
 
 from .output import join_lines, name_options, safe_streams
 

@@ -186,7 +186,7 @@ def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[st
     """Return a line for each thing that the file leaves out, below a heading."""
     count = format_count(len(saved.left_out), "thing")
     lines = [f"  {name} {reason}" for name, reason in saved.left_out.items()]
-    head = f"{arguments.target} leaves out {count} that it cannot say; --strict refuses instead:"
+    head = f"{arguments.target} leaves out {count} that it cannot express; --strict refuses instead:"
     return [head, *truncate_lines(lines, None if arguments.all else SHOWN, "  ")]
 
 

@@ -107,7 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
     still += [s for s in standing if s not in still]
     scene = Scene(model) if arguments.collisions else None
     fixed: list[kv.Symbol | str] = [*match_coordinates(model, arguments.still, "--still"), *still]
-    solver = InverseKinematics(model, [goal], scene=scene, still=fixed)
+    solver = InverseKinematics(model, [goal], scene=scene, fixed=fixed)
     result = solver.solve(assigned, starts=arguments.starts)
     positions = {str(s): result.best[s] for s in solver.coordinates}
     if arguments.picture is not None:

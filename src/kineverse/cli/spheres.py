@@ -23,7 +23,6 @@ from kineverse.planning.spheres.object_covers import (
     list_covers,
 )
 from kineverse.planning.spheres.sphere_cover import MOST, check_cover_settings
-from kineverse.planning.spheres.union_volume import union_volume
 
 from .arguments import (
     add_cache_options,
@@ -49,9 +48,8 @@ Every point of a shape lies in a sphere; the shapes of a link are covered togeth
 convex hulls that distances are computed to. The spheres are stored in the user's cache by the content of the
 shapes and the settings.
 
-"protrusion" is the largest distance of a sphere's points from the shapes, "excess" the volume of the spheres
-over that of the shapes, minus 1. By default spheres stick out by a tenth of the size of a link, from 5 mm to
-25 mm, or by more where 48 spheres are not enough for that.
+"protrusion" is the largest distance of a sphere's points from the shapes. By default spheres stick out by a
+tenth of the size of a link, from 5 mm to 25 mm, or by more where 48 spheres are not enough for that.
 
 The exit status is 0 if all went well, 1 if a link could not be covered.
 
@@ -153,7 +151,7 @@ def _cover(link: LinkCover, protrusion: float | None, most: int, force: bool) ->
         link.error = join_lines(error)
 
 
-HEAD = ("link", "shapes", "spheres", "protrusion [mm]", "excess", "time")
+HEAD = ("link", "shapes", "spheres", "protrusion [mm]", "time")
 
 
 def _format_links(links: Sequence[LinkCover]) -> list[str]:
@@ -169,14 +167,11 @@ def _format_links(links: Sequence[LinkCover]) -> list[str]:
 def _format_row(name: str, links: Sequence[tuple[LinkCover, SphereCover]]) -> tuple[str, ...]:
 
     seconds = sum(link.seconds for link, _ in links)
-    volumes = [union_volume(cover.centres, cover.radii) for _, cover in links]
-    inside = sum(v / (1.0 + cover.excess) for v, (_, cover) in zip(volumes, links, strict=True))
     return (
         name,
         str(sum(len(link.items) for link, _ in links)),
         str(sum(len(cover) for _, cover in links)),
         format_number(1e3 * max(cover.protrusion for _, cover in links), 3),
-        f"{sum(volumes) / inside - 1.0:.0%}",
         f"{seconds:.1f} s" if seconds else "cached",
     )
 
@@ -195,7 +190,6 @@ def _to_json(links: Iterable[LinkCover], status: int) -> dict[str, Any]:
 def _cover_to_json(cover: SphereCover) -> dict[str, Any]:
     return {
         "protrusion": cover.protrusion,
-        "excess": cover.excess,
         "centres": cover.centres.tolist(),
         "radii": cover.radii.tolist(),
     }
@@ -230,10 +224,10 @@ def _view(
 def _manage_cache(arguments: argparse.Namespace) -> int:
 
     def describe(one: CachedCover) -> tuple[dict[str, Any], tuple[str, ...]]:
-        spheres, protrusion, excess = len(one.cover), one.cover.protrusion, one.cover.excess
-        facts = {"name": one.name, "spheres": spheres, "protrusion": protrusion, "excess": excess}
-        row = one.name, str(spheres), format_number(1e3 * protrusion, 3), f"{excess:.0%}"
+        spheres, protrusion = len(one.cover), one.cover.protrusion
+        facts = {"name": one.name, "spheres": spheres, "protrusion": protrusion}
+        row = one.name, str(spheres), format_number(1e3 * protrusion, 3)
         return {**facts, "bytes": one.bytes}, row
 
-    head, entries = ("shape", "spheres", "protrusion [mm]", "excess"), [*map(describe, list_covers())]
+    head, entries = ("shape", "spheres", "protrusion [mm]"), [*map(describe, list_covers())]
     return manage_cache(arguments, arguments.model, "covers", cover_folder(), clear_covers, head, entries)

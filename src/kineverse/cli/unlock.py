@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     model = load_model(arguments, arguments.model)
     still = match_coordinates(model, arguments.still, "--still")
-    plan = plan_unlocking(model, goal, start, still=still, budget=arguments.budget)
+    plan = plan_unlocking(model, goal, start, fixed=still, budget=arguments.budget)
     if arguments.execute:
         return _execute(arguments, model, goal, start, still)
     _print(arguments, plan)
@@ -118,7 +118,7 @@ def _execute(
         if arguments.record is not None:
             about = {"model": arguments.model, "world": world.name}
             recorder = stack.enter_context(Recorder(arguments.record, model, about))
-        done = execute_unlocking(world, goal, still=still, budget=arguments.budget, on_step=recorder)
+        done = execute_unlocking(world, goal, fixed=still, budget=arguments.budget, on_step=recorder)
         if recorder is not None:
             recorder.write_outcome(done.as_data())
     _print(arguments, done)

@@ -158,7 +158,6 @@ class Batch:
         return np.ascontiguousarray(points)
 
     def _allocate(self, rows: int) -> list[Array]:
-        """Return new arrays that begin at cache lines."""
         return [
             allocate_aligned(rows * size).reshape(rows, *shape)
             for shape, size in zip(self._shapes, self._program.sizes, strict=True)

@@ -29,6 +29,16 @@ from .toolchain import (
 )
 
 Code = TypeVar("Code")
+_KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int64, "d": ctypes.c_double}
+
+
+def struct_fields(groups: str) -> list[tuple[str, Any]]:
+    """Return the fields of a structure, such as ``"i count room; p pairs lows; d reach"``.
+
+    Each group has a kind, of pointers, 64-bit integers and doubles, and names.
+    """
+    parts = (group.split() for group in groups.split(";"))
+    return [(name, _KINDS[kind]) for kind, *names in parts for name in names]
 
 
 def open_library(path: str) -> ctypes.CDLL:

@@ -19,8 +19,7 @@ from kineverse.errors import FormatError
 
 from .private_folder import NotPrivateError, PrivateFolder
 
-UNFINISHED = ".making-"
-"""Beginning of the names of files and folders that are not finished."""
+UNFINISHED = ".making-"  # beginning of the names of files and folders that are not finished
 
 _STALE_SECONDS = 3600.0
 _LAST_USE_RESOLUTION = 3600.0
@@ -180,7 +179,7 @@ class LibraryCache:
     def __init__(self, folder: Path, made: bool = False) -> None:
         self.folder = folder
         self._inside = inside = PrivateFolder(folder, made)
-        complaint = "The compiled library %s %s and will be made anew."
+        complaint = "The compiled library %s %s and will be compiled again."
         self._files = ContentCache(lambda: inside, ".so", MAXIMUM_BYTES, logger, complaint, _MARK)
 
     @property

@@ -71,12 +71,7 @@ _BINARY = {
     ca.OP_REMAINDER: "remainder",
     ca.OP_HYPOT: "hypot",
 }
-_COMPARISONS = {
-    ca.OP_LT: "{a} < {b}",
-    ca.OP_LE: "{a} <= {b}",
-    ca.OP_EQ: "{a} == {b}",
-    ca.OP_NE: "{a} != {b}",
-}
+_COMPARISONS = {ca.OP_LT: "{a} < {b}", ca.OP_LE: "{a} <= {b}", ca.OP_EQ: "{a} == {b}", ca.OP_NE: "{a} != {b}"}
 _CIRCLE = (ca.OP_SIN, ca.OP_COS)
 
 VECTOR = Dialect(
@@ -239,7 +234,6 @@ class _Statements:
         return self._dialect.conditions[step.op].format(**operands)
 
     def _define_circle(self, value: int, angle: str) -> str:
-        """Define the sine and cosine of an angle together."""
         pair = [self._circle[op].get(self._steps[value].arguments[0]) for op in _CIRCLE]
         self._defined.update(v for v in pair if v is not None)
         sine, cosine = (f"v{v}" if v is not None else f"unused{value}" for v in pair)

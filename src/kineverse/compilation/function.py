@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, overload
 from weakref import WeakSet
@@ -17,7 +19,8 @@ import numpy.typing as npt
 
 from kineverse.errors import CompileError, InvalidValueError
 from kineverse.expressions import Expression, ExpressionLike, array
-from kineverse.expressions.layout import ArrayShape
+from kineverse.expressions.expression import NO_NODES, from_casadi
+from kineverse.expressions.layout import SX, ArrayShape
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
@@ -351,7 +354,8 @@ class CompiledFunction(Generic[Results]):
         return self
 
     def __reduce__(self) -> Any:
-        return _restore, (self._outputs, self.inputs, self._single, self._wanted)
+        restore = partial(CompiledFunction, single=self._single, tier=self._wanted)
+        return restore, (self._outputs, self.inputs)
 
     def __repr__(self) -> str:
         inputs = ", ".join(self.names[:4]) + (", ..." if len(self.names) > 4 else "")
@@ -374,7 +378,27 @@ def _load(path: str) -> _Code:
     return _Code(ca.external(FUNCTION_NAME, path), address or 0, library)
 
 
-def _restore(
-    outputs: tuple[Expression, ...], inputs: tuple[Symbol, ...], single: bool, tier: WantedTier
-) -> CompiledFunction:
-    return CompiledFunction(outputs, inputs, single=single, tier=tier)
+def compile_columns(
+    columns: Sequence[SX], symbols: Sequence[Symbol], tier: WantedTier = "auto"
+) -> CompiledFunction[tuple[Array, ...]]:
+    """Compile columns of numbers as a function of a vector of symbols.
+
+    Different symbols may have one name here, as parameters of one path with different values do. The columns
+    contain no nodes: where a loop does not close the result is NaN, and no error.
+    """
+    names = Counter(map(str, set(symbols)))
+    inputs = [s if names[str(s)] == 1 else Symbol(f"{s.path}/input {i}") for i, s in enumerate(symbols)]
+    renamed = [(old.sx, new.sx) for old, new in zip(symbols, inputs, strict=True) if old is not new]
+    if renamed:
+        old, new = (ca.vertcat(*side) for side in zip(*renamed, strict=True))
+        columns = ca.substitute(list(columns), [old], [new])
+    outputs = [from_casadi(ca.densify(column), (column.numel(),), NO_NODES) for column in columns]
+    return compile(outputs, inputs, tier=tier)
+
+
+def insert_values(columns: list[SX], symbols: Sequence[Symbol]) -> list[SX]:
+    """Replace symbols by their own values, 0 for those without one."""
+    if not symbols:
+        return columns
+    values = ca.SX(ca.DM([s.value or 0.0 for s in symbols]))
+    return ca.substitute(columns, [ca.vertcat(*(s.sx for s in symbols))], [values])

@@ -129,7 +129,7 @@ class Program:
             raise CompileError("CasADi has no C for the inverse error function.")
         main = _MAIN.search(code)
         if main is None:
-            raise CompileError("CasADi's C is not what it was: its function is not found in it.")
+            raise CompileError("CasADi generates other C than before: its function was not found.")
         return (
             _PRELUDE + code[: main.start()] + _remove_branches(main, self.sizes, tables) + code[main.end() :]
         )
@@ -153,7 +153,7 @@ def _remove_branches(main: re.Match[str], sizes: Sequence[int], tables: dict[int
 
     body = _OUTPUT.sub(written, _INPUT.sub(r"arg[0][\1]", body))
     if body.count("res[") != sum(sizes) - sum(map(len, tables.values())):
-        raise CompileError("CasADi's C is not what it was: its results are not found in it.")
+        raise CompileError("CasADi generates other C than before: its results were not found.")
     data, copies = "", ""
     for k, table in tables.items():
         numbers = ", ".join(c_literal(table.get(place, 0.0)) for place in range(sizes[k]))

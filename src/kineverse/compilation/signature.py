@@ -146,7 +146,7 @@ def _symbols(inputs: Iterable[Symbol]) -> tuple[Symbol, ...]:
     symbols = tuple(inputs)
     for symbol in symbols:
         if not isinstance(symbol, Symbol):
-            raise ExpressionError(f"Inputs are symbols, and {_brief(symbol)} is none. {question}")
+            raise ExpressionError(f"Inputs have to be symbols, not {_brief(symbol)}. {question}")
     return symbols
 
 

@@ -227,7 +227,7 @@ INLINE void stream_end(void) {}
 #define PICK(a, b, ...) __builtin_shuffle(a, b, (I){__VA_ARGS__})
 #endif
 
-/* Transpose W vectors of W numbers: blocks of 1, 2, 4 numbers change places beside the diagonal. */
+/* Transpose W vectors of W numbers: blocks of 1, 2, 4 numbers change places next to the diagonal. */
 INLINE void transpose(V *r) {
 #if W == 8
   V s[8], t[8];

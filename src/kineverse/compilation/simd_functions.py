@@ -1,7 +1,7 @@
 """C source of elementary functions of SIMD vectors within 4 ulp.
 
 Every function reduces its argument to a small interval and evaluates a minimax polynomial there (Remez'
-algorithm, in 60 digits for double, then rounded; the error is given beside each, an ulp being 1.1e-16 to
+algorithm, in 60 digits for double, then rounded; the error is given next to each, an ulp being 1.1e-16 to
 2.2e-16 in double and 6e-8 to 1.2e-7 in float). Lanes outside of the range of the reduction (huge, tiny,
 infinite, outside of the domain) are computed by the C library, one by one and in double. NaN propagates.
 """
@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-Scalar: TypeAlias = Literal["float", "double"]
-"""The type of the numbers in a vector."""
+Scalar: TypeAlias = Literal["float", "double"]  # the type of the numbers in a vector
 
 TRIGONOMETRIC = r"""
 /* The nearest multiple of pi/2 is `turns` quarter turns, and x is r beyond it.

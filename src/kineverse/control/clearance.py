@@ -17,7 +17,7 @@ from kineverse.symbols import Symbol
 
 from .contact_constraints import ContactSlots
 from .position_program import PositionProgram
-from .quadratic_program import make_solver
+from .qp import QpSolver
 
 _SLOTS, _RADIUS = 24, 0.1
 _LONGEST = 0.2
@@ -44,15 +44,9 @@ class Clearance:
             rules = scene.find_always_colliding(self._sample(), margin)
         except NoSolutionError:  # Some of the states are outside of the domain of a closed loop.
             rules = scene.find_always_colliding(margin=margin)
+        reach = margin + _RADIUS
         self._contacts = ContactSlots(
-            scene,
-            self._speeds,
-            _SLOTS,
-            margin=margin,
-            radius=margin + _RADIUS,
-            gain=1.0,
-            twist=self._twist,
-            rules=rules,
+            scene, self._speeds, _SLOTS, margin=margin, radius=reach, gain=1.0, twist=self._twist, rules=rules
         )
         self.inputs: Sequence[Symbol] = self._contacts.inputs
         place = {s: k for k, s in enumerate(program.coordinates)}
@@ -66,14 +60,14 @@ class Clearance:
         self._lower, self._upper = np.zeros((2, n + rows + _SLOTS))
         self._H, self._f = np.zeros((n, n)), np.zeros(n)
         self._contacts.bind(self._H, self._f, self._A[rows:], self._lower[n + rows :])
-        self._solver = make_solver("daqp", n, rows + _SLOTS)
+        self._solver = QpSolver(n, rows + _SLOTS)
 
     def load(self, values: Mapping[Symbol, float]) -> None:
         """Set the values of all inputs."""
         self._values[:] = [values[s] for s in self.inputs]
 
     def measure(self, coordinates: Array) -> float:
-        """Find the near pairs, and return what the nearest lacks to the margin [m]; 0 if it lacks nothing."""
+        """Find the near pairs; return by how much the nearest falls short of the margin [m], or 0."""
         self._values[self._moved] = coordinates[self._source]
         self._contacts.update(self._values)
         distances = self._contacts.found.distances
@@ -82,14 +76,14 @@ class Clearance:
     @property
     def near(self) -> tuple[DistanceResult, ...]:
         """Pairs of the last measurement that are nearer than the margin, each once, nearest first."""
-        found = self._contacts.found
+        result = self._contacts.found
         near: dict[tuple[str, str], DistanceResult] = {}
-        for k in range(int(np.count_nonzero(found.distances < self.margin))):
-            near.setdefault((found[k].a, found[k].b), found[k])
+        for k in range(int(np.count_nonzero(result.distances < self.margin))):
+            near.setdefault((result[k].a, result[k].b), result[k])
         return tuple(near.values())
 
     def find_step(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> Array | None:
-        """Return the step of the coordinates for the last near pairs, None if there is none."""
+        """Return the step of the coordinates that separates the last near pairs; None if there is none."""
         n, static = self._n, self._static
         self._A[: static - n], self._A[static - n :] = A, 0.0
         self._lower[:static], self._lower[static:] = lower, -np.inf
@@ -98,8 +92,8 @@ class Clearance:
         self._upper[:n] = np.minimum(upper[:n], _LONGEST)
         self._H[:], self._f[:] = H, f
         self._contacts.write(1.0)
-        found = self._solver.solve(self._H, self._f, self._A, self._lower, self._upper)
-        return found.x if found.status == "solved" else None
+        result = self._solver.solve(self._H, self._f, self._A, self._lower, self._upper)
+        return result.x if result.status == "solved" else None
 
     def _twist(self, body: str) -> Expression:
         """Return the spatial twist of a body over the coordinates, (6, n)."""
@@ -117,7 +111,6 @@ class Clearance:
         return stack_columns(columns, (6,))
 
     def _sample(self) -> Iterator[State]:
-        """Yield random states."""
         home, generator = self._scene.model.default_state(), np.random.default_rng(0)
         start = home.vector(self._program.coordinates)
         for _ in range(_SAMPLES):

@@ -31,12 +31,12 @@ class StepTimes(NamedTuple):
 class TaskErrors(NamedTuple):
     """Errors of tasks at a state."""
 
-    names: tuple[str, ...]  # names (k,) of the tasks, and norms (k,) of their errors at the state
-    values: Array
+    names: tuple[str, ...]
+    values: Array  # (k,) norms of the errors at the state
     speed_goals: npt.NDArray[np.intp]  # places of goals about speeds among these
-    first_rows: npt.NDArray[np.intp]  # of their first rows in jacobian
-    jacobian: Array | None  # (m, n), (m,)
-    rate: Array | None
+    first_rows: npt.NDArray[np.intp]  # of these in the Jacobian
+    jacobian: Array | None  # (m, n), of all goals about speeds; None without any
+    rate: Array | None  # (m,), wanted
 
     def norms(self, speeds: Array) -> dict[str, float]:
         """Return the norm of the error of each task at speeds (n,), by name."""
@@ -83,7 +83,7 @@ class Command:
     def residuals(self) -> dict[str, float]:
         """Norm of the error of each task at the state, by name, in the unit of its expression.
 
-        That of a goal about speeds is the norm of what is missing, that of a keep its violation.
+        For a goal about speeds it is the norm of the rate error, for a keep its violation.
         """
         return self.errors.norms(self.vector)
 
@@ -95,7 +95,7 @@ class Command:
         return tuple(dict.fromkeys(name for k in order for name in self.names_of_row(k)))
 
     def names_of_row(self, index: int) -> tuple[str, ...]:
-        """Return the names of the constraints of a bound or row; of a contact, the names of both bodies."""
+        """Return the names of the constraints of a bound or row, or of both bodies of a contact."""
         static = len(self.row_names)
         if index < static:
             return self.row_names[index]

@@ -12,7 +12,7 @@ from kineverse.lie import Array
 
 from .command import SATURATED
 from .position_program import PositionProgram
-from .quadratic_program import make_solver
+from .qp import QpSolver
 
 if TYPE_CHECKING:
     from .clearance import Clearance
@@ -24,9 +24,9 @@ PROGRESS = 0.9**2
 _SETTLED, _SHORTEST = 1 - 1e-9, 1e-7
 _HALVINGS, _APPROACHES = 8, 8
 _COLLIDING = 1e9
-"""Smallest penalty of an overlap, beside weighted sums of squares."""
+"""Smallest penalty of an overlap, above all weighted sums of squares."""
 _EXACT_WEIGHT = 1e4
-"""Weight of equalities and violated constraints beside goals that are out of reach."""
+"""Weight of equalities and violated constraints, relative to goals that are out of reach."""
 
 
 class SearchEnd(NamedTuple):
@@ -37,7 +37,7 @@ class SearchEnd(NamedTuple):
 
 
 class ConfigurationSearch:
-    """Present coordinates of a program, and ways to change them."""
+    """Present coordinates of a program, and steps that change them."""
 
     def __init__(self, program: PositionProgram, clearance: Clearance | None) -> None:
         self.program, self.clearance, self.space = program, clearance, program.space
@@ -47,7 +47,7 @@ class ConfigurationSearch:
         self.x = self._run.input[:n]
         self.constants = self._run.input[:first]
         self.weights = self._run.input[first:]
-        self._solver = make_solver("daqp", n, len(program.names) - n)
+        self._solver = QpSolver(n, len(program.names) - n)
         self.rows: dict[str, slice] = {}
         self.exact = np.ones(len(program.weights), dtype=bool)
         start = 0
@@ -104,11 +104,11 @@ class ConfigurationSearch:
             if not total <= ratio * recent[k % _PATIENCE]:
                 break
             recent[k % _PATIENCE] = total
-            found = solve(H, f, A, lower, upper)
-            if found.status != "solved":
+            result = solve(H, f, A, lower, upper)
+            if result.status != "solved":
                 break
             before[:] = x
-            step = found.x
+            step = result.x
             x += step
             if quaternions:
                 normalize(x)
@@ -127,8 +127,8 @@ class ConfigurationSearch:
     def approach(self, home: Array, end: Array, generator: np.random.Generator) -> None:
         """Search the best point: equalities and constraints first, then goals as far as these allow.
 
-        It starts at the given end of a search, at the given state and at random, until two points satisfy
-        the constraints. If none does, all of them have weights at the first start.
+        It starts at the end of a search, at a home state and at random, until two points satisfy the
+        constraints. If none does, all of them have weights at the first start.
         """
         x, exact_only = self.x, np.where(self.exact, 1.0, 0.0)
         best = SearchEnd(end, math.inf)
@@ -175,10 +175,10 @@ class ConfigurationSearch:
             if least == math.inf:
                 return
             H.reshape(-1)[:: len(x) + 1] += damping
-            found = self._solver.solve(H, f, A, lower, upper)
-            if found.status != "solved":
+            result = self._solver.solve(H, f, A, lower, upper)
+            if result.status != "solved":
                 return
-            x += found.x
+            x += result.x
             self.space.normalize(x)
             total = self.evaluate()
             if total < least:
@@ -187,7 +187,7 @@ class ConfigurationSearch:
                 if settled:
                     return
             else:
-                if np.abs(found.x).max() < _SHORTEST:
+                if np.abs(result.x).max() < _SHORTEST:
                     break
                 x[:], damping = best, max(4 * damping, 0.01 * least)
                 self.evaluate()
@@ -196,7 +196,7 @@ class ConfigurationSearch:
     def clear(self) -> float:
         """Leave collisions while the tasks are kept; return 0 if that succeeds.
 
-        Else the weighted sum of squares if the bodies are apart, and more than that if they are not.
+        Else return the weighted sum of squares if the bodies are apart, and more than that if they are not.
         """
         clearance, x = self.clearance, self.x
         assert clearance is not None
@@ -226,19 +226,19 @@ class ConfigurationSearch:
         self.evaluate()
         values = self.outputs[5]
         # Unlike numpy's norm, hypot does not overflow.
-        found = {name: math.hypot(*values[rows].tolist()) for name, rows in self.rows.items()}
+        result = {name: math.hypot(*values[rows].tolist()) for name, rows in self.rows.items()}
         violations = values[self.first_violation :]
         for keep in self.program.keeps:
             rows = [k for k, names in enumerate(self.program.names) if keep in names]
-            found[keep] = max((abs(float(violations[k])) for k in rows), default=0.0)
-        return found
+            result[keep] = max((abs(float(violations[k])) for k in rows), default=0.0)
+        return result
 
     def active(self) -> tuple[str, ...]:
         """Return the names of the constraints whose multipliers are not 0 at the present coordinates."""
         self.weights[:] = np.where(self.exact, _EXACT_WEIGHT, 1.0)
         if self.evaluate() == math.inf:
             return ()
-        found = self._solver.solve(*self.outputs[:5])
-        sizes = np.abs(found.multipliers)
+        result = self._solver.solve(*self.outputs[:5])
+        sizes = np.abs(result.multipliers)
         order = sorted(np.flatnonzero(sizes > SATURATED).tolist(), key=lambda k: -float(sizes[k]))
         return tuple(dict.fromkeys(name for k in order for name in self.program.names[k]))

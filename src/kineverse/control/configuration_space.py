@@ -60,7 +60,7 @@ class ConfigurationSpace:
         return turning
 
     def draw(self, generator: np.random.Generator, start: Array) -> Array:
-        """Return random coordinates (n,): uniform within limits, around given ones where there are none."""
+        """Draw coordinates (n,): uniform within limits, or around others (n,) where there are no limits."""
         width = np.where(self.turning, math.pi, 1.0)
         low = np.where(np.isfinite(self.lower), self.lower, np.minimum(start, self.upper) - width)
         high = np.where(np.isfinite(self.upper), self.upper, np.maximum(start, self.lower) + width)
@@ -80,7 +80,7 @@ class ConfigurationSpace:
         np.copyto(q, np.minimum(np.maximum(q, self._least), self._largest), where=~self.turning)
 
     def bring_back(self, q: Array, start: Array) -> None:
-        """Bring coordinates with the period 2π within their limits, as near to given ones as possible."""
+        """Bring coordinates with the period 2π within their limits, as near to others (n,) as possible."""
         for i in np.flatnonzero(self.turning):
             value = q[i] - math.tau * round((q[i] - start[i]) / math.tau)
             if value > self.upper[i]:
@@ -92,14 +92,14 @@ class ConfigurationSpace:
 
 
 def find_coordinates(
-    model: ModelView, names: Iterable[Symbol | str], argument: str = "still"
+    model: ModelView, names: Iterable[Symbol | str], argument: str = "fixed"
 ) -> frozenset[Symbol]:
-    """Return independent coordinates of a model, given as symbols or names.
+    """Find the independent coordinates of symbols or names.
 
     A dependent coordinate stands for those that determine it, an articulation for all of its coordinates, and
     a speed for the coordinates that it drives.
     """
-    found: set[Symbol] = set()
+    result: set[Symbol] = set()
     known = {*model.symbols, *model.rates.dependent, *model.speeds}
     for symbol in find_symbols(model, names, argument):
         if symbol not in known and symbol.position not in known:
@@ -108,9 +108,9 @@ def find_coordinates(
             )
         dependent = model.rates.dependent.get(symbol.position)
         if dependent is not None:
-            found |= {s for s in dependent.symbols if s.has_derivative}
+            result |= {s for s in dependent.symbols if s.has_derivative}
         else:
-            found.add(symbol.position)
+            result.add(symbol.position)
         if symbol.order == 1:
-            found |= {x for x, row in model.rates.items() if symbol in row}
-    return frozenset(found)
+            result |= {x for x, row in model.rates.items() if symbol in row}
+    return frozenset(result)

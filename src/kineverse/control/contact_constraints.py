@@ -1,4 +1,11 @@
-"""Constraints of controllers that keep near pairs of bodies apart."""
+"""Constraints of controllers that keep near pairs of bodies apart.
+
+With the distance d of a pair, the normal n from a to b, the nearest points p, and the twists (v, ω) of both
+bodies over the columns, ``ḋ = n·(v_b + ω_b × p_b) - n·(v_a + ω_a × p_a) >= -γ max(d - margin, 0)`` by the
+envelope theorem; see :mod:`kineverse.geometry.distance_expressions`. Twists are compiled once for each group
+of bodies that move together, so other bodies may come near without another compilation. Within the margin a
+soft goal, ``½ weight (ḋ - rate)²``, separates the pair.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation import compile
-from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.c_library import SourceLibrary, struct_fields
 from kineverse.compilation.function import WantedTier
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
@@ -23,7 +30,7 @@ from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.symbols import Symbol
 
-from .velocity_program import INWARDS, RECOVERY_WEIGHT, check_slots
+from .velocity_program import INWARDS, RECOVERY_WEIGHT
 
 _SOURCE = r"""
 #include <stdint.h>
@@ -67,11 +74,9 @@ __attribute__((visibility("default"))) void write_rows(const Rows *r) {
 
 
 class _Struct(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("n", "width", "bodies", "used")),
-        *((name, ctypes.c_void_p) for name in ("group", "twists", "margins", "H", "f", "A", "lower")),
-        *((name, ctypes.c_void_p) for name in ("distances", "witnesses", "owners")),
-        *((name, ctypes.c_double) for name in ("gain", "recovery", "weight", "inwards")),
+    _fields_ = struct_fields(
+        "i n width bodies used; p group twists margins H f A lower distances witnesses owners; "
+        "d gain recovery weight inwards"
     )
 
 
@@ -147,7 +152,7 @@ def _address(array: npt.NDArray[Any]) -> int:
 class ContactSlots:
     """Rows of the nearest pairs of bodies."""
 
-    found: DistanceResults  # near pairs of the last update, nearest first, all of them
+    found: DistanceResults  # all near pairs of the last update, nearest first
 
     def __init__(
         self,
@@ -164,11 +169,9 @@ class ContactSlots:
     ) -> None:
         if not isinstance(scene, Scene):
             raise InvalidValueError(f"scene= is a kineverse.geometry.Scene of the model, not {scene!r}.")
-        check_slots(count)
         if not (math.isfinite(margin) and margin < radius):
             raise InvalidValueError(
-                f"Pairs count from a radius on that is larger than their margin, not {radius!r} m beside "
-                f"{margin!r} m."
+                f"radius= is larger than margin=, not {radius!r} m for a margin of {margin!r} m."
             )
         model = scene.model
         self._version = model.version
@@ -203,7 +206,7 @@ class ContactSlots:
         if self.scene.model.version != self._version:
             raise InvalidValueError(
                 "The model of the scene was edited since, so the rows of contacts are not about its bodies. "
-                "Build anew, or with a scene of model.snapshot()."
+                "Build the controller again, or with a scene of model.snapshot()."
             )
         self.found = self._query.at(values[self._scene_values], self.radius, self._facing)
         self._twists.input[:] = values[self._twist_values]
@@ -246,7 +249,6 @@ class ContactSlots:
 
 
 def _contiguous(array: Array) -> Array:
-    """Return an array that C can write to."""
     if not array.flags.c_contiguous or array.dtype != np.float64:
         raise InvalidValueError("Rows of contacts are written in place, into contiguous arrays of doubles.")
     return array

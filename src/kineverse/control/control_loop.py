@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 
 class SpeedCommand(Protocol):
-    """A command of a controller."""
+    """Command of a controller."""
 
     @property
     def speeds(self) -> Mapping[Symbol, float]:
@@ -34,17 +34,17 @@ class SpeedCommand(Protocol):
 
 
 class SpeedController(Protocol):
-    """A controller that a loop can run."""
+    """Controller that a loop can run."""
 
     @property
     def speeds(self) -> Sequence[Symbol]:
-        """The speeds of its commands."""
+        """Speeds of its commands."""
 
     def step(self, state: State, /) -> SpeedCommand:
         """Return the command at a state."""
 
     def reset(self, speeds: Mapping[Symbol, float], /) -> None:
-        """Take given speeds as the last command."""
+        """Take speeds as the last command."""
 
 
 class DurationSummary(NamedTuple):
@@ -57,15 +57,15 @@ class DurationSummary(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LoopReport:
-    """The outcome of a control loop."""
+    """Outcome of a control loop."""
 
-    cycles: int  # number of commands that the sink got
-    missed_deadlines: int  # number of periods at whose end no command had been given
+    cycles: int  # commands that the sink got
+    missed_deadlines: int  # periods that ended without a command
     worst_lateness: float  # longest time from a deadline to the end of its cycle [s]; 0 if none was missed
-    stale_cycles: int  # number of cycles without a state, or with one that was too old
-    errors: int  # number of cycles in which the controller raised an error, or had a speed that is not finite
-    last_error: KineverseError | None  # last of these errors
-    step_times: DurationSummary  # durations of the controller's steps [s], by the clock of the loop
+    stale_cycles: int  # cycles without a state, or with one that was too old
+    errors: int  # cycles in which the controller raised an error, or a speed was not finite
+    last_error: KineverseError | None
+    step_times: DurationSummary  # of the controller, by the clock of the loop
     interrupted: bool  # whether a KeyboardInterrupt ended the loop
 
 
@@ -137,20 +137,12 @@ def run_control_loop(
             raise
     if loop.fatal is not None:
         raise loop.fatal
-    return LoopReport(
-        loop.cycles,
-        missed,
-        worst,
-        loop.stale_cycles,
-        loop.errors,
-        loop.last_error,
-        loop.step_times(),
-        interrupted,
-    )
+    problems = loop.stale_cycles, loop.errors, loop.last_error
+    return LoopReport(loop.cycles, missed, worst, *problems, loop.step_times(), interrupted)
 
 
 class _Loop:
-    """The state of a loop, and its commands."""
+    """State of a loop, and its commands."""
 
     def __init__(
         self,
@@ -193,7 +185,7 @@ class _Loop:
         return dict.fromkeys(self.last, 0.0)
 
     def step_times(self) -> DurationSummary:
-        """Return the summary of the durations of steps."""
+        """Summarize the durations of steps."""
         if not self._steps:
             return DurationSummary(0.0, 0.0, 0.0)
         p99 = float(np.percentile(self._durations, 99))
@@ -258,7 +250,7 @@ def _accelerations(
     if not isinstance(acceleration, Mapping):
         acceleration = dict.fromkeys(speeds, acceleration)
     known = {str(name): s for s in speeds for name in (s, s.position)}
-    found = dict.fromkeys(speeds, DEFAULT_ACCELERATION)
+    result = dict.fromkeys(speeds, DEFAULT_ACCELERATION)
     for key, value in acceleration.items():
         if str(key) not in known:
             raise UnknownNameError(
@@ -266,5 +258,5 @@ def _accelerations(
             )
         if not (isinstance(value, int | float) and 0 < value < math.inf):
             raise InvalidValueError(f"The acceleration of '{key}' is a positive number, not {value!r}.")
-        found[known[str(key)]] = float(value)
-    return found
+        result[known[str(key)]] = float(value)
+    return result

@@ -13,12 +13,7 @@ import numpy.typing as npt
 from kineverse._runtime import CallLock, no_collection, one_at_a_time
 from kineverse.compilation import CompiledFunction
 from kineverse.compilation.function import WantedTier
-from kineverse.errors import (
-    InvalidValueError,
-    ShapeError,
-    UnknownNameError,
-    suggest,
-)
+from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
@@ -29,10 +24,10 @@ from .command import Command, StepTimes, TaskErrors
 from .control_loop import LoopReport, run_control_loop
 from .formulation import Formulation
 from .infeasibility import Diagnosis
-from .quadratic_program import make_solver
+from .qp import QpSolver
 from .regularization import Costs, acceleration_limits, check_weight, find_posture, joint_weights
 from .tasks import Target, Task
-from .velocity_program import RECOVERY_WEIGHT, VelocityProgram, arrange_inputs, check_slots
+from .velocity_program import RECOVERY_WEIGHT, VelocityProgram, arrange_inputs
 
 if TYPE_CHECKING:
     from kineverse.geometry import Scene
@@ -65,8 +60,8 @@ class Controller:
         Goals, holds and keeps.
     dt
         Time between two steps [s].
-    still
-        Coordinates or speeds that stay still, as symbols or names; a name of an articulation stands for its
+    fixed
+        Coordinates or speeds that do not move, as symbols or names; a name of an articulation stands for its
         coordinates.
     weights
         Factor on damping, smoothness and posture by coordinate or speed, as symbol or name. The default is
@@ -87,8 +82,6 @@ class Controller:
     margin, radius
         Distance that pairs keep, and distance from which they count [m]; the latter by default 0.05 m, or how
         far 2.5 m/s lead in a step if that is more. Bodies that approach faster need a larger one.
-    solver
-        ``"daqp"``, ``"proxsuite"`` or ``"osqp"``.
     tier
         Kind of evaluation, see :func:`kineverse.compile`; ``"interpreter"`` for controllers of a few hundred
         steps, for which C would be ready too late.
@@ -118,7 +111,7 @@ class Controller:
         tasks: Iterable[Task],
         *,
         dt: float,
-        still: Iterable[Symbol | str] = (),
+        fixed: Iterable[Symbol | str] = (),
         weights: Mapping[Symbol | str, ExpressionLike] | None = None,
         smooth: float = 1e-2,
         jerk: float = 0.0,
@@ -128,19 +121,16 @@ class Controller:
         contacts: int = 24,
         margin: float = 0.005,
         radius: float | None = None,
-        solver: str = "daqp",
         tier: WantedTier = "auto",
     ) -> None:
         check_weight("smooth", smooth)
         check_weight("jerk", jerk)
-        check_slots(contacts)
+        _check_slots(contacts)
         _check_step(dt)
         self.model = model
         step = parameter(_DT, float(dt))
         stated, chosen = acceleration_limits(model, acceleration)
-        self._formulation = formulation = Formulation(
-            model, tasks, dt=step, still=still, accelerations=chosen
-        )
+        formulation = Formulation(model, tasks, dt=step, fixed=fixed, accelerations=chosen)
         self.tasks = formulation.tasks
         self.speeds = formulation.speeds
         self._costs = Costs(smooth=smooth, jerk=jerk)
@@ -159,27 +149,21 @@ class Controller:
         self._queried = False
         self._default_radius = radius is None
         if scene is not None and contacts:
-            from .contact_constraints import ContactSlots  # for start-up time
+            # For start-up time: a controller without a scene imports no geometry.
+            from .contact_constraints import ContactSlots
 
+            reach, gain = _contact_radius(dt) if radius is None else radius, _contact_gain(dt)
             self._contacts = ContactSlots(
-                scene,
-                self.speeds,
-                contacts,
-                margin=margin,
-                radius=_contact_radius(dt) if radius is None else radius,
-                gain=_contact_gain(dt),
-                tier=tier,
+                scene, self.speeds, contacts, margin=margin, radius=reach, gain=gain, tier=tier
             )
             self.inputs = arrange_inputs({*self.inputs, *self._contacts.inputs})
             place = {s: k for k, s in enumerate(self.inputs)}
             self._program_values = np.array([place[s] for s in self._program.inputs], dtype=np.intp)
             self._contact_values = np.array([place[s] for s in self._contacts.inputs], dtype=np.intp)
-        self._solver = make_solver(solver, self._program.columns, self._program.rows, soft=None)
-        self._relaxed = self._solver
+        size = self._program.columns, self._program.rows
+        self._solver = self._relaxed = QpSolver(*size)
         if self._program.soft.any():
-            self._relaxed = make_solver(
-                solver, self._program.columns, self._program.rows, soft=self._program.soft
-            )
+            self._relaxed = QpSolver(*size, soft=self._program.soft)
         self._functions: list[CompiledFunction[Any]] = [self._program.function]
         if self._contacts is not None:
             self._functions.append(self._contacts.function)
@@ -241,7 +225,7 @@ class Controller:
 
     @one_at_a_time
     def reset(self, speeds: StateLike | None = None) -> None:
-        """Forget the last commands and solutions: the next step starts from given speeds, or from rest."""
+        """Forget the last commands and solutions: the next step starts from some speeds, or from rest."""
         self._solver.reset()
         self._relaxed.reset()
         known = as_state(speeds or {}, self.speeds)
@@ -278,7 +262,6 @@ class Controller:
         self._values[place] = self._settings[place - len(self._coordinates)] = number
 
     def _set_target(self, target: Target, value: npt.ArrayLike) -> None:
-        """Set the parameters of a target that tasks depend on."""
         numbers = target.numbers(value)
         if target not in self._target_places:
             used = [k for k, s in enumerate(target.parameters) if s in self._parameters]
@@ -296,7 +279,7 @@ class Controller:
 
     @property
     def contact_slots(self) -> ContactSlots:
-        """The rows of contacts.
+        """Rows of contacts.
 
         Raises
         ------
@@ -362,18 +345,18 @@ class Controller:
         if not math.isfinite(self._check.item()):
             raise self._diagnosis.not_finite()
         evaluated = perf_counter()
-        found = self._solver.solve(*self._quadratic_program)
-        if found.status != "solved" and self._relaxed is not self._solver:
-            found = self._relaxed.solve(*self._quadratic_program)
+        result = self._solver.solve(*self._quadratic_program)
+        if result.status != "solved" and self._relaxed is not self._solver:
+            result = self._relaxed.solve(*self._quadratic_program)
         solved = perf_counter()
         times = StepTimes(read - start, evaluated - read, solved - evaluated, solved - start)
-        if found.status != "solved":
+        if result.status != "solved":
             least = self._diagnosis.least_violation()
-            command = self._command(least.x, np.zeros(len(found.multipliers)), 0, times)
+            command = self._command(least.x, np.zeros(len(result.multipliers)), 0, times)
             if np.abs(least.violations).max() < _FEASIBLE:
                 return command  # the solver failed, not the problem
             raise self._diagnosis.infeasible(command)
-        return self._command(found.x, found.multipliers, found.iterations, times)
+        return self._command(result.x, result.multipliers, result.iterations, times)
 
     def _command(self, x: Array, multipliers: Array, iterations: int, times: StepTimes) -> Command:
         """Return the command of a solution, and remember it as the last one."""
@@ -387,16 +370,10 @@ class Controller:
             program.residuals, self._residuals.copy(), program.speed_goals, program.speed_rows, jacobian, rate
         )
         values = x.tolist()
+        speeds, progress = dict(zip(self.speeds, values, strict=False)), min(values[n:], default=1.0)
+        contacts = () if self._contacts is None else self._contacts.found
         return Command(
-            dict(zip(self.speeds, values, strict=False)),
-            vector,
-            min(values[n:]) if len(values) > n else 1.0,
-            times,
-            iterations,
-            multipliers,
-            self._row_names,
-            () if self._contacts is None else self._contacts.found,
-            errors,
+            speeds, vector, progress, times, iterations, multipliers, self._row_names, contacts, errors
         )
 
     def _read(self, state: StateLike | npt.ArrayLike) -> None:
@@ -463,6 +440,11 @@ def _contact_radius(dt: float) -> float:
 
 def _contact_gain(dt: float) -> float:
     return min(0.5 / dt, _CONTACT_GAIN)
+
+
+def _check_slots(count: object) -> None:
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise InvalidValueError(f"contacts= is a number of rows, 0 or more, not {count!r}.")
 
 
 def _check_step(dt: float) -> None:

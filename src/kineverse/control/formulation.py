@@ -20,8 +20,8 @@ from kineverse.expressions.gradient import stack_columns
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
-from kineverse.model.speed_limits import is_infinite, raw_max
-from kineverse.model.velocity_rows import VelocityRows, velocity_rows
+from kineverse.model.velocity_constraints.speed_limits import is_infinite, raw_max
+from kineverse.model.velocity_constraints.velocity_rows import VelocityRows, velocity_rows
 from kineverse.symbols import Symbol
 
 from .tasks import Goal, Hold, Keep, Task
@@ -37,10 +37,10 @@ class GoalRows:
     name: str
     error: Expression  # (k,) expression minus target; of a goal about speeds, minus the target alone
     jacobian: Expression  # (k, n) over the columns
-    correction: Expression  # (k,) wanted rates by the error alone, and with those of the target
-    rate: Expression
-    weight: Expression  # (k,) weights of the squared differences
-    about_speeds: bool = False  # True for a goal about speeds
+    correction: Expression  # (k,) wanted rates by the error alone
+    rate: Expression  # (k,) wanted rates, those of the target included
+    weight: Expression  # (k,)
+    about_speeds: bool = False
 
 
 @dataclass(frozen=True)
@@ -66,14 +66,14 @@ class Formulation:
         tasks: Iterable[Task],
         *,
         dt: ExpressionLike,
-        still: Iterable[Symbol | str] = (),
+        fixed: Iterable[Symbol | str] = (),
         accelerations: Mapping[Symbol, ExpressionLike] | None = None,
     ) -> None:
         self.model = model
         self.tasks = check_tasks(tasks)
         self._names = name_tasks(self.tasks)
         self._most_gain = 1.0 / as_expression(dt)
-        self._still = find_speeds(model, still, "still")
+        fixed_speeds = find_speeds(model, fixed, "fixed")
         rates = model.rates
         every = dict(model.constraints)
         errors = {task: rates.carry(task.error) for task in self.tasks if isinstance(task, Goal | Hold)}
@@ -114,8 +114,8 @@ class Formulation:
             for speed, limit in (accelerations or {}).items()
         }
         self._limits = every | brakes
-        found = self._rows(ranges, dt, None)
-        columns = (first | set(found.speeds)) - self._still
+        result = self._rows(ranges, dt, None)
+        columns = (first | set(result.speeds)) - fixed_speeds
         self.speeds: tuple[Symbol, ...] = tuple(sorted(columns, key=lambda s: s.sort_key))
         unknown = [s for s in self.speeds if s not in model.speeds]
         if unknown:
@@ -123,7 +123,7 @@ class Formulation:
                 f"The tasks are about '{unknown[0]}', and nothing in the model moves with it. "
                 f"{suggest(str(unknown[0]), map(str, model.speeds), 'speed')}"
             )
-        self.rows = found if found.speeds == self.speeds else self._rows(ranges, dt, self.speeds)
+        self.rows = result if result.speeds == self.speeds else self._rows(ranges, dt, self.speeds)
         self._check_keeps({name: c for name, c in keeps.items() if name in ranges})
         self.keeps = tuple(name for name in keeps if name not in equalities)
         self.goals = tuple(
@@ -150,26 +150,22 @@ class Formulation:
     @property
     def parts(self) -> dict[str, Expression]:
         """All values and derivatives in the rows of each task and constraint, by name, flat."""
-        found: dict[str, list[Expression]] = {}
+        result: dict[str, list[Expression]] = {}
         tasks: tuple[GoalRows | HoldRows, ...] = (*self.goals, *self.holds)
         for row in tasks:
-            found[row.name] = [row.error, row.jacobian.ravel()]
+            result[row.name] = [row.error, row.jacobian.ravel()]
         rows = self.rows
         for k, name in enumerate(rows.names):
             ends = [e for e in (rows.lower[k], rows.upper[k], rows.violation[k]) if e.symbols]
-            found.setdefault(name, []).extend([rows.matrix[k], *(e.ravel() for e in ends)])
-        return {name: as_expression(np.concatenate(part)) for name, part in found.items()}
+            result.setdefault(name, []).extend([rows.matrix[k], *(e.ravel() for e in ends)])
+        return {name: as_expression(np.concatenate(part)) for name, part in result.items()}
 
     def _rows(
         self, constraints: dict[str, Constraint], dt: ExpressionLike, speeds: Sequence[Symbol] | None
     ) -> VelocityRows:
+        rates, limits = self.model.rates, self._limits
         return velocity_rows(
-            constraints,
-            dt,
-            rates=self.model.rates,
-            speeds=speeds,
-            speed_limits=self._limits,
-            recovery="allowed",
+            constraints, dt, rates=rates, speeds=speeds, speed_limits=limits, recovery="allowed"
         )
 
     def _split_speed_goals(
@@ -189,24 +185,20 @@ class Formulation:
         slopes, constant = every.partial(speeds), every.substitute(dict.fromkeys(speeds, 0.0))
         first = 0
         for task, error in eliminated.items():
-            own, rows = set(error.symbols), slice(first, first + error.size)
-            if any(s.order for s in slopes[rows].symbols) or any(s.order > 1 for s in own):
+            symbols, rows = set(error.symbols), slice(first, first + error.size)
+            if any(s.order for s in slopes[rows].symbols) or any(s.order > 1 for s in symbols):
                 raise InvalidValueError(f"{task!r} is not linear in speeds, so no goal can be made of it.")
-            gradients[task] = {s: slopes[rows, i] for i, s in enumerate(speeds) if s in own}
+            gradients[task] = {s: slopes[rows, i] for i, s in enumerate(speeds) if s in symbols}
             constants[task] = constant[rows]
             first = rows.stop
         return gradients, constants
 
     def _goal_rows(
-        self,
-        goal: Goal,
-        error: Expression,
-        gradient: dict[Symbol, Expression],
-        constant: Expression | None,
+        self, goal: Goal, error: Expression, gradient: dict[Symbol, Expression], constant: Expression | None
     ) -> GoalRows:
         jacobian = self._matrix(goal, gradient)
-        given = as_expression(goal.weight).ravel()
-        weight = array([given[k if given.size > 1 else 0] for k in range(goal.error.size)])
+        weights = as_expression(goal.weight).ravel()
+        weight = array([weights[k if weights.size > 1 else 0] for k in range(goal.error.size)])
         if constant is not None:
             none = as_expression(np.zeros(goal.error.size))
             return GoalRows(self._names[goal], constant, jacobian, none, -constant, weight, True)
@@ -221,7 +213,7 @@ class Formulation:
         return GoalRows(self._names[goal], error, jacobian, correction, rate, weight)
 
     def _limit_gain(self, gain: ExpressionLike) -> Expression:
-        """Return a gain of at most 1/dt; with a larger one a step goes beyond its target."""
+        """Limit a gain to 1/dt; with a larger one a step exceeds its target."""
         return minimum(as_expression(gain), self._most_gain)
 
     def _check_keeps(self, keeps: Mapping[str, Constraint]) -> None:
@@ -239,7 +231,7 @@ class Formulation:
         if not any(s in gradient for s in self.speeds):
             named = ", ".join(f"'{s}'" for s in sorted(gradient, key=lambda s: s.sort_key))
             raise InvalidValueError(
-                f"{task!r} is moved by {named or 'no speed'} only, and all of that is to stay still."
+                f"{task!r} is moved by {named or 'no speed'} only, which fixed= keeps in place."
             )
         return self._stack(gradient, task.error.size)
 
@@ -267,26 +259,26 @@ def _parts(constraint: Constraint) -> tuple[Expression, ...]:
 def _relevant_constraints(model: ModelView, subject: Sequence[Expression]) -> dict[str, Constraint]:
     """Return the constraints that share a coordinate with a subject, or with a constraint of the result.
 
-    Coordinates in bounds of positions count: what bounds another coordinate moves it, and the other way
-    round. Those in bounds of speeds, such as the bolt of a lock, do not.
+    Coordinates in bounds of positions count: each moves the others. Those in bounds of speeds, such as the
+    bolt of a lock, do not.
     """
-    found = model.constraints_for(subject, closure=True)
+    result = model.constraints_for(subject, closure=True)
     while True:
-        shared = [*subject, *(part for c in found.values() for part in _parts(c))]
+        shared = [*subject, *(part for c in result.values() for part in _parts(c))]
         every = model.constraints_for(shared, bounds=True)
-        more = [c for name, c in every.items() if name not in found and c.order == 0]
+        more = [c for name, c in every.items() if name not in result and c.order == 0]
         if not more:
-            return found
-        found = model.constraints_for([*shared, *(part for c in more for part in _parts(c))], closure=True)
+            return result
+        result = model.constraints_for([*shared, *(part for c in more for part in _parts(c))], closure=True)
 
 
 def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) -> frozenset[Symbol]:
-    """Return the free speeds that stand for coordinates or speeds, given as symbols or names.
+    """Find the free speeds of coordinates, speeds or articulations, as symbols or names.
 
     A driven or dependent coordinate stands for all speeds in its row, an articulation for all of its
     coordinates.
     """
-    found: set[Symbol] = set()
+    result: set[Symbol] = set()
     for symbol in find_symbols(model, names, argument):
         row = model.rates.row(symbol.position) if symbol.order <= 1 else None
         speeds = {symbol.derivative() if symbol.order == 0 else symbol} if row is None else set(row)
@@ -296,12 +288,12 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
                 f"{argument}=: nothing in the model moves with '{unknown[0]}'. "
                 f"{suggest(str(unknown[0]), map(str, model.speeds), 'speed')}"
             )
-        found |= speeds
-    return frozenset(found)
+        result |= speeds
+    return frozenset(result)
 
 
 def find_symbols(model: ModelView, names: Iterable[Symbol | str], argument: str) -> Iterator[Symbol]:
-    """Yield symbols that are given as symbols or names; an articulation stands for its coordinates."""
+    """Yield the symbols of names; an articulation stands for its coordinates."""
     coordinates = set(map(str, model.symbols))
     for item in (names,) if isinstance(names, str | Symbol) else names:
         if isinstance(item, str) and item in model.articulations and item not in coordinates:
@@ -314,25 +306,25 @@ def find_symbols(model: ModelView, names: Iterable[Symbol | str], argument: str)
 
 
 def check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
-    """Return the tasks as a tuple, after a check of their kinds and number."""
+    """Check the kinds and the number of tasks."""
     if isinstance(tasks, Goal | Hold | Keep):
         tasks = (tasks,)
-    given = tuple(tasks)
-    for task in given:
+    checked = tuple(tasks)
+    for task in checked:
         if not isinstance(task, Goal | Hold | Keep):
             raise ExpressionError(f"A task is a Goal, a Hold or a Keep, not {task!r}.")
-    if not given:
+    if not checked:
         raise InvalidValueError("Without a task there is nothing to do; give a Goal, Hold or Keep.")
-    return given
+    return checked
 
 
 def name_tasks(tasks: Sequence[Task]) -> dict[Task, str]:
-    """Return a name for each task: its own, that of its only symbol, or its kind and number."""
+    """Name each task: by its name, by its only symbol, or by its kind and number."""
     named: dict[Task, str] = {}
     for k, task in enumerate(tasks):
-        own = str(task.expression) if isinstance(task.expression, Symbol) else ""
+        subject = str(task.expression) if isinstance(task.expression, Symbol) else ""
         kind = type(task).__name__.lower()
-        named[task] = task.name or (f"{kind} {own}" if own else f"{kind} {k + 1}")
+        named[task] = task.name or (f"{kind} {subject}" if subject else f"{kind} {k + 1}")
     twice = [name for name, count in Counter(named.values()).items() if count > 1]
     if twice:
         raise DuplicateNameError(f"Two tasks have the name {twice[0]!r}; give each a name=... of its own.")

@@ -61,8 +61,8 @@ class InverseKinematics:
         Collision scene of the model; None to ignore collisions. Only pairs that the tasks move relatively
         to each other count, without those that its rules except and those that always overlap. The scene
         stays at the last configuration that was tried.
-    still
-        Coordinates that stay still, as symbols or names; a name of an articulation stands for its
+    fixed
+        Coordinates that do not move, as symbols or names; a name of an articulation stands for its
         coordinates.
     margin
         Least distance of pairs of bodies [m].
@@ -86,7 +86,7 @@ class InverseKinematics:
     InvalidValueError
         If there is no goal or hold, for a task about speeds, or one that nothing moves.
     UnknownNameError
-        For a task about a symbol that the model does not have, an unknown name in ``still``, or a scene of
+        For a task about a symbol that the model does not have, an unknown name in ``fixed``, or a scene of
         another model.
     DuplicateNameError
         For two tasks of one name.
@@ -100,16 +100,17 @@ class InverseKinematics:
         tasks: Iterable[Task],
         *,
         scene: Scene | None = None,
-        still: Iterable[Symbol | str] = (),
+        fixed: Iterable[Symbol | str] = (),
         margin: float = 0.0,
         tolerance: float = 1e-5,
     ) -> None:
         self.model = model
-        self._program = program = PositionProgram(model, tasks, still, as_tolerance(tolerance))
+        self._program = program = PositionProgram(model, tasks, fixed, as_tolerance(tolerance))
         self.tasks, self.coordinates = program.tasks, program.coordinates
         self._clearance: Clearance | None = None
         if scene is not None:
-            from .clearance import Clearance  # for start-up time: without a scene there is no geometry
+            # For start-up time: a solver without a scene imports no geometry.
+            from .clearance import Clearance
 
             self._clearance = Clearance(scene, program, as_tolerance(margin, "The margin"))
         self._search = ConfigurationSearch(program, self._clearance)
@@ -159,13 +160,13 @@ class InverseKinematics:
         begin = perf_counter()
         starts, solutions = as_count("starts", starts, 1), as_count("solutions", solutions, 1)
         seed = as_count("seed", seed, 0)
-        given = self._load(values)
+        assigned = self._load(values)
         search, space, clearance = self._search, self._program.space, self._clearance
         x = search.x
         home = x.copy()
         search.iterations = 0
         search.weights[:] = self._program.weights
-        found: list[Array] = []
+        result: list[Array] = []
         obstacles: Counter[str] = Counter()
         best = blocked = SearchEnd(home, math.inf)
         generator: np.random.Generator | None = None
@@ -193,22 +194,22 @@ class InverseKinematics:
                     if error < blocked.error:
                         blocked = SearchEnd(x.copy(), error)
                     continue
-            if all(np.abs(x - other).max() > _DIFFERENT for other in found):
-                found.append(x.copy())
-            if len(found) == solutions:
+            if all(np.abs(x - other).max() > _DIFFERENT for other in result):
+                result.append(x.copy())
+            if len(result) == solutions:
                 break
-        found.sort(key=lambda q: float(np.linalg.norm(q - home)))
-        if found:
-            x[:] = found[0]
+        result.sort(key=lambda q: float(np.linalg.norm(q - home)))
+        if result:
+            x[:] = result[0]
         elif blocked.error < math.inf:
             x[:] = blocked.coordinates
         else:
             search.approach(home, best.coordinates, generator or np.random.default_rng(seed))
             space.bring_back(x, home)
-            # Monotone steps converge where full steps were given up, such as on the way to a distant target.
+            # Monotone steps converge where full steps were given up, such as towards a distant target.
             if search.is_done() and (clearance is None or clearance.measure(x) == 0.0):
-                found.append(x.copy())
-        return self._result(given, found, obstacles, used, begin)
+                result.append(x.copy())
+        return self._result(assigned, result, obstacles, used, begin)
 
     def batch(self, values: Iterable[StateLike], *, starts: int = 16, seed: int = 0) -> list[IkResult]:
         """Return the results of many targets, each as of :meth:`solve`.
@@ -219,13 +220,13 @@ class InverseKinematics:
         return [self.solve(target, starts=starts, seed=seed) for target in values]
 
     def _load(self, values: StateLike | None) -> Mapping[Symbol, float]:
-        """Write the values of all inputs, and return the given values by symbol."""
-        given = {} if values is None else self._given(values)
-        if isinstance(given, State):
-            vector = (self._home | given).vector(self.inputs)
+        """Write the values of all inputs, and return the assigned values by symbol."""
+        assigned = {} if values is None else self._given(values)
+        if isinstance(assigned, State):
+            vector = (self._home | assigned).vector(self.inputs)
         else:
             vector = self._defaults.copy()
-            for symbol, value in given.items():
+            for symbol, value in assigned.items():
                 if symbol in self._place:
                     vector[self._place[symbol]] = value
         if not np.isfinite(vector).all():
@@ -235,7 +236,7 @@ class InverseKinematics:
         self._program.space.normalize(self._search.x)
         if self._clearance is not None:
             self._clearance.load(dict(zip(self.inputs, vector.tolist(), strict=True)))
-        return given
+        return assigned
 
     def _given(self, values: StateLike) -> Mapping[Symbol, float]:
         """Return values by symbol; a state if they are one, or contain anything unusual."""
@@ -243,22 +244,21 @@ class InverseKinematics:
             return values
         try:
             # A state takes ten times as long, most of the time of an easy target.
-            given = {self._lookup[key]: value for key, value in values.items()}
-            if len(given) == len(values) and all(map(math.isfinite, given.values())):
-                return given
+            assigned = {self._lookup[key]: value for key, value in values.items()}
+            if len(assigned) == len(values) and all(map(math.isfinite, assigned.values())):
+                return assigned
         except (KeyError, TypeError, AttributeError):
             pass
         return as_state(values, self._known)
 
     def _result(
         self,
-        given: Mapping[Symbol, float],
+        assigned: Mapping[Symbol, float],
         found: Sequence[Array],
         obstacles: Counter[str],
         starts: int,
         begin: float,
     ) -> IkResult:
-        """Return the result at the present coordinates."""
         search = self._search
         residuals = search.residuals()
         active: tuple[str, ...] = ()
@@ -271,26 +271,15 @@ class InverseKinematics:
                 contacts = self._clearance.near
 
         def make_states() -> tuple[State, ...]:
-            whole = self._home | State(given)
+            whole = self._home | State(assigned)
             return tuple(
                 whole | State(dict(zip(self.coordinates, end.tolist(), strict=True))) for end in ends
             )
 
-        return IkResult(
-            bool(found),
-            residuals,
-            active,
-            contacts,
-            starts,
-            search.iterations,
-            perf_counter() - begin,
-            make_states,
-            self._explain,
-            obstacles,
-        )
+        effort, explain = (starts, search.iterations, perf_counter() - begin), self._explain
+        return IkResult(bool(found), residuals, active, contacts, *effort, make_states, explain, obstacles)
 
     def _explain(self, result: IkResult) -> str:
-        """Return the text of :attr:`.IkResult.why`."""
         if result.solved:
             return f"All tasks are done, after {result.starts} starts."
         self._load(result.best)
@@ -366,7 +355,7 @@ def inverse_kinematics(
     solutions: int = 1,
     seed: int = 0,
     scene: Scene | None = None,
-    still: Iterable[Symbol | str] = (),
+    fixed: Iterable[Symbol | str] = (),
     margin: float = 0.0,
     tolerance: float = 1e-5,
 ) -> IkResult:
@@ -374,12 +363,12 @@ def inverse_kinematics(
 
     Parameters
     ----------
-    model, tasks, scene, still, margin, tolerance
+    model, tasks, scene, fixed, margin, tolerance
         As for :class:`InverseKinematics`.
     values, starts, solutions, seed
         As for :meth:`InverseKinematics.solve`.
     """
-    solver = InverseKinematics(model, tasks, scene=scene, still=still, margin=margin, tolerance=tolerance)
+    solver = InverseKinematics(model, tasks, scene=scene, fixed=fixed, margin=margin, tolerance=tolerance)
     return solver.solve(values, starts=starts, solutions=solutions, seed=seed)
 
 
@@ -420,22 +409,22 @@ class IkResult:
 
     @cached_property
     def best(self) -> State:
-        """State of the solution that is nearest to the given state, else of the best point.
+        """State of the solution that is nearest to the first start, else of the best point.
 
-        That is the point of least weighted squared errors of goals found, where holds, keeps and constraints
-        are satisfied if that is possible. A state has values for everything in the model; what no task moves
-        has the given ones.
+        That is the point of least weighted squared errors of goals, where holds, keeps and constraints are
+        satisfied if that is possible. A state has values for everything in the model; what no task moves
+        keeps its values.
         """
         return self._states[0]
 
     @cached_property
     def solutions(self) -> tuple[State, ...]:
-        """Different solutions, the nearest to the given state first; empty if not solved."""
+        """Different solutions, the nearest to the first start first; empty if not solved."""
         return self._states if self.solved else ()
 
     @cached_property
     def why(self) -> str:
-        """Text that names what prevents a solution; computed on first use, by further searches."""
+        """Explanation of what prevents a solution; computed on first use, by further searches."""
         return self.explain(self)
 
     @cached_property

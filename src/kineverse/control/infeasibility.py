@@ -1,4 +1,7 @@
-"""Reasons for steps without a command: conflicting constraints, values that are not finite."""
+"""Reasons for steps without a command: conflicting constraints, values that are not finite.
+
+The rows are those of a quadratic program, ``lower <= [x; A x] <= upper`` (:mod:`.qp`).
+"""
 
 from __future__ import annotations
 
@@ -15,36 +18,43 @@ from kineverse.model.model_view import ModelView
 
 from .command import Command, name_contact
 from .formulation import Formulation
-from .qp import Vector
-from .quadratic_program import make_solver
+from .qp import QpSolver, Vector
 from .velocity_program import VelocityProgram
 
 if TYPE_CHECKING:
     from .contact_constraints import ContactSlots
 
+_WEIGHT = 1e6
+"""Weight of squared violations, relative to the squared distance from the point to be near to."""
+_HARD_WEIGHT = 1e4
+_SHORTEST = 1e-12
+
 
 class Conflict(NamedTuple):
-    """One member of a set of contradictory constraints."""
+    """Member of a set of contradictory constraints."""
 
-    name: str  # name of the constraint
-    operations: tuple[str, ...]  # operations of the model that wrote it
+    name: str
+    operations: tuple[str, ...]  # of the model, which wrote the constraint
     lower: float  # bounds that take part; infinite where that side does not
     upper: float
 
 
 class ConflictingBound(NamedTuple):
-    """One bound of a conflict of rows."""
+    """Bound in a conflict of rows."""
 
     row: int  # index of the row in [x; A x]
     side: int  # -1 for its lower bound, 1 for its upper one
 
 
 class LeastViolation(NamedTuple):
-    """The point that violates the soft rows least."""
+    """Point that violates the soft rows least.
 
-    x: Vector  # point, of shape (n,)
-    violations: Vector  # violations of [x
-    hard_rows_hold: bool  # whether the hard rows are satisfied
+    If the hard rows contradict each other, they are violated little, and the soft ones count for nothing.
+    """
+
+    x: Vector  # (n,)
+    violations: Vector  # (n + m,), of [x; A x]: negative below the lower bound, positive above the upper one
+    hard_rows_hold: bool
 
 
 def find_irreducible_conflict(
@@ -99,7 +109,10 @@ def find_least_violation(
     hard: ArrayLike | None = None,
     near: ArrayLike | None = None,
 ) -> LeastViolation:
-    """Find the point whose violations have the smallest sum of squares, within the hard rows."""
+    """Find the point whose violations have the smallest sum of squares, within the hard rows.
+
+    ``hard`` is a mask (n + m,); of the points that violate equally, the nearest to ``near`` (n,) is taken.
+    """
     rows, low, high = _stacked(A, lower, upper)
     n = rows.shape[1]
     held = np.zeros(len(rows), bool) if hard is None else np.asarray(hard, bool)
@@ -126,12 +139,6 @@ def find_least_violation(
     values = rows @ x
     under, over = np.maximum(low - values, 0.0), np.maximum(values - high, 0.0)
     return LeastViolation(x, np.where(over >= under, over, -under), holds)
-
-
-_WEIGHT = 1e6
-"""The weight of squared violations beside the squared distance from the point to be near to."""
-_HARD_WEIGHT = 1e4
-_SHORTEST = 1e-12
 
 
 def _stacked(A: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Vector, Vector, Vector]:
@@ -185,7 +192,6 @@ def _minimal_certificate(g: Vector, h: Vector, y: Vector) -> tuple[NDArray[np.in
 
 
 def _infeasible(g: Vector, h: Vector) -> bool:
-    """Return whether no x satisfies ``g x <= h``."""
     if not len(g):
         return False
     n, none = g.shape[1], np.full(len(g), -np.inf)
@@ -198,21 +204,12 @@ def _least_squares(
     """Return the point closest to another one, subject to rows, some of them soft."""
     count, n = g.shape
     free = np.zeros(n, bool)
-    solver = make_solver(
-        "daqp",
-        n,
-        count,
-        soft=np.concatenate([free, soft]),
-        soft_weight=np.concatenate([np.ones(n), weight]),
+    solver = QpSolver(
+        n, count, soft=np.concatenate([free, soft]), soft_weight=np.concatenate([np.ones(n), weight])
     )
     no_bound = np.full(n, np.inf)
-    solution = solver.solve(
-        np.eye(n),
-        -near,
-        np.ascontiguousarray(g),
-        np.concatenate([-no_bound, lower]),
-        np.concatenate([no_bound, upper]),
-    )
+    low, high = np.concatenate([-no_bound, lower]), np.concatenate([no_bound, upper])
+    solution = solver.solve(np.eye(n), -near, np.ascontiguousarray(g), low, high)
     return solution.x if solution.status == "solved" else None
 
 
@@ -231,15 +228,15 @@ class Diagnosis:
         self._evaluator, self._contacts = evaluator, contacts
 
     def not_finite(self) -> NotFiniteError:
-        """Return the error that names the tasks and constraints with values that are not finite."""
+        """Name the tasks and constraints with values that are not finite."""
         values = self._evaluator.input
         wrong = [str(s) for s, v in zip(self._program.inputs, values, strict=False) if not math.isfinite(v)]
         if wrong:
             return NotFiniteError(f"The state has no finite value for {', '.join(map(repr, wrong[:6]))}.")
         parts = self._formulation.parts
         symbols = self._program.function.inputs
-        found = compile(list(parts.values()), symbols, tier="interpreter")(values)
-        names = [name for name, part in zip(parts, found, strict=True) if not np.isfinite(part).all()]
+        result = compile(list(parts.values()), symbols, tier="interpreter")(values)
+        names = [name for name, part in zip(parts, result, strict=True) if not np.isfinite(part).all()]
         where = ", ".join(map(repr, names[:6])) or "the sum of the terms, which is too large"
         return NotFiniteError(
             f"A value or derivative is not finite at this state, in {where}: the state is a singularity of "
@@ -248,7 +245,7 @@ class Diagnosis:
         )
 
     def least_violation(self) -> LeastViolation:
-        """Return the speeds that violate the rows least, within the model's limits of single speeds."""
+        """Find the speeds that violate the rows least, within the model's limits of single speeds."""
         _, _, A, lower, upper, *_ = self._evaluator.outputs
         n, width = len(self._program.speeds), A.shape[1]
         # Keeps on single speeds become rows, which may give way.
@@ -269,7 +266,7 @@ class Diagnosis:
         )
 
     def infeasible(self, command: Command) -> InfeasibleError:
-        """Return the error with an irreducible conflict, and with the least-violating command."""
+        """Name an irreducible conflict; the error has the least-violating command."""
         conflict = self._find_conflict()
         listed = "; ".join(map(_describe_conflict, conflict))
         return InfeasibleError(
@@ -284,14 +281,14 @@ class Diagnosis:
         rows = self._formulation.rows
         column = {s: k for k, s in enumerate(self._program.speeds)}
         ends = compile([rows.lower, rows.upper], self._program.function.inputs, tier="interpreter")
-        found = []
+        result = []
         for row, low, high in zip(rows.rows, *ends(self._evaluator.input), strict=True):
             if len(row.weights) == 1:
                 ((speed, weight),) = row.weights.items()
                 if not weight.symbols:
                     below, above = sorted((low / float(weight), high / float(weight)))
-                    found.append((row.name, column[speed], float(below), float(above)))
-        return found
+                    result.append((row.name, column[speed], float(below), float(above)))
+        return result
 
     def _find_conflict(self) -> tuple[Conflict, ...]:
         """Return an irreducible set of contradictory constraints; rows of one name are one member."""
@@ -300,7 +297,7 @@ class Diagnosis:
         soft = self._program.soft
         lower, upper = np.where(soft, -math.inf, lower), np.where(soft, math.inf, upper)
         simple = self._simple_rows()
-        found: dict[str, tuple[float, float]] = {}
+        result: dict[str, tuple[float, float]] = {}
         for k, side in find_irreducible_conflict(A, lower, upper):
             if k < len(self._program.speeds):
                 # Bounds of several constraints are merged: those count that are as tight.
@@ -309,9 +306,9 @@ class Diagnosis:
             else:
                 names = list(self._names_of_row(k))
             for name in names:
-                low, high = found.get(name, (-math.inf, math.inf))
-                found[name] = (max(low, lower[k]), high) if side < 0 else (low, min(high, upper[k]))
-        return tuple(Conflict(name, self._operations(name), *map(float, e)) for name, e in found.items())
+                low, high = result.get(name, (-math.inf, math.inf))
+                result[name] = (max(low, lower[k]), high) if side < 0 else (low, min(high, upper[k]))
+        return tuple(Conflict(name, self._operations(name), *map(float, e)) for name, e in result.items())
 
     def _names_of_row(self, index: int) -> tuple[str, ...]:
         names = self._program.names

@@ -22,11 +22,7 @@ import casadi as ca
 import numpy as np
 
 from kineverse.compilation import compile
-from kineverse.errors import (
-    DuplicateNameError,
-    InvalidValueError,
-    NoSolutionError,
-)
+from kineverse.errors import DuplicateNameError, InvalidValueError, NoSolutionError
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
 from kineverse.expressions.gradient import stack_columns
 from kineverse.lie import Array
@@ -34,8 +30,8 @@ from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import TOLERANCE, is_equality
 from kineverse.model.rates import Rates, to_plain
-from kineverse.model.speed_limits import INFINITE, ZERO, raw_max, raw_min
-from kineverse.model.velocity_rows import velocity_rows
+from kineverse.model.velocity_constraints.speed_limits import INFINITE, ZERO, raw_max, raw_min
+from kineverse.model.velocity_constraints.velocity_rows import velocity_rows
 from kineverse.symbols import Symbol, parameter
 
 from .configuration_space import ConfigurationSpace, find_coordinates
@@ -53,10 +49,10 @@ _SAME = 1e-9
 class ErrorRows:
     """Rows of one task, or of an equality of the model."""
 
-    name: str  # name of the task or constraint
-    error: Expression  # (k,) errors, in plain independent coordinates
-    weights: Expression  # (k,) weights of their squares
-    tolerance: float  # largest entry where the task is done
+    name: str
+    error: Expression  # (k,), in plain independent coordinates
+    weights: Expression  # (k,), of the squares
+    tolerance: float  # largest error of a task that is done
     exact: bool  # True for holds and equalities, which are kept where goals are out of reach
 
 
@@ -64,17 +60,17 @@ class PositionProgram:
     """Compiled quadratic program of a Gauss-Newton step."""
 
     def __init__(
-        self, model: ModelView, tasks: Iterable[Task], still: Iterable[Symbol | str], tolerance: float
+        self, model: ModelView, tasks: Iterable[Task], fixed: Iterable[Symbol | str], tolerance: float
     ) -> None:
         self.model = model
         self.tasks = check_tasks(tasks)
-        fixed = find_coordinates(model, still)
+        still = find_coordinates(model, fixed)
         parts, ranges = self._collect(tolerance)
         self.parts, ranges = self._close(parts, ranges)
         errors = as_expression(np.concatenate([part.error for part in self.parts]))
         subjects = [errors, *(e for c in ranges.values() for e in (c.lower, c.expression, c.upper))]
-        moving = {s.position for e in subjects for s in e.gradient(heuristic=False)} - fixed
-        self._check_moved(fixed)
+        moving = {s.position for e in subjects for s in e.gradient(heuristic=False)} - still
+        self._check_moved(still)
         self.coordinates = tuple(sorted(moving, key=lambda s: s.sort_key))
         self.space = ConfigurationSpace(model, self.coordinates, ranges)
         self._compile(errors, ranges)
@@ -129,12 +125,12 @@ class PositionProgram:
                     else Constraint(*map(self.make_plain, (c.lower, c.expression, c.upper)))
                 )
         symbols = {name: {s for s in c.symbols if s.has_derivative} for name, c in waiting.items()}
-        found = {s for part in parts for s in part.error.symbols}
-        found |= {s for c in ranges.values() for s in c.symbols}
-        while named := [name for name in waiting if not found.isdisjoint(symbols[name])]:
+        result = {s for part in parts for s in part.error.symbols}
+        result |= {s for c in ranges.values() for s in c.symbols}
+        while named := [name for name in waiting if not result.isdisjoint(symbols[name])]:
             for name in named:
                 c = waiting.pop(name)
-                found |= symbols[name]
+                result |= symbols[name]
                 if is_equality(c):
                     error = (c.expression - c.lower).ravel()
                     parts.append(ErrorRows(name, error, as_expression(np.ones(error.size)), TOLERANCE, True))
@@ -144,13 +140,13 @@ class PositionProgram:
             raise InvalidValueError("There is no goal and no hold, so there is nothing to reach.")
         return tuple(parts), ranges
 
-    def _check_moved(self, fixed: frozenset[Symbol]) -> None:
+    def _check_moved(self, still: frozenset[Symbol]) -> None:
         for part in self.parts:
             moved = {s.position for s in part.error.gradient(heuristic=False)}
-            if part.name not in self.model.constraints and moved and moved <= fixed:
+            if part.name not in self.model.constraints and moved and moved <= still:
                 named = ", ".join(f"'{s}'" for s in sorted(moved, key=lambda s: s.sort_key))
                 raise InvalidValueError(
-                    f"'{part.name}' is moved by {named} only, and all of that is to stay still."
+                    f"'{part.name}' is moved by {named} only, which fixed= keeps in place."
                 )
 
     def _check_symbols(self, task: Task, expression: Expression) -> None:
@@ -165,14 +161,9 @@ class PositionProgram:
     def _compile(self, errors: Expression, ranges: dict[str, Constraint]) -> None:
         n = len(self.coordinates)
         gradient = errors.gradient(heuristic=False)
-        jacobian = stack_columns([gradient.get(s.derivative()) for s in self.coordinates], errors.shape)
-        table = velocity_rows(
-            ranges,
-            1.0,
-            rates=Rates({}),
-            speeds=[s.derivative() for s in self.coordinates],
-            recovery="allowed",
-        )
+        speeds = [s.derivative() for s in self.coordinates]
+        jacobian = stack_columns([gradient.get(s) for s in speeds], errors.shape)
+        table = velocity_rows(ranges, 1.0, rates=Rates({}), speeds=speeds, recovery="allowed")
         bounds, general = table.bounds, table.general
         count = len(general.names)
         scales = self._sample(errors, jacobian, ranges)
@@ -190,8 +181,8 @@ class PositionProgram:
         size = errors.size + len(away)
         self.weights = np.concatenate([scales, np.ones(len(away))])
         numbers = [parameter(f"inverse kinematics/weight/{k}", 1.0) for k in range(size)]
-        own = [weight for part in self.parts for weight in part.weights]
-        w = [numbers[k] * own[k] for k in range(errors.size)]
+        factors = [weight for part in self.parts for weight in part.weights]
+        w = [numbers[k] * factors[k] for k in range(errors.size)]
         # A row within its bounds is no error; outside of them it is.
         w += [numbers[errors.size + k] * binary(ca.OP_NE, violation, 0) for k, violation in enumerate(away)]
         weighted = jacobian * array(w[: errors.size]).reshape(errors.size, 1)
@@ -241,8 +232,8 @@ class PositionProgram:
                 function()
             except NoSolutionError:
                 return None
-            found: Array = function.outputs[0].copy()
-            return found if np.isfinite(found).all() else None
+            result: Array = function.outputs[0].copy()
+            return result if np.isfinite(result).all() else None
 
         squares: list[Array] = []
         generator = np.random.default_rng(0)

@@ -16,7 +16,7 @@ from kineverse.expressions.graph import dense_column
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import count_moved_bodies
 from kineverse.model.model_view import ModelView
-from kineverse.model.speed_limits import is_infinite, raw_min
+from kineverse.model.velocity_constraints.speed_limits import is_infinite, raw_min
 from kineverse.symbols import Symbol
 
 from .formulation import Formulation, GoalRows, HoldRows, find_speeds
@@ -35,20 +35,26 @@ _LEAST_SHARE = 0.01
 class Costs:
     """Weights of the terms that no task states."""
 
-    damping: float = 1e-4  # weight of squared speeds
-    smooth: float = 1e-2  # weights of the first
-    jerk: float = 0.0  # second differences of commands
-    progress: float = 10.0  # weight of the progress of holds, as a multiple of the largest one of goals
+    damping: float = 1e-4  # of squared speeds
+    smooth: float = 1e-2  # of first differences of commands
+    jerk: float = 0.0  # of second differences
+    progress: float = 10.0  # of the progress of holds, as a multiple of the largest weight of goals
     recovery: float = 5.0  # rate at which violations of limits decay [1/s]
 
 
 @dataclass(frozen=True)
 class JointWeights:
-    """Factors of the speeds in the terms that no task states."""
+    """Factors of the speeds in the terms that no task states.
 
-    shares: tuple[Expression, ...]  # (n,) factors c_i of damping, smoothness and posture
-    curvatures: Mapping[str, tuple[Expression, ...]]  # (n,)
-    immovable: frozenset[str]
+    The shares c_i are mean squares of the columns of the Jacobians of goals and holds over random states, so
+    that units do not matter, times the share of bodies that a speed moves. By the name of a goal about
+    positions, ``Σ κ_i v_i²`` bounds the second derivative of its errors: ``Σ_j |∂²e/∂q_i∂q_j| l_i/l_j``, with
+    l the root mean squares of the columns, times the same share.
+    """
+
+    shares: tuple[Expression, ...]  # (n,), c_i
+    curvatures: Mapping[str, tuple[Expression, ...]]  # (n,) each, κ_i
+    immovable: frozenset[str]  # equalities of the model whose gradient is nothing but rounding
 
 
 def joint_weights(
@@ -65,10 +71,10 @@ def joint_weights(
         chosen = find_speeds(model, (key,), "weights")
         if any(s not in factors for s in chosen):
             raise InvalidValueError(f"weights=: no task moves '{key}', so it has no weight.")
-        given = as_expression(weight)
-        if not given.symbols and not 0 < float(given) < math.inf:
+        factor = as_expression(weight)
+        if not factor.symbols and not 0 < float(factor) < math.inf:
             raise InvalidValueError(f"weights=: the weight of '{key}' is positive, not {weight!r}.")
-        factors |= dict.fromkeys(chosen, given)
+        factors |= dict.fromkeys(chosen, factor)
     squares, curvatures = _sample_jacobians(formulation)
     sizes = squares[len(formulation.goals) :].sum(axis=1)
     immovable = frozenset(
@@ -191,14 +197,14 @@ def find_posture(
             if isinstance(task, Goal) and isinstance(task.expression, Symbol)
         }
         weights = {s: posture for s in formulation.speeds if s.position not in asked}
-    found = {}
+    result = {}
     for speed, weight in weights.items():
         coordinate = speed.position
         if weight and coordinate in model.degrees_of_freedom and coordinate not in model.rates:
             lower, upper = model.limits(coordinate)
             if math.isfinite(lower) and math.isfinite(upper):
-                found[speed] = weight, (lower + upper) / 2
-    return found
+                result[speed] = weight, (lower + upper) / 2
+    return result
 
 
 def acceleration_limits(
@@ -215,14 +221,14 @@ def acceleration_limits(
     if chosen is None:
         return stated, {}
     if isinstance(chosen, Mapping):
-        given = {s: a for key, a in chosen.items() for s in find_speeds(model, (key,), "acceleration")}
+        limited = {s: a for key, a in chosen.items() for s in find_speeds(model, (key,), "acceleration")}
     else:
-        given = dict.fromkeys(model.speeds, chosen)
-    for speed, limit in given.items():
+        limited = dict.fromkeys(model.speeds, chosen)
+    for speed, limit in limited.items():
         if not (isinstance(limit, int | float) and 0 < limit < math.inf):
             raise InvalidValueError(
                 f"The acceleration of '{speed.position}' is a positive limit, not {limit!r}."
             )
-    limits = {s: as_expression(limit) for s, limit in given.items()}
+    limits = {s: as_expression(limit) for s, limit in limited.items()}
     limits |= {s: raw_min(stated[s], limit) for s, limit in limits.items() if s in stated}
     return stated, limits

@@ -1,4 +1,9 @@
-"""Tasks of controllers and inverse kinematics: goals, holds, keeps, their targets and task functions."""
+"""Tasks of controllers and inverse kinematics: goals, holds and keeps on any expression; targets.
+
+A task constrains an expression e of a model's symbols. It knows nothing of joints: the speeds that serve it
+are the keys of its gradient (task function approach: Samson, Le Borgne, Espiau 1991). Task functions, such as
+:func:`same_pose`, are expressions that are zero where a relation of frames holds.
+"""
 
 from __future__ import annotations
 
@@ -200,7 +205,6 @@ def _refuse_text(task: object, value: object) -> None:
 
 
 def _error_of(task: Goal | Hold, expression: Expression, target: ExpressionLike) -> Expression:
-    """Return expression minus target after checks."""
     _refuse_text(task, expression)
     _refuse_text(task, target)
     if not isinstance(expression, Expression):

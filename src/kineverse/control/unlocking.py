@@ -48,11 +48,11 @@ _SWEEPS = 3
 class LockSide:
     """Direction in which a constraint holds a coordinate, and the trend of the condition that frees it."""
 
-    name: str  # name of the constraint, with the side
+    name: str  # of the constraint, with the side
     coordinate: Symbol
-    way: Way  # the direction that is held
+    way: Way  # direction that is held
     room: Expression  # speed or distance that is left in this direction, positive if the lock is open
-    trend: Mapping[Symbol, Expression]
+    trend: Mapping[Symbol, Expression]  # gradient of the room by key, trends of logic included
 
     def behind(self, margins: Mapping[Symbol, float]) -> LockSide:
         """Return the side at a state in which each key is a margin back along the trend.
@@ -67,8 +67,8 @@ class LockSide:
 
 
 def find_lock_sides(model: ModelView, goals: Iterable[Symbol]) -> list[LockSide]:
-    """Return the sides of all locks on the way to goals: those on the goals, on their keys, and so on."""
-    found: list[LockSide] = []
+    """Find the sides of all locks that goals depend on: those on the goals, on their keys, and so on."""
+    result: list[LockSide] = []
     waiting = list(dict.fromkeys(goals))
     seen = set(waiting)
     while waiting:
@@ -76,11 +76,11 @@ def find_lock_sides(model: ModelView, goals: Iterable[Symbol]) -> list[LockSide]
         for name, constraint in model.constraints_for([coordinate]).items():
             held = constraint.expression
             if isinstance(held, Symbol) and constraint.order <= 1 and held.position == coordinate:
-                found += _sides(name, constraint, held)
-        keys = [key for side in found for key in side.trend if key not in seen]
+                result += _sides(name, constraint, held)
+        keys = [key for side in result for key in side.trend if key not in seen]
         waiting += dict.fromkeys(keys)
         seen.update(keys)
-    return found
+    return result
 
 
 def _sides(name: str, constraint: Constraint, held: Symbol) -> Iterator[LockSide]:
@@ -99,12 +99,12 @@ def _sides(name: str, constraint: Constraint, held: Symbol) -> Iterator[LockSide
         }
         if trend:
             room, *slopes = _values_of([way * (bound - offset), *trend.values()])
-            found = dict(zip(trend, slopes, strict=True))
-            yield LockSide(f"{name} {side}", coordinate, way, room, found)
+            result = dict(zip(trend, slopes, strict=True))
+            yield LockSide(f"{name} {side}", coordinate, way, room, result)
 
 
 def _values_of(expressions: list[Expression]) -> list[Expression]:
-    """Return expressions of the same values without gradients of their own, which weights have no use for."""
+    """Return expressions without gradients of their own, since weights have no use for them."""
     return [from_casadi(column[0], (), NO_NODES) for column in lower(expressions)]
 
 
@@ -154,9 +154,9 @@ def unlock(
         if not (finite_number(number) or 0.0) > 0:
             raise InvalidValueError(f"The {what} of unlocking is a positive number, not {number!r}.")
     goals = _check_goals(model, goal)
-    found = _sort_sides(find_lock_sides(model, goals), goals)
-    margins = {key: _margin(model, key, margin) for side in found for key in side.trend}
-    order = [side.behind(margins) for side in found]
+    result = _sort_sides(find_lock_sides(model, goals), goals)
+    margins = {key: _margin(model, key, margin) for side in result for key in side.trend}
+    order = [side.behind(margins) for side in result]
     tasks = [Goal(q, value, name=f"reach {q}", gain=2.0, weight=10.0) for q, value in goals.items()]
     wanted: Claims = {}
     for q, value in goals.items():
@@ -165,8 +165,8 @@ def unlock(
     shut = [_is_less(side.room, _SHUT) for side in order]
     needs = _pass_demand(order, shut, wanted) if demand else [as_expression(1.0)] * len(order)
     states = list(zip(order, shut, needs, strict=True))
-    scores = [_score(*pair, number) for number, pair in enumerate(zip(found, order, needs, strict=True))]
-    claims = _collect_claims(found, order, scores)
+    scores = [_score(*pair, number) for number, pair in enumerate(zip(result, order, needs, strict=True))]
+    claims = _collect_claims(result, order, scores)
     for (side, is_shut, need), score in zip(states, scores, strict=True):
         trend = {q: slope * _wins(q, slope, score, claims) for q, slope in side.trend.items()}
         length = sqrt(sum((s * s for s in trend.values()), as_expression(_TINY**2)))
@@ -206,8 +206,8 @@ def _collect_claims(sides: list[LockSide], behind: list[LockSide], scores: list[
         for q, slope in side.trend.items():
             wanted = back.trend[q] + is_open * slope
             for way in (1, -1):
-                own = score * _is_less(_TINY, way * wanted)
-                claims[q, way] = _larger(claims[q, way], own) if (q, way) in claims else own
+                claim = score * _is_less(_TINY, way * wanted)
+                claims[q, way] = _larger(claims[q, way], claim) if (q, way) in claims else claim
     return claims
 
 
@@ -228,8 +228,8 @@ def _pass_demand(sides: list[LockSide], shut: list[Expression], wanted: Claims) 
             passed = needs[k] * is_shut
             for q, slope in side.trend.items():
                 for way in (1, -1):
-                    own = passed * _is_less(_TINY, way * slope)
-                    known[q, way] = _larger(known[q, way], own) if (q, way) in known else own
+                    claim = passed * _is_less(_TINY, way * slope)
+                    known[q, way] = _larger(known[q, way], claim) if (q, way) in known else claim
     return needs
 
 
@@ -271,22 +271,21 @@ def _has_circle(sides: list[LockSide]) -> bool:
 
 
 def _is_less(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return 1 or 0; unlike :func:`.less` without a trend, which a weight has no use for."""
+    """Return 1 where a < b, else 0; without a trend, for which weights have no use."""
     return binary(ca.OP_LT, as_expression(a), as_expression(b))
 
 
 def _larger(a: Expression, b: Expression) -> Expression:
-    """Return the larger of two weights."""
     return binary(ca.OP_FMAX, a, b)
 
 
 def _check_goals(model: ModelView, goal: Mapping[Symbol, float] | Mapping[str, float]) -> dict[Symbol, float]:
     if not goal:
         raise InvalidValueError("Unlocking has a goal, such as {'garage/door': 1.5}.")
-    found: dict[Symbol, float] = {}
+    result: dict[Symbol, float] = {}
     for name, value in goal.items():
         symbol, number = model.degree_of_freedom(name), finite_number(value)
         if number is None:
             raise InvalidValueError(f"The goal of '{name}' is a finite number, not {value!r}.")
-        found[symbol] = number
-    return found
+        result[symbol] = number
+    return result

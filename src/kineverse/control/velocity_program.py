@@ -3,7 +3,7 @@
 Over the speeds v and the progress s in [0, 1] of each hold::
 
     minimise    Σ w |J v - r|²                      goals
-              + Σ w_r |a·v + k x|²                  way back of violated rows, x the violation
+              + Σ w_r |a·v + k x|²                  recovery of violated rows, x the violation
               + Σ (c_i d + Δt Σ κ_i w|g e|) v_i²    damping, larger where goals are far (Sugihara 2011)
               + Σ c_i (m (v_i - v_i⁻)² + j (v_i - 2 v_i⁻ + v_i⁻⁻)²)      smoothness, jerk
               + Σ c_i p (v_i - g (q_i* - q_i))²     posture, while goals are not reached
@@ -28,20 +28,19 @@ import numpy as np
 
 from kineverse.compilation import CompiledFunction, compile
 from kineverse.compilation.function import WantedTier
-from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
 from kineverse.expressions.functions import norm
 from kineverse.lie import Array
-from kineverse.model.speed_limits import INFINITE, ZERO, is_infinite, raw_max
+from kineverse.model.velocity_constraints.speed_limits import INFINITE, ZERO, is_infinite, raw_max
 from kineverse.symbols import Symbol, parameter
 
 from .formulation import Formulation, GoalRows, HoldRows
 from .regularization import Costs, JointWeights
 
 RECOVERY_WEIGHT = 1e3
-"""Weight of a way back, as a multiple of the largest one of goals."""
+"""Weight of the recovery of a violated row, as a multiple of the largest weight of goals."""
 INWARDS = 1e-3
-"""Distance inside of a bound at which a way back aims, so that it ends at the bound and not near it."""
+"""Distance inside of a bound at which recovery aims, so that it ends at the bound and not near it."""
 POSTURE_GAIN = 0.5
 REACHED = 0.1
 """Speed by which goals are reached below which the posture fades [unit/s]."""
@@ -95,13 +94,13 @@ class VelocityProgram:
         for i in range(n):
             violation = bounds.violation[i]
             if violation.symbols:
-                weight, rate = _way_back(violation, costs.recovery, largest)
+                weight, rate = _recovery(violation, costs.recovery, largest)
                 diagonal[i] = diagonal[i] + weight
                 linear[i] = linear[i] - weight * rate
         for k in range(len(general.names)):
             violation = general.violation[k]
             if violation.symbols:
-                weight, rate = _way_back(violation, costs.recovery, largest)
+                weight, rate = _recovery(violation, costs.recovery, largest)
                 row = general.matrix[k]
                 hessian = hessian + weight * (row.reshape(n, 1) @ row.reshape(1, n))
                 linear = [linear[i] - weight * rate * row[i] for i in range(n)]
@@ -198,8 +197,8 @@ class VelocityProgram:
     def _keep_residual(self, name: str) -> Expression:
         """Return the violation of a keep; 0 for one on speeds, which a command satisfies."""
         rows = self.formulation.rows
-        own = [abs(rows.violation[k]) for k, row in enumerate(rows.names) if row == name]
-        return reduce(raw_max, own, ZERO)
+        violations = [abs(rows.violation[k]) for k, row in enumerate(rows.names) if row == name]
+        return reduce(raw_max, violations, ZERO)
 
 
 def arrange_inputs(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
@@ -207,14 +206,8 @@ def arrange_inputs(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
     return tuple(sorted(symbols, key=lambda s: (s.value is not None, s.sort_key)))
 
 
-def _way_back(violation: Expression, gain: float, largest: Expression) -> tuple[Expression, Expression]:
-    """Return weight and wanted rate of a violated row; the weight is 0 inside of the bounds."""
+def _recovery(violation: Expression, gain: float, largest: Expression) -> tuple[Expression, Expression]:
+    """Return weight and wanted rate of the recovery of a row; the weight is 0 inside of the bounds."""
     outside = binary(ca.OP_NE, violation, 0)
     sign = binary(ca.OP_LT, 0, violation) - binary(ca.OP_LT, violation, 0)
     return RECOVERY_WEIGHT * largest * outside, -gain * (violation + INWARDS * sign)
-
-
-def check_slots(count: object) -> None:
-    """Raise InvalidValueError for a number of contact slots that is no natural number."""
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise InvalidValueError(f"contacts= is a number of rows, 0 or more, not {count!r}.")

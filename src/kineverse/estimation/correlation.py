@@ -36,14 +36,13 @@ def effective_sample_size(residuals: Array) -> int:
 def correlation_time(residuals: Array, deviations: float = 0.0) -> float:
     """Return the autocorrelation time of residuals (N, m) in order, in rows.
 
-    The component with the largest one counts, among those that are not small beside the others of positions
-    or orientations.
-    Outliers are clipped. Twenty rows or fewer cannot show a correlation, and have the time 1.
+    The component with the largest one counts, among those that are not small compared with the others of
+    positions or orientations. Outliers are clipped. Twenty rows or fewer have the time 1.
 
     Parameters
     ----------
     residuals
-        Residuals of neighbours next to each other, the three of positions first.
+        The three of positions first.
     deviations
         Number of standard deviations that are added to each estimate, for an upper confidence bound.
     """

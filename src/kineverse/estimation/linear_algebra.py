@@ -13,7 +13,7 @@ from kineverse.lie import Array
 
 _SINGULAR = (
     "Some directions are known so much better than others that floating point cannot hold both: a covariance "
-    "that was handed in is far too small, or an uncertainty far too large."
+    "is far too small, or an uncertainty far too large."
 )
 
 
@@ -28,8 +28,7 @@ def singularity_named() -> Iterator[None]:
 
 def invert_matrices(matrices: Array) -> Array:
     """Invert a stack of positive definite matrices."""
-    size = matrices.shape[-1]
-    if size == 1:
+    if matrices.shape[-1] == 1:
         return 1.0 / matrices
     with singularity_named():
         return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
@@ -42,14 +41,12 @@ def transposed(matrices: Array) -> Array:
 
 def multiply_vectors(matrices: Array, vectors: Array) -> Array:
     """Multiply matrices (..., m, n) by vectors (..., n)."""
-    result: Array = (matrices @ vectors[..., None])[..., 0]
-    return result
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def log_determinants(matrices: Array) -> Array:
     """Return the log determinants of positive definite matrices."""
-    result: Array = np.linalg.slogdet(matrices)[1]
-    return result
+    return np.asarray(np.linalg.slogdet(matrices)[1])
 
 
 def sum_log_determinants(matrices: Array) -> float:
@@ -75,9 +72,6 @@ def inverse_spd(matrix: Array) -> Array:
 
 def squared_errors(errors: Array, covariances: Array) -> Array:
     """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m)."""
-    try:
+    with singularity_named():
         weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
-    except np.linalg.LinAlgError:
-        raise InvalidValueError(_SINGULAR) from None
-    squares: Array = np.sum(errors * weighted, axis=1)
-    return squares
+        return np.asarray(np.sum(errors * weighted, axis=1))

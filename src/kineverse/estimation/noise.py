@@ -1,13 +1,19 @@
-"""Noise models: errors of poses and their covariance, and outliers."""
+"""Noise models: errors of poses and their covariance, and outliers.
+
+A measured pose is ``(p + δp, Exp(δθ) R)`` for the true position p and orientation R. Both errors are written
+in the axes of the observing frame, linear part first, like the rows of ``model.jacobian(frame, relative_to,
+form="world_aligned")``. ROS uses the same convention in ``PoseWithCovariance``.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kineverse._checks import finite_number
 from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -34,8 +40,8 @@ def pose_covariance(position: float, orientation: float) -> Array:
     for name, value in (("position", position), ("orientation", orientation)):
         if not (math.isfinite(value) and value > 0.0):
             raise InvalidValueError(
-                f"The standard deviation of the {name} is {value}. It has to be positive and finite; what is "
-                "not measured at all is left out."
+                f"The standard deviation of the {name} is {value}. It has to be positive and finite; leave "
+                "out what is not measured."
             )
     return np.diag([position**2] * 3 + [orientation**2] * 3)
 
@@ -81,11 +87,11 @@ class Outliers:
     gate: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < _as_number(self.fraction) < 1:
+        if not 0 < (finite_number(self.fraction) or 0.0) < 1:
             raise InvalidValueError(f"The fraction of outliers is between 0 and 1, not {self.fraction!r}.")
-        if not (math.isfinite(_as_number(self.reach)) and self.reach > 0):
+        if not (finite_number(self.reach) or 0.0) > 0:
             raise InvalidValueError(f"The reach of outliers is positive and finite, not {self.reach!r}.")
-        if self.gate is not None and not (math.isfinite(_as_number(self.gate)) and self.gate > 0):
+        if self.gate is not None and not (finite_number(self.gate) or 0.0) > 0:
             raise InvalidValueError(
                 f"The gate of outliers is a positive number of standard deviations, not {self.gate!r}."
             )
@@ -126,27 +132,19 @@ class Outliers:
         return math.exp(inlier - total), -total
 
 
-def _as_number(given: Any) -> float:
-    """Return a float; NaN for what is none."""
-    try:
-        return float(given)
-    except (TypeError, ValueError):
-        return math.nan
-
-
 def cauchy_weight(square: float, size: int) -> float:
     """Return the weight of a Cauchy distribution, which is robust to starts far away."""
     return (1 + size) / (1 + square)
 
 
-def as_outliers(given: Outliers | bool | None, has_gate: bool = False) -> Outliers | None:
+def as_outliers(argument: Outliers | bool | None, has_gate: bool = False) -> Outliers | None:
     """Convert an argument to an outlier model: True stands for the default, False and None for none."""
-    if isinstance(given, Outliers):
-        if given.gate is not None and not has_gate:
+    if isinstance(argument, Outliers):
+        if argument.gate is not None and not has_gate:
             raise InvalidValueError(
                 "Only a tracker has a gate of outliers. Here an outlier is defined by fraction and reach."
             )
-        return given
-    if given is None or isinstance(given, bool):
-        return Outliers() if given else None
-    raise InvalidValueError(f"Outliers are True, False or Outliers(fraction=, reach=), not {given!r}.")
+        return argument
+    if argument is None or isinstance(argument, bool):
+        return Outliers() if argument else None
+    raise InvalidValueError(f"Outliers are True, False or Outliers(fraction=, reach=), not {argument!r}.")

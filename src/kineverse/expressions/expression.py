@@ -665,8 +665,7 @@ def array(values: Any) -> Expression:
     return from_casadi(layout.from_column(elements, full), full, union_nodes(flat))
 
 
-_MOST_DIMENSIONS = 32
-"""The limit of the oldest supported version of numpy."""
+_MOST_DIMENSIONS = 32  # the limit of the oldest supported version of numpy
 
 
 def _flatten(values: Any, flat: list[Expression], depth: int = 0) -> ArrayShape | None:

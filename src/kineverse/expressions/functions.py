@@ -144,7 +144,7 @@ def square(x: ExpressionLike) -> Expression:
 
 
 def absolute(x: ExpressionLike) -> Expression:
-    """Return |x|, elementwise; gradient 0 at 0."""
+    """Return ``|x|``, elementwise; gradient 0 at 0."""
     return unary(ca.OP_FABS, as_expression(x))
 
 
@@ -164,7 +164,7 @@ def ceil(x: ExpressionLike) -> Expression:
 
 
 def copysign(x: ExpressionLike, y: ExpressionLike) -> Expression:
-    """Return |x| with the sign of y, elementwise. NaN counts as positive: processors give it either sign."""
+    """Return ``|x|`` with the sign of y, elementwise. A NaN counts as positive."""
     sign_of = as_expression(y)
     if not sign_of.is_constant:
         sign_of = binary(ca.OP_IF_ELSE_ZERO, _is_number(sign_of), sign_of)
@@ -287,9 +287,7 @@ def rint(x: ExpressionLike) -> Expression:
     above_half = operand - below
     odd = binary(ca.OP_LT, 2 * floor(below / 2), below)
     up = binary(
-        ca.OP_OR,
-        binary(ca.OP_LT, 0.5, above_half),
-        binary(ca.OP_AND, binary(ca.OP_EQ, above_half, 0.5), odd),
+        ca.OP_OR, binary(ca.OP_LT, 0.5, above_half), binary(ca.OP_AND, binary(ca.OP_EQ, above_half, 0.5), odd)
     )
     return copysign(below + up, operand)
 

@@ -146,11 +146,7 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
 
 
 def _collect(
-    expression: Expression,
-    by_key: layout.SX,
-    columns: list[int],
-    keys: list[Symbol],
-    nodes: frozenset[Node],
+    expression: Expression, by_key: layout.SX, columns: list[int], keys: list[Symbol], nodes: frozenset[Node]
 ) -> dict[Symbol, Expression]:
     shape = expression._shape
     result = {}
@@ -174,8 +170,10 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
             )
     listener = access_listener(expression)
     if listener is not None:
-        anew: Expression = listener.ask("jacobian" if heuristic else "facts", expression, array(list(wanted)))
-        return anew
+        result: Expression = listener.ask(
+            "jacobian" if heuristic else "facts", expression, array(list(wanted))
+        )
+        return result
     entries = gradient(expression, heuristic)
     columns = [entries.get(symbol.derivative()) for symbol in wanted]
     if wanted and not any(column is not None for column in columns):
@@ -202,8 +200,8 @@ def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     wanted = check_symbols(symbols)
     listener = access_listener(expression)
     if listener is not None:
-        anew: Expression = listener.ask("partial", expression, array(list(wanted)))
-        return anew
+        result: Expression = listener.ask("partial", expression, array(list(wanted)))
+        return result
     # D has no entries for parameters; dummy symbols with a derivative take their places.
     moving = dummy_symbols(wanted)
     entries = gradient(rename_symbols(_without_augmentation(expression), moving), False)

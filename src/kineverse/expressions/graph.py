@@ -105,9 +105,7 @@ def _has_infinite_product(sx: SX) -> bool:
 
 
 def topological_order(
-    nodes: Iterable[Node],
-    parts: Callable[[Node], Iterable[Expression]],
-    done: Callable[[Node], bool],
+    nodes: Iterable[Node], parts: Callable[[Node], Iterable[Expression]], done: Callable[[Node], bool]
 ) -> Iterator[Node]:
     """Yield the nodes, each after the nodes in its ``parts``, none twice and none that is ``done``.
 

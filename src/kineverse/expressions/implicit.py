@@ -37,8 +37,7 @@ from .substitution import apply_substitution
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
 
-RESIDUAL_TOLERANCE = 1e-10
-"""The largest norm of a residual at a solution, in its own unit [m] or [rad]."""
+RESIDUAL_TOLERANCE = 1e-10  # the largest norm of a residual at a solution, in its own unit [m] or [rad]
 
 FLOAT_RESIDUAL_TOLERANCE = 1e-4
 """The largest norm of a residual at a solution in float, where rounding leaves 1e-6 in a loop of metres."""
@@ -49,7 +48,7 @@ class ImplicitFunction:
     """A definition of unknowns as a function of inputs."""
 
     name: str  # name in error messages
-    unknowns: tuple[Symbol, ...]  # (n,), (k,)
+    unknowns: tuple[Symbol, ...]  # x, shape (n,)
     inputs: tuple[Symbol, ...]
     residual: Expression  # r(x, u), of shape (m,) with m at least n; all of it is zero at a solution
     rows: tuple[int, ...]  # n rows of the residual for Newton's method

@@ -37,7 +37,7 @@ def spline(
 ) -> Expression:
     """Return the cubic spline through points, elementwise; all of its derivatives are exact.
 
-    Surprise first: outside of its knots a spline continues *straight*, with the slopes at its ends. These are
+    Note that outside of its knots a spline continues *straight*, with the slopes at its ends. These are
     0 unless given, so it stays at its first and last value. The first derivative is continuous everywhere,
     the second between the first and the last knot. A periodic spline is twice continuously differentiable
     everywhere. At ±infinity a spline has its limit, which is the last value, or ±infinity with a slope; a
@@ -205,12 +205,7 @@ def _check_knots(t: list[float]) -> None:
             raise InvalidValueError(f"Knots increase: knot {i + 1} is {after:g}, and knot {i} is {before:g}.")
 
 
-def _slopes(
-    h: Array,
-    d: Array,
-    first: float,
-    last: float,
-) -> Array:
+def _slopes(h: Array, d: Array, first: float, last: float) -> Array:
     """Return the slopes at all knots for which the second derivative is continuous at the inner ones."""
     n = len(h)
     system, right = np.eye(n + 1), np.array([first, *np.zeros(n - 1), last])

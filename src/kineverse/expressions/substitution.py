@@ -66,7 +66,7 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
     for symbol, value in values.items():
         if not isinstance(symbol, Symbol):
             raise ExpressionError(
-                f"Only symbols can be replaced, and {symbol!r} is none; write {{kv.position('path'): value}}."
+                f"Only symbols can be replaced, not {symbol!r}; write {{kv.position('path'): value}}."
             )
         replacement = as_expression(value)
         if replacement.shape:
@@ -77,10 +77,10 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
             substitution[symbol] = replacement
     listener = access_listener(expression)
     if listener is not None and substitution:
-        anew: Expression = listener.ask(
+        result: Expression = listener.ask(
             "substitute", expression, array(list(substitution)), array(list(substitution.values()))
         )
-        return anew
+        return result
     moving = dummy_symbols(s for s, e in substitution.items() if not s.has_derivative and gradient_keys(e))
     if moving:
         # D of a parameter is empty, so a dummy symbol with a derivative is replaced in its place.

@@ -16,8 +16,7 @@ from kineverse.model.registry import FrameDeviation
 from kineverse.symbols import Symbol
 
 Matrix: TypeAlias = npt.NDArray[np.float64]
-Coefficients: TypeAlias = tuple[float, ...]
-"""Coefficients of the powers of a coordinate, constant first."""
+Coefficients: TypeAlias = tuple[float, ...]  # coefficients of the powers of a coordinate, constant first
 
 IDENTITY_COEFFICIENTS: Coefficients = (0.0, 1.0)
 NO_BODY = Body()
@@ -60,9 +59,9 @@ class JointDescription:
 
     name: str  # unique name; that of the coordinate if the joint is independent
     is_rotation: bool  # True for a rotation, False for a translation
-    axis: Vector3  # direction of the line, a unit vector, and a point on it [m]
+    axis: Vector3  # direction of the line, a unit vector
     point: Vector3
-    symbol: Symbol  # [rad], [m]
+    symbol: Symbol  # coordinate [rad] or [m]
     coefficients: Coefficients = IDENTITY_COEFFICIENTS
     bounds: JointBounds = field(default_factory=JointBounds)  # limits of position and velocity
     dynamics: Mapping[str, Any] = field(default_factory=dict)
@@ -86,7 +85,7 @@ class BallJointDescription:
 class LinkDescription:
     """Link of a robot description: its pose in its parent, and the joints that move it from there."""
 
-    name: str  # names of the frame
+    name: str  # name of the frame
     parent: str
     pose: Matrix  # parent_T_frame while all of its joints are at 0
     joints: list[JointDescription | BallJointDescription] = field(default_factory=list)

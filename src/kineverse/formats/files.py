@@ -45,15 +45,15 @@ def _replace(target: Path, content: bytes) -> None:
         target.write_bytes(content)
         return
     # In the folder of the target, because replacement is atomic only within one file system.
-    beside = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex}")
+    temporary = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex}")
     try:
-        with open(beside, "xb") as file:
+        with open(temporary, "xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
         with contextlib.suppress(FileNotFoundError):
-            shutil.copymode(target, beside)
-        os.replace(beside, target)
+            shutil.copymode(target, temporary)
+        os.replace(temporary, target)
     except BaseException:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise

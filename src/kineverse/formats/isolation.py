@@ -16,14 +16,9 @@ from typing import Any
 
 from kineverse.errors import KineverseError
 
-CPU_SECONDS = 20
-"""Largest CPU time of a call [s]. A large robot takes xacro about 2 s."""
-
-MEMORY = 4 << 30
-"""Largest address space of a call [bytes]."""
-
-_WAIT_SECONDS = 15 * CPU_SECONDS
-"""Longest wait for a call, on a machine that is busy otherwise [s]."""
+CPU_SECONDS = 20  # largest CPU time of a call [s]. A large robot takes xacro about 2 s
+MEMORY = 4 << 30  # largest address space of a call [bytes]
+_WAIT_SECONDS = 15 * CPU_SECONDS  # longest wait for a call, on a machine that is busy otherwise [s]
 
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Libraries of linear algebra reserve memory for each thread, which counts as used."""

@@ -240,7 +240,6 @@ def _build(source: Source, prefix: str | None) -> Iterator[tuple[str, Operation]
 
 
 def _root(source: Source, root: str | os.PathLike[str] | None) -> str:
-    """Return the folder below which a model may open files."""
     if source.collection:
         return NOWHERE if root is None else find_root(NOWHERE, root)
     return find_root(source.path.parent, root, source.folder)

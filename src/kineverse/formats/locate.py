@@ -23,13 +23,12 @@ _LISTED = 6
 _LONGEST = 200
 
 
-GALLERY = "articulations"
-"""First part of the names of the models that the package builds, one for each articulation."""
+GALLERY = "articulations"  # first part of the names of the scenes that ship, one for each articulation
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """File of a model, with its name if it ships; or a model of a collection, without a file.
+    """File of a model, with its name if it ships; or a model that a collection builds, without a file.
 
     ``shipped`` is its prefix by default.
     """
@@ -79,7 +78,9 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     group, _, member = text.partition("/")
     collection = registry.find_collection(group)
     if collection is not None and collection.has(member):
-        return Source(Path(text), collection.prefix or member, group)
+        document = collection.document(member)
+        prefix = collection.prefix or member
+        return Source(Path(text), prefix, group) if document is None else Source(document, prefix)
     if text.lstrip().startswith("<"):
         raise UnknownNameError(
             "This looks like the text of a description, where the name or path of a model is expected. "
@@ -99,7 +100,7 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
             f"{_shown(text)} is no regular file, but a pipe, a device, or a link that leads nowhere."
         )
     if path.is_absolute() or text.startswith("."):
-        raise UnknownNameError(f"There is no file {_shown(text)}.{_beside(path)}")
+        raise UnknownNameError(f"There is no file {_shown(text)}.{_path_hint(path)}")
     searched: list[str] = []
     seen: list[str] = []
     for place, folder in model_folders():
@@ -112,7 +113,7 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     if collection is not None:
         raise UnknownNameError(_no_member(group, collection, member))
     raise UnknownNameError(
-        f"There is no model {_shown(text)}.{_beside(path) if text else ''} {_similar(text, seen)} "
+        f"There is no model {_shown(text)}.{_path_hint(path) if text else ''} {_similar(text, seen)} "
         f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}.{_missing_places()} "
         f"Give the path of a file, or add its folder to the environment variable {MODEL_PATH}"
         f"{_more_robots(searched)}."
@@ -150,7 +151,7 @@ def _files(folder: Path, depth: int = _DEPTH) -> Iterator[Path]:
             folders.clear()
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for file in sorted(files):
-            # A template beside the file that it expands to does not make its name ambiguous.
+            # A template next to the file that it expands to does not make its name ambiguous.
             if file.endswith(suffixes) and not file.endswith(".xacro"):
                 yield Path(root, file)
 
@@ -224,8 +225,8 @@ def _more_robots(searched: list[str]) -> str:
     return "".join(f", or {way}" for way in left)
 
 
-def _beside(path: Path) -> str:
-    """Return a hint about a path that is no file: the models in that folder, or similar files beside it."""
+def _path_hint(path: Path) -> str:
+    """Return a hint about a path that is no file: the models in that folder, or similar files next to it."""
     if _is(path, Path.is_dir):
         inside = [p.relative_to(path).as_posix() for p in islice(_files(path, 2), _LISTED)]
         return f" It is a folder; models in it: {', '.join(inside) or 'none'}."
@@ -233,8 +234,8 @@ def _beside(path: Path) -> str:
         return ""
     if not _is(path.parent, Path.is_dir):
         return f" The folder {_shown(str(path.parent))} does not exist."
-    beside = [p.name for p in _files(path.parent, 0)]
-    return f" {suggest(path.name, beside, 'model file in its folder')}"
+    neighbours = [p.name for p in _files(path.parent, 0)]
+    return f" {suggest(path.name, neighbours, 'model file in its folder')}"
 
 
 def _expanded(text: str) -> Path:

@@ -25,8 +25,7 @@ from kineverse.symbols import Symbol
 
 from .reader_warnings import warn
 
-CLOSED = 1e-6
-"""Largest gap of a loop that counts as closed [m], [rad]: files have six digits."""
+CLOSED = 1e-6  # largest gap of a loop that counts as closed [m], [rad]: files have six digits
 
 _LOOKED_AT = 12
 _MOVED = 1e-6
@@ -78,7 +77,7 @@ class LoopClosures:
         gaps = self._gaps(loop)
         name = _shown(loop.name)
         if len(gaps) and gaps.max() <= CLOSED:
-            self._tell(loop, "is left out: it says nothing new, what it ties coincides whatever moves")
+            self._tell(loop, "is left out: it adds nothing, since what it connects coincides in every state")
             return
         if error is not None and self.loops == "refuse":
             raise FormatError(
@@ -89,7 +88,7 @@ class LoopClosures:
         if not any(row.symbols for rows in self._rows(loop) for row in rows.values()):
             self._tell(
                 loop,
-                f"is left out, and never holds: nothing moves what it ties, and {gaps.max():.3g} is left "
+                f"is left out, and never holds: nothing moves what it connects, and {gaps.max():.3g} is left "
                 "between its ends",
             )
             return

@@ -53,8 +53,7 @@ def _cached_pose(key: bytes) -> Pose:
     )
 
 
-SHORTEST = 1e-9
-"""Smallest length of a valid quaternion."""
+SHORTEST = 1e-9  # smallest length of a valid quaternion
 
 
 def is_valid_quaternion(xyzw: tuple[float, ...]) -> bool:
@@ -135,8 +134,7 @@ def is_identity(pose: Pose) -> bool:
     return all(abs(a - b) <= _SAME for a, b in zip(pose.rows, IDENTITY.rows, strict=True))
 
 
-ROTATION_TOLERANCE = 1e-13
-"""Largest deviation of an entry of a written rotation matrix."""
+ROTATION_TOLERANCE = 1e-13  # largest deviation of an entry of a written rotation matrix
 
 
 def rpy_angles(pose: Matrix) -> Vector3:

@@ -36,7 +36,7 @@ class ReaderWarnings:
         self.texts.append(remark)
         warn([f"{self.source}, {remark}"])
 
-    def mend(self, mistake: ElementError, taken: str, owner: Element | None = None) -> None:
+    def repair(self, mistake: ElementError, taken: str, owner: Element | None = None) -> None:
         """Add a warning about a mistake in a part of ``owner``, with the value used instead."""
         if self.strict:
             raise mistake

@@ -33,11 +33,8 @@ from .root_folder import (
 )
 from .xml_reader import quote
 
-MAX_DEPTH = 4
-"""Depth of the search for packages below a folder of a workspace variable."""
-
-MAX_FOLDERS = 20_000
-"""Most folders to visit below one such folder."""
+MAX_DEPTH = 4  # depth of the search for packages below a folder of a workspace variable
+MAX_FOLDERS = 20_000  # most folders to visit below one such folder
 
 _WORKSPACES = ("KINEVERSE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
 _PREFIXES = ("AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH", "CMAKE_PREFIX_PATH")
@@ -199,7 +196,6 @@ def _may_open(path: Folder, root: str, package: Path | None = None, folder: Fold
 
 
 def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterator[str]:
-    """Yield the real paths of the folders in which files may be opened."""
     # Most meshes lie below the root, and each further real path costs system calls.
     yield root
     if package is not None:
@@ -287,7 +283,6 @@ def _lines(places: Sequence[str]) -> str:
 def _folders_of(
     name: str, folder: Path, search: Sequence[Folder], log: _SearchLog, root: str | None
 ) -> Iterator[Path]:
-    """Yield the folders of a package by priority."""
     log.places.append(f"{folder.absolute()} and the folders above it")
     for place in search:
         log.places.append(str(place))

@@ -17,14 +17,12 @@ from .xml_reader import quote
 
 Folder: TypeAlias = "str | os.PathLike[str]"
 
-ROOT = "KINEVERSE_ROOT"
-"""Environment variable with folders whose files any description may open."""
+ROOT = "KINEVERSE_ROOT"  # environment variable with folders whose files any description may open
 
 MESH_FOLDERS = ("meshes", "mesh", "assets")
-"""Names of the folders of meshes that may lie beside the folder of a description."""
+"""Names of the folders of meshes that may lie next to the folder of a description."""
 
-NOWHERE = ""
-"""Root of a text without a folder; no path lies below it."""
+NOWHERE = ""  # root of a text without a folder; no path lies below it
 
 _REPOSITORY = (".git", ".hg")
 _PACKAGE = ("package.xml", "manifest.xml", "model.config")
@@ -62,9 +60,9 @@ def declared_roots() -> Iterator[str]:
 
 
 def mesh_folders(folder: Folder, root: str) -> Iterator[str]:
-    """Yield the folders of meshes beside the folder of a description, ``../meshes``, if it is in the root.
+    """Yield the folders of meshes next to the folder of a description, ``../meshes``, if it is in the root.
 
-    Robots that are no package have them there, as those of ROS: ``robot/urdf`` beside ``robot/meshes``. A
+    Robots that are no package have them there, as those of ROS: ``robot/urdf`` next to ``robot/meshes``. A
     link to another place is no such folder. A document states its folder itself, which may be outside.
     """
     here = os.path.realpath(folder) if os.fspath(folder) else ""

@@ -32,14 +32,14 @@ def save(
 
     The file is replaced atomically; after an error, the old file is unchanged. URDF and MJCF are read again
     before that, MJCF by MuJoCo if it is installed. Meshes that MuJoCo cannot read are converted, into a
-    folder beside the file.
+    folder next to the file.
     """
     target = _target(path)
     file_format = _check(target)
     if file_format.exact:
         if tuple(leave_out) or tolerance is not None:
             what = "nothing can be left out" if tolerance is None else "it has no tolerance"
-            raise FormatError(f"{target.name}: a document says all of a model exactly, so {what}.")
+            raise FormatError(f"{target.name}: a document holds all of a model exactly, so {what}.")
         registry.import_entry(file_format.write)(model, target)
         return SaveResult(target)
     try:

@@ -28,8 +28,7 @@ from kineverse.state import State
 
 from .resource_paths import locate_mesh
 
-SAMPLED_STATES = 32
-"""Number of random states within the limits in which poses and loops are checked."""
+SAMPLED_STATES = 32  # number of random states within the limits in which poses and loops are checked
 
 INERTIA_TOLERANCE = 1e-3
 """Tolerance of the triangle inequality of moments of inertia, relative to the largest.
@@ -37,8 +36,7 @@ INERTIA_TOLERANCE = 1e-3
 Files have few digits, and for a thin plate the largest is exactly the sum of the others.
 """
 
-LEAST_INERTIA = 1e-12
-"""Moments of inertia below this count as zero [kg m²]: a grain of sand has more."""
+LEAST_INERTIA = 1e-12  # moments of inertia below this count as zero [kg m²]: a grain of sand has more
 
 
 @dataclass(frozen=True, slots=True)

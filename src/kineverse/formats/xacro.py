@@ -252,7 +252,6 @@ class _Expansion:
             names["load_yaml"] = checked_yaml
 
     def _check_file(self, path: str) -> None:
-        """Check that a file may be opened."""
         plain, real = os.path.normpath(path), os.path.realpath(path)
         # What is taken for a package that is not there opens nothing.
         inside = any(is_below(real, package) for package in self._found)

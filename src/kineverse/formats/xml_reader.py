@@ -17,16 +17,12 @@ from kineverse.errors import FormatError
 
 from .files import MAX_BYTES
 
-MAX_DEPTH = 200
-"""Deepest nesting of elements. A URDF needs 5, however long its kinematic chains are."""
-
-Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"
-"""Tag, attributes, children, line."""
+MAX_DEPTH = 200  # deepest nesting of elements. A URDF needs 5, however long its kinematic chains are
+Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"  # tag, attributes, children, line
 
 _CHUNK_BYTES = 1 << 12
 
-TEXT = ""
-"""Key of the text of an element among its attributes; no attribute of XML has an empty name."""
+TEXT = ""  # key of the text of an element among its attributes; no attribute of XML has an empty name
 
 Visit: TypeAlias = Callable[[Element], None]
 Begin: TypeAlias = Callable[[Element], Visit]
@@ -50,15 +46,15 @@ def parse_xml(
     begin: Begin | None = None,
     texts: bool = False,
     depth: int = MAX_DEPTH,
-    mend: XmlFaultHandler | None = None,
+    on_recoverable_error: XmlFaultHandler | None = None,
 ) -> Element:
     """Parse a document and return its root element."""
     if len(data) > MAX_BYTES:
         raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most that is read of one document.")
     encoding = None
-    if mend is not None:
-        text, (data, encoding) = data, _declared(data, mend)
-        data = _commented(data, mend)
+    if on_recoverable_error is not None:
+        text, (data, encoding) = data, _declared(data, on_recoverable_error)
+        data = _commented(data, on_recoverable_error)
         if isinstance(text, str) and not isinstance(data, str):
             encoding = "utf-8"
     parser = expat.ParserCreate(encoding)
@@ -182,7 +178,7 @@ def _bytes(data: str | bytes) -> bytes:
         return b""
 
 
-def _declared(data: str | bytes, mend: XmlFaultHandler) -> tuple[str | bytes, str | None]:
+def _declared(data: str | bytes, on_recoverable_error: XmlFaultHandler) -> tuple[str | bytes, str | None]:
     """Return a document with blanks for a misplaced or misspelt declaration, and the encoding in it."""
     content = _bytes(data[: 1 << 16]).removeprefix(_BYTE_ORDER_MARK)
     good = _GOOD.match(content)
@@ -197,7 +193,7 @@ def _declared(data: str | bytes, mend: XmlFaultHandler) -> tuple[str | bytes, st
     if not end:
         return data, None
     line = content[:end].count(b"\n") + 1
-    mend(
+    on_recoverable_error(
         line, "<?xml ...?>: is not the first of the file, or misspelt, which XML forbids; it is passed over."
     )
     rest = _bytes(data).removeprefix(_BYTE_ORDER_MARK)
@@ -205,8 +201,7 @@ def _declared(data: str | bytes, mend: XmlFaultHandler) -> tuple[str | bytes, st
     return blank, encoding
 
 
-def _commented(data: str | bytes, mend: XmlFaultHandler) -> str | bytes:
-    """Return a document with blanks for comments that have two hyphens inside."""
+def _commented(data: str | bytes, on_recoverable_error: XmlFaultHandler) -> str | bytes:
     content = _bytes(data)
     pieces: list[bytes] = []
     start, at, literal = 0, 0, content.find(b"<![CDATA[")
@@ -224,7 +219,9 @@ def _commented(data: str | bytes, mend: XmlFaultHandler) -> str | bytes:
         inside = content[at + 4 : end]
         if b"--" in inside or inside.endswith(b"-"):
             line, counted = line + content.count(b"\n", counted, at), at
-            mend(line, "<!-- ... -->: has '--' inside, which XML forbids; it is a comment all the same.")
+            on_recoverable_error(
+                line, "<!-- ... -->: has '--' inside, which XML forbids; it is a comment all the same."
+            )
             pieces += [content[start:at], _NOT_A_BREAK.sub(b" ", content[at : end + 3])]
             start = end + 3
         at = end + 3

@@ -23,8 +23,7 @@ from . import poses
 from .reader_warnings import ReaderWarnings
 from .xml_reader import TEXT, Element, ElementError, abbreviate, find_child, quote
 
-LARGEST = 1e50
-"""Largest magnitude of coordinates, positions, and factors between positions."""
+LARGEST = 1e50  # largest magnitude of coordinates, positions, and factors between positions
 
 SMALLEST = 1e-50
 """Smallest factor between positions except 0: with a smaller one, limits of a follower are out of reach."""
@@ -135,7 +134,7 @@ def read_or_default(
     try:
         return read()
     except ElementError as mistake:
-        remarks.mend(mistake, taken, owner)
+        remarks.repair(mistake, taken, owner)
         return default
 
 
@@ -165,7 +164,7 @@ def read_origin(
         quaternion = None
     if quaternion is not None and "rpy" in origin[1]:
         mistake = ElementError(origin, "has both rpy and quat_xyzw; keep one of them.")
-        remarks.mend(mistake, "rpy is what counts", owner)
+        remarks.repair(mistake, "rpy is what counts", owner)
         quaternion = None
     if quaternion is None:
         return poses.pose_from_rpy(xyz, _read_origin_vector(origin, "rpy", owner, remarks))
@@ -173,13 +172,13 @@ def read_origin(
         xyzw = scale_to_bounds(parse_directions(quaternion, 4))
     except ValueError as error:
         mistake = ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.')
-        remarks.mend(mistake, "nothing is turned", owner)
+        remarks.repair(mistake, "nothing is turned", owner)
         return poses.pose_from_rpy(xyz, _ZERO)
     if not poses.is_valid_quaternion(xyzw):
         mistake = ElementError(
             origin, f'quat_xyzw="{abbreviate(quaternion)}" has length zero, and so is no rotation.'
         )
-        remarks.mend(mistake, "nothing is turned", owner)
+        remarks.repair(mistake, "nothing is turned", owner)
     return poses.pose_from_quaternion(xyz, xyzw)
 
 
@@ -194,8 +193,7 @@ def _read_origin_vector(origin: Element, key: str, owner: Element, remarks: Read
 
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 _INFINITE = {"inf": math.inf, "+inf": math.inf, "-inf": -math.inf}
-_UNBOUNDED = 1e16
-"""Magnitude from which a limit counts as none, as in older versions of SDF."""
+_UNBOUNDED = 1e16  # magnitude from which a limit counts as none, as in older versions of SDF
 
 
 def read_text(element: Element) -> str:
@@ -295,7 +293,7 @@ def read_element_pose(element: Element, remarks: ReaderWarnings) -> Pose:
         if not poses.is_valid_quaternion(tuple(xyzw)):
             said = abbreviate(read_text(element))
             mistake = ElementError(element, f"says {said}: it has length zero, and so is no rotation.")
-            remarks.mend(mistake, "nothing is turned")
+            remarks.repair(mistake, "nothing is turned")
         return poses.pose_from_quaternion((x, y, z), tuple(xyzw))
     x, y, z, *angles = read_numbers(element, 6)
     return poses.pose_from_rpy((x, y, z), tuple(math.radians(a) if degrees else a for a in angles))

@@ -5,67 +5,56 @@
 >>> model.degrees_of_freedom
 (screw/bolt,)
 
-``kineverse view articulations/screw`` shows it. Each module has the scenes of one family: functions that add
-joints and bodies to a :class:`~kineverse.gallery.scene.SceneBuilder`. Their name is that of the scene, and
-the first line of their docstring its summary.
+``kineverse view articulations/screw`` shows it. Scenes are documents; ``tools/scenes`` writes them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
 from functools import cache
+from pathlib import Path
 
 from kineverse.errors import UnknownNameError, suggest
-from kineverse.gallery import bases, linkages, mechanisms, multi_axis, single_axis, transmissions
-from kineverse.model.operation import Operation
 
-from .scene import Build, SceneBuilder
+__all__ = ["find_document", "names", "summary"]
 
-__all__ = ["names", "operations", "summary"]
-
-_FAMILIES = (single_axis, multi_axis, transmissions, bases, mechanisms, linkages)
+_FOLDER = Path(__file__).parent / "scenes"
 
 
 def names() -> tuple[str, ...]:
     """Return the names of all scenes, family by family."""
-    return tuple(_builds())
+    return tuple(_summaries())
 
 
 def summary(name: str) -> str:
-    """Return the summary of a scene in one line."""
-    shown = (_build(name).__doc__ or "").partition("\n")[0].removeprefix("Show ").rstrip(".")
-    return shown[:1].upper() + shown[1:]
-
-
-def operations(name: str, prefix: str | None = None) -> Iterator[Operation]:
-    """Yield the operations of a scene.
-
-    Parameters
-    ----------
-    name
-        Name of the scene.
-    prefix
-        Prefix of the names of frames, articulations and coordinates, without the slash.
+    """Return the summary of a scene in one line.
 
     Raises
     ------
     UnknownNameError
         If there is no such scene, with similar names.
     """
-    scene = SceneBuilder(prefix)
-    _build(name)(scene)
-    yield from scene.operations
+    try:
+        return _summaries()[name]
+    except KeyError:
+        raise UnknownNameError(
+            f"There is no articulation {name!r} in the gallery. {suggest(name, _summaries(), 'articulation')}"
+        ) from None
+
+
+def find_document(name: str) -> Path:
+    """Return the path of the document of a scene.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such scene, with similar names.
+    """
+    summary(name)
+    return _FOLDER / f"{name}.kv.json"
 
 
 @cache
-def _builds() -> dict[str, Build]:
-    return {build.__name__: build for family in _FAMILIES for build in family.SCENES}
-
-
-def _build(name: str) -> Build:
-    try:
-        return _builds()[name]
-    except KeyError:
-        raise UnknownNameError(
-            f"There is no articulation {name!r} in the gallery. {suggest(name, _builds(), 'articulation')}"
-        ) from None
+def _summaries() -> dict[str, str]:
+    found: dict[str, str] = json.loads((_FOLDER / "summaries.json").read_text(encoding="utf-8"))
+    return found

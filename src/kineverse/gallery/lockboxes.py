@@ -20,6 +20,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from kineverse.articulations.mechanisms.mechanism import STEEL, box_shape
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.expressions.expression import Expression
 from kineverse.logic import less
@@ -32,17 +33,12 @@ from kineverse.model.operation import Operation
 from kineverse.spatial import translation
 from kineverse.symbols import position
 
-from .shapes import box as box_shape
-
 Join: TypeAlias = Callable[[Expression, Expression], Expression]
 
-_LARGEST_SEED = 18
-"""Largest number of digits of a seed in a name."""
+_LARGEST_SEED = 18  # largest number of digits of a seed in a name
 _MOST_RINGS = 99
-_PARTS = (5, 41)
-"""Range of the number of parts of a box that is given by its seed alone."""
-_NEGATED = 0.25
-"""Share of negated conditions in such a box."""
+_PARTS = (5, 41)  # range of the number of parts of a box that is given by its seed alone
+_NEGATED = 0.25  # share of negated conditions in such a box
 
 
 class Condition(NamedTuple):
@@ -59,7 +55,7 @@ class Slider:
 
     upper: float = 1.0  # upper limit [m]
     groups: tuple[tuple[Condition, ...], ...] = ()  # conditions of the lock
-    speed: float = 0.4  # limits of the speed forward and backward [m/s]
+    speed: float = 0.4  # largest, in either direction [m/s]
     back: float = 0.4
     blocks: Literal["forward", "both"] = "forward"
 
@@ -193,7 +189,7 @@ def make_operations(box: Lockbox, prefix: str | None = None, join: Join = and_) 
     for k, (name, part) in enumerate(box.parts.items()):
         path, here = full[name], q[name]
         at = translation(0.1 * k, here, 0.0)
-        body = Body(visuals=box_shape((0.08, 0.2, 0.04)))
+        body = Body((box_shape((0.08, 0.2, 0.04), (0.0, 0.0, 0.0), STEEL),))
         yield AddFrame(path, Frame.from_transform(WORLD, at), body)
         limits = Constraint.from_expressions(0.0, here, part.upper)
         yield Constrain(f"{path}/position", limits)

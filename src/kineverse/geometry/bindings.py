@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.c_library import SourceLibrary, struct_fields
 from kineverse.compilation.toolchain import NO_COMPILER
 from kineverse.errors import CompileError
 
@@ -46,45 +46,30 @@ MeasuredPairs: TypeAlias = tuple[Indices, Floats, Floats, Floats]
 
 
 class _Struct(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("count", "moving", "bodies", "axis")),
-        *((name, ctypes.c_void_p) for name in (*_ARRAYS, "boxes", "leaves")),
-        *((name, ctypes.c_int64) for name in ("node_count", "leaf_count", "resets")),
+    _fields_ = struct_fields(
+        f"i count moving bodies axis; p {' '.join(_ARRAYS)} boxes leaves; i node_count leaf_count resets"
     )
 
 
 class _QueryStruct(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_double) for name in ("reach", "radius")),
-        *((name, ctypes.c_int64) for name in ("all", "room")),
-        *((name, ctypes.c_void_p) for name in ("allowed", "active", "known")),
-        *((name, ctypes.c_void_p) for name in ("pairs", "lows", "distances", "witnesses", "order")),
-        ("kept", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("pieces", "bodies", "distance", "witness")),
+    _fields_ = struct_fields(
+        "d reach radius; i all room; p allowed active known pairs lows distances witnesses order; "
+        "i kept; p pieces bodies distance witness"
     )
 
 
 class _FacingStruct(ctypes.Structure):
-    _fields_ = (
-        ("margins", ctypes.c_void_p),
-        *((name, ctypes.c_double) for name in ("usual", "angle", "apart")),
-    )
+    _fields_ = struct_fields("p margins; d usual angle apart")
 
 
 class _NeighbourStruct(ctypes.Structure):
-    _fields_ = (
-        ("reach", ctypes.c_double),
-        ("travel", ctypes.c_void_p),
-        ("pairs", ctypes.c_void_p),
-        *((name, ctypes.c_int64) for name in ("found", "room", "resets")),
-        *((name, ctypes.c_void_p) for name in ("selected", "members", "first")),
-        ("count", ctypes.c_int64),
-        ("boxes", ctypes.c_void_p),
+    _fields_ = struct_fields(
+        "d reach; p travel pairs; i found room resets; p selected members first; i count; p boxes"
     )
 
 
 class FacingPoints:
-    """Further facing points of near pairs of a query: what of them counts.
+    """Settings of contact manifolds: which further contact points of near, parallel faces are reported.
 
     Parallel faces are nearest at every point, and a query finds one of them. Faces that are parallel, up to
     an angle, have up to four further pairs of points, with the distance along the normal of the pair, see
@@ -98,7 +83,7 @@ class FacingPoints:
 
 
 class ObjectPlacement:
-    """Objects of a table at poses of their own, for other compiled code; the solids are shared."""
+    """Objects of a table at other poses, for other compiled code; the solids are shared."""
 
     def __init__(self, table: ObjectTable) -> None:
         if not collision_library.prepare(wait=True):
@@ -115,12 +100,9 @@ class ObjectPlacement:
 class MotionStruct(ctypes.Structure):
     """Motion along samples as C reads it, see :class:`.SampledMotion`."""
 
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("moved", "still", "room")),
-        *((name, ctypes.c_void_p) for name in ("moving", "standing", "selected", "placed", "boxes")),
-        *((name, ctypes.c_void_p) for name in ("compute", "inputs", "outputs", "columns")),
-        *((name, ctypes.c_int64) for name in ("coordinates", "first")),
-        *((name, ctypes.c_double) for name in ("limit", "least")),
+    _fields_ = struct_fields(
+        "i moved still room; p moving standing selected placed boxes compute inputs outputs columns; "
+        "i coordinates first; d limit least"
     )
 
 
@@ -147,10 +129,10 @@ class CollisionLibrary(SourceLibrary):
             return broadphase.find_near_pairs(table, reach)
         binding = _bind_table(table)
         while True:
-            found = self._code.near(binding.address, reach, *binding.results)
-            if found <= len(binding.lows):
-                return binding.pairs[:found], binding.lows[:found]
-            binding.reserve(2 * found)
+            result = self._code.near(binding.address, reach, *binding.results)
+            if result <= len(binding.lows):
+                return binding.pairs[:result], binding.lows[:result]
+            binding.reserve(2 * result)
 
     def measure(self, table: ObjectTable, pairs: Indices, limit: float) -> tuple[Floats, Floats]:
         """Measure pairs of objects, (K, 2) with the smaller index first, as far as C can."""
@@ -163,7 +145,7 @@ class CollisionLibrary(SourceLibrary):
         return distances, witnesses
 
     def extend(self, table: ObjectTable, ranked: RankedPairs, facing: FacingPoints) -> RankedPairs:
-        """Return ranked pairs with further facing points of near ones, nearest first; without C, as given."""
+        """Add further facing points of near pairs to ranked pairs, nearest first; not without C."""
         if self._code is None or not len(ranked[2]):
             return ranked
         binding = _bind_table(table)
@@ -174,12 +156,12 @@ class CollisionLibrary(SourceLibrary):
 
     def _extend(self, binding: _TableBinding, facing: FacingPoints) -> bool:
         """Add facing points to the results of a query; False, with larger buffers, if they were too short."""
-        found = self._code.extend(binding.address, binding.query_address, facing.address)
-        if found < 0:
+        result = self._code.extend(binding.address, binding.query_address, facing.address)
+        if result < 0:
             raise MemoryError("There is no memory for the facing points of near bodies.")
-        if found <= binding.query.room:
+        if result <= binding.query.room:
             return True
-        binding.reserve(2 * found)
+        binding.reserve(2 * result)
         return False
 
     def rank(
@@ -189,9 +171,9 @@ class CollisionLibrary(SourceLibrary):
         if self._code is not None:
             order = np.empty(len(pairs), dtype=np.int64)
             where = pairs.ctypes.data, len(pairs), distances.ctypes.data, radius, per_shape, order.ctypes.data
-            found = self._code.rank(_bind_table(table).address, *where)
-            if found >= 0:
-                return order[:found]
+            result = self._code.rank(_bind_table(table).address, *where)
+            if result >= 0:
+                return order[:result]
         return broadphase.rank_pairs(table, pairs, distances, radius, per_shape)
 
     def gather(
@@ -208,9 +190,9 @@ class CollisionLibrary(SourceLibrary):
         count = len(order)
         objects, bodies = np.empty((2, count, 2), dtype=np.int32)
         near, points = np.empty(count), np.empty((count, 9))
-        given = (array.ctypes.data for array in (pairs, distances, witnesses, order))
+        sources = (array.ctypes.data for array in (pairs, distances, witnesses, order))
         made = (array.ctypes.data for array in (objects, bodies, near, points))
-        self._code.gather(_bind_table(table).address, *given, count, *made)
+        self._code.gather(_bind_table(table).address, *sources, count, *made)
         return objects, bodies, near, points
 
     def search(
@@ -235,16 +217,16 @@ class CollisionLibrary(SourceLibrary):
         query = binding.query
         known = binding.ask(table, reach, radius, selection, per_shape)
         while True:
-            found = self._code.search(binding.address, binding.query_address)
-            if found < 0 and known is not None:
-                known.reserve(-2 * found)
-            elif found > query.room:
-                binding.reserve(2 * found)
+            result = self._code.search(binding.address, binding.query_address)
+            if result < 0 and known is not None:
+                known.reserve(-2 * result)
+            elif result > query.room:
+                binding.reserve(2 * result)
             elif query.kept <= 0 or facing is None or self._extend(binding, facing):
                 break
         if query.kept < 0:
-            pairs, lows = binding.pairs[:found], binding.lows[:found]
-            return (pairs, lows, binding.distances[:found], binding.witnesses[:found]), None
+            pairs, lows = binding.pairs[:result], binding.lows[:result]
+            return (pairs, lows, binding.distances[:result], binding.witnesses[:result]), None
         return None, binding.copy_ranked()
 
     def search_at(
@@ -338,12 +320,11 @@ class _TableBinding:
         if kept > self.query.room:
             self.reserve(2 * kept)
         buffers: tuple[npt.NDArray[Any], ...] = self.nearest
-        for own, given in zip(buffers, ranked, strict=True):
-            own[:kept] = given
+        for buffer, values in zip(buffers, ranked, strict=True):
+            buffer[:kept] = values
         self.query.kept = kept
 
     def copy_ranked(self) -> RankedPairs:
-        """Return the results of the last query."""
         kept = self.query.kept
         objects, bodies, near, points = self.nearest
         return objects[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy()
@@ -371,7 +352,7 @@ class _NeighbourBinding:
         self.reserve(1024)
 
     def reserve(self, count: int) -> None:
-        """Allocate a list for a number of pairs, which are found anew."""
+        """Allocate a list for a number of pairs, which are searched again."""
         self._pairs = np.empty((count, 2), dtype=np.int32)
         self._struct.pairs, self._struct.room, self._struct.resets = self._pairs.ctypes.data, count, -1
 

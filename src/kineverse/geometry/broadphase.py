@@ -11,7 +11,6 @@ This module is the numpy path; :mod:`.bindings` offers the same in C, several ti
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -37,50 +36,37 @@ _INHERITED = (
 )  # fmt: skip
 
 
-@dataclass(eq=False)
 class ObjectTable:
     """Table of M collision objects of B bodies, moving objects first."""
 
-    moving: int  # number of moving objects; the others are static
-    body: Indices  # (M,) index of the body of each object
-    allowed: Flags  # (B, B) 1 for pairs of bodies that are checked, symmetric; 0 on the diagonal
-    active: Flags = field(init=False)  # (M,) 1 for objects that have a solid
-    centre: Floats = field(init=False)  # (M, 3), (M,), [m]
-    half: Floats = field(init=False)
-    radius: Floats = field(init=False)
-    poses: Floats = field(init=False)  # (M, 3, 4) poses in the world
-    travel: Floats = field(init=False)  # (M,), [m]
-    position: Floats = field(init=False)  # (M, 3), [m]
-    low: Floats = field(init=False)
-    high: Floats = field(init=False)
-    corners: npt.NDArray[np.uintp] = field(init=False)  # (M,), (M, 3), [m]
-    corner_count: npt.NDArray[np.int64] = field(init=False)
-    edges: Floats = field(init=False)
-    radii: Floats = field(init=False)
-    round: Floats = field(init=False)
-    tip: Floats = field(init=False)
-    memory: npt.NDArray[np.void] = field(init=False)  # last results of C, in slots that later pairs overwrite
-    order: Indices = field(init=False)  # (M,) moving objects as last sorted along axis, then the static ones
-    sorted_boxes: Floats = field(init=False)
-    bounds: Floats | None = field(init=False)  # (M, M)
-    axis: int = 0  # axis of the sweep: 0, 1 or 2
-    binding: Any = None  # table as C reads it, once it exists
-    resets: int = 0  # number of resets of travel
-    static_changed: bool = True  # True if a static object was placed since the static tree was built
-
-    def __post_init__(self) -> None:
-        count = len(self.body)
-        self.active = np.zeros(count, dtype=np.uint8)
-        self.centre, self.half = np.zeros((count, 3)), np.zeros((count, 3))
-        self.radius, self.travel = np.zeros(count), np.zeros(count)
-        self.poses = np.tile(np.eye(4)[:3], (count, 1, 1))
+    def __init__(self, moving: int, body: Indices, allowed: Flags) -> None:
+        count = len(body)
+        self.moving = moving  # number of moving objects; the others are static
+        self.body = body  # (M,) index of the body of each object
+        self.allowed = allowed  # (B, B) 1 for pairs of bodies that are checked, symmetric; 0 on the diagonal
+        self.active: Flags = np.zeros(count, dtype=np.uint8)  # 1 for objects that have a solid
+        # Bounding box and bounding sphere in the frame of the object [m].
+        self.centre, self.half, self.radius = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
+        self.poses = np.tile(np.eye(4)[:3], (count, 1, 1))  # in the world
+        self.travel = np.zeros(count)  # upper bounds of the motion of any point since the last reset [m]
+        # Centre in the world, and corners of the axis-aligned bounding box [m].
         self.position, self.low, self.high = (np.zeros((count, 3)) for _ in range(3))
+        # Cores of the solids, see shapes.Core, which have to outlive the table: address and number of the
+        # corners, -1 without a core; half edges, radii of the ellipsoid, radius of the ball, tip [m].
         self.corners, self.corner_count = np.zeros(count, dtype=np.uintp), np.full(count, -1, dtype=np.int64)
         self.edges, self.radii, self.round = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
-        self.tip, self.memory = np.zeros(count), np.zeros(MEMORY_SLOTS, dtype=_MEMORY)
-        self.order = np.arange(count, dtype=np.int32)
-        self.sorted_boxes = np.empty((7, self.moving))
-        self.bounds = np.zeros((count, count)) if count <= MAX_BOUNDED_OBJECTS else None
+        self.tip = np.zeros(count)
+        self.memory = np.zeros(MEMORY_SLOTS, dtype=_MEMORY)  # last results of C; later pairs overwrite them
+        # Moving objects as last sorted along the axis of the sweep, then the static ones.
+        self.order: Indices = np.arange(count, dtype=np.int32)
+        self.axis = 0
+        self.sorted_boxes = np.empty((7, moving))  # work space of C
+        # For i < j, the last measured distance plus the travel of both at that time; 0 before. Minus the
+        # present travel it is a lower bound of the distance. None for too many objects.
+        self.bounds: Floats | None = np.zeros((count, count)) if count <= MAX_BOUNDED_OBJECTS else None
+        self.binding: Any = None  # table as C reads it, once it exists
+        self.resets = 0  # of travel
+        self.static_changed = True  # True if a static object was placed since the static tree was built
 
     @property
     def count(self) -> int:
@@ -105,11 +91,8 @@ class ObjectTable:
         rotation, translation = self.poses[objects, :, :3], self.poses[objects, :, 3]
         centre = np.einsum("kij,kj->ki", rotation, self.centre[objects]) + translation
         extent = np.einsum("kij,kj->ki", np.abs(rotation), self.half[objects])
-        self.position[objects], self.low[objects], self.high[objects] = (
-            centre,
-            centre - extent,
-            centre + extent,
-        )
+        self.position[objects] = centre
+        self.low[objects], self.high[objects] = centre - extent, centre + extent
 
     def inherit(self, old: ObjectTable, kept: npt.NDArray[np.integer[Any]]) -> None:
         """Copy rows of another table; ``kept`` holds (K, 2) indices in this table and in the other."""

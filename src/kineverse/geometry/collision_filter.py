@@ -73,13 +73,13 @@ def parse_known_rules(entries: Any, model: ModelView) -> tuple[Rule, ...]:
 
 
 def read_rules(model: ModelView) -> tuple[Rule, ...]:
-    """Return rules that a model keeps: first those of included models, below their prefix, then its own."""
-    found: list[Rule] = []
+    """Return the rules of a model: first those of included models, below their prefix, then others."""
+    result: list[Rule] = []
     for name, entries in model.data.items():
         if name.endswith(f"/{RULES}"):
             prefix = name.removesuffix(RULES)
-            found += [rule._replace(a=prefix + rule.a, b=prefix + rule.b) for rule in parse_rules(entries)]
-    return (*found, *parse_rules(model.data.get(RULES, ())))
+            result += [rule._replace(a=prefix + rule.a, b=prefix + rule.b) for rule in parse_rules(entries)]
+    return (*result, *parse_rules(model.data.get(RULES, ())))
 
 
 def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ...]:
@@ -116,7 +116,6 @@ def apply_rules(flags: Flags, bodies: Sequence[str], rules: Sequence[Rule]) -> F
 
 
 def _matching_bodies(name: str, index: Mapping[str, int], matches: dict[str, list[int]]) -> list[int]:
-    """Return the indices of the bodies that a name or pattern matches, and cache them in ``matches``."""
     if name not in matches:
         is_pattern = any(sign in name for sign in _WILDCARDS)
         candidates = index if is_pattern else (name,) if name in index else ()
@@ -169,7 +168,7 @@ def rigid_group(name: str, frames: Mapping[str, Frame]) -> str:
 
 
 def _supporting_body(name: str, frames: Mapping[str, Frame], index: Mapping[str, int]) -> int:
-    """Return the index of the nearest body at or above a frame that never moves; -1 if there is none."""
+    """Return the index of the nearest body at or above a frame that never moves; -1 for none."""
     while name not in index and name != WORLD:
         name = frames[name].parent
     return index.get(name, -1)

@@ -61,7 +61,7 @@ class CollisionWorld:
         self._own_rules = parse_known_rules(rules, model)
         meshes = (("triangles", triangles), ("decomposed", decomposed))
         wanted = "names or patterns of bodies"
-        some, others = (as_entries(f"{what}=", given, str, wanted) for what, given in meshes)
+        some, others = (as_entries(f"{what}=", entries, str, wanted) for what, entries in meshes)
         patterns = some, others, parse_exclusions(leave_out)
         for what, names in zip(("triangles", "decomposed", "leave_out"), patterns, strict=True):
             bodies = (name if isinstance(name, str) else name[0] for name in names)
@@ -93,7 +93,7 @@ class CollisionWorld:
     # -- the model -----------------------------------------------------------------------------------------
 
     def synchronize(self) -> None:
-        """Update to the model's present version; unchanged objects keep their solids, travel and bounds."""
+        """Follow the model to its present version; unchanged objects keep their solids, travel and bounds."""
         if self._version == self.model.version:
             return
         version = self.model.version
@@ -192,8 +192,7 @@ class CollisionWorld:
     ) -> RankedPairs | None:
         """Update to values of :attr:`inputs` and search the selected pairs, in one call of C.
 
-        None if an update and a search have to be made one after the other, see
-        :meth:`.CollisionLibrary.search_at`.
+        None if this takes an update and a search, see :meth:`.CollisionLibrary.search_at`.
         """
         address = self.kinematics_address
         usable = type(values) is np.ndarray and values.dtype == np.float64
@@ -201,13 +200,13 @@ class CollisionWorld:
             return None
         self._evaluator.input[:] = values
         kinematics = address, *self._addresses
-        found = collision_library.search_at(
+        result = collision_library.search_at(
             self.table, kinematics, radius + ACCURACY, radius, selection, per_shape, facing
         )
-        if found is not None:
+        if result is not None:
             self._placed_at, self._missing_state = (self.inputs, values.copy()), ""
             self.narrowphase.invalidate_poses(self.table.moving)
-        return found
+        return result
 
     @property
     def values(self) -> Floats:
@@ -229,7 +228,7 @@ class CollisionWorld:
         return poses
 
     def _select_inputs(self, state: StateLike) -> StateLike:
-        """Return the part of a mapping that poses depend on, after checking all other names."""
+        """Select the values that poses depend on, after a check of all other names."""
         if isinstance(state, State):
             return state
         inputs = {key for symbol in self.inputs for key in (symbol, str(symbol))}
@@ -316,7 +315,7 @@ class CollisionWorld:
     ) -> None:
         """Measure by coal the pairs whose distance is NaN, see :meth:`measure`.
 
-        If ``per_shape``, all of them are measured, also beside a nearer pair of the same bodies.
+        If ``per_shape``, all of them are measured, even if a nearer pair of the same bodies is known.
         """
         owners = self.table.body[pairs]
         keys = owners.min(axis=1).astype(np.int64) * len(self.bodies) + owners.max(axis=1)
@@ -401,7 +400,7 @@ class _NearestByBodies:
 
 
 def _compile_poses(moving: list[CollisionObject]) -> CompiledFunction[Floats]:
-    """Compile the poses of moving objects, those of a body together: (M, 3, 4)."""
+    """Compile the poses (M, 3, 4) of moving objects, those of a body together."""
     poses = []
     for _, group in groupby(moving, lambda item: item.body):
         items = [*group]
@@ -412,13 +411,13 @@ def _compile_poses(moving: list[CollisionObject]) -> CompiledFunction[Floats]:
 
 
 def _static_pose(item: CollisionObject, poses: dict[str, Floats]) -> Floats:
-    """Return the (3, 4) pose of an object that never moves; those of bodies are kept in ``poses``."""
+    """Return the (3, 4) pose of an object that never moves; ``poses`` keeps those of bodies."""
     if item.body not in poses:
         poses[item.body] = item.body_pose({})
     pose: Floats = poses[item.body][:3] @ item.shape.origin.matrix
     if not (np.abs(pose) <= FURTHEST).all():
         raise InvalidValueError(
-            f"Body '{item.body}' stands further than {FURTHEST:g} m away. Mend the model, or leave it out: "
+            f"Body '{item.body}' stands further than {FURTHEST:g} m away. Correct the model, or exclude it: "
             "Scene(model, leave_out=[...])."
         )
     return pose

@@ -39,11 +39,12 @@ def find_distance(world: CollisionWorld, a: str, b: str) -> DistanceResult:
     if len(pairs) > 1:
         # The distance of the most promising pair bounds the answer from above.
         lows = world.table.lower_bounds(pairs[:, 0], pairs[:, 1])
-        radius = _least_distance(world, pairs[[np.argmin(lows)]]) + ACCURACY
+        (promising,), _ = world.measure(pairs[[np.argmin(lows)]], np.zeros(1), math.inf)
+        radius = float(promising) + ACCURACY
         near = lows <= radius
         pairs, lows = pairs[near], lows[near]
-    (found,) = _nearest_pairs(world, pairs, lows, radius)
-    return found if found.a == a else found.swap()
+    (result,) = _nearest_pairs(world, pairs, lows, radius)
+    return result if result.a == a else result.swap()
 
 
 def find_pairs_within(
@@ -104,17 +105,13 @@ def find_distances_to(world: CollisionWorld, body: str, radius: float) -> list[D
     lows = table.lower_bounds(pairs[:, 0], pairs[:, 1])
     near = lows <= radius + ACCURACY
     nearest = _nearest_pairs(world, pairs[near], lows[near], radius)
-    return [found if found.a == body else found.swap() for found in nearest]
+    return [result if result.a == body else result.swap() for result in nearest]
 
 
 def _pair_product(members: list[int], others: list[int]) -> Indices:
-    """Return all pairs of two lists, (K, 2), the smaller number first."""
+    """Return all pairs (K, 2) of two lists, the smaller index first."""
     left, right = np.repeat(members, len(others)), np.tile(others, len(members))
     return np.stack([np.minimum(left, right), np.maximum(left, right)], axis=1).astype(np.int32)
-
-
-def _least_distance(world: CollisionWorld, pairs: Indices) -> float:
-    return float(world.measure(pairs, np.zeros(len(pairs)), math.inf)[0].min())
 
 
 def _nearest_pairs(world: CollisionWorld, pairs: Indices, lows: Floats, radius: float) -> DistanceResults:
@@ -172,7 +169,7 @@ class PreparedQuery:
     def __call__(self, radius: float | None = None, facing: FacingPoints | None = None) -> DistanceResults:
         """Return the selected pairs within the radius [m], or within another one, nearest first.
 
-        With ``facing``, pairs with parallel faces are there with further facing points.
+        With ``facing``, near pairs of parallel faces have further points.
         """
         within = self.radius if radius is None else radius
         with self._lock:
@@ -198,9 +195,9 @@ class PreparedQuery:
         within = self.radius if radius is None else radius
         check_radius(within)
         with self._lock:
-            found = self._world.search_at(values, within, self._select(), self.per_shape, facing)
-            if found is not None:
-                return DistanceResults(self._world, *found)
+            result = self._world.search_at(values, within, self._select(), self.per_shape, facing)
+            if result is not None:
+                return DistanceResults(self._world, *result)
             self._world.update(values)
             return self(within, facing)
 
@@ -251,13 +248,13 @@ class PreparedQuery:
         within = self.radius if radius is None else radius
         check_radius(within)
         motion = self._move(coordinates)
-        found = motion.struct
+        result = motion.struct
         for _ in motion.find_rows(_as_rows(Q, len(coordinates)), within, first=False):
-            near = self(found.limit)
+            near = self(result.limit)
             if len(near):
-                found.least = min(found.least, float(near.distances[0]))
-                found.limit = max(found.least, 0.0)
-        return float(found.least)
+                result.least = min(result.least, float(near.distances[0]))
+                result.limit = max(result.least, 0.0)
+        return float(result.least)
 
     @one_at_a_time
     def prepare(self) -> None:
@@ -273,7 +270,7 @@ class PreparedQuery:
             collision_library.bind(self._world.table)
 
     def _select(self) -> PairSelection:
-        """Return the selected pairs, whose objects have solids."""
+        """Select the pairs, and make the solids of their objects."""
         world = self._world
         if self._selection is None or self._version != world.model.version:
             flags = self._selected()
@@ -298,7 +295,6 @@ class PreparedQuery:
         return np.argwhere(np.triu(self._selected())).astype(np.int32)
 
     def _selected(self) -> Flags:
-        """Return the flags of the selected pairs at the model's present version."""
         self._world.synchronize()
         if self._version != self._world.model.version:
             self._selection = None
@@ -336,15 +332,15 @@ def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:
 
 def flag_matching(bodies: Sequence[str], patterns: str | Iterable[str]) -> npt.NDArray[np.bool_]:
     """Return (B,) flags of the bodies that match one of some names or patterns."""
-    found = np.zeros(len(bodies), dtype=bool)
+    result = np.zeros(len(bodies), dtype=bool)
     for pattern in (patterns,) if isinstance(patterns, str) else tuple(patterns):
         matching = np.array([matches_pattern(body, (pattern,)) for body in bodies], dtype=bool)
         if not matching.any():
             raise UnknownNameError(
                 f"No body of the scene is named or matched by '{pattern}'. {suggest(pattern, bodies, 'body')}"
             )
-        found |= matching
-    return found
+        result |= matching
+    return result
 
 
 def flag_subtree(model: ModelView, bodies: Sequence[str], frame: str) -> npt.NDArray[np.bool_]:

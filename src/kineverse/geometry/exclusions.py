@@ -33,24 +33,24 @@ def find_unusable_shapes(model: ModelView) -> dict[tuple[str, int], str]:
     ``Scene(model, leave_out=find_unusable_shapes(model))``.
     """
     known: dict[Geometry, str] = {}
-    found: dict[tuple[str, int], str] = {}
+    result: dict[tuple[str, int], str] = {}
     for name, body in model.bodies.items():
         for number, shape in enumerate(collision_shapes(body)):
             if shape.geometry not in known:
                 known[shape.geometry] = _find_problem(shape.geometry)
             if known[shape.geometry]:
-                found[name, number] = known[shape.geometry]
-    return found
+                result[name, number] = known[shape.geometry]
+    return result
 
 
 def label_unusable_shapes(model: ModelView, problems: Mapping[tuple[str, int], str]) -> dict[str, str]:
-    """Return labels of excluded shapes with the reasons; the body's name if all its shapes are excluded."""
+    """Label excluded shapes, with the reasons; by the body's name if all its shapes are excluded."""
     count = Counter(name for name, _ in problems)
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     for (name, number), why in problems.items():
         stays = count[name] < len(collision_shapes(model.bodies[name]))
-        found.setdefault(f"shape {number} of {name}" if stays else name, why)
-    return found
+        result.setdefault(f"shape {number} of {name}" if stays else name, why)
+    return result
 
 
 def remove_unusable_shapes(model: Model) -> tuple[str, ...]:

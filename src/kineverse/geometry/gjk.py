@@ -1,4 +1,9 @@
-"""Support functions, separating directions and distances (GJK) of convex solids, in Python."""
+"""Support functions, separating directions and distances (GJK) of convex solids, in Python.
+
+The gap of two convex solids along any direction is a lower bound of their distance, and the largest gap is
+the distance, see :mod:`.narrowphase`. GJK is the iteration of :mod:`.narrowphase_c`, a thousand times slower,
+with the same two bounds: it returns a distance only once they meet.
+"""
 
 from __future__ import annotations
 
@@ -33,15 +38,15 @@ def directional_gaps(a: PlacedSolid, b: PlacedSolid, directions: Floats) -> Floa
 def find_widest_gap(a: PlacedSolid, b: PlacedSolid, directions: Floats) -> tuple[float, Floats]:
     """Search for the direction with the largest gap; return the gap [m] and the unit direction (3,).
 
-    Candidates are the axes of both solids, fixed directions all around, and the given ones, (n, 3). A pattern
+    Candidates are the axes of both solids, fixed directions all around, and some more (n, 3). A pattern
     search with a shrinking step refines the best of them.
     """
     tried = np.concatenate(
         [directions, _DIRECTIONS, *(sign * rotation.T for _, rotation, _ in (a, b) for sign in (1.0, -1.0))]
     )
     values = directional_gaps(a, b, tried)
-    found = [_ascend(a, b, tried[k], float(values[k])) for k in np.argsort(-values, kind="stable")[:_STARTS]]
-    return max(found, key=lambda one: one[0])
+    result = [_ascend(a, b, tried[k], float(values[k])) for k in np.argsort(-values, kind="stable")[:_STARTS]]
+    return max(result, key=lambda one: one[0])
 
 
 def smoothed_support(placed: PlacedSolid, direction: Floats) -> Floats:
@@ -62,16 +67,16 @@ def smoothed_support(placed: PlacedSolid, direction: Floats) -> Floats:
 def support(placed: PlacedSolid, direction: Floats) -> Floats:
     """Return a support point (3,) of a solid in the world along a unit direction."""
     solid, rotation, position = placed
-    core, own = solid.core, direction @ rotation
+    core, local = solid.core, direction @ rotation
     assert core is not None
-    if core.tip and 2 * core.tip * own[2] >= core.radii[0] * np.hypot(own[0], own[1]):
+    if core.tip and 2 * core.tip * local[2] >= core.radii[0] * np.hypot(local[0], local[1]):
         return np.asarray(position + rotation @ np.array([0.0, 0.0, core.tip]))
-    point = np.where(own > 0.0, core.half, -core.half) + core.radius * own - [0.0, 0.0, core.tip]
+    point = np.where(local > 0.0, core.half, -core.half) + core.radius * local - [0.0, 0.0, core.tip]
     if core.corners.size:
-        point += core.corners[:, np.argmax(own @ core.corners)]
-    across = np.linalg.norm(core.radii * own)
+        point += core.corners[:, np.argmax(local @ core.corners)]
+    across = np.linalg.norm(core.radii * local)
     if across > 0.0:
-        point += core.radii**2 * own / across
+        point += core.radii**2 * local / across
     return np.asarray(position + rotation @ point)
 
 
@@ -109,7 +114,7 @@ def _support_values(solid: Solid, directions: Floats) -> Floats:
 
 
 def _spread_directions(count: int) -> Floats:
-    """Return a low-discrepancy sequence of unit directions, (count, 3): every prefix covers the sphere."""
+    """Return a low-discrepancy sequence of unit directions (count, 3)."""
     k = np.arange(1, count + 1)
     height, angle = 2.0 * (k * 0.7548776662466927 % 1.0) - 1.0, 2.0 * np.pi * (k * 0.5698402909980532 % 1.0)
     side = np.sqrt(1.0 - height**2)
@@ -148,11 +153,11 @@ def gjk_distance(a: PlacedSolid, b: PlacedSolid) -> tuple[float, Floats, Floats]
         nearest = _nearest_to_origin([*points, corner])
         if nearest is None:
             return None
-        kept, some, found = nearest
-        if not (nearer := float(np.linalg.norm(found))) < high:
+        kept, some, result = nearest
+        if not (nearer := float(np.linalg.norm(result))) < high:
             break
         points, origins = [[*points, corner][k] for k in kept], [[*origins, point][k] for k in kept]
-        direction, high, weights = found, nearer, some
+        direction, high, weights = result, nearer, some
     if not (high > 0.0 and high - low <= _ACCEPTED * size):
         return None
     return high, weights @ np.array(origins), direction / high
@@ -165,8 +170,8 @@ def gjk_distance_to_faces(
     solid, rotation_a, position_a = a
     corners = (faces.vertices @ rotation.T + position)[faces.faces]
     # In the frame of the solid, the distance of both bounding boxes is a lower bound.
-    seen = (corners - position_a) @ rotation_a - solid.centre
-    apart = np.maximum(np.maximum(seen.min(axis=1) - solid.half, -solid.half - seen.max(axis=1)), 0.0)
+    local = (corners - position_a) @ rotation_a - solid.centre
+    apart = np.maximum(np.maximum(local.min(axis=1) - solid.half, -solid.half - local.max(axis=1)), 0.0)
     lows = np.linalg.norm(apart, axis=1)
     best: tuple[float, Floats, Floats] | None = None
     for k in np.argsort(lows, kind="stable").tolist():
@@ -177,11 +182,11 @@ def gjk_distance_to_faces(
         triangle = Solid(
             None, faces, np.zeros(3), np.zeros(3), radius, core=Core.from_corners(corners[k] - middle)
         )
-        found = gjk_distance(a, (triangle, np.eye(3), middle))
-        if found is None:
+        result = gjk_distance(a, (triangle, np.eye(3), middle))
+        if result is None:
             return None
-        if best is None or found[0] < best[0]:
-            best = found
+        if best is None or result[0] < best[0]:
+            best = result
     return best
 
 
@@ -201,7 +206,7 @@ def _nearest_to_origin(points: list[Floats]) -> tuple[tuple[int, ...], Floats, F
                 continue
             if count == 4:
                 return None
-            found = weights @ corners
-            if best is None or found @ found < best[2] @ best[2]:
-                best = kept, weights, found
+            result = weights @ corners
+            if best is None or result @ result < best[2] @ best[2]:
+                best = kept, weights, result
     return best

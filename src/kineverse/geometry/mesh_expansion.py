@@ -18,7 +18,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 _NODE_BYTES = 2048
-"""Size for which a node counts beside its triangles [bytes]: it takes trimesh about as long as these."""
+"""Size of a node in addition to its triangles [bytes]: it takes trimesh about as long as these."""
 
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -34,7 +34,7 @@ class _Part:
 
 
 def expanded_size(path: Path) -> float:
-    """Return by how much a mesh file would be larger with all that it draws written out [bytes]."""
+    """Return the size that a mesh file gains if everything it draws is written out [bytes]."""
     kind = path.suffix.lower()
     if kind == ".dae":
         return _collada_size(path.read_bytes())
@@ -49,7 +49,7 @@ def expanded_size(path: Path) -> float:
 
 
 def _total(parts: Mapping[object, _Part]) -> float:
-    """Return by how much the parts that the part None draws are larger than the parts that are written."""
+    """Return the size of the parts that the part None draws, less that of the parts that are written."""
     sizes: dict[object, float] = {}
     stack: list[object] = [None]
     inside: set[object] = set()
@@ -73,7 +73,6 @@ def _total(parts: Mapping[object, _Part]) -> float:
 
 
 def _packed(path: Path, ending: str) -> list[bytes]:
-    """Return the contents of the files in an archive whose names have an ending."""
     if not zipfile.is_zipfile(path):
         return []
     with zipfile.ZipFile(path) as packed:
@@ -97,7 +96,7 @@ def _collada_size(content: bytes) -> float:
 def _collada_parts(root: ElementTree.Element) -> Iterator[tuple[object, _Part]]:
     """Yield the nodes and geometries of a COLLADA, and as None all of its scenes."""
     whole = _Part(0.0)
-    elements = list(root.iter())  # kept, since lxml makes each anew otherwise, with another id
+    elements = list(root.iter())  # kept, since lxml makes new ones otherwise, with other ids
     for element in elements:
         tag = _tag(element)
         if tag in ("geometry", "controller"):

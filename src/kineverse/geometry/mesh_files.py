@@ -86,17 +86,17 @@ def read_faces(file: MeshFile) -> Faces:
 
 def _read_file(file: MeshFile) -> Faces:
     try:
-        found = load_mesh_parts(file)
+        result = load_mesh_parts(file)
     except MissingDependencyError:
         raise
     except Exception as error:  # Parsers of trimesh raise all kinds of exceptions.
         raise FormatError(f"{file.path} cannot be read as a mesh: {summarize_error(error)}") from error
-    sizes = np.cumsum([0, *(len(part.vertices) for part in found[:-1])])
-    vertices = np.concatenate([np.asarray(part.vertices, dtype=float) for part in found]) * unit_length(
+    sizes = np.cumsum([0, *(len(part.vertices) for part in result[:-1])])
+    vertices = np.concatenate([np.asarray(part.vertices, dtype=float) for part in result]) * unit_length(
         file.path
     )
     faces = np.concatenate(
-        [np.asarray(part.faces, dtype=np.int64) + n for part, n in zip(found, sizes, strict=True)]
+        [np.asarray(part.faces, dtype=np.int64) + n for part, n in zip(result, sizes, strict=True)]
     )
     if not np.isfinite(vertices).all():
         raise FormatError(f"{file.path} has vertices that are not finite.")
@@ -118,10 +118,10 @@ def load_mesh_parts(file: MeshFile) -> list[Any]:
     _check_expansion(file)
     with _without_logging("trimesh"):
         scene = trimesh.load_scene(file.path, process=False, resolver=_FolderFiles(file.path.parent))
-        found = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
-    if not found:
+        result = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
+    if not result:
         raise OSError(f"{file.path} holds no triangles")
-    return found
+    return result
 
 
 def _check_packing(file: MeshFile) -> None:

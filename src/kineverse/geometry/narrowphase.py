@@ -101,7 +101,8 @@ class Narrowphase:
         distance: float = functor(pose_a, pose_b, self._request, result)
         if _TOUCH < distance < 1e300:
             if (i, j) in self._triangle_pairs:
-                self._witness = self._witness_from_points(distance)
+                point_a, point_b = result.getNearestPoint1(), result.getNearestPoint2()
+                self._witness = point_a, point_b, (point_b - point_a) / distance
                 return distance
             a, b = self._pair(i, j)
             if not (a.is_convex and b.is_convex):
@@ -134,10 +135,6 @@ class Narrowphase:
             return self._witness
         result = self._result
         return result.getNearestPoint1(), result.getNearestPoint2(), np.array(result.normal)
-
-    def _witness_from_points(self, distance: float) -> Witness:
-        point_a, point_b = self._result.getNearestPoint1(), self._result.getNearestPoint2()
-        return point_a, point_b, (point_b - point_a) / distance
 
     def _pair(self, i: int, j: int) -> tuple[Solid, Solid]:
         a, b = self._solids[i], self._solids[j]
@@ -193,10 +190,10 @@ class Narrowphase:
 
     def _solve(self, i: int, j: int) -> float:
         """Measure two separated convex solids by GJK, without coal."""
-        found = gjk_distance(*self._placed_solids(i, j))
-        if found is None:
+        result = gjk_distance(*self._placed_solids(i, j))
+        if result is None:
             return self._search(i, j)
-        distance, point, normal = found
+        distance, point, normal = result
         self._witness = point, point + distance * normal, normal
         return distance
 
@@ -235,10 +232,10 @@ class Narrowphase:
         solid, mesh = (j, i) if swapped else (i, j)
         surface = self._pair(mesh, mesh)[0].surface
         assert isinstance(surface, Faces)
-        found = gjk_distance_to_faces(self._placed_solids(solid, solid)[0], surface, *self._pose_views[mesh])
-        if found is None:
+        result = gjk_distance_to_faces(self._placed_solids(solid, solid)[0], surface, *self._pose_views[mesh])
+        if result is None:
             return None
-        distance, point, normal = found
+        distance, point, normal = result
         other = point + distance * normal
         self._witness = (other, point, -normal) if swapped else (point, other, normal)
         return distance
@@ -273,8 +270,8 @@ class Narrowphase:
         # Moved apart along the normal, they have their nearest points where they face each other.
         solid, rotation, position = b
         moved = position + (_APART_OF_RADIUS * min(a[0].radius, solid.radius) - distance) * normal
-        if (found := gjk_distance(a, (solid, rotation, moved))) is not None:
-            self._witness = found[1], found[1] + distance * normal, normal
+        if (result := gjk_distance(a, (solid, rotation, moved))) is not None:
+            self._witness = result[1], result[1] + distance * normal, normal
         else:
             self._witness = smoothed_support(a, normal), smoothed_support(b, -normal), normal
         return distance
@@ -299,12 +296,12 @@ class Narrowphase:
         (a, b), pose_a, pose_b = self._pair(i, j), self._transforms[i], self._transforms[j]
         coal = self._coal
         request = coal.CollisionRequest(coal.CollisionRequestFlag.CONTACT, _MAX_CONTACTS)
-        found = coal.CollisionResult()
+        result = coal.CollisionResult()
         one, other = a.stand_in or a.engine, b.stand_in or b.engine
-        coal.collide(one, pose_a, other, pose_b, request, found)
+        coal.collide(one, pose_a, other, pose_b, request, result)
         deepest, depth = None, -1.0
-        for k in range(found.numContacts()):
-            contact = found.getContact(k)
+        for k in range(result.numContacts()):
+            contact = result.getContact(k)
             if depth < -contact.penetration_depth < 1e300 and abs(np.linalg.norm(contact.normal) - 1) < 1e-6:
                 deepest, depth = contact, -contact.penetration_depth
         if deepest is None:

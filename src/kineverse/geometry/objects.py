@@ -30,27 +30,27 @@ def parse_exclusions(entries: Any) -> tuple[Exclusion, ...]:
     """Return the entries of ``leave_out=``: bodies, patterns, and single shapes (body, number)."""
     if isinstance(entries, str):
         return (entries,)
-    found = tuple(entries) if isinstance(entries, Iterable) else (entries,)
-    for entry in found:
+    result = tuple(entries) if isinstance(entries, Iterable) else (entries,)
+    for entry in result:
         body, number = entry if isinstance(entry, tuple) and len(entry) == 2 else (entry, 0)
         if not isinstance(body, str) or not hasattr(number, "__index__"):
             raise InvalidValueError(
                 f"leave_out= takes bodies, patterns, or shapes (body, number), not {entry!r:.80}."
             )
-    return found
+    return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CollisionObject:
     """Shape of a body, or one of the convex hulls that a mesh is decomposed into."""
 
-    body: str  # frame of the body
-    number: int  # index of the shape among the shapes of the body
-    shape: Shape  # geometry and its pose in the frame
+    body: str
+    number: int  # of the shape, among the shapes of the body
+    shape: Shape
     triangles: bool  # True if a mesh stays a triangle mesh rather than its convex hull
-    body_pose: Expression  # pose of the body, world_T_body: a (4, 4) expression
-    moves: bool  # True if it depends on any symbol
-    hull: Floats | None = None  # (n, 3), [m]
+    body_pose: Expression  # world_T_body, (4, 4)
+    moves: bool  # True if the pose depends on any symbol
+    hull: Floats | None = None  # (n, 3) corners in the frame of the shape [m]; None for the shape itself
 
     def make_solid(self) -> Solid:
         """Make the solid of the object, for distance computation."""
@@ -109,7 +109,7 @@ class CollisionObjects:
         """
         frames, bodies, rates = dict(model.frames), dict(model.bodies), model.rates.key
         same = _UnchangedPoses(self._frames, frames) if rates == self._rates else None
-        found: dict[str, tuple[CollisionObject, ...]] = {}
+        result: dict[str, tuple[CollisionObject, ...]] = {}
         for name, body in bodies.items():
             if matches_pattern(name, self._excluded_bodies) or not collision_shapes(body):
                 continue
@@ -117,9 +117,9 @@ class CollisionObjects:
             if kept is None or self._bodies[name] is not body or same is None or not same.contains(name):
                 kept = tuple(self._make_objects(model, name, body))
             if kept:
-                found[name] = kept
-        changed = list(found.items()) != list(self.by_body.items())
-        self._frames, self._bodies, self._rates, self.by_body = frames, bodies, rates, found
+                result[name] = kept
+        changed = list(result.items()) != list(self.by_body.items())
+        self._frames, self._bodies, self._rates, self.by_body = frames, bodies, rates, result
         return changed
 
     def _make_objects(self, model: ModelView, name: str, body: Body) -> Iterator[CollisionObject]:
@@ -183,7 +183,7 @@ def load_solids(objects: Iterable[CollisionObject]) -> list[Solid]:
             errors.append(error)
     if not errors:
         return solids
-    advice = "Mend the model, or leave such bodies out: Scene(model, leave_out=[...])."
+    advice = "Correct the model, or leave such bodies out: Scene(model, leave_out=[...])."
     if len(errors) == 1:
         raise type(errors[0])(f"{errors[0]} {advice}") from errors[0]
     lines = "\n".join(f"  {summarize_error(error, advice=False)}" for error in errors[:_MAX_LISTED])

@@ -51,16 +51,8 @@ class DistanceResult:
 
     def swap(self) -> DistanceResult:
         """Return the same result with a and b exchanged."""
-        return DistanceResult(
-            self.b,
-            self.a,
-            self.distance,
-            self.point_b,
-            self.point_a,
-            -self.normal,
-            self.shape_b,
-            self.shape_a,
-        )
+        points, shapes = (self.point_b, self.point_a), (self.shape_b, self.shape_a)
+        return DistanceResult(self.b, self.a, self.distance, *points, -self.normal, *shapes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +153,7 @@ class DistanceResults(Sequence[DistanceResult]):
     @property
     def shape_indices(self) -> Indices:
         """Indices (K, 2) of both shapes among the shapes of their bodies."""
-        return np.asarray(self._shape_numbers[self._object_indices])
+        return np.asarray(self._shape_numbers[self.object_indices])
 
     def __len__(self) -> int:
         return len(self.distances)
@@ -173,16 +165,10 @@ class DistanceResults(Sequence[DistanceResult]):
     def __getitem__(self, index: int | slice) -> DistanceResult | list[DistanceResult]:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
-        (a, b), shapes = self.body_indices[index].tolist(), self._shape_numbers[self._object_indices[index]]
-        return DistanceResult(
-            self._bodies[a],
-            self._bodies[b],
-            float(self.distances[index]),
-            self.points_a[index],
-            self.points_b[index],
-            self.normals[index],
-            *shapes.tolist(),
-        )
+        a, b = (self._bodies[k] for k in self.body_indices[index].tolist())
+        shapes = self._shape_numbers[self.object_indices[index]].tolist()
+        points = self.points_a[index], self.points_b[index]
+        return DistanceResult(a, b, float(self.distances[index]), *points, self.normals[index], *shapes)
 
     def __repr__(self) -> str:
         listed = "".join(f"\n  {pair}" for pair in self[:12])

@@ -24,7 +24,6 @@ from .distance_expressions import DistanceParameters, PairDistance, distance_exp
 from .distance_queries import (
     PairFlags,
     PreparedQuery,
-    find_pairs_within,
     flag_between,
     flag_matching,
     flag_pair,
@@ -35,7 +34,7 @@ from .mesh_files import Floats
 from .objects import Exclusion
 from .results import DistanceResult, DistanceResults, NearestPoint, RayHit
 
-_MAX_QUERIES, _MAX_PAIR_QUERIES = 32, 256
+_MAX_QUERIES, _MAX_PAIR_QUERIES, _SAMPLES = 32, 256, 200
 
 
 class Scene:
@@ -207,12 +206,12 @@ class Scene:
         InvalidValueError
             If the radius is negative or NaN.
         """
-        names, own = (one, other), parse_known_rules(rules, self.model)
+        names, added = (one, other), parse_known_rules(rules, self.model)
         symbols = None if moving is None else _as_list(moving)
 
         def choose() -> PairFlags:
             bodies = self.bodies
-            wanted = apply_rules(self._world.table.allowed, bodies, own)
+            wanted = apply_rules(self._world.table.allowed, bodies, added)
             wanted *= flag_between(*(flag_matching(bodies, each) for each in names))
             return wanted if symbols is None else wanted * flag_relatively_moving(self.model, bodies, symbols)
 
@@ -293,7 +292,8 @@ class Scene:
         InvalidValueError
             If there are no states.
         """
-        return except_never_within(self._world, states, margin)
+        counts, number = self._count_within(states, margin)
+        return self._except(counts == 0, f"never within {margin:g} m at {number} states")
 
     @one_at_a_time
     def find_always_colliding(
@@ -305,7 +305,43 @@ class Scene:
         errors and the meaning see :meth:`find_never_colliding`. Of a single state, such as the default one,
         these are the pairs that overlap there.
         """
-        return except_always_within(self._world, states, margin)
+        counts, number = self._count_within(states, margin)
+        return self._except(counts == number, f"within {margin:g} m at all of {number} states")
+
+    def _except(self, chosen: npt.NDArray[np.bool_], why: str) -> tuple[Rule, ...]:
+        bodies, allowed = self._world.bodies, self._world.table.allowed
+        pairs = np.argwhere(np.tril(allowed * chosen)).tolist()
+        return tuple(Rule(bodies[b], bodies[a], False, why) for a, b in pairs)
+
+    def _count_within(
+        self, states: Iterable[StateLike] | None, margin: float
+    ) -> tuple[npt.NDArray[np.int64], int]:
+        """Count the states at which pairs of bodies, (B, B) below the diagonal, are within a margin; and all.
+
+        By default, states are sampled within limits; a state at which a loop does not close is left out.
+        """
+        world = self._world
+        world.synchronize()
+        sampled: Iterable[Floats] = ()
+        if states is None:
+            samples = StateSamples(world.model, count=_SAMPLES)
+            columns = [np.zeros(samples.size), *map(samples.values_of, world.inputs)]
+            sampled = np.stack(columns, axis=1)[:, 1:]
+        counts, number = np.zeros((len(world.bodies),) * 2, dtype=np.int64), 0
+        for state in sampled if states is None else states:
+            try:
+                world.update(state)
+            except NoSolutionError:
+                if states is None:
+                    continue
+                raise
+            near = distance_queries.find_pairs_within(world, margin).body_indices
+            # The first body of each result precedes the second.
+            counts[near[:, 1], near[:, 0]] += 1
+            number += 1
+        if not number:
+            raise InvalidValueError("Pairs that touch never or always are found at states; there is none.")
+        return counts, number
 
     # -- rays and points -----------------------------------------------------------------------------------
 
@@ -383,61 +419,3 @@ class Scene:
 
 def _as_list(symbols: Symbol | str | Iterable[Symbol | str]) -> list[Symbol | str]:
     return [symbols] if isinstance(symbols, Symbol | str) else list(symbols)
-
-
-_SAMPLED = 200
-
-
-def except_never_within(
-    world: CollisionWorld, states: Iterable[StateLike] | None, margin: float
-) -> tuple[Rule, ...]:
-    """Return rules that except the checked pairs that are within a margin [m] at no state."""
-    counts, states_count = _count_within(world, states, margin)
-    return _make_rules(world, counts == 0, f"never within {margin:g} m at {states_count} states")
-
-
-def except_always_within(
-    world: CollisionWorld, states: Iterable[StateLike] | None, margin: float
-) -> tuple[Rule, ...]:
-    """Return rules that except the checked pairs that are within a margin [m] at every state."""
-    counts, states_count = _count_within(world, states, margin)
-    return _make_rules(world, counts == states_count, f"within {margin:g} m at all of {states_count} states")
-
-
-def _make_rules(world: CollisionWorld, chosen: npt.NDArray[np.bool_], why: str) -> tuple[Rule, ...]:
-    pairs = np.argwhere(np.tril(world.table.allowed * chosen)).tolist()
-    return tuple(Rule(world.bodies[b], world.bodies[a], False, why) for a, b in pairs)
-
-
-def _count_within(
-    world: CollisionWorld, states: Iterable[StateLike] | None, margin: float
-) -> tuple[npt.NDArray[np.int64], int]:
-    """Return the numbers of states at which pairs of bodies are within a margin, and that of all states.
-
-    The numbers of pairs, (B, B), are below the diagonal. If no states are given, they are sampled within
-    limits; a state at which a loop does not close is left out.
-    """
-    world.synchronize()
-    counts, number = np.zeros((len(world.bodies),) * 2, dtype=np.int64), 0
-    for state in _sample_inputs(world) if states is None else states:
-        try:
-            world.update(state)
-        except NoSolutionError:
-            if states is None:
-                continue
-            raise
-        near = find_pairs_within(world, margin).body_indices
-        # The first body of each result precedes the second.
-        counts[near[:, 1], near[:, 0]] += 1
-        number += 1
-    if not number:
-        raise InvalidValueError(
-            "Pairs that touch never or always are found by sampling states; none is given."
-        )
-    return counts, number
-
-
-def _sample_inputs(world: CollisionWorld) -> Floats:
-    """Return values of the world's inputs, the default ones first and then random ones within limits."""
-    samples = StateSamples(world.model, count=_SAMPLED)
-    return np.stack([np.zeros(samples.size), *map(samples.values_of, world.inputs)], axis=1)[:, 1:]

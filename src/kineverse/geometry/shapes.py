@@ -100,7 +100,7 @@ Primitive: TypeAlias = Box | Sphere | Cylinder | Capsule | Cone | Ellipsoid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hull:
-    """A convex polytope: the points x with ``normals @ x <= offsets``; (F, 3) and (F,) [m]."""
+    """Convex polytope: the points x with ``normals @ x <= offsets``; (F, 3) and (F,) [m]."""
 
     normals: Floats
     offsets: Floats
@@ -115,10 +115,13 @@ class Core:
     """
 
     half: Floats  # (3,) half edges of the box [m]
-    radius: float = 0.0  # radius of the ball [m]
-    radii: Floats = field(default_factory=lambda: np.zeros(3))  # (3,), [m]
-    corners: Floats = field(default_factory=lambda: np.empty((3, 0)))  # (3, n), [m]
-    tip: float = 0.0  # [m], (0, 0, tip)
+    radius: float = 0.0  # of the ball [m]
+    radii: Floats = field(
+        default_factory=lambda: np.zeros(3)
+    )  # of the ellipsoid; a disc if the last is 0 [m]
+    # (3, n) corners; the first is repeated until n is a multiple of 8. n = 0 for a core that is no hull [m].
+    corners: Floats = field(default_factory=lambda: np.empty((3, 0)))
+    tip: float = 0.0  # half the height of a cone between (0, 0, tip) and a disc at (0, 0, -tip) [m]
 
     @staticmethod
     def from_corners(points: Floats) -> Core:
@@ -132,13 +135,13 @@ class Core:
 class Solid:
     """Immutable shape for distance computation; equal geometries share one solid."""
 
-    engine: Any  # geometry of coal
-    surface: Primitive | Hull | Faces  # surface for ray casts: a primitive, a hull, or triangles
-    centre: Floats  # bounding box in the frame of the solid: (3,) centre and (3,) half edges [m]
+    engine: Any  # geometry of coal, which keeps pointers only: the solid outlives all functors made of it
+    surface: Primitive | Hull | Faces
+    centre: Floats  # (3,) centre and half edges of the bounding box [m]
     half: Floats
-    radius: float  # radius of the bounding sphere about centre [m]
-    stand_in: Any = None  # geometry of coal for pairs with a cylinder; None if that is engine
-    core: Core | None = None  # support description for our own GJK; None for triangles
+    radius: float  # of the bounding sphere about the centre [m]
+    stand_in: Any = None  # geometry of coal for pairs with a cylinder; None if that is the engine
+    core: Core | None = None  # None for triangles
 
     @property
     def is_convex(self) -> bool:
@@ -184,7 +187,8 @@ def scale_solid(solid: Solid, factor: float) -> Solid:
         made = _hull_solid(factor * solid.core.corners.T)
     else:
         assert not isinstance(solid.surface, Faces)
-        made = _of_primitive(_scale_primitive(solid.surface, factor))
+        sizes = [factor * size for size in _sizes(solid.surface)]
+        made = _of_primitive(_resize_primitive(solid.surface, sizes))
     return replace(made, radius=factor * solid.radius)
 
 
@@ -286,12 +290,7 @@ def _drop_degenerate(vertices: Floats, faces: Integers) -> Integers:
 
 
 def _solid_around(
-    engine: Any,
-    surface: Hull | Faces,
-    centre: Floats,
-    half: Floats,
-    points: Floats,
-    core: Core | None = None,
+    engine: Any, surface: Hull | Faces, centre: Floats, half: Floats, points: Floats, core: Core | None = None
 ) -> Solid:
     engine.computeLocalAABB()
     radius = float(np.linalg.norm(points - centre, axis=1).max())
@@ -344,10 +343,6 @@ SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
 """Smallest and largest size of a primitive; beyond them a size is taken for a mistake [m]."""
 
 
-def _scale_primitive(geometry: Primitive, factor: float) -> Primitive:
-    return _resize_primitive(geometry, [factor * size for size in _sizes(geometry)])
-
-
 def _resize_primitive(geometry: Primitive, sizes: Sequence[float]) -> Primitive:
     if isinstance(geometry, Box | Ellipsoid):
         x, y, z = sizes
@@ -371,10 +366,10 @@ def _sizes(geometry: Primitive) -> tuple[float, ...]:
 
 def solid_surface(solid: Solid) -> Faces | Primitive:
     """Return the surface of a solid: its primitive, or triangles that face outwards."""
-    return _hull_faces(solid.engine) if isinstance(solid.surface, Hull) else solid.surface
+    return hull_faces(solid.engine) if isinstance(solid.surface, Hull) else solid.surface
 
 
-def _hull_faces(convex: Any) -> Faces:
+def hull_faces(convex: Any) -> Faces:
     """Return the triangles of a ``coal.Convex``, counter-clockwise seen from outside."""
     vertices = np.array(convex.points())
     triangles = [convex.polygons(k) for k in range(convex.num_polygons)]

@@ -13,8 +13,7 @@ from kineverse.symbols import Symbol
 
 from .hand_model import bodies_with_shapes
 
-MOST_JOINTS = 3
-"""Most free coordinates of one finger."""
+MOST_JOINTS = 3  # most free coordinates of one finger
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +69,6 @@ def find_palms(model: ModelView, robot: str, srdf: Srdf | None = None) -> list[t
 
 
 def _parents_first(parents: Mapping[str, str]) -> Iterable[str]:
-    """Return frames with each after its parent."""
     done: dict[str, None] = {}
     for frame in parents:
         path = []

@@ -22,21 +22,15 @@ from .finger_branches import Branch, path_to_root
 from .hand_model import HandModel
 
 _SAMPLES = 33
-_NEAR = 4e-3
-"""Opening at which fingers count as nearly closed: their pads face each other there [m]."""
-_FLAT = 2e-3
-"""Unevenness of a pad [m]."""
+_NEAR = 4e-3  # opening at which fingers count as nearly closed: their pads face each other there [m]
+_FLAT = 2e-3  # unevenness of a pad [m]
 _CELLS = 14
-_REACH = 0.3
-"""Length of the rays from the middle to the pads [m]."""
-_ALIGNED = 0.85
-"""Cosine of the angle below which an axis is taken for the approach direction."""
-_SLOWER = 0.4
-"""Least motion of one finger against the other's; fingers that mirror each other have 1."""
+_REACH = 0.3  # length of the rays from the middle to the pads [m]
+_ALIGNED = 0.85  # cosine of the angle below which an axis is taken for the approach direction
+_SLOWER = 0.4  # least motion of one finger against the other's; fingers that mirror each other have 1
 _STILL_OPEN, _WIDEST = 0.45, 0.4
 """Largest gap of closed fingers as a part of that of open ones, and the largest gap at all [m]."""
-_LEAST_STROKE = 5e-3
-"""Least change of the gap of a gripper [m]."""
+_LEAST_STROKE = 5e-3  # least change of the gap of a gripper [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +44,7 @@ class Pads:
     size: tuple[float, float]  # lengths along x and z
     opened: Mapping[Symbol, float]  # values of the joints at both ends of the motion
     closed: Mapping[Symbol, float]
-    stroke: Array  # rows (n, 5)
+    stroke: Array  # (n, 5): part of the motion in [0, 1], gap [m], middle between the pads [m]
 
     def parts_at(self, gaps: Array) -> Array:
         """Return the parts of the motion at which the pads have gaps (n,) [m], or the nearest ends of it."""
@@ -106,7 +100,7 @@ def _find_pads(motion: _Motion, root: Array) -> tuple[Pads | None, str]:
         return None, "they do not move against each other"
     outwards = moved[0].mean(axis=0) - root
     if np.linalg.norm(np.cross(outwards, y)) < 1e-4:
-        return None, "nothing tells which way they point"
+        return None, "their direction is undetermined"
     x = _approach(motion, y, outwards)
     axes = lie.round_exact(np.stack([x, y, np.cross(x, y)], axis=1))
     return _measure(motion, axes, float(moved[0].mean(axis=0) @ y))
@@ -278,8 +272,8 @@ class _Motion:
 
     def nearest(self) -> DistanceResult:
         """Return the nearest pair of bodies at the tips of the two branches, the first one's first."""
-        found = self.scene.distances((f, g) for f in self.tips[0] for g in self.tips[1])
-        return min(found, key=lambda pair: pair.distance)
+        result = self.scene.distances((f, g) for f in self.tips[0] for g in self.tips[1])
+        return min(result, key=lambda pair: pair.distance)
 
     def track(self, frames: Sequence[str], points: Sequence[Array], parts: Iterable[float]) -> Array:
         """Return the positions (n, 2, 3) of points of two frames at parts of the motion."""

@@ -25,26 +25,19 @@ from .gripper_detection import Gripper
 from .hand_model import HandModel, bodies_with_shapes
 from .handles import Handle
 
-_RETREAT = 0.1
-"""Distance of the pose from which the hand approaches [m]."""
-_SLACK = 4e-3
-"""Gap of the pads minus the thickness of the bar, before the fingers touch [m]."""
-_MARGIN = 1e-3
-"""Least distance of the hand from the object before the fingers touch [m]."""
+_RETREAT = 0.1  # distance of the pose from which the hand approaches [m]
+_SLACK = 4e-3  # gap of the pads minus the thickness of the bar, before the fingers touch [m]
+_MARGIN = 1e-3  # least distance of the hand from the object before the fingers touch [m]
 _MOST_TILT, _MOST_TILT_OF_KNOB = math.radians(100), math.radians(20)
 """Largest angle about the bar: a hand that comes from the edge of a flap keeps its grasp while that opens."""
 _DEPTHS = (0.0, 0.5, 1.0, -0.5)
 """Parts of the depth of the pads at which a bar is tried first; 1 is at their tips."""
-_CANDIDATES = 6
-"""Candidates for each grasp that is asked for."""
-_NEAR = 0.6
-"""Distance from the bar up to which shapes are looked at [m]."""
-_REACH = 0.05
-"""Distance up to which the clearance of a grasp counts [m]."""
+_CANDIDATES = 6  # candidates for each grasp that is asked for
+_NEAR = 0.6  # distance from the bar up to which shapes are checked [m]
+_REACH = 0.05  # distance up to which the clearance of a grasp counts [m]
 _CLOSING, _AWAY = 14, np.array([0.1, 0.25, 0.5, 1.0])
-"""Number of gaps of fingers that close, and parts of the way to the pose before the approach."""
-_ADVANCES, _TOUCHING = 20, 1e-4
-"""Most steps in which fingers close, and the distance at which one touches [m]."""
+"""Number of gaps of fingers that close, and parts of the path to the pose before the approach."""
+_ADVANCES, _TOUCHING = 20, 1e-4  # most steps in which fingers close, and distance of a touch [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +96,7 @@ def sample_grasps(
     """Return grasps across a bar, without contact of the gripper with the object, the best first.
 
     Grasps differ in the angle about the bar, the place along it, the depth, and by half a turn about the
-    approach; around a knob also in the angle about its axis. The way from ``approach`` to ``pose`` and the
+    approach; around a knob also in the angle about its axis. The path from ``approach`` to ``pose`` and the
     closing fingers are free of collisions with everything that is not the robot's.
     Upright grasps at the middle of the bar and of the pads come first, of similar ones the clearer.
 
@@ -136,7 +129,7 @@ def sample_grasps(
             f"{gripper.hand} opens {gripper.width * 1e3:.0f} mm. find_handles and find_grippers list others."
         )
     surroundings = _Surroundings(model, gripper, handle, tuple(decomposed), state or model.default_state())
-    found: list[tuple[float, Grasp]] = []
+    result: list[tuple[float, Grasp]] = []
     hits: Counter[tuple[str, str]] = Counter()
     rng = np.random.default_rng(seed)
     for grasp, cost in _candidates(gripper, handle, surroundings.bar, _CANDIDATES * count, slant, rng):
@@ -150,13 +143,13 @@ def sample_grasps(
         clearance = surroundings.clearance(closed)
         # Edges of a bar that is not round spread the fingers, and hold it less well than its sides.
         cost += closed.thickness / handle.thickness - min(clearance, 0.02) / 0.02
-        found.append((cost, replace(closed, clearance=clearance)))
-        if len(found) == count:
+        result.append((cost, replace(closed, clearance=clearance)))
+        if len(result) == count:
             break
-    if not found:
+    if not result:
         raise InvalidValueError(_explain(gripper, handle, hits))
-    found.sort(key=lambda entry: entry[0])
-    return tuple(grasp for _, grasp in found)
+    result.sort(key=lambda entry: entry[0])
+    return tuple(grasp for _, grasp in result)
 
 
 def _candidates(
@@ -202,12 +195,7 @@ class _Surroundings:
     """Bodies around a handle, and a hand that is tried there, all in the frame of the handle."""
 
     def __init__(
-        self,
-        model: ModelView,
-        gripper: Gripper,
-        handle: Handle,
-        decomposed: tuple[str, ...],
-        state: State,
+        self, model: ModelView, gripper: Gripper, handle: Handle, decomposed: tuple[str, ...], state: State
     ) -> None:
         robot = _frames_of_robot(model, gripper)
         scene = Scene(model, leave_out=[f for f in model.bodies if f in robot], decomposed=decomposed)
@@ -222,7 +210,7 @@ class _Surroundings:
                 pieces.append(part)
         # Of a decomposed handle, the bar is the piece in its middle.
         if not pieces:
-            raise InvalidValueError(f"The model has no shape {handle.shape} of {handle.frame}: find it anew.")
+            raise InvalidValueError(f"{handle.frame} has no shape {handle.shape}: find the handle again.")
         bar = min(pieces, key=lambda part: float(np.linalg.norm(part.middle - middle)))
         self.bar = replace(bar, pose=frame_T_world @ bar.pose)
         obstacles = {}

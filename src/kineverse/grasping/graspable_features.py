@@ -1,4 +1,4 @@
-"""Convex parts of placed bodies, and bars among them: slim parts that stand out from what they are fixed to.
+"""Convex parts of placed bodies, and bars: thin parts that protrude from their parent body.
 
 All poses, points and directions are in the world [m].
 """
@@ -20,16 +20,11 @@ from kineverse.geometry.shapes import Solid, solid_from_geometry
 from kineverse.lie import Array, unit_vector
 from kineverse.model.body import Geometry, Mesh, Sphere
 
-MOST_THICK = 0.09
-"""Largest thickness of a bar [m]: hardly a gripper opens further."""
-_LONG = 1.5
-"""Length per width above which a part is a bar, and a knob below."""
-_FLAT, _WIDE = 3.0, 2.0
-"""Width per thickness from which on a part is a plate, and per width of what it carries, if it is a panel."""
-_STANDS_OUT = 3e-3
-"""Least length by which a bar stands out from what it is fixed to [m]."""
-_TOUCH = 2e-3
-"""Largest gap of parts that are fixed to each other [m]."""
+MOST_THICK = 0.09  # largest thickness of a bar [m]: hardly a gripper opens further
+_LONG = 1.5  # length per width above which a part is a bar, and a knob below
+_FLAT, _WIDE = 3.0, 2.0  # width by thickness of a plate, width of a panel by that of what it carries
+_STANDS_OUT = 3e-3  # least length by which a bar stands out from what it is fixed to [m]
+_TOUCH = 2e-3  # largest gap of parts that are fixed to each other [m]
 _STEPS = 144
 
 
@@ -128,12 +123,12 @@ def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBa
     for cluster in _clusters([part for part in link if part.is_slim and part is not panel]):
         inside = {id(part) for part in cluster}
         rest = [part for part in link if id(part) not in inside]
-        found = [bar for part in cluster if (bar := _bar(part, cluster, rest, around))]
-        if found:
+        result = [bar for part in cluster if (bar := _bar(part, cluster, rest, around))]
+        if result:
             # The bar between its mounts, and not a mount, whichever stands out further.
-            found = [bar for bar in found if not bar.is_knob] or found
-            furthest = max(bar.stands_out for bar in found)
-            outer = [bar for bar in found if bar.stands_out > furthest - _STANDS_OUT]
+            result = [bar for bar in result if not bar.is_knob] or result
+            furthest = max(bar.stands_out for bar in result)
+            outer = [bar for bar in result if bar.stands_out > furthest - _STANDS_OUT]
             bars.append(max(outer, key=lambda bar: float(bar.part.size[0])))
     return bars
 
@@ -149,7 +144,6 @@ def _find_panel(link: Sequence[Part]) -> Part | None:
 
 
 def _clusters(parts: Sequence[Part]) -> list[tuple[Part, ...]]:
-    """Return the connected components of parts that touch."""
     left, clusters = list(parts), []
     while left:
         cluster = [left.pop(0)]
@@ -166,10 +160,10 @@ def _bar(
 ) -> ProtrudingBar | None:
     # A part that moves alone is fixed to something of another link, each of what it touches is tried.
     fixtures = [rest] if rest else [[other] for other in _fixed_to(part, around)]
-    found = [_stand_out(part, fixture) for fixture in fixtures]
-    if not found:
+    result = [_stand_out(part, fixture) for fixture in fixtures]
+    if not result:
         return None
-    stands_out, x, is_knob = max(found, key=lambda entry: entry[0])
+    stands_out, x, is_knob = max(result, key=lambda entry: entry[0])
     if stands_out < _STANDS_OUT:
         return None
     along = [axis - (axis @ x) * x for axis in part.axes.T if abs(axis @ x) < 0.5]

@@ -20,8 +20,7 @@ from .finger_branches import Branch, Palm, find_palms, hand_frame, path_to_root
 from .fingertip_geometry import Pads, find_pads, reaches_pads
 from .hand_model import HandModel, bodies_with_shapes, usable_bodies
 
-_TYPICAL = 0.015
-"""Thickness of a bar for which the grasp pose is given [m]."""
+_TYPICAL = 0.015  # thickness of a bar for which the grasp pose is given [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,20 +115,20 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
     UnknownNameError
         If the robot has no gripper, or none at this frame; the message lists the grippers.
     """
-    found, why = _search(model, robot, srdf)
+    result, why = _search(model, robot, srdf)
     name = f"The robot '{robot}'" if robot else "The model"
-    if not found:
+    if not result:
         if hand is not None:
             model.fk(hand)  # raises for an unknown frame
         reasons = "".join(f"\n  {line}" for line in why) or " None of its links carries two moving branches."
         raise UnknownNameError(f"{name} has no gripper with two opposed fingers.{reasons}")
     if hand is None:
-        return found[0]
-    for gripper in found:
+        return result[0]
+    for gripper in result:
         near = hand in model.frames and not model.speeds_of(hand, gripper.hand)
         if hand in (gripper.hand, *gripper.bodies) or near:
             return gripper
-    listed = ", ".join(repr(gripper.hand) for gripper in found)
+    listed = ", ".join(repr(gripper.hand) for gripper in result)
     raise UnknownNameError(f"{name} has no gripper at '{hand}'. Its grippers are at: {listed}.")
 
 
@@ -141,7 +140,7 @@ def _search(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Grip
 
 
 def _search_anew(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Gripper, ...], list[str]]:
-    found: list[tuple[tuple[float, ...], Gripper]] = []
+    result: list[tuple[tuple[float, ...], Gripper]] = []
     why: list[str] = []
     for rank, palm in find_palms(model, robot, srdf):
         reasons = list(palm.refused)
@@ -150,12 +149,12 @@ def _search_anew(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple
             if gripper is not None:
                 # The hand at the default state, as the robot sees it: y points to the left.
                 place = np.asarray(model.fk(gripper.hand)(model.default_state()))[:3, 3]
-                found.append(((rank, -round(gripper.width, 4), round(float(place[1]), 4)), gripper))
+                result.append(((rank, -round(gripper.width, 4), round(float(place[1]), 4)), gripper))
                 continue
         more = [f"and {len(reasons) - _MOST_LISTED} more"] if len(reasons) > _MOST_LISTED else []
         why.append(f"At {palm.root}: {'; '.join(reasons[:_MOST_LISTED] + more)}.")
-    found.sort(key=lambda entry: entry[0])
-    return tuple(gripper for _, gripper in found), why
+    result.sort(key=lambda entry: entry[0])
+    return tuple(gripper for _, gripper in result), why
 
 
 def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> Gripper | None:
@@ -216,11 +215,9 @@ def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> 
 
 
 _MOST_LISTED = 6
-_LARGEST = 0.5
-"""Diagonal of the box around a finger that is too large for one [m]."""
+_LARGEST = 0.5  # diagonal of the box around a finger that is too large for one [m]
 
-_STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))
-"""Ball at the origin of a frame, in place of shapes that cannot be read."""
+_STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))  # for shapes that cannot be read
 
 
 def _reach(pads: Pads) -> float:

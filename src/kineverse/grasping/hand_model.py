@@ -68,14 +68,18 @@ class HandModel:
 
     def box_corners(self, frames: Iterable[str]) -> Array:
         """Return the corners (n, 3) of the boxes around the shapes of placed bodies, in the world [m]."""
-        wanted, found = set(frames), []
-        for item in self.scene.collision_world.objects:
-            if item.body in wanted:
-                solid = item.make_solid()
-                corners = solid.centre + _SIGNS * solid.half
-                pose = self.scene.pose(item.body) @ item.shape.origin.matrix
-                found.append(corners @ pose[:3, :3].T + pose[:3, 3])
-        return np.concatenate(found)
+        return find_box_corners(self.scene, frames)
+
+
+def find_box_corners(scene: Scene, frames: Iterable[str]) -> Array:
+    """Return the corners (n, 3) of the boxes around the shapes of bodies in a scene, in the world [m]."""
+    wanted, result = set(frames), []
+    for item in scene.collision_world.objects:
+        if item.body in wanted:
+            solid = item.make_solid()
+            pose = scene.pose(item.body) @ item.shape.origin.matrix
+            result.append((solid.centre + _SIGNS * solid.half) @ pose[:3, :3].T + pose[:3, 3])
+    return np.concatenate(result)
 
 
 _SIGNS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T

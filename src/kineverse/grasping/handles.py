@@ -21,11 +21,9 @@ from kineverse.symbols import Symbol
 from .finger_branches import path_to_root
 from .graspable_features import Part, ProtrudingBar, find_bars, find_parts, free_length
 
-_FREE = 0.15
-"""Free space in front of a bar that a hand needs [m]."""
+_FREE = 0.15  # free space in front of a bar that a hand needs [m]
 _PART_OF_RANGE = 0.05
-_WITHIN = 0.5
-"""Cosine above which a bar points along the opening motion, and below minus which it points inside."""
+_WITHIN = 0.5  # cosine above which a bar points along the opening motion, or inside below minus it
 _PLACES = 9
 
 
@@ -100,11 +98,7 @@ def find_handles(
 
 
 def find_handle(
-    model: ModelView,
-    coordinate: Symbol | str,
-    frame: str | None = None,
-    *,
-    decomposed: Iterable[str] = (),
+    model: ModelView, coordinate: Symbol | str, frame: str | None = None, *, decomposed: Iterable[str] = ()
 ) -> Handle:
     """Return the best handle that a coordinate moves, or the one at a frame.
 
@@ -113,17 +107,17 @@ def find_handle(
     UnknownNameError
         If there is none; the message says which bodies the coordinate moves and why none is a handle.
     """
-    found, why = _search(model, coordinate, decomposed)
+    result, why = _search(model, coordinate, decomposed)
     if frame is not None:
         model.fk(frame)  # raises for an unknown frame
-        at = [handle for handle in found if handle.frame == frame]
-        if found and not at:
-            listed = ", ".join(repr(handle.frame) for handle in found)
+        at = [handle for handle in result if handle.frame == frame]
+        if result and not at:
+            listed = ", ".join(repr(handle.frame) for handle in result)
             raise UnknownNameError(f"'{coordinate}' moves no handle at '{frame}'. Its handles: {listed}.")
-        found = tuple(at)
-    if not found:
+        result = tuple(at)
+    if not result:
         raise UnknownNameError(f"'{coordinate}' moves no handle. {why}")
-    return found[0]
+    return result[0]
 
 
 def _search(
@@ -166,12 +160,12 @@ def _search_anew(
         for bar in find_bars(body, around):
             before, after = poses[bar.part.body], shifts[bar.part.body]
             shift = (after @ lie.inverse(before) @ np.append(bar.part.middle, 1.0))[:3] - bar.part.middle
-            way = float(np.linalg.norm(shift))
-            along = float(bar.rotation[:, 0] @ shift) / max(way, 1e-6) if is_known else 0.0
+            distance = float(np.linalg.norm(shift))
+            along = float(bar.rotation[:, 0] @ shift) / max(distance, 1e-6) if is_known else 0.0
             if along < -_WITHIN or not _is_free(bar, body, around):
                 continue
             handle = _make_handle(model, symbol, bar, before, body, around)
-            rated.append((link not in own, along < _WITHIN, -round(way, 4), handle.thickness, handle))
+            rated.append((link not in own, along < _WITHIN, -round(distance, 4), handle.thickness, handle))
     rated.sort(key=lambda row: row[:4])
     why = f"It moves {_listed([f for f in moved if f in scene.bodies])}: no slim shape of these stands out, "
     why += "with free space in front of it."

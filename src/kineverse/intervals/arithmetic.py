@@ -163,10 +163,6 @@ def interval_polynomial(coefficients: tuple[float, ...], a: RealInterval) -> Rea
     return result
 
 
-def _number(x: float, otherwise: float) -> float:
-    return otherwise if math.isnan(x) else x
-
-
 def _pow(x: float, y: float) -> float:
     try:
         return math.pow(x, y)
@@ -183,9 +179,10 @@ def _ends(function: Callable[[float], float], a: RealInterval) -> RealInterval:
 
 def _at(function: Callable[[float], float], x: float, otherwise: float) -> float:
     try:
-        return _number(function(x), otherwise)
+        value = function(x)
     except (OverflowError, ValueError):
         return otherwise
+    return otherwise if math.isnan(value) else value
 
 
 def _cosine(a: RealInterval, peak: float) -> RealInterval:

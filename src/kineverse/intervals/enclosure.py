@@ -151,7 +151,7 @@ class _Solver:
         return [tuple(u) for u in unknowns]
 
     def _find_box(self, inputs: list[RealInterval]) -> _Box | None:
-        """Return a box with one solution for each input, Y, and β/(1 - β) with β = |1 - Y ∂r/∂x|.
+        """Return a box with one solution for each input, Y, and β/(1 - β) with ``β = |1 - Y ∂r/∂x|``.
 
         The box is centred on the tangent D at the middle m, which is far closer to the solution than x is.
         The residual along it is r(x, m) + (∂r/∂u + ∂r/∂x D)(u - m).
@@ -286,7 +286,7 @@ def _step(term: Term, args: list[TaylorSeries]) -> TaylorSeries:
 
 
 def _enclose_truth(excess: RealInterval, contrast: float) -> RealInterval:
-    """Return the range of (1 + tanh(x·R))/2, which is 0 or 1 to the last bit from |x|·R = 20 on."""
+    """Return the range of (1 + tanh(x·R))/2, which is 0 or 1 to the last bit from ``|x|·R = 20`` on."""
     low, high = interval_unary(ca.OP_TANH, (excess[0] * contrast, excess[1] * contrast))
     return (
         1.0 if excess[0] * contrast >= SATURATED else max(0.0, math.nextafter((1 + low) / 2, -math.inf)),
@@ -314,13 +314,13 @@ def _piecewise(
     starts = knots[:-1] if periodic else (knots[0], *knots)
     begins = knots[:-1] if periodic else (-math.inf, *knots)
     ends = knots[1:] if periodic else (*knots, math.inf)
-    found: TaylorSeries | None = None
+    result: TaylorSeries | None = None
     for piece, start, begin, end in zip(pieces, starts, begins, ends, strict=True):
         if begin <= high and low <= end:
             inside: RealInterval = (max(low, begin), min(high, end))
             here = taylor_polynomial(piece, taylor_subtract((inside, *x[1:]), taylor_constant(start)))
-            found = here if found is None else taylor_hull(found, here)
-    return _UNKNOWN if found is None else found
+            result = here if result is None else taylor_hull(result, here)
+    return _UNKNOWN if result is None else result
 
 
 _PIECES = {1: 64, 2: 8, 3: 4}
@@ -337,18 +337,18 @@ def enclose_bound(bound: Expression, box: Mapping[Symbol, RealInterval]) -> Real
     symbols = [s for s in bound.symbols if s.value is None]
     sides = [box.get(s, REALS) for s in symbols]
     count = _PIECES.get(len(symbols), 1)
-    found: RealInterval | None = None
+    result: RealInterval | None = None
     for piece in product(*(_divide(side, count) for side in sides)):
         (((low, high), *_),) = enclosures.enclose(
             [root], {s: (x,) for s, x in zip(symbols, piece, strict=True)}
         )
         here = -math.inf if math.isnan(low) else low, math.inf if math.isnan(high) else high
-        found = here if found is None else interval_hull(found, here)
-        if found == REALS:
+        result = here if result is None else interval_hull(result, here)
+        if result == REALS:
             break
-    assert found is not None
+    assert result is not None
     # Enclosures are rounded outwards by single digits, which nobody wants to see.
-    return float(f"{found[0]:.14g}"), float(f"{found[1]:.14g}")
+    return float(f"{result[0]:.14g}"), float(f"{result[1]:.14g}")
 
 
 def _divide(side: RealInterval, count: int) -> list[RealInterval]:

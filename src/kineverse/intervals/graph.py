@@ -44,9 +44,9 @@ _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """An operation (by CasADi's number, or a name) on other terms."""
+    """Operation (by CasADi's number, or a name) on other terms."""
 
-    index: int  # number of the term; arguments have smaller ones
+    index: int  # arguments have smaller ones
     op: int | str
     args: tuple[Term, ...]
     data: Any = None  # number of a constant, a symbol, a contrast, or a node
@@ -56,8 +56,8 @@ class Term:
 class TermGraph:
     """The terms of one or more expressions."""
 
-    def __init__(self, given: Mapping[Symbol, float]) -> None:
-        self._given = given
+    def __init__(self, constants: Mapping[Symbol, float]) -> None:
+        self._given = constants
         self._known: dict[Any, Term] = {}
         self._node_terms: dict[Node, list[Term]] = {}
 
@@ -198,11 +198,11 @@ def _formula(node: Node) -> Expression:
 
 def reachable_terms(roots: tuple[Term, ...]) -> list[Term]:
     """Return the arguments and deciders of terms, theirs, and so on, arguments first."""
-    found: dict[int, Term] = {}
+    result: dict[int, Term] = {}
     stack = list(roots)
     while stack:
         term = stack.pop()
-        if term.index not in found:
-            found[term.index] = term
+        if term.index not in result:
+            result[term.index] = term
             stack += [*term.args, *term.deciders]
-    return [found[index] for index in sorted(found)]
+    return [result[index] for index in sorted(result)]

@@ -201,8 +201,7 @@ def _weighted(
     total = ZERO_INTERVAL
     for i in range(1, k + last):
         total = interval_add(
-            total,
-            interval_multiply((float(i), float(i)), interval_multiply(a[i], b[k - i])),
+            total, interval_multiply((float(i), float(i)), interval_multiply(a[i], b[k - i]))
         )
     return total
 

@@ -36,7 +36,7 @@ Estimates and controllers overstep limits."""
 class InputDomain:
     """Domain of one input: limits, or a full revolution."""
 
-    lower: float  # limits [m] or [rad]
+    lower: float  # [m] or [rad]
     upper: float
     whole: bool = False  # True for an angle without limits
 
@@ -100,10 +100,10 @@ class InputDomain:
 class BranchGuess:
     """Fitted guess: Σ coefficient · product of basis functions, plus a linear term in periodic inputs."""
 
-    intervals: tuple[InputDomain, ...]  # domain of each input, shape (k,)
-    degree: int  # degree of the basis functions in each input
-    coefficients: Array  # one column for each unknown, shape (P, n)
-    winding: Array  # slopes of the unknowns over periodic inputs, shape (k, n)
+    intervals: tuple[InputDomain, ...]  # (k,), of the inputs
+    degree: int  # of the basis functions in each input
+    coefficients: Array  # (P, n), a column for each unknown
+    winding: Array  # (k, n) slopes of the unknowns over periodic inputs
 
     @staticmethod
     def fit(
@@ -158,16 +158,16 @@ def _evaluate_products(inputs: Array, intervals: Sequence[InputDomain], degree: 
 def list_products(intervals: Sequence[InputDomain], degree: int) -> list[tuple[int, ...]]:
     """Return the index of the basis function of each input for each product."""
     most = degree if len(intervals) > FEW else degree * len(intervals)
-    found: list[tuple[tuple[int, ...], int]] = [((), 0)]
+    result: list[tuple[tuple[int, ...], int]] = [((), 0)]
     for interval in intervals:
         orders = interval.orders(degree)
-        found = [
+        result = [
             ((*which, i), total + order)
-            for which, total in found
+            for which, total in result
             for i, order in enumerate(orders)
             if total + order <= most
         ]
-    return [which for which, _ in found]
+    return [which for which, _ in result]
 
 
 _SAMPLES = {1: 65, 2: 17, 3: 9}
@@ -241,7 +241,7 @@ class BranchSamples:
                 format_point(self.equations.inputs, end, named=False),
             )
             raise NoSolutionError(
-                f"Loop '{self.name}' does not close on the way to {to}: it ends, or is singular, at {at}. "
+                f"Loop '{self.name}' does not close between home and {to}: it ends, or is singular, at {at}. "
                 "Narrow the limits, or the loop's within={...}, so that it closes everywhere."
             )
         return reached.solution
@@ -298,7 +298,6 @@ def format_point(symbols: Sequence[Symbol], values: Array, named: bool = True) -
 
 
 def _corners(intervals: Sequence[InputDomain], generator: np.random.Generator) -> Array:
-    """Return the corners of a box, or a random selection of many."""
     ends = np.array([(i.lower, i.upper) for i in intervals]).reshape(-1, 2)
     if len(ends) <= _MOST_CORNERED:
         return _grid(list(ends))

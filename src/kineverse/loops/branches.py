@@ -31,7 +31,7 @@ def find_branches(
     # Equal starts in every process, so that branches have equal numbers everywhere.
     generator = np.random.default_rng(0)
     starts = [near, *(near + generator.uniform(-1, 1, (_TRIES, len(near))) * reach)]
-    found: list[Array] = []
+    result: list[Array] = []
     smallest = np.inf
     for start in starts:
         x, gap = equations.close(start, u, 60)
@@ -46,14 +46,14 @@ def find_branches(
             continue
         turns = np.where(angles, np.round((x - near) / (2 * np.pi)), 0.0)
         x = x - 2 * np.pi * turns
-        if all(_distance(x, other, angles) > _SAME for other in found):
-            found.append(x)
-    if found:
+        if all(_distance(x, other, angles) > _SAME for other in result):
+            result.append(x)
+    if result:
         # Mirror images are equally near, and rounding, which processors do differently, must not number them.
-        keys = [np.linalg.norm(np.array(found) - near, axis=1), *-np.array(found).T]
+        keys = [np.linalg.norm(np.array(result) - near, axis=1), *-np.array(result).T]
         order = np.lexsort([_rank_distinct(key) for key in reversed(keys)])
-        found = [found[k] for k in order]
-    return found, float(smallest)
+        result = [result[k] for k in order]
+    return result, float(smallest)
 
 
 def _rank_distinct(values: Array) -> npt.NDArray[np.intp]:
@@ -99,7 +99,7 @@ class ContinuationResult:
     """Result of a continuation."""
 
     solution: Array  # unknowns at the last point
-    part: float  # completed fraction of the path, 1 for all of it
+    part: float  # completed fraction of the path
 
 
 def continue_solution(
@@ -121,17 +121,17 @@ def continue_solution(
         tangent = -least_squares(by_x, by_u @ direction)
         predicted = x + step * tangent
         u = start + (done + step) * direction
-        found, gap = equations.close(predicted, u, 8)
-        moved = float(np.linalg.norm(found - x))
-        wrong = float(np.linalg.norm(found - predicted))
+        result, gap = equations.close(predicted, u, 8)
+        moved = float(np.linalg.norm(result - x))
+        wrong = float(np.linalg.norm(result - predicted))
         near = gap < CLOSURE_TOLERANCE and wrong <= 0.1 * max(moved, 1e-6) + 1e-9
         # Near a singularity the tangent is unreliable, but such short steps stay on the branch.
         if near or (step <= _SHORTEST and gap < CLOSURE_TOLERANCE and wrong < 0.05):
-            _, next_by_x, next_by_u = equations(found, u)
+            _, next_by_x, next_by_u = equations(result, u)
             if step == 1.0 and _change(by_x, next_by_x) > _LITTLE:
                 step = FIRST_STEP
                 continue
-            x, done, by_x, by_u = found, done + step, next_by_x, next_by_u
+            x, done, by_x, by_u = result, done + step, next_by_x, next_by_u
             step *= 2 if near else 1
         elif step > _SHORTEST:
             step /= 2

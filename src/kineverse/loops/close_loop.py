@@ -140,7 +140,7 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
         # Coordinates with free speeds of their own cannot be dependent, so they come first.
         coordinates.sort(key=lambda s: model.carry(s) is s)
         by_name = {str(s): s for s in coordinates}
-        limits = {s: found for s in coordinates if (found := self._limits(model, s)) is not None}
+        limits = {s: result for s in coordinates if (result := self._limits(model, s)) is not None}
         limits.update({by_name[n]: (a, b) for n, a, b in self._known(self.within, by_name)})
         home = {s: s.value or 0.0 for s in residual.symbols}
         for s in coordinates:
@@ -309,10 +309,10 @@ class LoopConstraint(Operation, document_kind="LoopConstraint"):
                 f"Loop '{self.name}' cannot move: nothing changes what its mask names between '{frame}' and "
                 f"'{to}'."
             )
-        found = {f"{name}/{axis}": Constraint.from_expressions(0.0, rows[axis], 0.0) for axis in moving}
+        result = {f"{name}/{axis}": Constraint.from_expressions(0.0, rows[axis], 0.0) for axis in moving}
         if any(abs(float(row)) > APART for axis, row in alone.items() if axis not in moving):
-            found[f"{name}/apart"] = Constraint.from_expressions(0.0, norm(array(list(rows.values()))), 0.0)
+            result[f"{name}/apart"] = Constraint.from_expressions(0.0, norm(array(list(rows.values()))), 0.0)
         for k, sign in enumerate(upright_signs(pose, self.mask)):
             if model.resolve(sign).symbols:
-                found[f"{name}/upright{k or ''}"] = Constraint.from_expressions(0.0, sign, math.inf)
-        return found
+                result[f"{name}/upright{k or ''}"] = Constraint.from_expressions(0.0, sign, math.inf)
+        return result

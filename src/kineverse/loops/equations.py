@@ -19,23 +19,23 @@ from kineverse.symbols import Symbol
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-def as_mask(given: Any, name: str) -> tuple[str, ...]:
+def as_mask(value: Any, name: str) -> tuple[str, ...]:
     """Convert a mask, a sequence or text of distinct names out of :data:`AXES`, to a tuple."""
-    mask = tuple(given) if isinstance(given, list | tuple | str) else ()
+    mask = tuple(value) if isinstance(value, list | tuple | str) else ()
     if not mask or not all(axis in AXES for axis in mask) or len(set(mask)) < len(mask):
         raise InvalidValueError(
-            f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {given!r}."
+            f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {value!r}."
         )
     return mask
 
 
-def as_ends(given: Any, name: str) -> tuple[tuple[str, str], ...]:
+def as_ends(value: Any, name: str) -> tuple[tuple[str, str], ...]:
     """Convert further pairs of frames to tuples."""
-    pairs = tuple(given) if isinstance(given, list | tuple) else (given,)
+    pairs = tuple(value) if isinstance(value, list | tuple) else (value,)
     for pair in pairs:
         if not isinstance(pair, list | tuple) or [type(end) for end in pair] != [str, str]:
             raise InvalidValueError(
-                f"Loop '{name}' takes more=((frame, to), ...), pairs of names of frames, not {given!r}."
+                f"Loop '{name}' takes more=((frame, to), ...), pairs of names of frames, not {value!r}."
             )
     return tuple((frame, to) for frame, to in pairs)
 
@@ -82,7 +82,7 @@ MOST_EFFORT = 150_000.0
 class WorkBudget:
     """Budget of work for the analysis of a loop, independent of machine and process."""
 
-    name: str  # name of the loop
+    name: str  # of the loop
     left: float = MOST_EFFORT  # remaining work; an evaluation of a few equations is 1
 
     def spend(self, amount: float) -> None:

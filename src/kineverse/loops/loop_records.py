@@ -23,9 +23,9 @@ class LoopRecord:
 
     name: str
     ends: tuple[tuple[str, str], ...]  # pairs of frames (frame, to) that coincide in the axes of the mask
-    mask: tuple[str, ...]  # names out of x y z rx ry rz
-    free: tuple[str, ...]  # names of the free
-    dependent: tuple[str, ...]  # of the dependent coordinates
+    mask: tuple[str, ...]  # some of x y z rx ry rz
+    free: tuple[str, ...]  # coordinates
+    dependent: tuple[str, ...]
     constraints: tuple[str, ...] = ()
 
 
@@ -34,23 +34,16 @@ def make_loop_record(
 ) -> Articulation:
     """Return the record of a loop with dependent coordinates."""
     frame, to = ends[0]
-    return Articulation(
-        SOLVED_LOOP,
-        to,
-        frame,
-        dynamics=(
-            ("free", tuple(map(str, closed.free))),
-            ("dependent", tuple(map(str, closed.dependent))),
-            ("ends", ends),
-            ("mask", mask),
-            ("mobility", closed.mobility),
-            ("branches", closed.branches),
-            ("branch", closed.branch),
-            ("condition", closed.condition),
-            ("worst at", closed.worst),
-            ("domain", closed.function.domain),
-        ),
-    )
+    facts = {
+        "free": tuple(map(str, closed.free)),
+        "dependent": tuple(map(str, closed.dependent)),
+        "ends": ends,
+        "mask": mask,
+        **{name: getattr(closed, name) for name in ("mobility", "branches", "branch", "condition")},
+        "worst at": closed.worst,
+        "domain": closed.function.domain,
+    }
+    return Articulation(SOLVED_LOOP, to, frame, dynamics=tuple(facts.items()))
 
 
 def make_constrained_record(

@@ -136,54 +136,49 @@ def solve_loop(
     spans = np.array([max(map(abs, limits.get(s, (np.pi,)))) for s in followers])
     reach = np.where(angles, np.pi, np.where(np.isfinite(spans), spans, np.pi) + 1.0)
     stands = None if upright is None else compile(upright, [*followers, *inputs], tier="interpreter")
-    found, gap = find_branches(equations, x, u, angles, reach, stands)
+    result, gap = find_branches(equations, x, u, angles, reach, stands)
     where = format_point(free, u[: len(free)]) or "all configurations"
-    if not found:
+    if not result:
         raise NoSolutionError(
             f"Loop '{name}' does not close at {where}: {gap:.6g} is left between its ends. "
             "Begin where it does, with home={...}."
         )
-    if not 0 <= branch < len(found):
+    if not 0 <= branch < len(result):
         raise NoSolutionError(
-            f"Loop '{name}' has {len(found)} branches at {where}, numbered from 0, and none is {branch}."
+            f"Loop '{name}' has {len(result)} branches at {where}, numbered from 0, and none is {branch}."
         )
     intervals = [
         _interval(name, s, limits.get(s), bool(turns)) for s, turns in zip(free, goes_round, strict=False)
     ]
-    sampled, seed, steps, rows = _fit_guess(name, equations, intervals, found[branch], u, angles)
+    sampled, seed, steps, rows = _fit_guess(name, equations, intervals, result[branch], u, angles)
     if parameters:
         # The guess is fitted for one value of the parameters only, so others need more steps.
         steps += _MORE_STEPS
     domain = (*map(_domain, seed.intervals), *((-np.inf, np.inf) for _ in parameters))
     function = ImplicitFunction(name, followers, inputs, residual, rows, seed.expression(free), steps, domain)
     return SolvedLoop(
-        function, free, followers, len(coordinates) - rank, len(found), branch,
+        function, free, followers, len(coordinates) - rank, len(result), branch,
         sampled.condition, tuple(sampled.worst.tolist()),
     )  # fmt: skip
 
 
-def _rank(equations: Equations, x: Array, given: Array) -> int:
+def _rank(equations: Equations, x: Array, inputs: Array) -> int:
     """Return the generic rank of ∂r/∂q: the largest near a closed configuration, which may be singular."""
     generator = np.random.default_rng(0)
     most = 0
     for scale in (0.0, 0.0, 1e-3, 1e-2, 0.05, 0.1, 0.2):
-        near, gap = equations.close(x + scale * generator.uniform(-1, 1, len(x)), given, 60)
+        near, gap = equations.close(x + scale * generator.uniform(-1, 1, len(x)), inputs, 60)
         if gap < CLOSURE_TOLERANCE:
-            values = np.linalg.svd(equations(near, given)[1], compute_uv=False)
+            values = np.linalg.svd(equations(near, inputs)[1], compute_uv=False)
             most = max(most, int((values > RANK * max(values.max(initial=0.0), _SMALL)).sum()))
     return most
 
 
 def _choose_dependent(
-    name: str,
-    equations: Equations,
-    x: Array,
-    given: Array,
-    rank: int,
-    dependent: Sequence[Symbol] | None,
+    name: str, equations: Equations, x: Array, inputs: Array, rank: int, dependent: Sequence[Symbol] | None
 ) -> tuple[Symbol, ...]:
-    """Return the dependent coordinates: the given ones, or the last possible ones."""
-    by_q = equations(x, given)[1]
+    """Choose the dependent coordinates: the wanted ones, or the last possible ones."""
+    by_q = equations(x, inputs)[1]
     coordinates = equations.unknowns
     if dependent is not None:
         strange = [str(s) for s in dependent if s not in coordinates]

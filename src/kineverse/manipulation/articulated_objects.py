@@ -1,4 +1,4 @@
-"""Articulated objects of a model: doors, flaps and drawers, told apart by their motions."""
+"""Articulated objects of a model: doors, flaps and drawers, distinguished by their motions."""
 
 from __future__ import annotations
 
@@ -22,13 +22,10 @@ MotionKind: TypeAlias = Literal["door", "flap", "drawer", "knob", "linkage"]
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 
 _SAMPLES = 5
-_STILL = 1e-6
-"""Rotation below which a motion is a translation [rad]."""
-_SAME = 1e-3
-"""Largest difference of the axes of a motion about one axis, as direction and as point [m]."""
+_STILL = 1e-6  # rotation below which a motion is a translation [rad]
+_SAME = 1e-3  # largest difference of the axes of a motion about one axis, as direction and as point [m]
 _UPRIGHT = math.cos(math.pi / 4)
-_KNOB = 0.08
-"""Largest distance of a knob from its axis [m]."""
+_KNOB = 0.08  # largest distance of a knob from its axis [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +73,14 @@ def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[Articul
         raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
     free = [s for s in model.degrees_of_freedom if not (robot and is_of_robot(s.path, robot))]
     defaults = model.default_state()
-    found = []
+    result = []
     for coordinate, frames in moved_frames(model, free).items():
         limits = sorted(map(float, model.limits(coordinate)), key=lambda v: abs(v - defaults[coordinate]))
         bodies = [name for name in frames if name in model.bodies and collision_shapes(model.bodies[name])]
         if bodies and all(map(math.isfinite, limits)) and limits[0] != limits[1]:
             kind = _find_kind(model, coordinate, bodies, limits)
-            found.append(ArticulatedObject(coordinate, kind, *limits))
-    return tuple(found)
+            result.append(ArticulatedObject(coordinate, kind, *limits))
+    return tuple(result)
 
 
 def find_shut_value(model: ModelView, coordinate: Symbol) -> float:
@@ -96,8 +93,8 @@ def find_shut_value(model: ModelView, coordinate: Symbol) -> float:
 def select_objects(
     objects: Sequence[ArticulatedObject], patterns: Iterable[str]
 ) -> tuple[ArticulatedObject, ...]:
-    """Return objects whose coordinates match any of some names or patterns, in the order of the patterns."""
-    found: dict[Symbol, ArticulatedObject] = {}
+    """Return the objects whose coordinates match names or patterns, in the order of the patterns."""
+    result: dict[Symbol, ArticulatedObject] = {}
     for pattern in patterns:
         matching = [one for one in objects if matches_pattern(str(one.coordinate), [pattern])]
         if not matching:
@@ -105,8 +102,8 @@ def select_objects(
             raise UnknownNameError(
                 f"No door, drawer or other object is named '{pattern}'. {suggest(pattern, names, 'object')}"
             )
-        found.update((one.coordinate, one) for one in matching)
-    return tuple(found.values())
+        result.update((one.coordinate, one) for one in matching)
+    return tuple(result.values())
 
 
 def _find_kind(

@@ -1,7 +1,7 @@
 """Drives of a base that rolls on wheels: turns on the spot and straight lines between furniture.
 
-Such a base has fewer speeds than coordinates, so a straight way between two configurations would slip. The
-ways are searched on a lattice of places with eight headings (Dijkstra), in a tree that serves several goals.
+Such a base has fewer speeds than coordinates, so a straight path between two configurations would slip. The
+paths are searched on a lattice of places with eight headings (Dijkstra), in a tree that serves several goals.
 From places near a goal a direct leg (a turn, a line and a turn) is tried, as in hybrid A* (Dolgov, Thrun,
 Montemerlo and Diebel, IJRR 29, 2010).
 """
@@ -25,34 +25,21 @@ from kineverse.symbols import Symbol
 
 from .session import Session, Speeds
 
-_SPEED, _TURN = 0.3, 0.8
-"""Largest speeds of a drive [m/s], [rad/s]."""
-_ACCELERATION = 0.5
-"""Acceleration and deceleration [m/s²], [rad/s²]."""
-_SHARE = 0.8
-"""Share of the limits of speeds that a drive takes."""
-_GRID, _HEADINGS = 0.15, 8
-"""Distance of neighbouring places of the lattice [m], and number of headings."""
-_FINE, _FINE_TURN = 0.02, math.radians(2.0)
-"""Distances of the places of a way that are checked [m], [rad]."""
-_NEAR, _MOST_LEGS = 0.5, 40
-"""Distance from a goal at which direct legs are tried [m], and the largest number of known places tried."""
-_MOST_PLACES = 3000
-"""Largest number of places of the lattice from one start."""
-_ARRIVED, _TURNED = 5e-4, 5e-4
-"""Errors at the end of a line and of a turn [m], [rad]."""
-_CROSS, _HEADING = 3.0, 4.0
-"""Gains of the steering: heading by the distance from the line [rad/m], and rate by the heading [1/s]."""
-_STEERING = 0.25
-"""Share of the speed of turns that steers along a line."""
-_START_SHARE = 0.8
-"""Share of the distance at the start that a drive keeps, where it is less than the margin."""
+_SPEED, _TURN = 0.3, 0.8  # largest speeds of a drive [m/s], [rad/s]
+_ACCELERATION = 0.5  # acceleration and deceleration [m/s²], [rad/s²]
+_SHARE = 0.8  # share of the limits of speeds that a drive takes
+_GRID, _HEADINGS = 0.15, 8  # distance of neighbouring places of the lattice [m], and number of headings
+_FINE, _FINE_TURN = 0.02, math.radians(2.0)  # distances of the places of a path that are checked [m], [rad]
+_NEAR, _MOST_LEGS = 0.5, 40  # distance from a goal [m], and number of known places, for direct legs
+_MOST_PLACES = 3000  # largest number of places of the lattice from one start
+_ARRIVED, _TURNED = 5e-4, 5e-4  # errors at the end of a line and of a turn [m], [rad]
+_CROSS, _HEADING = 3.0, 4.0  # gains: heading by distance from the line [rad/m], rate by heading [1/s]
+_STEERING = 0.25  # share of the speed of turns that steers along a line
+_START_SHARE = 0.8  # share of the distance at the start that a drive keeps, where it is less than the margin
 _EXACT = 1e-9
 
-Place: TypeAlias = tuple[float, float, float]
-"""Place of a base: x [m], y [m] and angle [rad]."""
-_Key: TypeAlias = tuple[int, int, int]
-"""Place of the lattice: steps ahead and to the left of the start, and number of the heading."""
+Place: TypeAlias = tuple[float, float, float]  # place of a base: x [m], y [m] and angle [rad]
+_Key: TypeAlias = tuple[int, int, int]  # steps ahead and to the left of the start, number of the heading
 
 
 class BaseDrive:
@@ -63,12 +50,12 @@ class BaseDrive:
         model: ModelView,
         base: Sequence[Symbol],
         scene: Scene,
-        own: Sequence[str],
+        robot_bodies: Sequence[str],
         others: Sequence[str],
         margin: float,
     ) -> None:
         self._model, self.base = model, tuple(base)
-        self._scene, self._watch = scene, scene.watch(own, others, margin)
+        self._scene, self._watch = scene, scene.watch(robot_bodies, others, margin)
         rates = [model.rates.get(s, {}) for s in base]
         self._speeds = tuple(dict.fromkeys(v for row in rates for v in row))
         here = State(dict.fromkeys((*model.symbols, *model.speeds), 0.0))
@@ -98,7 +85,7 @@ class BaseDrive:
         return most
 
     def search(self, state: State) -> DriveSearch:
-        """Return the search of ways from the place of a state, with everything else as there."""
+        """Return the search of paths from the place of a state, with everything else as there."""
         start = tuple(float(state[s]) for s in self.base)
         assert len(start) == 3
         speed, turn = self._most
@@ -128,7 +115,7 @@ class BaseDrive:
         """Turn to the angle of a place, or roll straight on to it."""
         along = (end[:2] - start[:2]) / length if length > _EXACT else np.zeros(2)
         heading = np.array([math.cos(end[2]), math.sin(end[2])])
-        way = 1.0 if along @ heading >= 0.0 else -1.0
+        direction = 1.0 if along @ heading >= 0.0 else -1.0
         speed, rest = 0.0, math.inf
         most = self._most[0 if length > _EXACT else 1]
         while True:
@@ -146,7 +133,7 @@ class BaseDrive:
                 wanted = end[2] - math.atan(_CROSS * aside)
                 steering = _STEERING * self._most[1]
                 rate = min(max(_HEADING * _wrap(wanted - angle), -steering), steering)
-                rolling = way * speed
+                rolling = direction * speed
             else:
                 rate, rolling = math.copysign(speed, turned), 0.0
             vector = rolling * self._straight + rate * self._turn
@@ -154,7 +141,7 @@ class BaseDrive:
 
 
 class DriveSearch:
-    """Search of ways from one place to several goals; what was found for one helps the others."""
+    """Search of paths from one place to several goals; what was found for one helps the others."""
 
     def __init__(
         self,
@@ -181,24 +168,24 @@ class DriveSearch:
         return self._is_free(np.array([self._start]))
 
     def find(self, goal: Place) -> Array | None:
-        """Return a way (K, 3) to a goal; None if there is none among the places of the lattice."""
+        """Return a path (K, 3) to a goal; None if there is none among the places of the lattice."""
         self._place()
         if not self._is_free(np.array([goal])):
             return None
         known = sorted((k for k in self._done if self._is_near(k, goal)), key=lambda k: self._costs[k])
-        if (way := self._leg(self._start, goal)) is not None:
-            return way
+        if (path := self._leg(self._start, goal)) is not None:
+            return path
         for key in known[:_MOST_LEGS]:
-            if (way := self._finish(key, goal)) is not None:
-                return way
+            if (path := self._finish(key, goal)) is not None:
+                return path
         while self._heap and len(self._done) < _MOST_PLACES:
             cost, key = heapq.heappop(self._heap)
             if cost > self._costs[key]:
                 continue
             self._done.append(key)
             self._expand(key)
-            if self._is_near(key, goal) and (way := self._finish(key, goal)) is not None:
-                return way
+            if self._is_near(key, goal) and (path := self._finish(key, goal)) is not None:
+                return path
         return None
 
     def _is_near(self, key: _Key, goal: Place) -> bool:
@@ -220,36 +207,31 @@ class DriveSearch:
         i, j, k = key
         angle = 2.0 * math.pi * k / _HEADINGS
         di, dj = round(math.cos(angle)), round(math.sin(angle))
-        turned = [(i, j, (k + way) % _HEADINGS) for way in (1, -1)]
+        turned = [(i, j, (k + turn) % _HEADINGS) for turn in (1, -1)]
         for other in (*turned, (i + di, j + dj, k), (i - di, j - dj, k)):
             here, there = self._at(key), self._at(other)
-            cost = self._costs[key] + self._duration(here, there)
+            length = math.hypot(there[0] - here[0], there[1] - here[1])
+            cost = self._costs[key] + length / self._speed + abs(_wrap(there[2] - here[2])) / self._turn
             if cost < self._costs.get(other, math.inf) and self._is_free(_between(here, there)):
                 self._costs[other], self._parents[other] = cost, key
                 heapq.heappush(self._heap, (cost, other))
-
-    def _duration(self, a: Place, b: Place) -> float:
-        return math.hypot(b[0] - a[0], b[1] - a[1]) / self._speed + abs(_wrap(b[2] - a[2])) / self._turn
 
     def _leg(self, start: Place, goal: Place) -> Array | None:
         """Return a turn, a line and a turn to a goal, ahead or backwards; None if both touch something."""
         x, y = goal[0] - start[0], goal[1] - start[1]
         if math.hypot(x, y) < _EXACT:
-            ways = [np.array([start, goal])]
+            paths = [np.array([start, goal])]
         else:
             ahead = math.atan2(y, x)
-            ways = [
+            paths = [
                 np.array([start, (*start[:2], angle), (*goal[:2], angle), goal])
                 for angle in (ahead, ahead + math.pi)
             ]
-        ways.sort(key=lambda way: sum(abs(_wrap(b[2] - a[2])) for a, b in pairwise(way)))
-        return next((way for way in ways if self._goes_through(way)), None)
-
-    def _goes_through(self, way: Array) -> bool:
-        return all(self._is_free(_between(a, b)) for a, b in pairwise(way))
+        paths.sort(key=lambda path: sum(abs(_wrap(b[2] - a[2])) for a, b in pairwise(path)))
+        return next((w for w in paths if all(self._is_free(_between(a, b)) for a, b in pairwise(w))), None)
 
     def _finish(self, key: _Key, goal: Place) -> Array | None:
-        """Return the way by a place of the lattice to a goal, shortened; None if no leg leads on."""
+        """Return the path by a place of the lattice to a goal, shortened; None if no leg leads on."""
         leg = self._leg(self._at(key), goal)
         if leg is None:
             return None
@@ -262,17 +244,17 @@ class DriveSearch:
 
     def _shorten(self, places: list[Place]) -> Array:
         """Return places with direct legs instead of several, wherever they touch nothing."""
-        way, at = [np.array([places[0]])], 0
+        path, at = [np.array([places[0]])], 0
         while at < len(places) - 1:
             legs = ((to, self._leg(places[at], places[to])) for to in range(len(places) - 1, at + 1, -1))
             step = np.array(places[at : at + 2])
             at, leg = next(((to, leg) for to, leg in legs if leg is not None), (at + 1, step))
-            way.append(leg[1:])
-        return np.concatenate(way)
+            path.append(leg[1:])
+        return np.concatenate(path)
 
 
 def _between(start: Sequence[float], end: Sequence[float]) -> Array:
-    """Return places (N, 3) from one to another, the shorter way around."""
+    """Return places (N, 3) from one to another, turning the shorter way."""
     a, b = np.array(start), np.array(end)
     away = np.array([b[0] - a[0], b[1] - a[1], _wrap(float(b[2] - a[2]))])
     count = max(math.hypot(away[0], away[1]) / _FINE, abs(away[2]) / _FINE_TURN)

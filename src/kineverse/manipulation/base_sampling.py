@@ -15,21 +15,24 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-_NEAREST, _FARTHEST = 0.3, 1.1
-"""Distance of a base from the point that the hand has to reach [m]."""
-_SIDE, _TURN = math.radians(110.0), math.radians(60.0)
-"""Largest angles between base and coming hand, and between the front of the base and the point [rad]."""
+_NEAREST, _FARTHEST = 0.3, 1.1  # distance of a base from the point that the hand has to reach [m]
+_SIDE, _TURN = math.radians(110.0), math.radians(60.0)  # of base from hand, of its front from the point [rad]
 
 
 class BaseSampler:
     """Random places of a mobile base at which it touches nothing, as far as there are some."""
 
     def __init__(
-        self, scene: Scene, base: Sequence[Symbol], own: Sequence[str], others: Sequence[str], margin: float
+        self,
+        scene: Scene,
+        base: Sequence[Symbol],
+        robot_bodies: Sequence[str],
+        others: Sequence[str],
+        margin: float,
     ) -> None:
         self.base = tuple(base)
         self._scene = scene
-        carried = [b for b in own if {*scene.model.symbols_of(b)} <= {*base}]
+        carried = [b for b in robot_bodies if {*scene.model.symbols_of(b)} <= {*base}]
         self._watch = scene.watch(carried, others, margin) if base and carried else None
 
     def draw(
@@ -84,9 +87,13 @@ def find_free_state(
 ) -> tuple[State | None, str]:
     """Return the first of some states in which a robot touches nothing, and its contact in the first."""
     scene = Scene(model)
-    own = [body for body in scene.bodies if is_of_robot(body, robot)]
+    robot_bodies = [body for body in scene.bodies if is_of_robot(body, robot)]
     others = [body for body in scene.bodies if not is_of_robot(body, robot)]
-    near = scene.watch(own, others, radius=max(margin, 0.0), rules=rules) if own and others else None
+    near = (
+        scene.watch(robot_bodies, others, radius=max(margin, 0.0), rules=rules)
+        if robot_bodies and others
+        else None
+    )
     contact = None
     for state in states:
         if near is None:

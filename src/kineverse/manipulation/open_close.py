@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from kineverse.errors import KineverseError
 from kineverse.state import State
@@ -16,8 +17,7 @@ from .opening.grasped_opening import open_object
 from .outcome import Outcome
 from .session import Session
 
-_PLANS = ("plan", "place")
-"""Computations that are no control steps."""
+_PLANS = ("plan", "place")  # computations that are no control steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +63,8 @@ class OpenCloseReport:
     @property
     def grasp_error(self) -> float:
         """Largest motion of the held object in the hand [m]; NaN if nothing was held."""
-        found = [float(one.measures.get("grasp_error", math.nan)) for one in self.outcomes]
-        return max((error for error in found if not math.isnan(error)), default=math.nan)
+        result = [float(one.measures.get("grasp_error", math.nan)) for one in self.outcomes]
+        return max((error for error in result if not math.isnan(error)), default=math.nan)
 
     @property
     def reason(self) -> str:
@@ -120,7 +120,7 @@ class OpenCloseRunner:
         self.current: ArticulatedObject | None = None
         self.opening = True
         self._start, self._on_step = start, on_step
-        self._hand, self._seconds, self._seed = hand, seconds, seed
+        self._options: dict[str, Any] = {"hand": hand, "seconds": seconds, "seed": seed}
         self._error, self._failed = 0.0, False
 
     def open_and_close(self, one: ArticulatedObject) -> OpenCloseReport:
@@ -144,14 +144,7 @@ class OpenCloseRunner:
         return OpenCloseReport(one, opened, closed, self._error, tuple(times))
 
     def _move(self, one: ArticulatedObject, target: float) -> Outcome:
-        return open_object(
-            self.session,
-            one.coordinate,
-            target=target,
-            hand=self._hand,
-            seconds=self._seconds,
-            seed=self._seed,
-        )
+        return open_object(self.session, one.coordinate, target=target, **self._options)
 
     def _act(self, skill: Callable[[], Outcome]) -> Outcome:
         """Return the outcome of a skill; an error of the library is one that is not done."""
@@ -161,17 +154,10 @@ class OpenCloseRunner:
         try:
             return skill()
         except KineverseError as error:
-            value, world = float(session.world.state[one.coordinate]), session.world
-            reason = f"{type(error).__name__}: {error}"
-            return Outcome(
-                False,
-                value,
-                reason,
-                world.name,
-                world.time - begin,
-                session.steps - first,
-                {"failure": "other"},
-            )
+            world, reason = session.world, f"{type(error).__name__}: {error}"
+            value, seconds = float(world.state[one.coordinate]), world.time - begin
+            steps, measures = session.steps - first, {"failure": "other"}
+            return Outcome(False, value, reason, world.name, seconds, steps, measures)
         finally:
             session.phase, session.reference, session.vectors = "", None, {}
 

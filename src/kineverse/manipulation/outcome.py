@@ -63,10 +63,3 @@ class SkillError(KineverseError):
     def __init__(self, kind: str, reason: str) -> None:
         super().__init__(reason)
         self.kind = kind
-
-
-class SlipError(SkillError):
-    """Loss of a held handle."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__("other", reason)

@@ -32,21 +32,21 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True, eq=False)
 class HandReference:
-    """Way of a hand that a controller follows."""
+    """Path of a hand that a controller follows."""
 
-    poses: Array  # world poses (K, 4, 4) along the way [m]
-    share: float = 0.0  # share of the way that lies behind, in [0, 1]
+    poses: Array  # world poses (K, 4, 4) along the path [m]
+    share: float = 0.0  # share of the path that was passed, in [0, 1]
 
     @property
     def pose(self) -> Array:
-        """Pose (4, 4) of the way that is wanted now."""
+        """Pose (4, 4) on the path that is wanted now."""
         pose: Array = self.poses[round(self._place)].copy()
         pose[:3, 3] = self.ahead[0]
         return pose
 
     @property
     def ahead(self) -> Array:
-        """Points (k, 3) of the rest of the way [m], the present one first."""
+        """Points (k, 3) of the rest of the path [m], the present one first."""
         points, place = self.poses[:, :3, 3], self._place
         before = int(place)
         after = min(before + 1, len(points) - 1)
@@ -61,10 +61,8 @@ class HandReference:
 
 Speeds = Mapping[Symbol, float]
 
-STALE = 0.06
-"""Age of the latest readings from which on a skill ends [s]."""
-_MADE = 64
-"""Number of motions that are remembered."""
+STALE = 0.06  # age of the latest readings from which on a skill ends [s]
+_MADE = 64  # number of motions that are remembered
 
 
 class Session:
@@ -105,7 +103,7 @@ class Session:
     command
         The controller's command from which they come; None if there is none.
     reference
-        The way of the hand that a controller follows; None if there is none.
+        The path of the hand that a controller follows; None if there is none.
     vectors
         Vectors of the controller by name, each with its origin in the world [m], for pages and recordings.
     phase
@@ -115,7 +113,7 @@ class Session:
     cpu, wall
         Durations of the computations of each step by the name given to :meth:`timed` [s].
     made
-        Placements of the grasped motions that were made, the last one at the end: their ways lead back, too.
+        Placements of completed grasped motions, oldest first; reversed, they serve to move the object back.
     answers
         Whether the world has answered the last step within the time-out.
     untrusted
@@ -245,7 +243,6 @@ class Session:
             )
 
     def _resolve(self, speeds: Mapping[Symbol, float] | Mapping[str, float]) -> Speeds:
-        """Return finite speeds by symbol."""
         if not isinstance(speeds, Mapping):
             raise InvalidValueError(f"Speeds are a mapping from symbols or names to numbers, not {speeds!r}.")
         resolved: dict[Symbol, float] = {}
@@ -267,7 +264,6 @@ class Session:
         return resolved
 
     def _advance(self, speeds: Speeds) -> None:
-        """Advance the world by a step, and update the belief."""
         robot = self.world.robot
         self.commands = {s: v for s, v in speeds.items() if is_of_robot(s.path, robot)}
         try:

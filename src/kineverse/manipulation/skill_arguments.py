@@ -16,11 +16,8 @@ from kineverse.worlds import World
 TOLERANCE = 0.02
 """Distance from a limit within which an object is open or shut, unless its range is short [m], [rad]."""
 
-_FIXED = 1e-9
-"""Range of a coordinate up to which it counts as fixed [m], [rad]."""
-_LEAST_TOLERANCE, _SHARE = 1e-3, 0.02
-"""Least tolerance of a value between the limits [m], [rad], as near as controllers settle, and its share of
-the way."""
+_FIXED = 1e-9  # range of a coordinate up to which it counts as fixed [m], [rad]
+_LEAST_TOLERANCE, _SHARE = 1e-3, 0.02  # least tolerance between limits [m], [rad], and share of the distance
 
 
 def find_object_coordinate(world: World, what: Symbol | str) -> Symbol:
@@ -77,7 +74,7 @@ def choose_tolerance(
 ) -> float:
     """Return the distance from a target up to which an object is there [m], [rad].
 
-    By default that is 2 % of the way, between 1 and 20 mm (mrad). At a limit, where an object is open or
+    By default that is 2 % of the distance, between 1 and 20 mm (mrad). At a limit, where an object is open or
     shut, it is 20 mm. It is never more than a tenth of the coordinate's range.
     """
     lower, upper = (float(v) for v in model.limits(coordinate, state))
@@ -86,8 +83,8 @@ def choose_tolerance(
     elif min(abs(target - lower), abs(target - upper)) <= _FIXED:
         tolerance = TOLERANCE
     else:
-        way = abs(target - float(state[coordinate]))
-        tolerance = min(max(_LEAST_TOLERANCE, _SHARE * way), TOLERANCE)
+        distance = abs(target - float(state[coordinate]))
+        tolerance = min(max(_LEAST_TOLERANCE, _SHARE * distance), TOLERANCE)
     return min(tolerance, max(0.0, 0.1 * (upper - lower))) if math.isfinite(upper - lower) else tolerance
 
 

@@ -1,9 +1,9 @@
-"""Sweep of an object: what is in its way from one value of its coordinate to another one.
+"""Swept volume of an object: what is in its way from one value of its coordinate to another.
 
-The bodies that a coordinate moves are placed along the way so densely that no point of them goes further than
-:data:`STEP` at a time. There they are measured against everything that is not the robot's and that they move
-relative to: fixed furniture, furniture that other coordinates move, and what carries the object itself. Which
-overlaps mean nothing is said by :class:`.FurnitureOverlaps`, as it is for worlds and for their judge.
+The bodies that a coordinate moves are placed along the path so densely that no point of them moves by more
+than :data:`STEP` at a time. There they are checked against everything that is not the robot's and that they
+move relative to: fixed furniture, furniture that other coordinates move, and what carries the object itself.
+:class:`.FurnitureOverlaps` excepts overlaps that mean nothing, as it does for worlds and their judge.
 """
 
 from __future__ import annotations
@@ -31,16 +31,12 @@ from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 from .outcome import SkillError
 
-STEP = 5e-4
-"""Longest way of a point of the object between two places where it is looked at [m]."""
+STEP = 5e-4  # longest distance of a point of the object between two places where it is checked [m]
 
-_COARSE = 32
-"""Number of parts of a way whose lengths are measured."""
+_COARSE = 32  # number of parts of a path whose lengths are measured
 _MOST_PLACES = 100_000
-_TURNED = 1e-6
-"""Change of an entry of a rotation from which on a body has turned."""
-_CLEAR = 3e-3
-"""Distance before the first contact up to which a way is said to be free [m]."""
+_TURNED = 1e-6  # change of an entry of a rotation from which on a body has turned
+_CLEAR = 3e-3  # distance before the first contact up to which a path is reported as free [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +46,13 @@ class Obstacle:
     coordinate: Symbol  # coordinate of the object, and the value that it was to reach [m], [rad]
     target: float
     body: str  # body of the object
-    other: str  # the one that is in its way
+    other: str  # body in its way
     value: float  # value of the coordinate from which on they overlap [m], [rad]
     depth: float  # largest depth of the two on the way to the target [m]
-    free: float  # value up to which the way is free, a little before the contact [m], [rad]
+    free: float  # value up to which the path is free, a little before the contact [m], [rad]
     unit: str = ""  # "rad" if the object turns, "m" if it slides
     carrier: Symbol | None = None  # coordinate that moves the other body; None if none does
-    aside: float | None = None  # [m], [rad]
+    aside: float | None = None  # value of the carrier at which the path is free [m], [rad]; None if none is
 
     @property
     def measures(self) -> dict[str, Any]:
@@ -67,12 +63,12 @@ class Obstacle:
         value, target, free = (f"{v:.3f} {self.unit}".rstrip() for v in (self.value, self.target, self.free))
         text = (
             f"'{self.body}' meets '{self.other}' at {value} of '{self.coordinate}': on the way to {target} "
-            f"they would overlap by {1e3 * self.depth:.3g} mm. The way is free up to {free}."
+            f"they would overlap by {1e3 * self.depth:.3g} mm. The path is free up to {free}."
         )
         if self.aside is not None:
             return f"{text} Move '{self.carrier}' to {self.aside:.3f} first."
         if self.carrier is not None:
-            return f"{text} '{self.carrier}' moves what is in the way; none of its ends leaves the way free."
+            return f"{text} '{self.carrier}' moves what is in the way; none of its ends leaves the path free."
         return text
 
 
@@ -96,7 +92,7 @@ def find_obstacle(
     start: State | None = None,
     least: float = OVERLAP,
 ) -> Obstacle | None:
-    """Return the first thing in the way of an object from its value to a target; None if the way is free.
+    """Return the first thing in the way of an object from its value to a target; None if the path is free.
 
     What overlaps at the begin counts as far as it gets deeper than :class:`.FurnitureOverlaps` allows. The
     robot counts nowhere: it moves.
@@ -108,8 +104,8 @@ def find_obstacle(
 
     sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot), make)
     sweep.start = start
-    found = sweep.find(coordinate, state, target, least)
-    return None if found is None else sweep.find_aside(found, state)
+    result = sweep.find(coordinate, state, target, least)
+    return None if result is None else sweep.find_aside(result, state)
 
 
 class _Sweep:
@@ -138,12 +134,12 @@ class _Sweep:
             return None
         values = self._divide(coordinate, state, start, target)
         for k in self._find_near(query, coordinate, values):
-            found = query(0.0)
-            excess = -found.distances - self._overlaps.allowances(found)
+            result = query(0.0)
+            excess = -result.distances - self._overlaps.allowances(result)
             worst = int(np.argmax(excess)) if len(excess) else 0
             if not len(excess) or excess[worst] <= least:
                 continue
-            pair = found[worst]
+            pair = result[worst]
             one, other = (pair.a, pair.b) if motion.moves(pair.a) else (pair.b, pair.a)
             deepest = self._find_deepest(query, coordinate, values[k:], one, other)
             first = values[max(0, k - math.ceil(_CLEAR / STEP))]
@@ -152,7 +148,7 @@ class _Sweep:
         return None
 
     def find_aside(self, found: Obstacle, state: State) -> Obstacle:
-        """Return an obstacle with the coordinate that moves it, and where it leaves the way free."""
+        """Return an obstacle with the coordinate that moves it, and where it leaves the path free."""
         model = self._model
         free = [s for s in model.degrees_of_freedom if not (self._robot and is_of_robot(s.path, self._robot))]
         moving = [
@@ -188,7 +184,7 @@ class _Sweep:
             if first is None:
                 return
             k += first
-            # What rests on something touches on a long way.
+            # What rests on something touches for long.
             inputs = self._scene.collision_world.values
             while True:
                 yield k
@@ -223,8 +219,8 @@ class _Sweep:
         parts = [np.array([start])]
         for k, ((p, R), (p_next, R_next)) in enumerate(pairwise(places)):
             turn = np.linalg.norm((R_next - R).reshape(len(R), -1), axis=1) / math.sqrt(2.0)
-            way = float((np.linalg.norm(p_next - p, axis=1) + turn * radius).max(initial=0.0))
-            count = min(max(1, math.ceil(way / STEP)), _MOST_PLACES // _COARSE)
+            length = float((np.linalg.norm(p_next - p, axis=1) + turn * radius).max(initial=0.0))
+            count = min(max(1, math.ceil(length / STEP)), _MOST_PLACES // _COARSE)
             parts.append(np.linspace(coarse[k], coarse[k + 1], count + 1)[1:])
         return np.concatenate(parts)
 
@@ -243,6 +239,6 @@ class _Sweep:
         """Return the largest depth of two bodies at some values [m]."""
         pair, deepest = {one, other}, 0.0
         for _ in self._find_near(query, coordinate, values):
-            depths = (-found.distance for found in query(0.0) if {found.a, found.b} == pair)
+            depths = (-result.distance for result in query(0.0) if {result.a, result.b} == pair)
             deepest = max(deepest, *depths, 0.0)
         return deepest

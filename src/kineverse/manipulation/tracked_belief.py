@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from kineverse.compilation import compile
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError
 from kineverse.estimation import ObservedPose, Outliers, Tracker, pose_covariance
 from kineverse.estimation.noise import CHI_SQUARED_6
 from kineverse.lie import Array, inverse, pose_difference, rotation_z, transform
@@ -24,7 +24,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Sensors, World
-from kineverse.worlds.sensor_sampler import find_camera, find_marked_frames, find_robot_base
+from kineverse.worlds.sensor_sampler import find_observed_frames, find_robot_base
 
 from .belief import check_believed
 
@@ -65,8 +65,8 @@ class BaseFilter:
         adjoint = np.eye(3)
         adjoint[:2, 2] = -step[1], step[0]
         adjoint[:2] = rotation_z(-step[2])[:2, :2] @ adjoint[:2]
-        way = float(np.linalg.norm(step[:2]) + abs(step[2]))
-        self.covariance = adjoint @ self.covariance @ adjoint.T + way * np.diag(self._variance)
+        distance = float(np.linalg.norm(step[:2]) + abs(step[2]))
+        self.covariance = adjoint @ self.covariance @ adjoint.T + distance * np.diag(self._variance)
 
     def correct(self, seen: Array, known: Array, deviations: Array) -> None:
         """Correct the estimate by landmarks."""
@@ -101,27 +101,24 @@ def motion_of(poses: Array) -> Array:
     return slopes
 
 
-_LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4
-"""Smallest stated noise of poses [m], [rad], for sensors without any."""
+_LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4  # of poses [m], [rad], for sensors without noise
 _MOVING, _RESTING = 0.04, 4e-4
 """Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
 and .002 rad/√s and .0013 m/√s at rest."""
 _MOVED, _REFUTED = 1.0, 0.3
 """Times for which a part counts as moving after a command, and after a refuted prediction [s].
 In the latter all of the tracker's process noise counts."""
-_STILL = 1e-3
-"""Largest speed of a part that rests [m/s], [rad/s]."""
+_STILL = 1e-3  # largest speed of a part that rests [m/s], [rad/s]
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
-"""Error of the motion of joints relative to the commanded one, and beside it [rad/√s], [m/√s]."""
-_HORIZON = 0.04
-"""Longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays."""
+"""Error of the motion of joints relative to the commanded one, and independent of it [rad/√s], [m/√s]."""
+_HORIZON = 0.04  # longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays
 
 
 class TrackedBelief:
     """Belief that reads observations and commands, and never the truth.
 
     Coordinates that were never seen have their default value, and half the width of their limits as
-    deviation. If the time of the world goes back, as by a reset, all begins anew: objects are believed where
+    deviation. If the time of the world goes back, as by a reset, all starts again: objects are believed where
     they were, with that same deviation until they are seen.
 
     Parameters
@@ -157,22 +154,14 @@ class TrackedBelief:
     def __init__(self, model: ModelView, robot: str, sensors: Sensors | None = None) -> None:
         self.sensors = sensors = Sensors() if sensors is None else sensors
         self._model = model
-        own = [name for name in model.frames if is_of_robot(name, robot)]
-        if not own:
-            prefixes = {name.partition("/")[0] for name in model.frames}
-            raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
         remarks = []
-        found = sensors.camera or find_camera(own)
-        if found is None:
+        frames = find_observed_frames(model, robot, sensors)
+        self.camera, marked = frames.camera, frames.marked
+        if not frames.has_camera:
             remarks.append(
-                f"No frame of '{robot}' is named like a camera, so markers are seen from '{own[0]}'; "
+                f"No frame of '{robot}' is named like a camera, so markers are seen from '{self.camera}'; "
                 "camera= names another one."
             )
-        self.camera = found or own[0]
-        marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
-        for name in (self.camera, *marked):
-            if name not in model.frames:
-                raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
         coordinates = {*model.degrees_of_freedom}
         moving = {name: coordinates.intersection(model.fk(name).symbols) for name in marked}
         self._landmarks = {name: np.asarray(model.fk(name)({})) for name in marked if not moving[name]}
@@ -288,7 +277,7 @@ class TrackedBelief:
         return self._predict(horizon)
 
     def _begin(self, stamp: float) -> None:
-        """Begin anew at a time, with objects where they were believed."""
+        """Start again at a time, with objects where they were believed."""
         self.tracker.wait()  # each update before would take a hundred times as long
         if not math.isinf(self._now):
             self._estimate = self.tracker.reset(dict(self.tracker.estimate.state), at=stamp)
@@ -316,7 +305,6 @@ class TrackedBelief:
         return total
 
     def _read_robot(self, observation: Observation) -> None:
-        """Take the readings of encoders and odometry."""
         stamp, joints = observation.stamp, observation.joints
         known = [s for s in joints if s in self._place]
         if stamp == self._read:
@@ -350,7 +338,6 @@ class TrackedBelief:
         self._spread = (1.0 - gain) * spread
 
     def _look(self, observation: Observation) -> None:
-        """Update the tracker with the poses of a picture."""
         stamp, self._shared = observation.stamp, None
         poses = np.tile(np.eye(4), (len(self._index), 1, 1))
         mask = np.zeros(len(poses), dtype=bool)

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
         Shape as Shape,
         Sphere as Sphere,
     )
+    from .changes import Change as Change, Diff as Diff
     from .comparison import BehaviourComparison as BehaviourComparison, compare_models as compare_models
     from .constraint import Constraint as Constraint
-    from .diff import Change as Change, Diff as Diff
     from .edit import Edit as Edit
     from .frame import WORLD as WORLD, Frame as Frame
     from .frame_dependence import count_moved_bodies as count_moved_bodies, moved_frames as moved_frames
@@ -52,7 +52,7 @@ lazy_face(
         ".body": "Body Box Capsule Cone Cylinder Ellipsoid Inertia Mesh Pose Shape Sphere",
         ".comparison": "BehaviourComparison compare_models",
         ".constraint": "Constraint",
-        ".diff": "Change Diff",
+        ".changes": "Change Diff",
         ".edit": "Edit",
         ".frame": "WORLD Frame",
         ".frame_dependence": "count_moved_bodies moved_frames",

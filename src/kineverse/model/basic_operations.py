@@ -165,7 +165,7 @@ class SoftLimits(Operation, document_kind="SoftLimits"):
 
     name: str  # name of the articulation; the constraint is called name/soft_limits
     q: Expression  # coordinate, or expression of the joint position [rad] or [m]
-    lower: float  # soft limits [rad] or [m]
+    lower: float  # soft limit [rad] or [m]
     upper: float
 
     def apply(self, model: ReadRecorder) -> Writes:

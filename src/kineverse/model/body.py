@@ -17,12 +17,10 @@ from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import Expression
 
 _RIGID = 2e-5
-_FARTHEST = 1e100
-"""Largest coordinate of a pose [m]. Products of a chain of such poses do not overflow."""
+_FARTHEST = 1e100  # largest coordinate of a pose [m]. Products of a chain of such poses do not overflow
 
 Vector3: TypeAlias = tuple[float, float, float]
-AxisLike: TypeAlias = "Sequence[float] | npt.NDArray[Any]"
-"""Three numbers, not all zero."""
+AxisLike: TypeAlias = "Sequence[float] | npt.NDArray[Any]"  # three numbers, not all zero
 Rgba: TypeAlias = tuple[float, float, float, float]
 
 

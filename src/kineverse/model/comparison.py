@@ -14,13 +14,11 @@ import numpy as np
 
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.lie import Array
-from kineverse.symbols import Symbol
 
 from .articulation import Articulation
 from .body import Mesh, Pose
-from .diff import Change, Diff, find_moved_tags
+from .changes import Change, Diff, find_moved_tags
 from .frame import Frame
-from .history import History, HistoryEntry
 from .model import Model, Snapshot
 from .model_view import ModelView
 from .operation import KINDS, RATES
@@ -32,10 +30,10 @@ class Delta:
     """Difference in one part of a value."""
 
     what: str  # path of the part within the value
-    before: Any  # old
-    after: Any  # new content of the part; None if there is none
-    distance: float = inf  # [m]
-    angle: float = 0.0  # angle of the rotation from one transform to the other [rad]; 0 for other parts
+    before: Any  # content of the part; None if there is none
+    after: Any
+    distance: float = inf  # of origins [m]; of numbers relative to the larger one above one; inf for texts
+    angle: float = 0.0  # of the rotation from one transform to the other [rad]
     at_default: tuple[float, float] = (inf, 0.0)  # distance and angle at the default state
 
     def is_within(self, tolerance: float) -> bool:
@@ -48,7 +46,7 @@ def measure_deltas(changes: Sequence[Change], samples: StateSamples) -> list[tup
 
     Meshes are compared by file name. The folder, and the form of the path, make no difference.
     """
-    parts = [_parts(change) for change in changes]
+    parts = [_differing_parts(change) for change in changes]
     pairs = [(a, b) for found in parts for _, a, b in found if _is_symbolic(a, b)]
     measured = iter(_measure_distance(pairs, samples))
     return [
@@ -63,12 +61,13 @@ def measure_deltas(changes: Sequence[Change], samples: StateSamples) -> list[tup
 # -- finding -----------------------------------------------------------------------------------------------
 
 
-def _parts(change: Change) -> list[tuple[str, Any, Any]]:
-    if change.before is None or change.after is None:
+def _differing_parts(change: Change) -> list[tuple[str, Any, Any]]:
+    before, after = change.before, change.after
+    if before is None or after is None:
         return []
     if change.kind == RATES:  # each a pair of the coordinate and what moves it
-        return list(_walk("", change.before[1], change.after[1]))
-    return list(_walk("", change.before, change.after))
+        before, after = before[1], after[1]
+    return list(_walk("", before, after))
 
 
 def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -76,7 +75,7 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
     if a is b or (_is_number(a) and _is_number(b) and isnan(a) and isnan(b)):
         return
     if type(a) is not type(b) or isinstance(a, (Expression, Pose)):
-        if not _equal(a, b):
+        if a != b:
             yield what, _number(a), _number(b)
     elif isinstance(a, Frame):
         if a.parent != b.parent:
@@ -98,17 +97,13 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
     elif isinstance(a, tuple) and not _are_numbers(a):
         for i in range(max(len(a), len(b))):
             yield from _walk(f"{what}[{i}]", *(side[i] if i < len(side) else None for side in (a, b)))
-    elif not _equal(a, b):
+    elif a != b:
         yield what, a, b
 
 
 def _file(mesh: Mesh) -> str:
     """Return the path of a mesh file, without access to the disk."""
     return mesh.uri if "://" in mesh.uri else os.path.normpath(os.path.join(mesh.folder, mesh.uri))
-
-
-def _equal(a: Any, b: Any) -> bool:
-    return bool(a == b)
 
 
 def _are_named(value: Any) -> bool:
@@ -135,29 +130,29 @@ def _number(value: Any) -> Any:
 
 def _is_symbolic(a: Any, b: Any) -> bool:
     """Return whether two parts are expressions of one shape, or an expression and a number."""
-    if not (isinstance(a, Expression) or isinstance(b, Expression)):
+    if not any(isinstance(v, Expression) for v in (a, b)):
         return False
-    if not all(isinstance(v, (Expression, Pose)) or _is_number(v) for v in (a, b)):
-        return False
-    return _shape(a) == _shape(b)
+    return _shape(a) == _shape(b) is not None
 
 
-def _shape(value: Any) -> tuple[int, ...]:
+def _shape(value: Any) -> tuple[int, ...] | None:
     if isinstance(value, Expression):
         return value.shape
-    return (4, 4) if isinstance(value, Pose) else ()
+    if isinstance(value, Pose):
+        return (4, 4)
+    return () if _is_number(value) else None
 
 
 def transform_of(frame: Frame) -> Pose | Expression:
     """Return parent_T_frame as numbers if it is constant, else as an expression."""
-    if not all(isinstance(factor, Pose) for factor in frame.factors):
+    poses = [factor for factor in frame.factors if isinstance(factor, Pose)]
+    if len(poses) < len(frame.factors):
         return frame.transform
-    if len(frame.factors) == 1 and isinstance(frame.factors[0], Pose):
-        return frame.factors[0]
-    product: Array = reduce(
-        np.matmul, [factor.matrix for factor in frame.factors if isinstance(factor, Pose)], np.eye(4)
+    return (
+        poses[0]
+        if len(poses) == 1
+        else Pose.from_matrix(reduce(np.matmul, (p.matrix for p in poses), np.eye(4)))
     )
-    return Pose.from_matrix(product)
 
 
 # -- measuring ---------------------------------------------------------------------------------------------
@@ -166,11 +161,10 @@ def transform_of(frame: Frame) -> Pose | Expression:
 def _measure(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
     """Return distance, angle, and both at the default state, of two parts without symbols."""
     if isinstance(a, Pose) and isinstance(b, Pose):
-        distance, angle = (float(x[0]) for x in measure_pose_distances(a.matrix[None], b.matrix[None]))
-        return distance, angle, (distance, angle)
+        return _summarize(*measure_pose_distances(a.matrix[None], b.matrix[None]))
     if (_is_number(a) and _is_number(b)) or (_are_numbers(a) and _are_numbers(b) and len(a) == len(b)):
-        distance = float(_measure_number_distance(np.array([a], dtype=float), np.array([b], dtype=float))[0])
-        return distance, 0.0, (distance, 0.0)
+        one, other = (np.array([side], dtype=float) for side in (a, b))
+        return _summarize(_measure_number_distance(one, other), np.zeros(1))
     return inf, 0.0, (inf, 0.0)
 
 
@@ -178,29 +172,25 @@ def _measure_distance(
     pairs: Sequence[tuple[Any, Any]], samples: StateSamples
 ) -> Iterator[tuple[float, float, tuple[float, float]]]:
     """Yield maximum distance, maximum angle, and both at the default state, for pairs of expressions."""
-    sides = [(as_expression(_matrix(a)), as_expression(_matrix(b))) for a, b in pairs]
+    sides = [tuple(as_expression(v.matrix if isinstance(v, Pose) else v) for v in (a, b)) for a, b in pairs]
     trends = [_trends(a, b) for a, b in sides]
     everything = [e for (a, b), trend in zip(sides, trends, strict=True) for e in (a, b, *trend)]
     numbers = iter(samples.values(everything))
     for (a, _), trend in zip(sides, trends, strict=True):
         one, other = next(numbers), next(numbers)
-        angles: Array = np.zeros(len(one))
         if a.shape == (4, 4):
             distances, angles = measure_pose_distances(one, other)
         else:
-            distances = _measure_number_distance(one, other)
+            distances, angles = _measure_number_distance(one, other), np.zeros(len(one))
         for _ in trend[::2]:
             # Expressions with equal values differ if a gradient is overridden, so gradients are compared too.
             distances = np.maximum(distances, _measure_number_distance(next(numbers), next(numbers)))
-        yield (
-            float(distances.max()),
-            float(angles.max()),
-            (float(distances[0]), float(angles[0])),
-        )
+        yield _summarize(distances, angles)
 
 
-def _matrix(value: Any) -> Any:
-    return value.matrix if isinstance(value, Pose) else value
+def _summarize(distances: Array, angles: Array) -> tuple[float, float, tuple[float, float]]:
+    """Return the largest distance, the largest angle, and both at the first state."""
+    return float(distances.max()), float(angles.max()), (float(distances[0]), float(angles[0]))
 
 
 def _trends(a: Expression, b: Expression) -> list[Expression]:
@@ -248,7 +238,7 @@ def compare_models(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
     before, after
         The models. They need no common history.
     """
-    old, new = _snapshot(before), _snapshot(after)
+    old, new = (model.snapshot() if isinstance(model, Model) else model for model in (before, after))
     entries = {entry.tag: entry for entry in old.entries}
     later = {entry.tag: entry for entry in new.entries}
     common = [tag for tag in entries if tag in later]
@@ -257,13 +247,13 @@ def compare_models(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
         changes=tuple(_changes(old, new)),
         added=tuple(tag for tag in later if tag not in entries),
         removed=tuple(tag for tag in entries if tag not in later),
-        replaced=tuple(tag for tag in common if _writes_differ(entries[tag], later[tag])),
+        replaced=tuple(
+            tag
+            for tag in common
+            if entries[tag] is not later[tag] and entries[tag].writes != later[tag].writes
+        ),
         moved=find_moved_tags(common, list(later), entries),
     )
-
-
-def _snapshot(model: Model | Snapshot) -> Snapshot:
-    return model.snapshot() if isinstance(model, Model) else model
 
 
 def _changes(old: Snapshot, new: Snapshot) -> Iterator[Change]:
@@ -278,10 +268,6 @@ def _changes(old: Snapshot, new: Snapshot) -> Iterator[Change]:
         for name, value in after.items():
             if name not in before:
                 yield Change(kind, name, None, value)
-
-
-def _writes_differ(one: HistoryEntry, other: HistoryEntry) -> bool:
-    return one is not other and one.writes != other.writes
 
 
 SIGNS = {"+": "added", "-": "removed", "~": "changed"}
@@ -339,15 +325,8 @@ class ModelComparison:
         poses = samples.values([model.fk(c.name) for c in changes for model in (self.before, self.after)])
         found = {}
         for change, one, other in zip(changes, poses[::2], poses[1::2], strict=True):
-            distances, angles = measure_pose_distances(one, other)
-            found[change.path] = Delta(
-                "place",
-                change.before.parent,
-                change.after.parent,
-                float(distances.max()),
-                float(angles.max()),
-                (float(distances[0]), float(angles[0])),
-            )
+            off = _summarize(*measure_pose_distances(one, other))
+            found[change.path] = Delta("place", change.before.parent, change.after.parent, *off)
         return found
 
     def _is_redundant_record(self, change: Change) -> bool:
@@ -397,25 +376,18 @@ class ModelComparison:
         """Return whether the writes of an operation differ by more than rounding."""
         old, new = (model.history.entry(tag).writes for model in (self.before, self.after))
         different = [cell for cell in {*old, *new} if old.get(cell) != new.get(cell)]
+        counting = {found.change.path for found in self.differences}
         return any(
-            path in self._counting or not _is_last(self.after.history, tag, path)
+            path in counting
+            or self.after.history.writers(path)[-1:] not in ([tag], [])  # not its last writer
             for path in (f"{kind}/{name}" for kind, name in different)
         )
-
-    @cached_property
-    def _counting(self) -> frozenset[str]:
-        return frozenset(found.change.path for found in self.differences)
 
     @property
     def counts(self) -> dict[str, int]:
         """Numbers of added, removed and changed values."""
         signs = [found.sign for found in self.differences]
         return {word: signs.count(sign) for sign, word in SIGNS.items()}
-
-
-def _is_last(history: History, tag: str, path: str) -> bool:
-    """Return whether an operation is the last writer of a path."""
-    return history.writers(path)[-1:] in ([tag], [])
 
 
 COMPARED_STATES = 100
@@ -476,18 +448,13 @@ class BehaviourComparison:
         self.freedoms = _partition_names(list(old), list(new))
         samples = StateSamples(before, after, count=COMPARED_STATES)
         self.states = samples.size
+        common = self.frames["common"]
+        poses = samples.values([model.fk(frame) for frame in common for model in (before, after)])
         found = [
-            PoseDifference(frame, *_largest_pose_difference(*poses))
-            for frame, poses in zip(
-                self.frames["common"],
-                _paired_poses(samples, before, after, self.frames["common"]),
-                strict=True,
-            )
+            PoseDifference(frame, *_summarize(*measure_pose_distances(one, other))[:2])
+            for frame, one, other in zip(common, poses[::2], poses[1::2], strict=True)
         ]
-        self.largest = (
-            max((a.distance for a in found), default=0.0),
-            max((a.angle for a in found), default=0.0),
-        )
+        self.largest = tuple(max((getattr(a, f) for a in found), default=0.0) for f in ("distance", "angle"))
         self.apart = sorted(
             (a for a in found if max(a.distance, a.angle) > tolerance), key=lambda a: (-a.distance, -a.angle)
         )
@@ -496,7 +463,9 @@ class BehaviourComparison:
             for name in self.freedoms["common"]
             for s in (old[name], old[name].derivative())
             if not _limits_equal(
-                limits := before.limits(s), others := after.limits(_matching_symbol(s, new[name])), tolerance
+                limits := before.limits(s),
+                others := after.limits(new[name].derivative() if s.order else new[name]),
+                tolerance,
             )
         ]
 
@@ -514,26 +483,6 @@ def _partition_names(before: list[str], after: list[str]) -> dict[str, list[str]
         "added": [name for name in after if name not in old],
         "common": [name for name in before if name in new],
     }
-
-
-def _paired_poses(
-    samples: StateSamples, before: ModelView, after: ModelView, frames: list[str]
-) -> list[tuple[Array, ...]]:
-    """Return the poses of each frame in both models, shape (states, 4, 4) each."""
-    poses = samples.values([model.fk(frame) for frame in frames for model in (before, after)])
-    return list(zip(poses[::2], poses[1::2], strict=True))
-
-
-def _largest_pose_difference(
-    one: Array,
-    other: Array,
-) -> tuple[float, float]:
-    distances, angles = measure_pose_distances(one, other)
-    return float(distances.max()), float(angles.max())
-
-
-def _matching_symbol(symbol: Symbol, position: Symbol) -> Symbol:
-    return position.derivative() if symbol.order else position
 
 
 def _limits_equal(one: tuple[float, float], other: tuple[float, float], tolerance: float) -> bool:

@@ -15,8 +15,8 @@ from kineverse.symbols import Symbol
 from . import registry
 from .basic_operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .body import Body, Pose
+from .changes import Change, Diff, find_moved_tags
 from .constraint import Constraint
-from .diff import Change, Diff, find_moved_tags
 from .frame import WORLD, Frame, TransformLike
 from .history import History, HistoryEntry
 from .operation import Operation
@@ -238,7 +238,6 @@ class Edit:
         return operation.default_tag()
 
     def _diff(self, version: int, changes: Iterable[Change], reruns: int) -> Diff:
-        """Return the difference that the edit made."""
         moved: tuple[str, ...] = ()
         if self._again:
             old = [entry.tag for entry in self._order if entry.tag not in self._added]

@@ -551,11 +551,11 @@ class History:
 
     def _renumber(self) -> None:
         # Copies and snapshots may share the entries, so they are replaced and not modified.
-        anew = [
+        renumbered = [
             HistoryEntry(e.tag, e.operation, i * _GAP, e.reads, e.writes) for i, e in enumerate(self.sequence)
         ]
         self._undo.append((self._put_entries, (self.sequence,)))
-        self._put_entries(anew)
+        self._put_entries(renumbered)
         self._dirty = [(self.entries[tag].place, tag) for _, tag in self._dirty if tag in self.entries]
         heapq.heapify(self._dirty)
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from kineverse._checks import finite_number
 from kineverse.compilation import CompiledFunction
-from kineverse.compilation.column_functions import compile_columns, insert_values
+from kineverse.compilation.function import compile_columns, insert_values
 from kineverse.errors import (
     ExpressionError,
     InvalidValueError,

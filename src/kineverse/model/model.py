@@ -11,10 +11,9 @@ from kineverse._runtime import no_collection
 from kineverse.errors import EditError, ExpressionError, UnknownAttributeError
 from kineverse.symbols import Symbol
 
-from .diff import Change, Diff
+from .changes import Change, Diff, Listener, Listeners
 from .edit import Edit
 from .history import History, HistoryEntry
-from .listeners import Listener, Listeners
 from .model_view import ModelView
 from .read_recorder import ABSENT
 from .registry import LoopTreatment
@@ -199,7 +198,7 @@ class Model(ModelView):
         return self.copy()
 
     def __reduce__(self) -> Any:
-        return _restore, (self.snapshot(),)
+        return Snapshot.model, (self.snapshot(),)
 
 
 class Snapshot(ModelView):
@@ -234,14 +233,4 @@ class Snapshot(ModelView):
         return hash(tuple(self.tags))
 
     def __reduce__(self) -> Any:
-        return _restore_snapshot, (self._head, self._entries, self._version)
-
-
-def _restore(snapshot: Snapshot) -> Model:
-    return snapshot.model()
-
-
-def _restore_snapshot(
-    head: dict[str, dict[str, Any]], entries: tuple[HistoryEntry, ...], version: int
-) -> Snapshot:
-    return Snapshot(head, entries, version)
+        return Snapshot, (self._head, self._entries, self._version)

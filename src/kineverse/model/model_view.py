@@ -29,7 +29,7 @@ from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, EqualityConstraints, project
 from .registry import SaveResult
 from .symbolic_view import SymbolicView, cached_for_version
-from .velocity_rows import Recovery, VelocityRows, velocity_rows
+from .velocity_constraints.velocity_rows import Recovery, VelocityRows, velocity_rows
 from .violations import ConstraintChecker, Violations, find_violations
 
 
@@ -52,6 +52,18 @@ class ModelView(SymbolicView):
 
         A constraint is relevant if its expression shares a coordinate, of any order, with the subject or a
         key of the subject's gradient. So a pose finds the lock on a velocity.
+
+        Parameters
+        ----------
+        subject
+            One or several expressions, symbols, or names of frames, which stand for their poses.
+        exact
+            True for the formula of the papers, ``V(φ_c) ∩ V(ψ) ≠ ∅``: symbols instead of coordinates, without
+            gradients.
+        bounds
+            True to compare the symbols of bounds as well.
+        closure
+            True to repeat the search with the symbols of the result until it is closed.
         """
         with self._lock:
             self._catch_up()
@@ -86,6 +98,21 @@ class ModelView(SymbolicView):
         Constraints without any of the given symbols, or with speeds that are not given, are listed as
         ``unchecked``. A loop that does not close is listed by its name. Like any constraint without a value
         it comes first, with NaN as value and excess.
+
+        Parameters
+        ----------
+        values
+            A state, or a mapping from symbols or names to numbers.
+        tolerance
+            Largest excess of a satisfied constraint, in the unit of the constraint.
+
+        Raises
+        ------
+        UnknownNameError
+            If a constraint has a given symbol and a missing position, a name is unknown, or a state has no
+            value of any symbol of the model.
+        DuplicateNameError
+            If a symbol has two values, by name and by symbol, or several symbols have one name.
         """
         with self._lock:
             self._catch_up()
@@ -100,6 +127,12 @@ class ModelView(SymbolicView):
         """Return the constraints as a compiled function of a vector, for loops.
 
         It is :meth:`violations` of the present version of the model. Each thread needs one of its own.
+
+        Parameters
+        ----------
+        symbols
+            Symbols of the vector, by default :attr:`symbols`; for constraints on speeds append these.
+            Constraints on others are not checked. Parameters that are not given have their own values.
         """
         with self._lock:
             return self._make_checker(self.symbols if symbols is None else tuple(check_symbols(symbols)))
@@ -126,6 +159,14 @@ class ModelView(SymbolicView):
         within their constant limits. That is what clips estimates, and what samples are drawn from. With
         ``values``, the limits are those at that state, where the door may be locked at 0: that is what a
         controller needs to know now.
+
+        Parameters
+        ----------
+        symbol
+            A symbol or its name: a coordinate or a speed.
+        values
+            A state, or a mapping from symbols or names to numbers. Bounds that cannot be evaluated there are
+            ignored.
         """
         with self._lock:
             self._catch_up()
@@ -171,7 +212,13 @@ class ModelView(SymbolicView):
         return lower, upper
 
     def symbol(self, name: str) -> Symbol:
-        """Return the symbol of a name; its coordinate is a free or dependent coordinate of the model."""
+        """Return the symbol of a name; its coordinate is a free or dependent coordinate of the model.
+
+        Raises
+        ------
+        UnknownNameError
+            With similar names.
+        """
         path, order = parse_symbol_name(name)
         coordinates = (*self.symbols, *self.rates.dependent)
         for known in coordinates:
@@ -192,7 +239,13 @@ class ModelView(SymbolicView):
         )
 
     def degree_of_freedom(self, name: Symbol | str) -> Symbol:
-        """Return the degree of freedom of a name."""
+        """Return the degree of freedom of a name.
+
+        Raises
+        ------
+        UnknownNameError
+            With similar names.
+        """
         known = {str(s): s for s in self.degrees_of_freedom}
         if str(name) not in known:
             raise UnknownNameError(
@@ -278,7 +331,30 @@ class ModelView(SymbolicView):
 
         With a subject, these are the constraints relevant for it and the speed limits of all coordinates that
         they involve; without one, all constraints. See :meth:`constraints_for` and
-        :mod:`kineverse.model.velocity_rows`, for ``gain`` and ``recovery`` as well.
+        :mod:`kineverse.model.velocity_constraints.velocity_rows`, for ``gain`` and ``recovery`` as well.
+
+        Parameters
+        ----------
+        dt
+            Control period [s], a number or an expression.
+        subject
+            One or several expressions, symbols, or names of frames, which stand for their poses.
+        speeds
+            Columns; by default the speeds of the constraints, sorted. All other speeds are assumed to be 0.
+        gain
+            Gain [1/s] in (0, 1/dt], a number or an expression; 1/dt by default.
+        recovery
+            ``"required"`` or ``"allowed"`` outside of bounds.
+        extra
+            Further constraints by name, as (lower, expression, upper), which the model does not have. They
+            are rows whatever the subject is, with the constraints relevant for their expressions.
+
+        Raises
+        ------
+        DuplicateNameError
+            For an extra constraint with the name of a constraint of the model.
+        InvalidValueError
+            For a step, gain or recovery that is not possible, or an extra constraint that is none.
         """
         with self._lock:
             every = dict(self.constraints)
@@ -318,6 +394,27 @@ class ModelView(SymbolicView):
 
         **Limits and other constraints are ignored.** At 100 rad/s, a door with a limit of 1.57 rad is at 100
         rad after one second, and :meth:`violations` reports it.
+
+        Parameters
+        ----------
+        state
+            Values of at least all coordinates that move: a state, or a mapping from symbols or names of this
+            model to numbers.
+        speeds
+            Values by free speed or its name [m/s], [rad/s]; the default is 0.
+        dt
+            Duration [s]; may be negative.
+        clip
+            True to clip each coordinate to its limits afterwards, as in :meth:`default_state`: constraints on
+            a linear function of one coordinate. Other constraints, such as those on a sum of two coordinates
+            or locks of speeds, are ignored.
+
+        Raises
+        ------
+        UnknownNameError
+            For a speed that moves no coordinate, or a symbol that is not in the model.
+        InvalidValueError
+            For NaN or an infinite step, or if coordinates diverge.
         """
         with self._lock:
             self._settle()
@@ -338,6 +435,21 @@ class ModelView(SymbolicView):
 
         It is :meth:`integrate` without clipping, of the present version of the model. Each thread needs one
         of its own.
+
+        Parameters
+        ----------
+        speeds
+            Speeds of the vector of speeds; all others are zero. By default :attr:`speeds`.
+        symbols
+            Symbols of the vector of coordinates, by default :attr:`symbols`. Coordinates that the rates of
+            moving ones contain have to be among them; parameters that are not have their own values.
+
+        Raises
+        ------
+        UnknownNameError
+            If a symbol is not in the model, or a speed moves none of the symbols.
+        DuplicateNameError
+            If a symbol is given twice.
         """
         with self._lock:
             layout = self.symbols if symbols is None else tuple(check_symbols(symbols))
@@ -358,6 +470,23 @@ class ModelView(SymbolicView):
         These are position constraints with equal bounds, such as loop closures; see
         :mod:`kineverse.model.projection`. The result satisfies them and the other constraints on their
         coordinates. Coordinates of satisfied constraints and all other values stay.
+
+        Parameters
+        ----------
+        state
+            A state, or a mapping from symbols or names to numbers.
+        fixed
+            Coordinates and articulations that stay fixed, as symbols or names.
+        tolerance
+            Largest residual of a satisfied equality, in its unit.
+
+        Raises
+        ------
+        NoSolutionError
+            If no solution is found, naming the violated constraints, their residuals and the attempts; or if
+            a loop does not close at the state.
+        UnknownNameError
+            If a value is missing, or a name is unknown.
         """
         with self._lock:
             self._catch_up()
@@ -384,6 +513,24 @@ class ModelView(SymbolicView):
 
         A document contains the whole model. URDF and MJCF cannot express all motions and constraints: motions
         are refused by name, constraints are left out with a remark; see :func:`kineverse.formats.saver.save`.
+
+        Parameters
+        ----------
+        path
+            Path of the file.
+        tolerance
+            Largest error of a frame in URDF and MJCF, in position [m] and angle [rad], guaranteed; None for
+            no error.
+        leave_out
+            Names of constraints and articulations to leave out.
+        strict
+            True to refuse constraints that the format cannot express.
+
+        Raises
+        ------
+        FormatError
+            If the name has another ending, the file cannot be written, or the format cannot express the
+            model.
         """
         names = (leave_out,) if isinstance(leave_out, str) else leave_out
         return registry.save_model(self, path, tolerance=tolerance, leave_out=names, strict=strict)

@@ -12,12 +12,7 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from kineverse.errors import (
-    DuplicateNameError,
-    ExpressionError,
-    InvalidValueError,
-    suggest,
-)
+from kineverse.errors import DuplicateNameError, ExpressionError, InvalidValueError, suggest
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.symbols import Symbol
 

@@ -148,12 +148,10 @@ def _limits_single(row: ResidualRow) -> bool:
     return len(row.value.symbols) == 1 and _line(row.value) is not None
 
 
-TOLERANCE = 1e-9
-"""Largest residual of a satisfied constraint, as in :meth:`kineverse.Model.violations`."""
+TOLERANCE = 1e-9  # largest residual of a satisfied constraint, as in :meth:kineverse.Model.violations
 
 _STEPS, _NEARER = 100, 40
-_LONGEST = 0.5
-"""Longest step [m], [rad]. Linearisations are not valid beyond."""
+_LONGEST = 0.5  # longest step [m], [rad]. Linearisations are not valid beyond
 _STARTS = 12
 _SINGULAR, _AT_BOUND = 1e-9, 1e-9
 

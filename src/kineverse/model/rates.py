@@ -230,7 +230,7 @@ def as_entry(coordinate: Symbol, value: Mapping[Symbol, ExpressionLike] | Expres
 
 def _check_coordinate(coordinate: Symbol) -> None:
     if not isinstance(coordinate, Symbol) or coordinate.order or not coordinate.has_derivative:
-        raise ModelError(f"Only positions have a rate, and '{coordinate}' is none.")
+        raise ModelError(f"Only positions have a rate, not '{coordinate}'.")
 
 
 def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> RateRow:
@@ -292,7 +292,6 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             self._rows[x] = self._combine(rows[x])
 
     def _expand(self, row: RateRow) -> RateRow:
-        """Return a row in terms of independent coordinates."""
         if not self.dependent:
             return row
         result: dict[Symbol, Expression] = {}
@@ -377,8 +376,8 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
 
     @property
     def _title(self) -> str:
-        beside = f" and {len(self.dependent)} dependent coordinates" if self.dependent else ""
-        return f"{len(self)} rates{beside}"
+        dependent = f" and {len(self.dependent)} dependent coordinates" if self.dependent else ""
+        return f"{len(self)} rates{dependent}"
 
     def __eq__(self, other: object) -> bool:
         return self.key == other.key if isinstance(other, Rates) else NotImplemented

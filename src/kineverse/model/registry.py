@@ -61,9 +61,9 @@ class FileFormat:
     suffixes: tuple[str, ...]  # endings of the file names that it reads
     read: str  # function from a FileContent to an iterable of (tag, operation)
     written: tuple[str, ...] = ()  # endings of the file names that it writes
-    write: str = ""  # (model, path, leave_out, tolerance, strict)
-    recognize: Callable[[str, bytes], bool] | None = None  # (name, content)
-    exact: bool = False  # (model, path)
+    write: str = ""  # function of (model, path, leave_out, tolerance, strict) to the content of files
+    recognize: Callable[[str, bytes], bool] | None = None  # of (name, content), where formats share a suffix
+    exact: bool = False  # True if files hold all of a model; then write is a function of (model, path)
     loop_element: str = ""  # element of the format that closes a loop; empty if the format has none
     reference: bytes = b""  # text in every file that refers to further files; empty if files never do
 
@@ -79,11 +79,12 @@ class FileFormat:
 
 @dataclass(frozen=True, slots=True)
 class ModelCollection:
-    """Models that functions build, loaded as ``collection/name``."""
+    """Models that functions build, or documents that ship, loaded as ``collection/name``."""
 
     list_names: str  # function that returns all names
-    build: str  # function from a name and a prefix to an iterable of operations
     summary: str  # number of its models, for errors: "one for each ..."
+    build: str = ""  # function from a name and a prefix to an iterable of operations; empty for documents
+    find_document: str = ""  # function from a name to the path of its document; empty if models are built
     accept: str = ""  # predicate of names, if list_names has examples alone; empty if it has all names
     prefix: str = ""  # prefix of a model by default; that of an empty text is the name of the model
 
@@ -95,8 +96,12 @@ class ModelCollection:
         """Return the names of the models, or examples of them."""
         return tuple(import_entry(self.list_names)())
 
+    def document(self, name: str) -> Path | None:
+        """Return the path of the document of a model; None for a model that is built."""
+        return import_entry(self.find_document)(name) if self.find_document else None
+
     def operations(self, name: str, prefix: str | None) -> Iterator[Operation]:
-        """Yield the operations of a model."""
+        """Yield the operations of a model that is built."""
         yield from import_entry(self.build)(name, prefix)
 
 
@@ -121,7 +126,7 @@ class SaveResult:
 
     path: Path  # path of the file
     remarks: tuple[str, ...] = ()  # differences between the file and the model that are no errors
-    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)  # [m], [rad]
+    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)  # bounds, where a tolerance allows any
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -137,19 +142,21 @@ class SaveResult:
 
 _COLLECTIONS: Mapping[str, ModelCollection] = {
     "articulations": ModelCollection(
-        "kineverse.gallery:names", "kineverse.gallery:operations", summary="one for each articulation"
+        "kineverse.gallery:names",
+        summary="one for each articulation",
+        find_document="kineverse.gallery:find_document",
     ),
     "kitchens": ModelCollection(
         "kineverse.gallery.kitchens:example_seeds",
-        "kineverse.gallery.kitchens:kitchen_operations",
         summary="one for each seed from 0 on",
+        build="kineverse.gallery.kitchens:kitchen_operations",
         accept="kineverse.gallery.kitchens:is_seed",
         prefix="kitchen",
     ),
     "lockboxes": ModelCollection(
         "kineverse.gallery.lockboxes:example_boxes",
-        "kineverse.gallery.lockboxes:lockbox_operations",
         summary="one for each seed from 0 on",
+        build="kineverse.gallery.lockboxes:lockbox_operations",
         accept="kineverse.gallery.lockboxes:has_lockbox",
         prefix="lockbox",
     ),

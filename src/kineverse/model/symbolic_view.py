@@ -137,7 +137,6 @@ class SymbolicView:
         self._derived: dict[Hashable, Any] = {}
 
     def _invalidate(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
-        """Invalidate the caches that changes affect."""
         kinds = {cell[0] for cell, _, _ in changes}
         if self._is_indexed:
             self._pending += changes
@@ -253,7 +252,6 @@ class SymbolicView:
         return known
 
     def _eliminate_dependent(self, constraint: Constraint) -> Constraint:
-        """Return a constraint in terms of independent coordinates and free speeds."""
         rates = self.rates
         if not any(s.position in rates.dependent for s in constraint.symbols):
             return constraint
@@ -313,7 +311,13 @@ class SymbolicView:
     # -- kinematics ----------------------------------------------------------------------------------------
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
-        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates."""
+        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates.
+
+        Raises
+        ------
+        UnknownNameError
+            If a frame does not exist, with similar names.
+        """
         with self._lock:
             self._settle()
             known = self._poses.get((frame, relative_to))
@@ -333,7 +337,35 @@ class SymbolicView:
         symbols: Sequence[Symbol] | None = None,
         heuristic: bool = False,
     ) -> Expression:
-        """Return the geometric Jacobian of a frame, 6×n: linear rows [m] first, then angular rows [rad]."""
+        r"""Return the geometric Jacobian a_J_b of a frame, 6×n: linear rows [m], then angular rows [rad].
+
+        It maps the speeds to the twist of the frame b in the frame a, where a_p_b and a_R_b are its position
+        and its rotation in :meth:`fk`:
+
+        .. math::
+
+            \begin{pmatrix} v \\ \omega \end{pmatrix} = {}_aJ_b(q)\, \dot q, \qquad
+            v = \frac{d}{dt}\, {}_ap_b, \qquad
+            [\omega]_\times = \frac{d}{dt} \left( {}_aR_b \right) {}_aR_b^\top
+
+        Parameters
+        ----------
+        frame, relative_to
+            Moving frame b and reference frame a.
+        form
+            ``world_aligned``: v and ω as above, at the origin of b in axes of a; ``world``: the spatial twist
+            v + p × ω and ω; ``body``: Rᵀv and Rᵀω, in axes of b.
+        symbols
+            Positions or velocities, one for each column. By default the speeds that move the frame, sorted
+            (:meth:`speeds_of`).
+        heuristic
+            True to include heuristic gradient entries. The default is the exact Jacobian.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such frame or form, with similar names.
+        """
         if form not in ("world_aligned", "world", "body"):
             raise UnknownNameError(
                 f"There is no form {form!r}; forms are 'world_aligned', 'world' and 'body'."
@@ -400,6 +432,18 @@ class SymbolicView:
         """Return the centre of mass, (3,) [m] in the world; coordinates are carried by their rates.
 
         Bodies without mass do not count.
+
+        Parameters
+        ----------
+        frame
+            Frame whose bodies count, with those of all frames below it; by default all bodies.
+
+        Raises
+        ------
+        UnknownNameError
+            If the frame does not exist, with similar names.
+        ModelError
+            If none of the bodies has a mass, with their names.
         """
         with self._lock:
             self._settle()
@@ -438,6 +482,11 @@ class SymbolicView:
         coordinates of a joint in its own order. A dependent coordinate, as of a mimic joint or a closed loop,
         is replaced by those that determine it. Pass them to :func:`kineverse.compile` for input vectors in
         this order instead of sorted by name.
+
+        Raises
+        ------
+        UnknownNameError
+            If a frame does not exist, with similar names.
         """
         with self._lock:
             self._settle()

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_tolerance
-from kineverse.compilation.column_functions import compile_columns, insert_values
-from kineverse.compilation.function import WantedTier
+from kineverse.compilation.function import WantedTier, compile_columns, insert_values
 from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.graph import lower

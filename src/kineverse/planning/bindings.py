@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.compilation.c_library import SourceLibrary
+from kineverse.compilation.c_library import SourceLibrary, struct_fields
 from kineverse.compilation.interruption import WATCH, raise_signal
 from kineverse.compilation.toolchain import NO_COMPILER, NO_UNDEFINED_FLAGS
 from kineverse.compilation.vector_program import vector_header
@@ -19,34 +19,17 @@ from kineverse.geometry.bindings import collision_library
 
 SOURCES = ("collision.c", "edges.c", "rrt_connect.c", "manifold.c", "roadmap.c")
 
-OBSTACLE = np.dtype(
-    [
-        ("rotation", np.float32, 9),
-        ("translation", np.float32, 3),
-        ("size", np.float32, 3),
-        ("kind", np.int32),
-        ("body", np.int32),
-        ("first", np.int32),
-        ("planes", np.int32),
-        ("aligned", np.int32),
-        ("object", np.int32),
-    ]
-)
-LINK = np.dtype(
-    [
-        ("ball", np.float32, 4),
-        ("low", np.float32, 3),
-        ("high", np.float32, 3),
-        ("pose", np.int32),
-        ("first", np.int32),
-        ("coarse", np.int32),
-        ("first_shape", np.int32),
-        ("shapes", np.int32),
-        ("exact", np.int32),
-    ]
-)
+
+def _integers(names: str) -> list[tuple[str, type[np.int32]]]:
+    return [(name, np.int32) for name in names.split()]
+
+
+_VECTORS = ("rotation", np.float32, 9), ("translation", np.float32, 3), ("size", np.float32, 3)
+OBSTACLE = np.dtype([*_VECTORS, *_integers("kind body first planes aligned object")])
+_BOUNDS = ("ball", np.float32, 4), ("low", np.float32, 3), ("high", np.float32, 3)
+LINK = np.dtype([*_BOUNDS, *_integers("pose first coarse first_shape shapes exact")])
 SHAPE = np.dtype([("pose", np.float64, 12), ("object", np.int64)])
-COARSE = np.dtype([("sphere", np.float32, 4), ("first", np.int32), ("count", np.int32)])
+COARSE = np.dtype([("sphere", np.float32, 4), *_integers("first count")])
 
 MOST_COORDINATES = 64
 """Largest number of coordinates, as in ``edges.c``."""
@@ -58,56 +41,47 @@ FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY, TOO_LONG = range(5)
 """Outcomes of a search."""
 
 
-def _fields(kinds: str, names: str) -> list[tuple[str, Any]]:
-    types = {"p": ctypes.c_void_p, "i": ctypes.c_longlong, "d": ctypes.c_double}
-    return [(name, types[kind]) for kind, name in zip(kinds, names.split(), strict=True)]
-
-
 class ObstacleSetStruct(ctypes.Structure):
     """Set of obstacles as C reads it."""
 
-    _fields_ = _fields("pppiiiii", "items boxes chunks count padded padded_chunks pose link")
+    _fields_ = struct_fields("p items boxes chunks; i count padded padded_chunks pose link")
 
 
 class CheckerStruct(ctypes.Structure):
     """Tables of a collision checker as C reads them."""
 
-    _fields_ = _fields(
-        "iiiippppiipppppppppiippppppppd",
-        "coordinates poses conditions stored compute kept lower upper links bodies link coarse fine planes "
-        "allowed world moving fineness turns pairs moving_pairs pair moving_pair shape objects object_poses "
-        "object_positions object_centres is_within margin",
+    _fields_ = struct_fields(
+        "i coordinates poses conditions stored; p compute kept lower upper; i links bodies; p link coarse "
+        "fine planes allowed world moving fineness turns; i pairs moving_pairs; p pair moving_pair shape "
+        "objects object_poses object_positions object_centres is_within; d margin"
     )
 
 
 class ProjectionStruct(ctypes.Structure):
     """Projection onto a manifold as C reads it."""
 
-    _fields_ = _fields(
-        "ppidippid",
-        "step kept stored tolerance steps exact exact_kept exact_stored exact_tolerance",
+    _fields_ = struct_fields(
+        "p step kept; i stored; d tolerance; i steps; p exact exact_kept; i exact_stored; d exact_tolerance"
     )
 
 
 class SearchStruct(ctypes.Structure):
     """Search and its results as C reads and writes them."""
 
-    _fields_ = _fields(
-        "ppdddiiiiiiiidd",
-        "checker projection range resolution seconds nodes most_edges seed "
-        "iterations edges count_start count_goal status elapsed gap",
+    _fields_ = struct_fields(
+        "p checker projection; d range resolution seconds; i nodes most_edges seed iterations edges "
+        "count_start count_goal status; d elapsed gap"
     )
 
 
 class RoadmapStruct(ctypes.Structure):
     """Roadmap, a query and its results as C reads and writes them."""
 
-    _fields_ = _fields(
-        "pddddiiiipppppppppppppiiiiiiiiiiidd",
-        "checker resolution least greed seconds seed degree room least_batch period columns lengths "
-        "targets incoming next node edge passing visits_start visits_goal order_start order_goal count "
-        "ends drawn round query samples nodes_checked edges_checked reached_start reached_goal status "
-        "elapsed gap",
+    _fields_ = struct_fields(
+        "p checker; d resolution least greed seconds; i seed degree room least_batch; p period columns "
+        "lengths targets incoming next node edge passing visits_start visits_goal order_start order_goal; "
+        "i count ends drawn round query samples nodes_checked edges_checked reached_start reached_goal "
+        "status; d elapsed gap"
     )
 
 
@@ -166,7 +140,7 @@ def _declare_signatures(code: Any) -> None:
 
 
 def _ensure_memory(failed: int, function: Any, arguments: tuple[Any, ...]) -> int:
-    """Raise MemoryError where a function of C says that it has failed, which is for lack of memory only."""
+    """Raise MemoryError where a function of C has failed, which only happens for lack of memory."""
     raise_signal()
     if failed:
         raise MemoryError("There is no memory for the check of configurations.")
@@ -174,6 +148,6 @@ def _ensure_memory(failed: int, function: Any, arguments: tuple[Any, ...]) -> in
 
 
 def _ensure_whole(result: int, function: Any, arguments: tuple[Any, ...]) -> int:
-    """Raise the exception for which a function of C has ended early, if there is one."""
+    """Raise the exception that ended a function of C early, if there is one."""
     raise_signal()
     return result

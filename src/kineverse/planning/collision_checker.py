@@ -50,11 +50,11 @@ LEAST_INFLATION = 2e-4
 
 
 class LateCheckError(NoSolutionError):
-    """The check of a path that was found takes longer than it may."""
+    """The check of a found path takes longer than it may."""
 
 
 class CollisionChecker:
-    """Collision check of many configurations of some coordinates; everything else stands still."""
+    """Collision check of many configurations of some coordinates; everything else is fixed."""
 
     def __init__(
         self,
@@ -100,20 +100,20 @@ class CollisionChecker:
         if any(e.nodes for e in outputs):
             outputs.append(as_expression(sum((p.sum() for p in poses), as_expression(0.0)) * 0.0))
         moving = {*self.coordinates}
-        found = {s for e in outputs for s in e.symbols} - moving
-        self.parameters = tuple(sorted(found, key=lambda s: s.sort_key))
+        result = {s for e in outputs for s in e.symbols} - moving
+        self.parameters = tuple(sorted(result, key=lambda s: s.sort_key))
         self.conditions = len(outputs) - len(poses)
         return VectorProgram(outputs, self.coordinates, self.parameters, scalar="float")
 
     def _in_group(self, body: str, group: str) -> list[tuple[CollisionObject, Solid, Array]]:
-        """Return the objects of a body with their solids and their poses in its rigid group, (4, 4)."""
+        """Return the objects of a body with their solids and their poses (4, 4) in its rigid group."""
         world = self.scene.collision_world
         offset = self.scene.model.fk(body, group)({})
         items = ((world.objects[k], world.solid(k)) for k in world.members[world.body_index(body)])
         return [(item, solid, offset @ item.shape.origin.matrix) for item, solid in items]
 
     def _place_static(self, dependence: FrameDependence) -> None:
-        """Collect the obstacles of the world: all objects that stand still."""
+        """Collect the obstacles of the world."""
         world = self.scene.collision_world
         self._static = np.array(
             [k for k, o in enumerate(world.objects) if not dependence.moves(o.body)], dtype=int
@@ -132,7 +132,7 @@ class CollisionChecker:
     def _place_moving(
         self, members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]], poses: Sequence[int]
     ) -> None:
-        """Collect the shapes of the bodies that move, each body in a set of its own."""
+        """Collect the shapes of the moving bodies, a set for each."""
         lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
         self._costs = []
@@ -142,12 +142,12 @@ class CollisionChecker:
         for k, items in enumerate(members):
             solids = [solid for _, solid, _ in items]
             bodies, places = np.zeros(len(solids), dtype=np.int32), np.array([T[:3] for _, _, T in items])
-            found = ObstacleSet(solids, bodies, places, self._planes, lanes, poses[k], k)
-            self._sets.append(found)
-            self._costs.append(found.cost)
+            result = ObstacleSet(solids, bodies, places, self._planes, lanes, poses[k], k)
+            self._sets.append(result)
+            self._costs.append(result.cost)
 
     def _choose_pairs(self, dependence: FrameDependence) -> None:
-        """Choose for each pair of moving bodies whether shapes or spheres stand for the second one.
+        """Choose for each pair of moving bodies whether shapes or spheres represent the second one.
 
         Where spheres touch, the shapes of both are compared, unless these are spheres.
         """
@@ -181,37 +181,16 @@ class CollisionChecker:
         program, links = self.program, self.links
         self._kept = program.prepare(np.zeros(len(self.parameters)))
         self.struct = CheckerStruct(
-            n,
-            len(self.groups),
-            self.conditions,
-            program.stored,
-            program.compute_address,
-            self._kept.ctypes.data,
-            self.lower.ctypes.data,
-            self.upper.ctypes.data,
-            len(links.links),
-            len(self.standing),
-            links.links.ctypes.data,
-            links.coarse.ctypes.data,
-            links.fine.ctypes.data,
-            self._plane_table.ctypes.data,
-            self._allowed.ctypes.data,
-            ctypes.addressof(self._world.struct),
-            ctypes.addressof(self._set_structs),
-            self._fineness.ctypes.data,
-            self._turns.ctypes.data,
-            len(self.pairs),
-            len(self.moving_pairs),
-            self.pairs.ctypes.data,
-            self.moving_pairs.ctypes.data,
-            links.shapes.ctypes.data,
-            self._objects.address,
-            self._objects.poses.ctypes.data,
-            self._objects.positions.ctypes.data,
-            self.scene.collision_world.table.centre.ctypes.data,
-            self._objects.is_within,
-            margin,
-        )
+            n, len(self.groups), self.conditions, program.stored, program.compute_address,
+            self._kept.ctypes.data, self.lower.ctypes.data, self.upper.ctypes.data, len(links.links),
+            len(self.standing), links.links.ctypes.data, links.coarse.ctypes.data, links.fine.ctypes.data,
+            self._plane_table.ctypes.data, self._allowed.ctypes.data, ctypes.addressof(self._world.struct),
+            ctypes.addressof(self._set_structs), self._fineness.ctypes.data, self._turns.ctypes.data,
+            len(self.pairs), len(self.moving_pairs), self.pairs.ctypes.data, self.moving_pairs.ctypes.data,
+            links.shapes.ctypes.data, self._objects.address, self._objects.poses.ctypes.data,
+            self._objects.positions.ctypes.data, self.scene.collision_world.table.centre.ctypes.data,
+            self._objects.is_within, margin,
+        )  # fmt: skip
 
     @property
     def address(self) -> int:
@@ -219,7 +198,7 @@ class CollisionChecker:
         return ctypes.addressof(self.struct)
 
     def place(self, state: State) -> None:
-        """Place everything as at a state: obstacles, and what the poses depend on beside the coordinates."""
+        """Place the obstacles at a state, and set everything else that poses depend on."""
         self.scene.update(state)
         table, parameters = self.scene.collision_world.table, state.vector(self.parameters)
         poses = table.poses[self._static]
@@ -238,7 +217,7 @@ class CollisionChecker:
     def version(self) -> tuple[int, BodyPairs]:
         """Number of the placement, and the pairs that are left out.
 
-        While it stays, and the margin and the limits, so do the answers. Other checkers have other numbers.
+        Answers stay the same as long as these, the margin and the limits do.
         """
         return self._placed, self._excepted
 
@@ -252,7 +231,7 @@ class CollisionChecker:
             self._except(frozenset())
 
     def _except(self, pairs: BodyPairs) -> None:
-        """Make C use the tables without some pairs, which are kept: holds come again."""
+        """Switch C to tables without some pairs, which are kept for the next holds."""
         if pairs not in self._tables:
             self._tables[pairs] = self._without(pairs)
         self._excepted, s = pairs, self.struct
@@ -261,7 +240,6 @@ class CollisionChecker:
         s.pairs, s.moving_pairs = len(spheres), len(shapes)
 
     def _without(self, pairs: BodyPairs) -> PairTables:
-        """Return the tables of checked pairs without some of them."""
         standing = {body: k for k, body in enumerate(self.standing)}
         numbers = {body: k for k, body in enumerate(self.moving)}
         allowed = self._allowed.copy()
@@ -297,65 +275,60 @@ class CollisionChecker:
 
     def valid(self, Q: Floats32) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of the configurations (N, n) that are within limits, allowed and free."""
-        found = np.zeros(len(Q), dtype=np.uint8)
-        self._code.kineverse_valid(self.address, Q.ctypes.data, len(Q), found.ctypes.data)
-        return found.astype(bool)
+        result = np.zeros(len(Q), dtype=np.uint8)
+        self._code.kineverse_valid(self.address, Q.ctypes.data, len(Q), result.ctypes.data)
+        return result.astype(bool)
 
     def edges(
         self, A: Floats32, B: Floats32, resolution: float = RESOLUTION, least: float = 0.0
     ) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of the straight edges between configurations (N, n) that are free."""
-        found = np.zeros(len(A), dtype=np.uint8)
+        result = np.zeros(len(A), dtype=np.uint8)
         self._code.kineverse_edges(
-            self.address, A.ctypes.data, B.ctypes.data, len(A), resolution, least, found.ctypes.data
+            self.address, A.ctypes.data, B.ctypes.data, len(A), resolution, least, result.ctypes.data
         )
-        return found.astype(bool)
+        return result.astype(bool)
 
     def find_collision(self, points: Floats32, seconds: float = math.inf) -> tuple[int, float] | None:
-        """Return the first edge of a polyline (N, n) that is not certainly free, and a fraction of it."""
+        """Find the first edge of a polyline (N, n) that is not certainly free, and a fraction of it."""
         where = ctypes.c_double()
-        found = self._code.kineverse_certify(
-            self.address,
-            points.ctypes.data,
-            len(points),
-            RESOLUTION,
-            LEAST_INFLATION,
-            seconds,
+        result = self._code.kineverse_certify(
+            self.address, points.ctypes.data, len(points), RESOLUTION, LEAST_INFLATION, seconds,
             ctypes.addressof(where),
-        )
-        if found == -3:
+        )  # fmt: skip
+        if result == -3:
             raise LateCheckError
-        if found < -1:
+        if result < -1:
             raise MemoryError("There is no memory for the check of a path.")
-        return None if found < 0 else (int(found), where.value)
+        return None if result < 0 else (int(result), where.value)
 
     def outputs(self, q: Floats32) -> tuple[Floats32, Floats32]:
         """Return the poses (K, 3, 4) of the rigid groups and the conditions at a configuration (n,)."""
         count = 12 * len(self.groups)
-        found = np.zeros(count + self.conditions, dtype=np.float32)
-        self._code.kineverse_poses(self.address, q.ctypes.data, found.ctypes.data)
-        return found[:count].reshape(-1, 3, 4), found[count:]
+        result = np.zeros(count + self.conditions, dtype=np.float32)
+        self._code.kineverse_poses(self.address, q.ctypes.data, result.ctypes.data)
+        return result[:count].reshape(-1, 3, 4), result[count:]
 
     def _find_turns(self) -> Array:
-        """Return by which angle a unit of each coordinate turns a body, the largest one found (n,) [rad].
+        """Find the largest angle by which a unit of each coordinate turns a body (n,) [rad].
 
-        Threads and gears turn bodies so fast that two poses do not tell how far they are apart.
+        Threads and gears turn bodies so fast that two poses do not show how far they are apart.
         """
-        generator, found = np.random.default_rng(0), np.zeros(len(self.coordinates))
-        for q in generator.uniform(-1.0, 1.0, (2, len(found))).astype(np.float32):
+        generator, result = np.random.default_rng(0), np.zeros(len(self.coordinates))
+        for q in generator.uniform(-1.0, 1.0, (2, len(result))).astype(np.float32):
             before = self.outputs(q)[0][:, :, :3]
-            for i in range(len(found)):
+            for i in range(len(result)):
                 near = q.copy()
                 near[i] += _SAME
                 change = np.linalg.norm(self.outputs(near)[0][:, :, :3] - before, axis=(1, 2))
                 turns = np.nan_to_num(change / math.sqrt(2.0) / float(near[i] - q[i]), nan=0.0)
-                found[i] = max(found[i], turns.max(initial=0.0))
-        return found
+                result[i] = max(result[i], turns.max(initial=0.0))
+        return result
 
     def find_periodic(self, candidates: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """Return flags (n,) of those coordinates whose full turns change no pose and no condition."""
+        """Return flags (n,) of the candidates whose full turns change no pose and no condition."""
         generator = np.random.default_rng(0)
-        found = candidates.copy()
+        result = candidates.copy()
         # At other places too: a screw whose pitch happens to be 0 is not periodic.
         elsewhere = self.program.prepare(generator.uniform(-1.0, 1.0, len(self.parameters)))
         self.struct.kept = elsewhere.ctypes.data
@@ -364,9 +337,9 @@ class CollisionChecker:
                 turned = q.copy()
                 turned[i] += math.tau
                 pairs = zip(self.outputs(q), self.outputs(turned), strict=True)
-                found[i] &= all(np.allclose(a, b, atol=_SAME, equal_nan=True) for a, b in pairs)
+                result[i] &= all(np.allclose(a, b, atol=_SAME, equal_nan=True) for a, b in pairs)
         self.struct.kept = self._kept.ctypes.data
-        return found
+        return result
 
 
 def is_switching(expression: Expression) -> bool:

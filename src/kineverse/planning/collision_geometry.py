@@ -21,7 +21,7 @@ from .spheres.object_covers import cover_key, find_or_make_tree
 
 
 class LinkTable:
-    """Spheres of the bodies that move, each in the frame of its pose."""
+    """Spheres of the moving bodies, each in the frame of its pose."""
 
     def __init__(
         self,
@@ -43,7 +43,8 @@ class LinkTable:
             link["pose"], link["first"] = pose, len(coarse)
             link["first_shape"], link["shapes"] = shapes, len(items)
             shapes += len(items)
-            corners = np.concatenate([_placed_corners(solid, T) for _, solid, T in items])
+            boxes = ((box_corners(s.centre - s.half, s.centre + s.half), T) for _, s, T in items)
+            corners = np.concatenate([points @ T[:3, :3].T + T[:3, 3] for points, T in boxes])
             link["low"], link["high"] = corners.min(axis=0), corners.max(axis=0)
             key = cover_key([(solid, T) for _, solid, T in items], protrusion)
             tree = find_or_make_tree(key, partial(_make_tree, items, protrusion))
@@ -69,18 +70,13 @@ def _make_tree(items: Sequence[tuple[CollisionObject, Solid, Array]], protrusion
     return make_sphere_tree(cover.centres, cover.radii)
 
 
-def _placed_corners(solid: Solid, T: Array) -> Array:
-    corners = box_corners(solid.centre - solid.half, solid.centre + solid.half)
-    return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
-
-
 def box_corners(low: Iterable[float], high: Iterable[float]) -> Array:
     """Return the corners (8, 3) of a box."""
     return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
 
 
 _SAME_PLANE = 6
-"""Digits to which planes of a hull are told apart."""
+"""Digits in which planes of a hull differ."""
 _ALIGNED = 1e-5
 """Largest distance of a shape from the one along the axes that stands for it [m]."""
 _COSTS = np.array([2.0, 3.0, 1.5, 1.0, 0.0])
@@ -126,15 +122,9 @@ class ObstacleSet:
         for boxes in (self._boxes, self._chunks):
             boxes[:3], boxes[3:] = _EMPTY, -_EMPTY
         self.struct = ObstacleSetStruct(
-            self._items.ctypes.data,
-            self._boxes.ctypes.data,
-            self._chunks.ctypes.data,
-            count,
-            chunks * lanes,
-            padded_chunks,
-            pose,
-            link,
-        )
+            self._items.ctypes.data, self._boxes.ctypes.data, self._chunks.ctypes.data, count, chunks * lanes,
+            padded_chunks, pose, link,
+        )  # fmt: skip
         self._poses = np.full((count, 3, 4), np.nan)
         self.place(poses)
 
@@ -182,12 +172,12 @@ class ObstacleSet:
 
 
 def _aligned_rows(rows: int, columns: int) -> Floats32:
-    """Return rows of floats, not initialised, that begin at cache lines for whole vectors of columns."""
+    """Allocate rows of floats that begin at cache lines, for whole vectors of columns."""
     return allocate_aligned(rows * columns // 2).view(np.float32).reshape(rows, columns)
 
 
 def _hull_planes(solid: Solid) -> Array:
-    """Return the planes of a hull, or of a polytope around another solid: rows of a normal and an offset [m].
+    """Return the planes (F, 4) of a hull, or of a polytope around another solid: normals and offsets [m].
 
     Planes that are equal up to rounding are one, as those of triangles in one face. Large faces come first,
     since they separate most.
@@ -222,10 +212,9 @@ def _support(core: Core, normals: Array) -> Array:
 
 
 def _spatial_order(points: Array, size: int) -> npt.NDArray[np.intp]:
-    """Return an order of points in which those of a chunk are near to each other.
+    """Order points so that those of a chunk are near to each other.
 
-    The points are halved along the axis of their largest spread, at multiples of the size, until they are
-    chunks.
+    The points are halved along the axis of their largest spread, at multiples of the size.
     """
     done: list[npt.NDArray[np.intp]] = []
     waiting = [np.arange(len(points))]

@@ -36,7 +36,7 @@ _MOST_POINTS = 50_000
 """Number of points that polishing may add to a path."""
 _STEPS, _POLISHING = 8, 12
 _DAMPING = 1e-5
-"""Damping of Newton's step where rows depend on each other, beside squares of derivatives [m²], [rad²]."""
+"""Damping of Newton's step where rows depend on each other, added to squares of derivatives [m²], [rad²]."""
 _ROWS = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -56,7 +56,7 @@ class FrameHold(Hold):
 def hold_frames(
     model: ModelView, a: str, b: str, mask: str = "xyz rx ry rz", offset: ExpressionLike | None = None
 ) -> FrameHold:
-    """Return the hold of a frame by another one in some directions."""
+    """Make the hold of a frame by another one in some directions."""
     rows = mask.replace(",", " ").split()
     names = [r for part in rows for r in ([part] if part in _ROWS else part)]
     if not names or len(set(names)) < len(names) or not set(names) <= set(_ROWS):
@@ -94,7 +94,8 @@ class Manifold:
         self._targets: list[Symbol] = []
         errors = [e for hold in holds for e in self._rows_of(model, hold)]
         self.rows = as_expression(array([*errors, *equalities]))
-        jacobian = _jacobian(self.rows, symbols)
+        gradient = self.rows.gradient(heuristic=False)
+        jacobian = stack_columns([gradient.get(s.derivative()) for s in symbols], self.rows.shape)
         for hold in holds:
             moved = {s.position for s in model.rates.resolve(hold.error).gradient(heuristic=False)}
             if moved.isdisjoint(symbols):
@@ -102,8 +103,8 @@ class Manifold:
         # A coordinate that stands still, or stays at its limit, has no column.
         free = [parameter(f"planning/free/{i}", 1.0) for i in range(len(symbols))]
         outputs = [newton_step(self.rows, jacobian * array(free)), largest(self.rows)]
-        found = {s for e in outputs for s in e.symbols} - {*symbols, *free, *self._targets}
-        self._others = tuple(sorted(found, key=lambda s: s.sort_key))
+        result = {s for e in outputs for s in e.symbols} - {*symbols, *free, *self._targets}
+        self._others = tuple(sorted(result, key=lambda s: s.sort_key))
         self.parameters = (*self._others, *self._targets)
         self._program = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="float")
         self._exact = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="double")
@@ -114,16 +115,9 @@ class Manifold:
         self.targets = hold_targets(holds)
         self._state: State | None = None
         self.struct = ProjectionStruct(
-            self._program.compute_address,
-            self._kept.ctypes.data,
-            self._program.stored,
-            TOLERANCE,
-            _STEPS,
-            self._exact.compute_address,
-            self._exact_kept.ctypes.data,
-            self._exact.stored,
-            EXACT,
-        )
+            self._program.compute_address, self._kept.ctypes.data, self._program.stored, TOLERANCE, _STEPS,
+            self._exact.compute_address, self._exact_kept.ctypes.data, self._exact.stored, EXACT,
+        )  # fmt: skip
 
     def _rows_of(self, model: ModelView, hold: Hold) -> list[Expression]:
         if not _is_number(hold):
@@ -141,7 +135,7 @@ class Manifold:
         return ctypes.addressof(self.struct)
 
     def place(self, state: State, targets: Array) -> None:
-        """Set the values of everything that the holds depend on beside the coordinates."""
+        """Set the values of everything else that the holds depend on."""
         if state is self._state and np.array_equal(targets, self.targets):
             return
         self._state, self.targets = state, targets
@@ -150,7 +144,7 @@ class Manifold:
         self._exact.prepare(values, self._exact_kept)
 
     def project(self, Q: Floats32) -> npt.NDArray[np.bool_]:
-        """Project configurations (N, n) in place; return flags (N,) of those that arrive within limits."""
+        """Project configurations (N, n) in place; return flags (N,) of those that converge within limits."""
         arrived = np.zeros(len(Q), dtype=np.uint8)
         self._code.kineverse_project(
             self._checker.address, self.address, Q.ctypes.data, len(Q), arrived.ctypes.data
@@ -158,7 +152,7 @@ class Manifold:
         return arrived.astype(bool)
 
     def polish(self, Q: Array) -> tuple[Array, Array]:
-        """Return configurations (N, n) on the manifold, within limits, in double, and residuals (N,)."""
+        """Return configurations (N, n) projected in double precision, within limits, and residuals (N,)."""
         return self._polish(Q, _POLISHING)
 
     def residuals(self, Q: Array) -> Array:
@@ -176,46 +170,36 @@ class Manifold:
     def refine(self, points: npt.NDArray[np.floating[Any]]) -> Array | None:
         """Return a polyline (N, n) in double on the manifold, so dense that lines between points keep to it.
 
-        Half way between two points the residual is at most :data:`DEVIATION`. None if a point does not arrive
-        within limits.
+        Half way between two points the residual is at most :data:`DEVIATION`. None if a point does not
+        converge within limits.
         """
         work = np.empty((len(points) + _MOST_POINTS, points.shape[1]))
         work[: len(points)] = points
+        buffer = work.ctypes.data, len(points), len(work)
         count = self._code.kineverse_refine(
-            self._checker.address,
-            self.address,
-            work.ctypes.data,
-            len(points),
-            len(work),
-            _POLISHING,
-            DEVIATION,
+            self._checker.address, self.address, *buffer, _POLISHING, DEVIATION
         )
         return None if count < 0 else work[:count].copy()
 
 
 def hold_targets(holds: Sequence[Hold]) -> Array:
-    """Return the numbers that holds have as targets, of all holds one after the other."""
-    found = [np.zeros(0)]
+    """Return the numeric targets of holds, one after the other."""
+    result = [np.zeros(0)]
     for hold in holds:
         if _is_number(hold):
             value = hold.target if isinstance(hold.target, int | float) else as_expression(hold.target)({})
-            found.append(np.full(hold.expression.shape, value, dtype=float).ravel())
-    return np.concatenate(found)
+            result.append(np.full(hold.expression.shape, value, dtype=float).ravel())
+    return np.concatenate(result)
 
 
 def _is_number(hold: Hold) -> bool:
-    """Return True if the target of a hold is a number, or an array of some."""
+    """Return True if the target of a hold consists of numbers."""
     return isinstance(hold.target, int | float) or not as_expression(hold.target).symbols
 
 
 def manifold_key(holds: Sequence[Hold]) -> tuple[object, ...]:
-    """Return what the program of a manifold depends on: holds with other numbers as targets share it."""
+    """Return the key of a manifold's program, which holds with other numeric targets share."""
     return tuple((hold.expression, None if _is_number(hold) else hold.target) for hold in holds)
-
-
-def _jacobian(rows: Expression, symbols: Sequence[Symbol]) -> Expression:
-    gradient = rows.gradient(heuristic=False)
-    return stack_columns([gradient.get(s.derivative()) for s in symbols], rows.shape)
 
 
 def newton_step(rows: Expression, jacobian: Expression) -> Expression:
@@ -237,8 +221,8 @@ def newton_step(rows: Expression, jacobian: Expression) -> Expression:
 
 
 def largest(rows: Expression) -> Expression:
-    """Return the largest magnitude of some rows (k,)."""
-    found = abs(rows[0])
+    """Return the largest magnitude of rows (k,)."""
+    result = abs(rows[0])
     for k in range(1, rows.size):
-        found = as_expression(maximum(found, abs(rows[k])))
-    return found
+        result = as_expression(maximum(result, abs(rows[k])))
+    return result

@@ -70,7 +70,7 @@ class ModeSegment:
 
 @dataclass(frozen=True, slots=True)
 class ModePath:
-    """Path through modes: its segments, the number of searches, and what is wrong with it."""
+    """Path through modes: its segments, the number of searches, and the problem without a goal."""
 
     segments: list[ModeSegment]
     iterations: int
@@ -91,8 +91,8 @@ class _Node:
     def segments(self, modes: Sequence[Mode]) -> list[ModeSegment]:
         if self.parent is None:
             return []
-        own = ModeSegment(modes[self.parent.mode], self.points, self.touching)
-        return [*self.parent.segments(modes), own]
+        last = ModeSegment(modes[self.parent.mode], self.points, self.touching)
+        return [*self.parent.segments(modes), last]
 
 
 class ModeSearch:
@@ -125,14 +125,14 @@ class ModeSearch:
             )
         self._objects = np.array([s in objects for s in scene.space.symbols], dtype=bool)
         self._still = [
-            np.array([s in objects - own for s in scene.space.symbols], dtype=bool) for own in moved
+            np.array([s in objects - movable for s in scene.space.symbols], dtype=bool) for movable in moved
         ]
         self._touching = [scene.touching_pairs(mode.along) for mode in self._modes]
         self._searches = 0
         self._generator = np.random.default_rng(seed)
 
     def run(self, q: Array) -> ModePath:
-        """Return a path from a configuration (n,)."""
+        """Search a path through the modes from a configuration (n,)."""
         self._end = working_seconds() + self._seconds
         first = self._find_mode(q)
         if first is None:
@@ -174,7 +174,7 @@ class ModeSearch:
         return ModePath(best.segments(self._modes), self._searches, problem)
 
     def _compile(self, holds: Sequence[Hold]) -> None:
-        """Compile what searches along holds need. This is done once, so its time does not count."""
+        """Compile programs for holds; that happens once, so its time does not count."""
         begin = working_seconds()
         self._scene.manifold(holds)
         self._end += working_seconds() - begin
@@ -190,11 +190,11 @@ class ModeSearch:
         return None
 
     def _signature(self, node: _Node) -> tuple[object, ...]:
-        """Return what makes a node differ from others: its mode and where the objects are."""
+        """Return the mode of a node and the rounded places of the objects, by which nodes are told apart."""
         return node.mode, tuple(np.round(node.q[self._objects] / _SAME).astype(int).tolist())
 
     def _exclude(self, one: int, other: int) -> bool:
-        """Return True if one frame would have to be at two others."""
+        """Return True if two modes would hold one frame at two others."""
         a, b = (
             {hold.frames[0]: hold.frames[1] for hold in self._modes[k].along if isinstance(hold, FrameHold)}
             for k in (one, other)
@@ -202,7 +202,7 @@ class ModeSearch:
         return any(a[frame] != b[frame] for frame in a.keys() & b.keys())
 
     def _object_values(self, node: _Node) -> list[Array]:
-        """Return values of the coordinates at the next change: objects at their limits, or anywhere."""
+        """Choose coordinates for the next change of modes: objects at their limits first, then anywhere."""
         moving = self._objects & ~self._still[node.mode]
         if not moving.any():
             return [node.q]
@@ -214,7 +214,7 @@ class ModeSearch:
         return [np.where(moving, lower + share * (upper - lower), node.q) for share in shares]
 
     def _change(self, node: _Node, other: int, values: Array) -> _Node | None:
-        """Return a node in another mode, with the objects at given values; None if there is no way."""
+        """Search a node in another mode, with the objects at the values of some coordinates."""
         mode = self._modes[node.mode]
         holds = tuple(dict.fromkeys((*mode.along, *self._modes[other].along)))
         touching = self._touching_around(node) | self._touching[other]
@@ -227,12 +227,12 @@ class ModeSearch:
         )
 
     def _touching_around(self, node: _Node) -> BodyPairs:
-        """Return the pairs that may touch in a node's mode and where it was entered."""
+        """Return the pairs that may touch in a node's mode, and where it was entered."""
         before = _NO_PAIRS if node.parent is None else self._touching[node.parent.mode]
         return before | self._touching[node.mode]
 
     def _reach_goal(self, node: _Node) -> ModeSegment | None:
-        """Return a way to the goal within the mode of a node; None if there is none."""
+        """Search a segment to the goal within the mode of a node."""
         still, mode = self._still[node.mode], self._modes[node.mode]
         touching = self._touching_around(node) | self._scene.touching_pairs(self._tasks)
         if self._ends is not None:
@@ -247,7 +247,7 @@ class ModeSearch:
         return None if points is None else ModeSegment(mode, points, touching)
 
     def _concerns_still(self, node: _Node) -> bool:
-        """Return True if a task is about objects that stand still in the mode, and is not met."""
+        """Return True if a task is about objects that do not move in the mode, and is not met."""
         moving = {
             s for s, still in zip(self._scene.space.symbols, self._still[node.mode], strict=True) if not still
         }
@@ -260,11 +260,7 @@ class ModeSearch:
         return False
 
     def _solve(
-        self,
-        holds: Sequence[Hold],
-        near: Array,
-        touching: BodyPairs,
-        still: npt.NDArray[np.bool_],
+        self, holds: Sequence[Hold], near: Array, touching: BodyPairs, still: npt.NDArray[np.bool_]
     ) -> Array:
         self._searches += 1
         self._compile(holds)

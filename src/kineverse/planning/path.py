@@ -17,14 +17,8 @@ from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .path_checks import PathChecks
-from .path_rounding import (
-    PathSection,
-    TimedSection,
-    join_sections,
-    parameterize_sections,
-    section_times,
-)
+from .path_rounding import PathSection, TimedSection, join_sections, parameterize_sections, section_times
+from .state_validity import PathChecks
 from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.kinematic_limits import RAMP
 
@@ -43,8 +37,8 @@ class Path:
     symbols
         The n coordinates, the columns of :attr:`points`.
     points
-        Configurations (N, n) that are joined by straight lines [m], [rad]. Without a way they are the best
-        partial path: from the start to the point of the search that is nearest to a goal.
+        Configurations (N, n) that are joined by straight lines [m], [rad]. If no path was found, the best
+        partial one: from the start to the point of the search that is nearest to a goal.
     why
         How the path was found, or why there is none.
     seconds
@@ -106,8 +100,8 @@ class Path:
     ) -> Trajectory:
         """Return the fastest motion along the path, from rest to rest.
 
-        Corners are rounded as far as the way stays free, by the same certificate as the path; where it does
-        not, the motion stops. Holds are met up to 1e-5 m or rad.
+        Corners are rounded as far as the motion is certainly free, and it stops at the others. Holds are
+        met up to 1e-5 m or rad.
 
         Parameters
         ----------
@@ -119,7 +113,7 @@ class Path:
             :func:`.motion_limits`.
         velocity, acceleration
             Largest speeds and accelerations (n,), which replace those of the model; a number for all
-            coordinates applies beside them.
+            coordinates applies in addition.
 
         Raises
         ------
@@ -143,9 +137,9 @@ class Path:
 
     @cached_property
     def _times(self) -> Array:
-        found = section_times(self.points, self._parameterize(DEVIATION, RAMP, None, None))
-        found.flags.writeable = False
-        return found
+        result = section_times(self.points, self._parameterize(DEVIATION, RAMP, None, None))
+        result.flags.writeable = False
+        return result
 
     def _parameterize(
         self,
@@ -159,11 +153,11 @@ class Path:
         checks = self._own_checks()
         checks.ensure_current()
         stated = motion_limits(checks.model, self.symbols, ramp=ramp, state=self.state)
-        given = {"velocity=": velocity, "acceleration=": acceleration}
+        chosen = {"velocity=": velocity, "acceleration=": acceleration}
         limits = MotionLimits(
             *(
-                own if other is None else _combine_limits(own, _as_numbers(name, other))
-                for own, (name, other) in zip(stated, given.items(), strict=True)
+                limit if other is None else _combine_limits(limit, _as_numbers(name, other))
+                for limit, (name, other) in zip(stated, chosen.items(), strict=True)
             )
         )
         deviation = _as_numbers("deviation=", deviation)
@@ -173,13 +167,13 @@ class Path:
     def _own_checks(self) -> PathChecks:
         if self.checks is None:
             raise InvalidValueError(
-                "This path was pickled, and what checks it stayed behind: take path.trajectory() and "
+                "This path was pickled without its collision checks: call path.trajectory() and "
                 "path.clearance() in the process that planned it. Trajectories can be pickled."
             )
         return self.checks
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the path without its checks, which are of one process."""
+        """Leave out the checks, which belong to one process."""
         return {**self.__dict__, "checks": None, "sections": ()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -223,46 +217,12 @@ class Path:
 
 
 def _combine_limits(own: Array, given: Array) -> Array:
-    """Return given limits (n,), or those of the model bounded by a number; what is wrong stays so."""
+    """Combine the limits of the model (n,) with an array that replaces them, or a number that bounds them."""
     return given if given.ndim or not given > 0 else np.minimum(own, given)
 
 
-def _as_numbers(name: str, given: Any) -> Array:
+def _as_numbers(name: str, value: Any) -> Array:
     try:
-        return np.asarray(given, dtype=float)
+        return np.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        raise InvalidValueError(f"{name} is a number or an array of numbers, not {given!r:.80}.") from None
-
-
-def densify(points: Array, step: float) -> Array:
-    """Return the points of a polyline (N, n) with others between them, at most a step apart."""
-    if len(points) < 2:
-        return points
-    counts = np.maximum(np.ceil(_segment_lengths(points) / step), 1).astype(int)
-    ends = np.cumsum(counts)
-    shares = (np.arange(ends[-1]) - np.repeat(ends - counts, counts)) / np.repeat(counts, counts)
-    at = np.append(np.repeat(np.arange(len(counts)), counts) + shares, len(counts))
-    return _interpolate(points, np.arange(float(len(points))), at)
-
-
-def sample_path(points: Array, step: float) -> Array:
-    """Return samples of a polyline (N, n), at most a step apart: its points and others, or some of many."""
-    lengths = _segment_lengths(points)
-    count = int(np.ceil(lengths.sum() / step)) + 1
-    if len(points) <= 4 * count:
-        return densify(points, step)
-    along = np.concatenate([[0.0], np.cumsum(lengths)])
-    return _interpolate(points, along, np.linspace(0.0, along[-1], count))
-
-
-def _segment_lengths(points: Array) -> Array:
-    return np.asarray(np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)))
-
-
-def _interpolate(points: Array, along: Array, at: Array) -> Array:
-    """Return rows of a polyline (N, n) with knots at (N,), at places (M,) from the first to the last."""
-    lengths = along[1:] - along[:-1]
-    slopes = np.zeros(points.shape)
-    slopes[:-1] = (points[1:] - points[:-1]) / np.where(lengths > 0.0, lengths, 1.0)[:, None]
-    k = np.searchsorted(along, at, side="right") - 1
-    return np.asarray(slopes[k] * (at - along[k])[:, None] + points[k])
+        raise InvalidValueError(f"{name} is a number or an array of numbers, not {value!r:.80}.") from None

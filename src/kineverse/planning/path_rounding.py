@@ -14,7 +14,7 @@ from kineverse.errors import ShapeError
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .path_checks import PathChecks
+from .state_validity import PathChecks
 from .trajectories import BlendedPath, Trajectory, round_corners, time_parameterize
 from .trajectories.kinematic_limits import MotionLimits
 
@@ -32,9 +32,9 @@ _STEP = 0.02
 class PathSection(NamedTuple):
     """Part of a path with holds of its own, from one of its points to another; the motion rests at both."""
 
-    first: int  # indices of the points
+    first: int  # index of its first and last point
     last: int
-    checks: PathChecks  # checks of configurations between them
+    checks: PathChecks
 
 
 class TimedSection(NamedTuple):
@@ -52,30 +52,30 @@ def parameterize_sections(
     deviation: npt.ArrayLike,
     sections: Sequence[PathSection],
 ) -> list[TimedSection]:
-    """Return the motions along the sections of a path (N, n), see :func:`parameterize_path`."""
-    given = np.asarray(deviation, dtype=float)
-    if given.shape not in ((), (len(points),)):
+    """Compute the motions along the sections of a path (N, n), see :func:`parameterize_path`."""
+    deviations = np.asarray(deviation, dtype=float)
+    if deviations.shape not in ((), (len(points),)):
         raise ShapeError(
             f"deviation= is a number or an array of one for each of the {len(points)} points, not of shape "
-            f"{given.shape}."
+            f"{deviations.shape}."
         )
-    found = []
+    result = []
     for section in sections:
         part = slice(section.first, section.last + 1)
-        allowed = given if given.ndim == 0 else given[part]
-        found.append(
+        allowed = deviations if deviations.ndim == 0 else deviations[part]
+        result.append(
             TimedSection(section, *parameterize_path(points[part], symbols, limits, allowed, section.checks))
         )
-    return found
+    return result
 
 
 def join_sections(sections: Sequence[TimedSection]) -> Trajectory:
-    """Return the motion along sections one after the other."""
+    """Join the motions along sections."""
     return reduce(Trajectory.then, [timed.trajectory for timed in sections])
 
 
 def section_times(points: Array, sections: Sequence[TimedSection]) -> Array:
-    """Return the times (N,) at which a motion along sections is nearest to points of a path (N, n)."""
+    """Compute the times (N,) at which a motion along sections is nearest to points of a path (N, n)."""
     times, begin = np.zeros(len(points)), 0.0
     for (first, last, _), path, trajectory in sections:
         times[first : last + 1] = begin + passing_times(points[first : last + 1], path, trajectory)
@@ -90,7 +90,7 @@ def parameterize_path(
     deviation: npt.ArrayLike,
     checks: PathChecks,
 ) -> tuple[BlendedPath, Trajectory]:
-    """Return the rounded path and its fastest motion, which is certainly free wherever the path is.
+    """Round a path and find its fastest motion, which is certainly free wherever the path is.
 
     The motion is checked, and corners are rounded less where it collides, down to a stop.
     """
@@ -113,7 +113,7 @@ def parameterize_path(
 
 
 def passing_times(points: Array, path: BlendedPath, trajectory: Trajectory) -> Array:
-    """Return the times (N,) at which a motion along a rounded path is nearest to its points (N, n)."""
+    """Compute the times (N,) at which a motion along a rounded path is nearest to its points (N, n)."""
     times = _fine_times(trajectory)
     travelled = _lengths(trajectory.positions_at(times))
     # The way along the rounded path to the middle of each blend, and along the polyline to its corner.
@@ -122,13 +122,13 @@ def passing_times(points: Array, path: BlendedPath, trajectory: Trajectory) -> A
     way = np.concatenate([[0.0], np.cumsum(path.lengths - cut[:-1] - cut[1:])])
     at_corners = np.interp(way * (travelled[-1] / max(way[-1], 1e-300)), travelled, times)
     corners = np.concatenate([[0.0], np.cumsum(path.lengths)])
-    found: Array = np.interp(_lengths(points), corners, at_corners)
-    found[-1] = trajectory.duration
-    return found
+    result: Array = np.interp(_lengths(points), corners, at_corners)
+    result[-1] = trajectory.duration
+    return result
 
 
 def _drop_near(points: Array, deviation: npt.ArrayLike) -> tuple[Array, npt.ArrayLike]:
-    """Return points (N, n) and deviations without inner points that are as good as equal to the one before.
+    """Drop inner points (N, n), and their deviations, that practically equal the one before.
 
     Such a short edge has a direction of its own, for which the motion would slow down.
     """
@@ -137,12 +137,12 @@ def _drop_near(points: Array, deviation: npt.ArrayLike) -> tuple[Array, npt.Arra
     if len(points) > 2 and not keep[-1]:
         keep[[-2, -1]] = False, True
     keep[0] = True
-    given = np.asarray(deviation)
-    return points[keep], given[keep] if given.shape == keep.shape else deviation
+    deviations = np.asarray(deviation)
+    return points[keep], deviations[keep] if deviations.shape == keep.shape else deviation
 
 
 def _round_valid(points: Array, deviation: npt.ArrayLike, checks: PathChecks) -> BlendedPath:
-    """Return a path whose blends are valid at samples."""
+    """Round corners as far as samples of the blends are valid."""
     path = round_corners(points, deviation, lambda Q: checks.valid(Q, RESIDUAL))
     if len(path.points) < 3:
         return path
@@ -158,7 +158,7 @@ def _round_valid(points: Array, deviation: npt.ArrayLike, checks: PathChecks) ->
 
 
 def _round_free(path: BlendedPath, checks: PathChecks) -> BlendedPath:
-    """Return a path with smaller blends, each of which is certainly free."""
+    """Shrink blends until each is certainly free."""
     allowed = _deviations(path)
     unchecked = np.flatnonzero(allowed).tolist()
     for attempt in range(_ROUNDS):
@@ -171,7 +171,7 @@ def _round_free(path: BlendedPath, checks: PathChecks) -> BlendedPath:
 
 
 def _find_collision(path: BlendedPath, trajectory: Trajectory, checks: PathChecks) -> int | None:
-    """Return the point whose blend is nearest to the first collision of a motion; None if there is none."""
+    """Find the point whose blend is nearest to the first collision of a motion; None without a collision."""
     corners = np.flatnonzero(path.reach) + 1
     if not len(corners):
         return None
@@ -189,28 +189,27 @@ def _find_collision(path: BlendedPath, trajectory: Trajectory, checks: PathCheck
 
 
 def _fine_times(trajectory: Trajectory) -> Array:
-    """Return the times of the knots, and of others between them that are far apart."""
+    """Return the times of the knots, and others between distant ones."""
     steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
     counts = np.maximum(np.ceil(steps / _STEP), 1).astype(int)
     parts = [k + np.arange(count) / count for k, count in enumerate(counts.tolist())]
     at = np.concatenate([*parts, [float(len(counts))]])
-    found: Array = np.interp(at, np.arange(len(trajectory)), trajectory.times)
-    return found
+    result: Array = np.interp(at, np.arange(len(trajectory)), trajectory.times)
+    return result
 
 
 def _deviations(path: BlendedPath) -> Array:
-    """Return the distances between the points of a path (N,) and its blends."""
-    found: Array = np.zeros(len(path.points))
-    found[1:-1] = path.deviation
-    return found
+    result: Array = np.zeros(len(path.points))
+    result[1:-1] = path.deviation
+    return result
 
 
 def _chords(path: BlendedPath, corner: int) -> Array:
-    """Return points on the blend of an inner corner whose chords are near to it."""
+    """Sample the blend of an inner corner so densely that its chords are near to it."""
     return path.blend(corner, 3 + math.ceil(math.sqrt(2 * path.deviation[corner] / _SAGITTA)))
 
 
 def _lengths(points: Array) -> Array:
-    """Return the lengths of a polyline (N, n) from its first point to each (N,)."""
-    found: Array = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    return found
+    """Return the lengths (N,) of a polyline from its first point to each."""
+    result: Array = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return result

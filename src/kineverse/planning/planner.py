@@ -51,7 +51,7 @@ class Planner:
     certified between its samples too, and judged by the collision scene before it is returned.
 
     Everything is computed from the model: an edit of the model is followed at the next call. Calls of several
-    threads wait for each other: planners of their own are faster. Pickled, a planner is built again in the
+    threads wait for each other: a planner for each thread is faster. Pickled, a planner is built again in the
     other process, without its roadmap.
 
     Parameters
@@ -102,7 +102,7 @@ class Planner:
     ) -> None:
         if not isinstance(model, ModelView):
             raise InvalidValueError(f"A planner takes a model, such as kv.load(...), not {model!r:.80}.")
-        planning_functions()  # says at once that there is no compiler
+        planning_functions()  # raises at once if there is no compiler
         self._lock = CallLock()
         self.model = model
         self.margin = as_tolerance(margin, "The margin")
@@ -124,20 +124,20 @@ class Planner:
             )  # fmt: skip
 
     def _check_separate_pairs(self, Q: Array) -> PlanningScene:
-        """Return the scene in which pairs are checked that are apart at some of the configurations (N, n)."""
-        found = self.planning_scene.find_separate_pairs(Q)
-        if found:
-            self._separate |= found
+        """Check pairs from now on that are apart at one of the configurations (N, n); return the scene."""
+        result = self.planning_scene.find_separate_pairs(Q)
+        if result:
+            self._separate |= result
             self.planning_scene = self._build(self.planning_scene.state)
         return self.planning_scene
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how the planner is made again in another process, with everything where it stands."""
+        """Make the planner again in another process, with everything at its present place."""
         options = {"rules": self._rules, "margin": self.margin, "protrusion": self._protrusion}
         return _restore, (self.model, self._move, {**options, **self._options}, self.planning_scene.state)
 
     def _synchronize(self) -> PlanningScene:
-        """Return everything about the present version of the model, which is built if it is another one."""
+        """Return the scene of the present version of the model, built again after an edit."""
         if self.planning_scene.version != self.model.version:
             self.planning_scene = self._build(self.model.default_state() | self.planning_scene.state)
         return self.planning_scene
@@ -154,10 +154,9 @@ class Planner:
 
     @property
     def excluded(self) -> tuple[Rule, ...]:
-        """Rules for pairs of bodies that touch wherever the coordinates are; these are not checked.
+        """Rules for pairs of bodies that touch at all samples of the coordinates; these are not checked.
 
-        Samples say which. A pair that is apart where things are placed, or at a start or goal, is checked
-        from then on.
+        A pair that is apart where things are placed, or at a start or goal, is checked from then on.
         """
         return self.planning_scene.excluded
 
@@ -187,11 +186,9 @@ class Planner:
         UnknownNameError, InvalidValueError
             For unknown names and values that are not finite.
         """
-        self._synchronize().place(self._whole(state))
+        scene = self._synchronize()
+        scene.place(scene.state | read_state(self.model, state))
         self._check_separate_pairs(self.planning_scene.here[None])
-
-    def _whole(self, state: StateLike) -> State:
-        return self.planning_scene.state | read_state(self.model, state)
 
     # -- configurations ------------------------------------------------------------------------------------
 
@@ -213,7 +210,7 @@ class Planner:
 
     @one_at_a_time
     def edges(self, A: npt.ArrayLike, B: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Return flags (N,) of straight ways from A to B, (N, n) each, that are free at 32 samples a unit.
+        """Return flags (N,) of straight lines from A to B, (N, n) each, that are free at 32 samples a unit.
 
         Starts and limits are not checked.
         """
@@ -224,16 +221,14 @@ class Planner:
         return self.checker.edges(starts.astype(np.float32), ends.astype(np.float32))
 
     def _start(self, start: Any) -> Array:
-        """Return a start (n,) from a vector or a state."""
-        found = self._configurations(start, "start")
-        if len(found) != 1:
+        result = self._configurations(start, "start")
+        if len(result) != 1:
             raise ShapeError(
-                f"start has {len(found)} configurations; there is one start. Goals may be several."
+                f"start has {len(result)} configurations; there is one start. Goals may be several."
             )
-        return np.asarray(found[0])
+        return np.asarray(result[0])
 
     def _configurations(self, Q: Any, name: str) -> Array:
-        """Return configurations (N, n) from one or several vectors or states."""
         return read_configurations(self.space, self.planning_scene.state, Q, name)
 
     # -- holds and solutions -------------------------------------------------------------------------------
@@ -277,11 +272,11 @@ class Planner:
         self._synchronize()
         count, seed = as_count("count", count, 1), as_count("seed", seed, 0)
         seconds = as_tolerance(seconds, "seconds=")
-        given = as_holds("tasks", tasks)
-        if not given and not self.space.equalities:
+        holds = as_holds("tasks", tasks)
+        if not holds and not self.space.equalities:
             raise InvalidValueError("There is no hold and no goal, so every configuration is a solution.")
         scene = self.planning_scene
-        return scene.solutions(given, scene.here, count, seconds, seed, scene.touching_pairs(given))
+        return scene.solutions(holds, scene.here, count, seconds, seed, scene.touching_pairs(holds))
 
     # -- paths ---------------------------------------------------------------------------------------------
 
@@ -355,7 +350,7 @@ class Planner:
             scene = self._check_separate_pairs(ends)
         elif not len(ends):
             raise ShapeError("There is no goal: goals has no rows.")
-        # What a goal lets touch does not touch on the way, unless there is no other one.
+        # Pairs that may touch at the goal may touch along the path only if there is no other one.
         for allowed in dict.fromkeys((scene.touching_pairs(holds), touching)):
             path = scene.between(q, ends, holds, allowed, seconds, seed, roadmap=roadmap, optimize=optimize)
             if path.found:
@@ -367,26 +362,25 @@ class Planner:
         return path
 
     def _plan_modes(self, search: ModeSearch, q: Array, begin: float) -> Path:
-        """Return the path through modes that a search finds."""
-        scene, found = self.planning_scene, search.run(q)
+        scene, result = self.planning_scene, search.run(q)
         parts, modes, sections, first = [q[None]], [], [], 0
-        for segment in found.segments:
+        for segment in result.segments:
             parts.append(segment.points[1:])
             last = first + len(segment.points) - 1
             modes.append((segment.mode.name, first, last))
             checks = scene.checks(segment.touching, scene.manifold(segment.mode.along))
             sections.append(PathSection(first, last, checks))
             first = last
-        touching = frozenset(pair for segment in found.segments for pair in segment.touching)
+        touching = frozenset(pair for segment in result.segments for pair in segment.touching)
         whole = np.vstack(parts)
-        why = found.problem or f"Found through {len(modes)} modes, after {found.iterations} searches."
+        why = result.problem or f"Found through {len(modes)} modes, after {result.iterations} searches."
         path = scene.path(
-            not found.problem, whole, why, begin, perf_counter() - begin, found.iterations, touching
+            not result.problem, whole, why, begin, perf_counter() - begin, result.iterations, touching
         )
         return replace(path, modes=tuple(modes), sections=tuple(sections))
 
     def _choose_roadmap(self, method: str, holds: Sequence[Hold]) -> Roadmap | None:
-        """Return the roadmap that a method searches; None for trees."""
+        """Return the roadmap of a method; None for trees."""
         if method not in _METHODS:
             raise InvalidValueError(f"method is {method!r}; there are {', '.join(map(repr, _METHODS))}.")
         if method == "rrt-connect":
@@ -402,15 +396,15 @@ class Planner:
         return self.roadmap
 
     def _no_solution(self, tasks: Sequence[Hold], touching: BodyPairs) -> str:
-        """Return why no configuration was found that meets tasks: out of reach, or what touches there."""
+        """Explain why no configuration was found that meets tasks: out of reach, or in contact."""
         scene, checker = self.planning_scene, self.checker
         manifold = scene.manifold(tasks)
         assert manifold is not None
         tries = np.random.default_rng(0).uniform(checker.lower, checker.upper, (_TRIES, len(self.symbols)))
         rows = tries.astype(np.float32)
         rows = rows[manifold.project(rows)]
-        given = (f"'{task.name}'" if task.name else "goals without names" for task in tasks)
-        names = " and ".join(dict.fromkeys(given))
+        labels = (f"'{task.name}'" if task.name else "goals without names" for task in tasks)
+        names = " and ".join(dict.fromkeys(labels))
         if not len(rows):
             why = f"Out of reach: no configuration within limits was found that meets {names}."
             if self.space.unlimited:
@@ -418,8 +412,8 @@ class Planner:
                 why += f" Without limits, so searched within 32 m or rad of the start: {named}."
             return why
         judge = scene.judge(touching)
-        found = [judge.contacts(row.astype(float), checker.struct.margin) for row in rows[:_TASK_GOALS]]
-        least = max((c for c in found if len(c)), key=lambda c: float(c[0].distance), default=None)
+        result = [judge.contacts(row.astype(float), checker.struct.margin) for row in rows[:_TASK_GOALS]]
+        least = max((c for c in result if len(c)), key=lambda c: float(c[0].distance), default=None)
         example = "" if least is None else f", at least of {describe_contacts(least)}"
         return (
             f"No configuration without collision was found that meets {names}. In reach, but with contacts "
@@ -439,9 +433,9 @@ def _restore(
 
 
 def as_holds(argument: str, tasks: Any) -> tuple[Hold, ...]:
-    """Return holds from holds and goals, one or several."""
-    given = as_entries(argument, tasks, (Hold, Goal), "kv.control.Hold or Goal, or planner.hold(a, b)")
-    return tuple(t if isinstance(t, Hold) else Hold(t.expression, t.target, name=t.name) for t in given)
+    """Turn holds and goals, one or several, into holds."""
+    entries = as_entries(argument, tasks, (Hold, Goal), "kv.control.Hold or Goal, or planner.hold(a, b)")
+    return tuple(t if isinstance(t, Hold) else Hold(t.expression, t.target, name=t.name) for t in entries)
 
 
 def _are_tasks(goals: Any) -> bool:

@@ -29,19 +29,18 @@ from kineverse.symbols import Symbol
 from .collision_checker import BodyPairs, CollisionChecker, LateCheckError
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
 from .path import Path
-from .path_checks import PathChecks
 from .planning_space import BEYOND, FULL_TURN, HALF_TURN, PlanningSpace
 from .query import MORE_PATIENCE, PATIENCE, checked_by, connect, connect_on_manifold
 from .sampling_planners import MOST_EDGES, Roadmap
 from .start_goal import MOST_BATCHES, Endpoints, find_solutions
-from .state_validity import SceneJudge, describe_contacts
+from .state_validity import PathChecks, SceneJudge, describe_contacts
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
 _JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _TOO_FAR = (
-    "A way was found to a goal that is {:.4g} away, but to check it takes longer than the time given. Give "
+    "A path was found to a goal that is {:.4g} away, but to check it takes longer than the time given. Give "
     "more seconds=, or nearer goals."
 )
 _MOST_MANIFOLDS = 16
@@ -50,7 +49,7 @@ _SAME = 1e-5
 
 
 class PlanningScene:
-    """Present version of a model, with everything placed at a state: what searches of paths are about."""
+    """Present version of a model, placed at a state, with everything that searches of paths need."""
 
     def __init__(
         self,
@@ -98,13 +97,9 @@ class PlanningScene:
         return self.state.vector(self.space.symbols)
 
     def find_separate_pairs(self, Q: Array) -> BodyPairs:
-        """Return the pairs that are not checked, but are apart at some configurations (N, n)."""
+        """Return the unchecked pairs that are apart at one of the configurations (N, n)."""
         margin = self.checker.struct.margin
         return find_separate_pairs(self.scene, self.space, self.excluded, self.state, Q, margin)
-
-    def _replace(self) -> None:
-        """Place the checker again where everything stands."""
-        self.checker.place(self.state)
 
     def set_bounds(
         self,
@@ -114,7 +109,7 @@ class PlanningScene:
         beyond: float = BEYOND,
         turn: float | Array = HALF_TURN,
     ) -> None:
-        """Set the bounds of a search from a start (n,) to points (N, n); some coordinates may stand still."""
+        """Set the bounds of a search from a start (n,) to points (N, n), with some coordinates fixed."""
         lower, upper = self.space.bounds(start, points, beyond, turn)
         if still is not None:
             lower, upper = np.where(still, start, lower), np.where(still, start, upper)
@@ -131,7 +126,7 @@ class PlanningScene:
         still: Flags | None = None,
         batches: int = MOST_BATCHES,
     ) -> Array:
-        """Return solutions (K, n), those near to a configuration first; some coordinates have its values.
+        """Find solutions (K, n), the nearest to a configuration first, with some coordinates fixed.
 
         Coordinates without limits are searched further and further away.
         """
@@ -142,13 +137,13 @@ class PlanningScene:
             for beyond in reaches:
                 self.set_bounds(near, near[None], still, beyond)
                 share = seconds / len(reaches)
-                found = find_solutions(self.checker, manifold, near, count, share, seed, batches)
-                if len(found):
+                result = find_solutions(self.checker, manifold, near, count, share, seed, batches)
+                if len(result):
                     break
-        return found
+        return result
 
     def manifold(self, holds: Sequence[Hold]) -> Manifold | None:
-        """Return the manifold of holds and equalities of the model, at the present place."""
+        """Return the manifold of holds and equalities of the model; None for the whole space."""
         if not holds and not self.space.equalities:
             return None
         key = manifold_key(holds)
@@ -193,13 +188,13 @@ class PlanningScene:
         optimize: bool = False,
         around: bool = True,
     ) -> Path:
-        """Return a path from a configuration (n,) to any of some ends (K, n), see :meth:`.Planner.plan`.
+        """Search a path from a configuration (n,) to any of some ends (K, n), see :meth:`.Planner.plan`.
 
-        Bodies of the pairs ``touching`` may touch, and some coordinates may stand still. With ``around``,
-        joints that turn fully also go the long way round.
+        Bodies of the pairs ``touching`` may touch, and some coordinates may be fixed. With ``around``, joints
+        that turn fully also go the long way round.
         """
         begin, worked = perf_counter(), working_seconds()
-        given, ends = ends, np.array([self.space.nearest_turn(end, q) for end in ends])
+        wanted, ends = ends, np.array([self.space.nearest_turn(end, q) for end in ends])
         self.set_bounds(q, ends, still)
         manifold = self.manifold(holds)
         with self.checker.excepting(touching):
@@ -210,7 +205,7 @@ class PlanningScene:
             usable = endpoints.check_goals(ends)
             if isinstance(usable, str):
                 return self.no_path(q, usable, begin)
-            ways = self._ways(first.q, [goal.q for goal in usable], given, ends, around and roadmap is None)
+            ways = self._ways(first.q, [goal.q for goal in usable], wanted, ends, around and roadmap is None)
             for k, (turn, variants) in enumerate(ways):
                 if len(ways) > 1:
                     self.set_bounds(q, ends, still, turn=turn)
@@ -240,24 +235,24 @@ class PlanningScene:
             return replace(best, seconds=perf_counter() - begin)
 
     def _ways(
-        self, q: Array, goals: list[Array], given: Array, ends: Array, around: bool
+        self, q: Array, goals: list[Array], wanted: Array, ends: Array, around: bool
     ) -> list[tuple[float | Array, list[Array]]]:
-        """Return the searches from a configuration (n,): how far joints may turn, and goals (n,).
+        """List the searches from a configuration (n,): how far joints may turn, and goals (n,).
 
-        Goals that are more than half a turn away by their values are first sought as they are given (K, n).
-        Then any that are full turns from a goal are, by the shortest ways, as the ends (K, n) are, and last
-        by the long way round. A roadmap is on a circle and needs one search.
+        Goals that are more than half a turn away by their values (K, n) are tried as such first; then full
+        turns of them, by the shortest turns, as in the ends (K, n); last by the long way round. A roadmap is
+        on a circle and needs one search.
         """
         short = [v for goal in goals for v in self.space.equivalents(goal, q)]
-        found: list[tuple[float | Array, list[Array]]] = [(HALF_TURN, short)]
+        result: list[tuple[float | Array, list[Array]]] = [(HALF_TURN, short)]
         if not around or not self.space.turning.any():
-            return found
+            return result
         wound = [int(np.argmin(np.abs(ends - goal).max(axis=1))) for goal in goals]
-        far = [goal + given[k] - ends[k] for goal, k in zip(goals, wound, strict=True)]
+        far = [goal + wanted[k] - ends[k] for goal, k in zip(goals, wound, strict=True)]
         if any(np.abs(a - b).max() > _SAME for a, b in zip(far, goals, strict=True)):
-            found.insert(0, (np.maximum(np.abs(np.array(far) - q).max(axis=0) + _SAME, HALF_TURN), far))
+            result.insert(0, (np.maximum(np.abs(np.array(far) - q).max(axis=0) + _SAME, HALF_TURN), far))
         long = [v for goal in goals for v in self.space.equivalents(goal, q, turn=FULL_TURN)]
-        return [*found, (FULL_TURN, long)]
+        return [*result, (FULL_TURN, long)]
 
     def _connect(
         self,
@@ -273,19 +268,19 @@ class PlanningScene:
         optimize: bool,
         asked: float,
     ) -> Path:
-        """Return a path between checked ends."""
+        """Search a path between checked ends."""
         targets = np.ascontiguousarray(variants, dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched, until = perf_counter(), checked_by(working_seconds(), seconds)
         if manifold is None:
             patience = MORE_PATIENCE if optimize else PATIENCE
-            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience, asked)
+            result = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience, asked)
         else:
-            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges, asked)
+            result = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges, asked)
         spent = perf_counter() - searched
-        if found.problem:
-            return self.no_path(found.points, found.problem, begin, spent, found.iterations)
-        points = found.points
+        if result.problem:
+            return self.no_path(result.points, result.problem, begin, spent, result.iterations)
+        points = result.points
         # A roadmap may wind further than the variants do.
         turns = np.where(self.space.turning, np.round((points[-1] - targets) / math.tau), 0.0) * math.tau
         k = int(np.argmin(np.abs(targets + turns - points[-1]).max(axis=1)))
@@ -293,12 +288,12 @@ class PlanningScene:
         contact = self.judge(touching).first_contact(points, _JUDGED, until)
         if contact is not None:
             problem = f"The scene finds a contact on the path: {describe_contacts([contact[1]])}."
-            return self.no_path(points, problem, begin, spent, found.iterations)
-        why = f"Found after {found.iterations} samples{'' if roadmap is None else roadmap.describe()}."
-        return self.path(True, points, why, begin, spent, found.iterations, touching, manifold)
+            return self.no_path(points, problem, begin, spent, result.iterations)
+        why = f"Found after {result.iterations} samples{'' if roadmap is None else roadmap.describe()}."
+        return self.path(True, points, why, begin, spent, result.iterations, touching, manifold)
 
     def judge(self, touching: BodyPairs = frozenset()) -> SceneJudge:
-        """Return the judge of the scene in which some pairs may touch, at the present place."""
+        """Return the judge of the scene in which some pairs may touch, at the present state."""
         if touching not in self._judges:
             if len(self._judges) >= _MOST_MANIFOLDS:
                 self._judges.clear()
@@ -309,7 +304,7 @@ class PlanningScene:
         return judge
 
     def no_path(self, points: Array, why: str, begin: float, spent: float = 0.0, iterations: int = 0) -> Path:
-        """Return the answer that there is no path, with the reason and points (N, n) on the way."""
+        """Make the answer that there is no path, with points (N, n) of a partial one."""
         return self.path(False, np.atleast_2d(points), why, begin, spent, iterations)
 
     def path(
@@ -323,23 +318,19 @@ class PlanningScene:
         touching: BodyPairs = frozenset(),
         manifold: Manifold | None = None,
     ) -> Path:
-        """Return a path through points (N, n), with what is known about it.
-
-        Times are the one at which planning began and the one that the search took [s].
-        """
+        """Make a path through points (N, n); times are the beginning of planning and of the search [s]."""
         checks, seconds = self.checks(touching, manifold), perf_counter() - begin
         return Path(found, self.space.symbols, points, why, seconds, spent, iterations, checks.state, checks)
 
     def checks(self, touching: BodyPairs, manifold: Manifold | None) -> PathChecks:
-        """Return the checks of a path at the present place."""
-        state, judge = self.state, self.judge(touching)
-        return PathChecks(
-            self.model, state, self.checker, judge, manifold, touching, self._replace, self._lock
-        )
+        """Make the checks of a path at the present state."""
+        judge, checker = self.judge(touching), self.checker
+        restore = lambda: checker.place(self.state)  # noqa: E731
+        return PathChecks(self.model, self.state, checker, judge, manifold, touching, restore, self._lock)
 
 
 def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
-    """Return the bodies at and below a frame; without any, those below the next frame above that has some.
+    """Return the bodies at and below a frame, or if there are none, below its nearest ancestor with some.
 
     So a tool frame between the fingers stands for the palm and the fingers. A frame that never moves stands
     for one body: a whole kitchen may be below it.
@@ -354,7 +345,7 @@ def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> 
 
 
 def _are_apart(model: ModelView, a: str, b: str) -> bool:
-    """Return True if no one of two frames carries the other."""
+    """Return True if neither of two frames carries the other."""
     lookup = model.frames.__getitem__
     return WORLD not in (a, b) and a != b and a not in ancestors(b, lookup) and b not in ancestors(a, lookup)
 
@@ -365,37 +356,35 @@ _APART = 1e-4
 
 
 def find_overlapping_pairs(scene: Scene, space: PlanningSpace) -> tuple[Rule, ...]:
-    """Return rules for pairs of bodies that touch wherever the coordinates are, those of the others as well.
+    """Return rules for pairs of bodies that touch at all samples of all coordinates of the model.
 
-    So a robot that stands in a wall by default, and is placed elsewhere, does not lose the pairs with the
-    wall.
+    A robot that stands in a wall by default, and is placed elsewhere, keeps its pairs with the wall.
     """
     home = scene.model.default_state()
     samples = StateSamples(scene.model, count=_SAMPLES)
     columns = {s: samples.values_of(s).tolist() for s in home if s.has_derivative and not s.order}
     states = [home.updated({s: values[k] for s, values in columns.items()}) for k in range(samples.size)]
     pairs = {frozenset(pair) for pair in scene.pairs_affected_by(space.symbols)}
-    found = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
-    return tuple(rule for rule in found if frozenset((rule.a, rule.b)) in pairs)
+    result = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
+    return tuple(rule for rule in result if frozenset((rule.a, rule.b)) in pairs)
 
 
 def find_separate_pairs(
     scene: Scene, space: PlanningSpace, rules: tuple[Rule, ...], state: State, Q: Array, margin: float
 ) -> frozenset[frozenset[str]]:
-    """Return the pairs of bodies of some rules that are apart at some of the configurations (N, n) [m].
+    """Return the pairs of some rules that are apart at one of the configurations (N, n).
 
     Samples miss a small gap, in which a start may be.
     """
-    found = set()
+    result = set()
     for q in Q if rules else ():
         if _has_poses(scene, state.updated(dict(zip(space.symbols, q.tolist(), strict=True)))):
             results = scene.distances((rule.a, rule.b) for rule in rules)
-            found |= {frozenset((r.a, r.b)) for r in results if r.distance > margin + _APART}
-    return frozenset(found)
+            result |= {frozenset((r.a, r.b)) for r in results if r.distance > margin + _APART}
+    return frozenset(result)
 
 
 def _has_poses(scene: Scene, state: State) -> bool:
-    """Return True if all loops close at a state."""
     try:
         scene.update(state)
     except NoSolutionError:

@@ -26,10 +26,10 @@ _WILDCARDS = "*?["
 _LARGEST = 1e6
 """Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
 HALF_TURN, FULL_TURN = math.pi + 0.3, math.tau + 0.3
-"""Angles by which joints that turn fully may turn to either side of the start: for the short way to
-everything, and for the long way round as well [rad]."""
+"""Angles by which joints that turn fully may turn to either side of the start: the short way, and the long
+way round as well [rad]."""
 BEYOND = 2.0
-"""Length by which coordinates without limits may go beyond what is given [m], [rad]."""
+"""Length by which coordinates without limits may exceed the start and the goals [m], [rad]."""
 CONDITION_TOLERANCE = 1e-5
 """Largest excess of a constraint that counts as satisfied; float has seven digits."""
 
@@ -104,11 +104,11 @@ class PlanningSpace:
         """Return finite bounds (n,) of a search from a start (n,) to or about configurations (N, n).
 
         A joint that turns fully, without limits, may turn by an angle to either side of the start [rad];
-        another coordinate without limits may go beyond the start and the given ones by a length [m], [rad].
+        another coordinate without limits may exceed the start and the points by a length [m], [rad].
         """
-        given = np.vstack([start[None], points])
-        low = np.where(self.turning, start - turn, given.min(axis=0) - beyond)
-        high = np.where(self.turning, start + turn, given.max(axis=0) + beyond)
+        both = np.vstack([start[None], points])
+        low = np.where(self.turning, start - turn, both.min(axis=0) - beyond)
+        high = np.where(self.turning, start + turn, both.max(axis=0) + beyond)
         finite = np.isfinite(self.lower), np.isfinite(self.upper)
         return np.where(finite[0], self.lower, low), np.where(finite[1], self.upper, high)
 
@@ -123,27 +123,26 @@ class PlanningSpace:
         return np.asarray(self.equivalents(q, start, most=1)[0])
 
     def equivalents(self, q: Array, start: Array, most: int = 32, turn: float = HALF_TURN) -> Array:
-        """Return configurations (K, n) within bounds about a start that are q but for full turns of joints.
+        """Return configurations (K, n) within bounds about a start that equal q up to full turns of joints.
 
-        The nearest to the start come first. Without any there is q itself.
+        The nearest to the start come first; if there are none, q itself is returned.
         """
         if not self.turning.any():
             return q[None]
         low, high = self.bounds(start, q[None], turn=turn)
-        found = q[None].copy()
+        result = q[None].copy()
         for i in np.flatnonzero(self.turning).tolist():
             first = math.ceil((low[i] - q[i]) / math.tau - 1e-9)
             last = math.floor((high[i] - q[i]) / math.tau + 1e-9)
             turned = [float(q[i]) + k * math.tau for k in range(first, last + 1)] or [float(q[i])]
-            found = np.repeat(found, len(turned), axis=0)
-            found[:, i] = turned * (len(found) // len(turned))
+            result = np.repeat(result, len(turned), axis=0)
+            result[:, i] = turned * (len(result) // len(turned))
             if len(turned) > 1:
-                found = found[np.argsort(np.linalg.norm(found - start, axis=1), kind="stable")[:most]]
-        return found
+                result = result[np.argsort(np.linalg.norm(result - start, axis=1), kind="stable")[:most]]
+        return result
 
 
 def _fold(e: Expression) -> Expression | float:
-    """Return the number that an expression is everywhere, or the expression."""
     return e if e.symbols else float(e)
 
 
@@ -152,17 +151,17 @@ def _is_bounded(excess: Expression) -> bool:
 
 
 def free_coordinates(model: ModelView) -> tuple[Symbol, ...]:
-    """Return the independent coordinates whose speeds are free, without those of a base that rolls."""
+    """Return the independent coordinates whose speeds are free, without those of a rolling base."""
     rolling = _rolling_coordinates(model)
     return tuple(s for s in model.degrees_of_freedom if s not in rolling)
 
 
 def _rolling_coordinates(model: ModelView) -> set[Symbol]:
-    """Return the coordinates that fewer speeds drive: they do not move independently."""
+    """Return the coordinates that fewer speeds drive, so that they do not move independently."""
     driven: dict[Symbol, set[Symbol]] = {
         x: {*row} for x, row in model.rates.items() if x not in model.rates.dependent
     }
-    found: set[Symbol] = set()
+    result: set[Symbol] = set()
     groups: list[tuple[set[Symbol], set[Symbol]]] = []
     for x, speeds in driven.items():
         joined = [g for g in groups if g[1] & speeds]
@@ -170,12 +169,12 @@ def _rolling_coordinates(model: ModelView) -> set[Symbol]:
         groups.append(({x}.union(*(g[0] for g in joined)), speeds.union(*(g[1] for g in joined))))
     for coordinates, speeds in groups:
         if len(speeds) < len(coordinates):
-            found |= coordinates
-    return found
+            result |= coordinates
+    return result
 
 
 def read_configurations(space: PlanningSpace, placed: State, Q: Any, name: str) -> Array:
-    """Return configurations (N, n) from one or several vectors or states."""
+    """Read configurations (N, n) from one or several vectors or states."""
     if isinstance(Q, Mapping):
         Q = [Q]
     if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], Mapping):
@@ -200,47 +199,48 @@ def read_configurations(space: PlanningSpace, placed: State, Q: Any, name: str) 
     return np.ascontiguousarray(points)
 
 
-def _read_state(space: PlanningSpace, placed: State, given: Any, name: str) -> Array:
-    if not isinstance(given, Mapping):
-        raise InvalidValueError(f"{name} has {given!r:.80} among states.")
-    state = read_state(space.model, given)
+def _read_state(space: PlanningSpace, placed: State, entry: Any, name: str) -> Array:
+    if not isinstance(entry, Mapping):
+        raise InvalidValueError(f"{name} has {entry!r:.80} among states.")
+    state = read_state(space.model, entry)
     moved = {*space.symbols}
     other = [s for s, v in state.items() if not s.order and s not in moved and placed.get(s, v) != v]
     if other:
         listed = ", ".join(f"'{s}' is {state[s]:.6g} and not {placed[s]:.6g}" for s in other[:4])
         more = f", and {len(other) - 4} more" if len(other) > 4 else ""
         raise InvalidValueError(
-            f"{name} differs from where things stand that the planner does not move: {listed}{more}. Place "
-            "them first, planner.place(state), or move them as well, Planner(model, move=[...])."
+            f"{name} differs from the placed state in coordinates that the planner does not move: "
+            f"{listed}{more}. Place them first, planner.place(state), or move them as well, "
+            "Planner(model, move=[...])."
         )
     return (placed | state).vector(space.symbols)
 
 
-def read_state(model: ModelView, given: Any) -> State:
-    """Return the state that a state or a mapping from symbols or names of a model says."""
-    return given if isinstance(given, State) else as_state(given, (*model.symbols, *model.speeds))
+def read_state(model: ModelView, state: Any) -> State:
+    """Read a state or a mapping from symbols or names."""
+    return state if isinstance(state, State) else as_state(state, (*model.symbols, *model.speeds))
 
 
 def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) -> tuple[Symbol, ...]:
-    given = (move,) if isinstance(move, Symbol | str) else tuple(move)
+    entries = (move,) if isinstance(move, Symbol | str) else tuple(move)
     names = {str(s): s for s in model.degrees_of_freedom}
-    found: dict[Symbol, None] = {}
-    for item in given:
+    result: dict[Symbol, None] = {}
+    for item in entries:
         if isinstance(item, str) and any(sign in item for sign in _WILDCARDS):
             matching = [s for name, s in names.items() if fnmatchcase(name, item)]
             if not matching:
                 raise UnknownNameError(
                     f"move=: no coordinate matches '{item}'. {suggest(item, names, 'coordinate')}"
                 )
-            found.update(dict.fromkeys(matching))
+            result.update(dict.fromkeys(matching))
         else:
             chosen = find_coordinates(model, [item], "move")
-            found.update(dict.fromkeys(sorted(chosen, key=lambda s: s.sort_key)))
-    rolling = [s for s in found if s in _rolling_coordinates(model)]
+            result.update(dict.fromkeys(sorted(chosen, key=lambda s: s.sort_key)))
+    rolling = [s for s in result if s in _rolling_coordinates(model)]
     if rolling:
         raise InvalidValueError(
             f"move=: {', '.join(map(repr, map(str, rolling[:6])))} cannot move independently: wheels that "
-            "roll drive them, and a straight way between two configurations would slip. Leave them out and "
+            "roll drive them, and a straight line between two configurations would slip. Leave them out and "
             "place the base with place(), or give it a base that moves freely."
         )
-    return tuple(found)
+    return tuple(result)

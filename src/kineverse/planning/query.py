@@ -25,19 +25,19 @@ _FINER = 8.0
 _FINEST = 4000.0
 _ATTEMPTS, _NEXT_SEED = 16, 7919
 _LEAST_CHECK = 1.0
-"""Time for the checks of what is found [s]; or as long as the search may take, if that is longer."""
+"""Least time for the checks of a path [s]; the limit of the search, if that is longer."""
 _TELLING = 100
 """Number of samples after which a small tree says that its root cannot be left."""
 _WIDER, _WIDE_EDGES = 1e-3, 10_000
-"""Margin beyond the one asked for: edges of a search are mostly free between their samples then [m]. A way,
-as of a door, may be too narrow for it: after that many edges, or half of the time, searches go on without."""
+"""Wider margin, with which edges of a search are mostly free between their samples [m]. A passage, such as a
+door, may be too narrow for it: after that many edges, or half of the time, searches go on without."""
 
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """Outcome of a connection."""
+    """Outcome of a query."""
 
-    points: Array  # configurations (N, n) of the path, or of the best partial one
+    points: Array  # (N, n) configurations of the path, or of the best partial one
     problem: str  # why it does not lead to a goal; empty if it does
     iterations: int  # number of samples
 
@@ -53,9 +53,9 @@ def connect(
     patience: int = PATIENCE,
     asked: float | None = None,
 ) -> Connected:
-    """Return a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
+    """Find a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
 
-    Edges of the search that collide between samples are planned anew, with more samples.
+    Edges that collide between samples are planned again, with more samples.
     """
     begin = working_seconds()
     search = RrtConnect(checker)
@@ -69,27 +69,24 @@ def connect(
             with checker.widened(by, np.vstack([starts, goals])) as wider:
                 share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
                 if roadmap is None:
-                    found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, edges=most)
+                    result = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, edges=most)
                 else:
-                    found = roadmap.solve(checker, starts, goals, share, seed + _NEXT_SEED * attempt)
-            iterations += found.iterations
-            if found.found or not wider:
+                    result = roadmap.solve(checker, starts, goals, share, seed + _NEXT_SEED * attempt)
+            iterations += result.iterations
+            if result.found or not wider:
                 break
-        if not found.found:
-            return Connected(
-                found.points.astype(float),
-                explain_failure(found, seconds if asked is None else asked),
-                iterations,
-            )
+        if not result.found:
+            problem = explain_failure(result, seconds if asked is None else asked)
+            return Connected(result.points.astype(float), problem, iterations)
         # Parts of a shortcut that just passes would not be certain by themselves.
         with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
-            points = search.shorten(found.points, seconds - (working_seconds() - begin), seed, patience)
+            points = search.shorten(result.points, seconds - (working_seconds() - begin), seed, patience)
         certain = _repair(search, checker, points, begin + seconds, checked_by(begin, seconds), seed, edges)
         if certain is not None:
             return Connected(certain.astype(float), "", iterations)
     problem = (
-        "A path was found whose samples are free, but something thin lies between two of them, and no way "
-        "around it was found in the time given. More seconds=, or another seed=, may find one."
+        "A path was found whose samples are free, but something thin lies between two of them, and no "
+        "detour was found in time. More seconds=, or another seed=, may find one."
     )
     return Connected(points.astype(float), problem, iterations)
 
@@ -103,7 +100,7 @@ def _repair(
     seed: int,
     edges: int,
 ) -> Floats32 | None:
-    """Return a path that is certainly free: edges that are not are planned anew, with more samples."""
+    """Plan edges that are not certainly free again, with more samples; None without a detour."""
     resolution = RESOLUTION
     for _ in range(_REPAIRS):
         collision = checker.find_collision(points, checked - working_seconds())
@@ -129,11 +126,10 @@ def connect_on_manifold(
     edges: int = MOST_EDGES,
     asked: float | None = None,
 ) -> Connected:
-    """Return a path on a manifold from any of some starts (S, n) to any of some goals (G, n).
+    """Find a path on a manifold from one of (S, n) starts to one of (G, n) goals.
 
-    Its points are in double precision on the manifold, and lines between them keep to it; see
-    :meth:`.Manifold.refine`. A path that collides between samples is searched again, with another seed and
-    more samples.
+    Its points are on the manifold in double precision, and lines between them keep to it, see
+    :meth:`.Manifold.refine`. If it collides between samples, another seed and more samples are tried.
     """
     begin = working_seconds()
     search = RrtConnect(checker, manifold)
@@ -147,13 +143,13 @@ def connect_on_manifold(
             left = seconds - (working_seconds() - begin)
             with checker.widened(by, np.vstack([starts, goals])) as wider:
                 share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
-                found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)
-                iterations += found.iterations
-                points = search.contract(found.points, left) if found.found else found.points
-            if found.found or not wider:
+                result = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)
+                iterations += result.iterations
+                points = search.contract(result.points, left) if result.found else result.points
+            if result.found or not wider:
                 break
-        if not found.found:
-            problem = problem or explain_failure(found, seconds if asked is None else asked)
+        if not result.found:
+            problem = problem or explain_failure(result, seconds if asked is None else asked)
             return Connected(points.astype(float), problem, iterations)
         exact = manifold.refine(points)
         if exact is None:
@@ -168,16 +164,16 @@ def connect_on_manifold(
 
 
 def checked_by(begin: float, seconds: float) -> float:
-    """Return when what a search has found is checked, which began and may last some seconds."""
+    """Return the time by which the result of a search is checked."""
     return begin + seconds + max(seconds, _LEAST_CHECK)
 
 
 def explain_failure(found: SearchResult, seconds: float) -> str:
-    """Return why a search has found no path, and how far it has come."""
-    own, other = found.nodes
+    """Explain why a search has found no path, and how far it has come."""
     if found.status == TOO_LONG:
-        return f"A way was found, but it has more than the {PATH_ROOM} points of a path: choose nearer goals."
-    reached = f"{own} configurations were reached from the start and {other} from the goals"
+        return f"A path was found, but it has more than the allowed {PATH_ROOM} points: choose nearer goals."
+    forth, back = found.nodes
+    reached = f"{forth} configurations were reached from the start and {back} from the goals"
     names = ("the start", "the goal") if found.iterations >= _TELLING else ()
     enclosed = [name for name, count in zip(names, found.nodes, strict=False) if count < 8]
     hint = f" It seems that {' and '.join(enclosed)} cannot be left." if enclosed else ""

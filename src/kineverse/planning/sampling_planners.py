@@ -23,7 +23,7 @@ RANGE = 1.0
 """Largest length of an edge of a tree [rad], [m]; longer where a goal is thousands of them away."""
 _MOST_NODES = 200_000
 MOST_EDGES = 1 << 40
-"""Number of edges of a search that only its time ends."""
+"""Number of edges of a search that is limited by time alone."""
 PATH_ROOM = 16_384
 """Largest number of points of a path."""
 
@@ -71,7 +71,7 @@ class RrtConnect:
         return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
 
     def shorten(self, points: Floats32, seconds: float, seed: int, patience: int) -> Floats32:
-        """Return a shorter path: points on it are joined where the way between them is certainly free."""
+        """Shorten a path (N, n): join points on it by straight lines that are certainly free."""
         s = self._setup(seconds, seed, RESOLUTION)
         room = len(points) + 64
         work = np.zeros((room, points.shape[1]), dtype=np.float32)
@@ -79,20 +79,20 @@ class RrtConnect:
         count = self._code.kineverse_shortcut(
             ctypes.addressof(s), work.ctypes.data, len(points), room, patience, LEAST_INFLATION
         )
-        found = work[:count]
-        apart = np.abs(np.diff(found, axis=0)).max(axis=1, initial=0.0) > 1e-6
-        # The ends stay exact, whatever is dropped.
+        result = work[:count]
+        apart = np.abs(np.diff(result, axis=0)).max(axis=1, initial=0.0) > 1e-6
         keep = np.concatenate([[True], apart])
-        keep[-1] = True
-        return np.ascontiguousarray(found[keep])
+        keep[-1] = True  # the ends stay exact
+        return np.ascontiguousarray(result[keep])
 
     def contract(self, points: Floats32, seconds: float) -> Floats32:
-        """Return a shorter path on the manifold: it contracts like a band, while its samples are free."""
+        """Contract a path on the manifold like a rubber band, while its samples are free."""
         s = self._setup(seconds, 0, RESOLUTION)
         work = np.zeros((3 * len(points) + 64, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points
-        given = ctypes.addressof(s), work.ctypes.data, len(points), len(work)
-        return work[: self._code.kineverse_relax(*given)]
+        return work[
+            : self._code.kineverse_relax(ctypes.addressof(s), work.ctypes.data, len(points), len(work))
+        ]
 
     def _setup(self, seconds: float, seed: int, resolution: float) -> SearchStruct:
         s = self._struct
@@ -103,23 +103,15 @@ class RrtConnect:
 
 
 MOST_NODES = 20_000
-"""Number of nodes of a roadmap for which there is memory, unless told otherwise."""
+"""Default largest number of nodes of a roadmap."""
 _DEGREE, _MOST_DEGREE = 12, 64
 _GREED = 5.0
-"""Weight of the distance to the goal in the order of the search: shortcuts make up for longer ways."""
+"""Weight of the distance to the goal in the order of the search: shortcuts make up for longer paths."""
 _LEAST_BATCH = 32
 _UNKNOWN, _BLOCKED = 0, 2
 _PADDING = 64
-_VISIT = np.dtype(
-    [
-        ("closed", np.int64),
-        ("seen", np.int64),
-        ("cost", np.float32),
-        ("rest", np.float32),
-        ("from", np.int32),
-        ("edge", np.int32),
-    ]
-)
+_VISIT = np.dtype("i8, i8, f4, f4, i4, i4")
+"""State of a node in a search: closed, seen, cost, rest, from, edge."""
 
 
 class Roadmap:
@@ -152,40 +144,26 @@ class Roadmap:
         if not 1 <= as_count("degree", degree, 1) <= _MOST_DEGREE:
             raise InvalidValueError(f"degree is {degree}; it has to be at most {_MOST_DEGREE}.")
         if room * degree >= 2**31:
-            raise InvalidValueError(
-                f"nodes is {nodes}; with {degree} edges each there may be {2**31 // degree}."
-            )
+            limit = 2**31 // degree
+            raise InvalidValueError(f"nodes is {nodes}; with {degree} edges each there may be {limit}.")
         self._symbols, self._turning = tuple(symbols), turning.copy()
         self._code = planning_functions()
         self._path = np.zeros((PATH_ROOM, n), dtype=np.float32)
         self._period = np.where(turning, 2 * np.pi, np.inf).astype(np.float32)
         # Columns are read in whole vectors, the last one included.
         columns = allocate_aligned((room + _PADDING) * n // 2 + 1).view(np.float32)
-        edges = room * degree
-        self._node, self._edge = np.zeros(room, dtype=np.uint8), np.zeros(edges, dtype=np.uint8)
-        self._arrays: dict[str, npt.NDArray[Any]] = {
-            "period": self._period,
-            "columns": columns,
-            "lengths": np.zeros(edges, dtype=np.float32),
-            "targets": np.zeros(edges, dtype=np.int32),
-            "incoming": np.zeros(room, dtype=np.int32),
-            "next": np.zeros(edges, dtype=np.int32),
-            "node": self._node,
-            "edge": self._edge,
-            "passing": np.zeros(room, dtype=np.uint8),
-            "visits_start": np.zeros(room, dtype=_VISIT),
-            "visits_goal": np.zeros(room, dtype=_VISIT),
-            "order_start": np.zeros(room, dtype=np.int32),
-            "order_goal": np.zeros(room, dtype=np.int32),
-        }
+        self._arrays: dict[str, npt.NDArray[Any]] = {"period": self._period, "columns": columns}
+        of_nodes: dict[str, npt.DTypeLike] = {"incoming": np.int32, "node": np.uint8, "passing": np.uint8}
+        of_nodes |= dict.fromkeys(("visits_start", "visits_goal"), _VISIT)
+        of_nodes |= dict.fromkeys(("order_start", "order_goal"), np.int32)
+        of_edges = {"lengths": np.float32, "targets": np.int32, "next": np.int32, "edge": np.uint8}
+        self._arrays |= {name: np.zeros(room, dtype=kind) for name, kind in of_nodes.items()}
+        self._arrays |= {name: np.zeros(room * degree, dtype=kind) for name, kind in of_edges.items()}
+        self._node, self._edge = self._arrays["node"], self._arrays["edge"]
         self._struct = s = RoadmapStruct(
-            resolution=RESOLUTION,
-            least=LEAST_INFLATION,
-            greed=_GREED,
-            degree=degree,
-            room=room,
+            resolution=RESOLUTION, least=LEAST_INFLATION, greed=_GREED, degree=degree, room=room,
             least_batch=_LEAST_BATCH,
-        )
+        )  # fmt: skip
         for name, array in self._arrays.items():
             setattr(s, name, array.ctypes.data)
         self._version: object = None
@@ -197,7 +175,7 @@ class Roadmap:
         return int(self._struct.count)
 
     def suits(self, symbols: Sequence[Symbol], turning: npt.NDArray[np.bool_]) -> bool:
-        """Return whether it is of these n coordinates, which turn fully where flags (n,) are set."""
+        """Return whether the roadmap is of n coordinates that turn fully where flags (n,) are set."""
         return self._symbols == tuple(symbols) and np.array_equal(self._turning, turning)
 
     def solve(
@@ -219,7 +197,7 @@ class Roadmap:
         return SearchResult(points, s.status, s.samples, (s.reached_start, s.reached_goal), s.gap)
 
     def _forget(self, checker: CollisionChecker) -> None:
-        """Forget what another place, other pairs or another margin may have changed."""
+        """Forget results that another placement, other pairs or another margin may have changed."""
         margin, count = checker.struct.margin, len(self)
         for states in (self._node[:count], self._edge[: count * self._struct.degree]):
             if checker.version != self._version:

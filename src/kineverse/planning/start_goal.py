@@ -18,7 +18,7 @@ from .state_validity import SceneJudge, describe_contacts
 _LIMIT = 1e-6
 _ROUNDING = 1e-5
 _SAMPLES, _ENOUGH = 4096, 50
-"""Number of random configurations, and of free ones among them that say where others would be."""
+"""Number of random configurations, and of free ones among them that are enough to find barriers."""
 _NEAR = 0.01
 """Largest residual of an end that is brought onto a manifold [m], [rad]."""
 
@@ -40,40 +40,34 @@ class Endpoints:
         self._space, self._checker, self._judge, self._manifold = space, checker, judge, manifold
 
     def check(self, what: str, q: Array) -> Endpoint:
-        """Return a start or goal (n,), with the reason why it cannot be used."""
+        """Check a start or goal (n,); return it with the reason why it cannot be used."""
         outside = self._beyond_limits(q)
         if outside:
             return Endpoint(q, f"{what} is out of limits: {outside}.")
         if self._manifold is not None:
-            given = q
+            original = q
             off = float(self._manifold.residuals(q[None])[0])
             if off <= _NEAR:
                 points, residuals = self._manifold.polish(q[None])
                 q, off = points[0], float(residuals[0])
             if not off <= EXACT or self._beyond_limits(q):
-                return Endpoint(
-                    given,
-                    f"{what} does not meet the holds: it is off by {off:.3g}. planner.solutions(holds) "
-                    "finds some.",
-                )
+                why = f"{what} does not meet the holds: it is off by {off:.3g}."
+                return Endpoint(original, f"{why} planner.solutions(holds) finds configurations that do.")
         checker = self._checker
         narrow = np.ascontiguousarray(np.clip(q, checker.lower, checker.upper)[None], dtype=np.float32)
         if checker.valid(narrow)[0]:
             return Endpoint(q)
         _, conditions = checker.outputs(narrow[0])
-        broken = [
-            name for name, c in zip(self._space.condition_names, conditions, strict=False) if not c <= 0
-        ]
+        names = self._space.condition_names
+        broken = [name for name, c in zip(names, conditions, strict=False) if not c <= 0]
         if broken:
             return Endpoint(q, f"{what} violates {', '.join(map(repr, broken[:6]))}.")
         contacts = self._judge.contacts(q)
         if len(contacts):
             return Endpoint(q, f"{what} is in collision: {describe_contacts(contacts)}.")
         nearest = self._judge.contacts(q, checker.struct.margin + _ROUNDING)
-        found = [f"'{c.a}' and '{c.b}' are {1e3 * c.distance:.4g} mm apart" for c in [*nearest][:3]]
-        return Endpoint(
-            q, f"{what} is free, but nearer to a contact than margin= allows: {', '.join(found)}."
-        )
+        pairs = ", ".join(f"'{c.a}' and '{c.b}' are {1e3 * c.distance:.4g} mm apart" for c in nearest[:3])
+        return Endpoint(q, f"{what} is free, but nearer to a contact than margin= allows: {pairs}.")
 
     def check_goals(self, ends: Array) -> list[Endpoint] | str:
         """Return the goals among configurations (K, n) that can be used, or why there are none.
@@ -88,8 +82,8 @@ class Endpoints:
             if inside.any():
                 return [Endpoint(end) for end in ends[inside]]
         names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
-        found = [self.check(name, end) for name, end in zip(names, ends, strict=True)]
-        return [end for end in found if not end.reason] or " ".join(end.reason for end in found[:3])
+        result = [self.check(name, end) for name, end in zip(names, ends, strict=True)]
+        return [end for end in result if not end.reason] or " ".join(end.reason for end in result[:3])
 
     def _beyond_limits(self, q: Array) -> str:
         lower, upper = self._space.lower, self._space.upper
@@ -104,9 +98,9 @@ class Endpoints:
 
 
 def describe_barrier(space: PlanningSpace, checker: CollisionChecker, start: Array, ends: Array) -> str:
-    """Return a sentence on a coordinate whose values between start (n,) and goals (K, n) are not free.
+    """Describe a coordinate whose values between start (n,) and goals (K, n) are not free; empty without one.
 
-    It is empty if there is no such coordinate. Random configurations tell, so this is no proof.
+    Random configurations are checked, so this is no proof.
     """
     generator = np.random.default_rng(0)
     lower, upper = checker.lower.astype(float), checker.upper.astype(float)
@@ -126,7 +120,7 @@ def describe_barrier(space: PlanningSpace, checker: CollisionChecker, start: Arr
         if not checker.valid(samples.astype(np.float32)).any():
             where = f"'{space.symbols[i]}' between {inner[0]:.4g} and {inner[1]:.4g}"
             return (
-                f" The goal may be out of reach: every way leads through {where}, and {_SAMPLES} random "
+                f" The goal may be out of reach: every path leads through {where}, and {_SAMPLES} random "
                 "configurations there are not free."
             )
         samples[:, i] = generator.uniform(lower[i], upper[i], _SAMPLES)
@@ -135,7 +129,7 @@ def describe_barrier(space: PlanningSpace, checker: CollisionChecker, start: Arr
 
 _BATCH = 2048
 MOST_BATCHES = 1_000_000
-"""Number of batches of a search that only its time ends."""
+"""Number of batches of a search that is limited by time alone."""
 _IDLE = 8
 """Number of batches without anything new after which there is nothing more to find."""
 _APART = 0.05
@@ -151,11 +145,11 @@ def find_solutions(
     seed: int,
     batches: int = MOST_BATCHES,
 ) -> Array:
-    """Return configurations (K, n) on a manifold, free of collisions, at most some number of them."""
+    """Find different configurations (K, n) on a manifold, free of collisions; the nearest come first."""
     generator = np.random.default_rng(seed)
     begin = working_seconds()
     lower, upper = checker.lower.astype(float), checker.upper.astype(float)
-    found, idle = np.zeros((0, len(near))), 0
+    result, idle = np.zeros((0, len(near))), 0
     for k in range(batches):
         if k == 0:
             tries = near + generator.standard_normal((_BATCH, len(near))) * (upper - lower) / 8
@@ -164,16 +158,16 @@ def find_solutions(
             tries = generator.uniform(lower, upper, (_BATCH, len(near)))
         rows = np.ascontiguousarray(np.clip(tries, lower, upper), dtype=np.float32)
         rows = np.ascontiguousarray(rows[manifold.project(rows)])
-        rows, before = rows[checker.valid(rows)], len(found)
+        rows, before = rows[checker.valid(rows)], len(result)
         if len(rows):
             exact, residuals = manifold.polish(rows[: 4 * count].astype(float))
             inside = (exact >= lower - 1e-9).all(axis=1) & (exact <= upper + 1e-9).all(axis=1)
             exact = exact[inside & (residuals <= EXACT)]
             # Polishing moves them a little.
             free = checker.valid(np.ascontiguousarray(np.clip(exact, lower, upper), dtype=np.float32))
-            found = np.vstack([found, exact[free]])
-            found = found[unique_rows(found, _APART)]
-        idle = 0 if len(found) > before else idle + 1
-        if len(found) >= count or (len(found) and idle >= _IDLE) or working_seconds() - begin > seconds:
+            result = np.vstack([result, exact[free]])
+            result = result[unique_rows(result, _APART)]
+        idle = 0 if len(result) > before else idle + 1
+        if len(result) >= count or (len(result) and idle >= _IDLE) or working_seconds() - begin > seconds:
             break
-    return found[np.argsort(np.linalg.norm(found - near, axis=1), kind="stable")][:count]
+    return result[np.argsort(np.linalg.norm(result - near, axis=1), kind="stable")][:count]

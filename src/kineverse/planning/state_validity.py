@@ -1,24 +1,35 @@
-"""Validity of configurations and paths by the collision scene, in double precision."""
+"""Validity of configurations and paths: by the collision scene, and by the compiled check of a planner."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
+from kineverse._runtime import CallLock
 from kineverse.compilation.build_queue import working_seconds
+from kineverse.errors import InvalidValueError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .collision_checker import LateCheckError
-from .path import densify, sample_path
+from .collision_checker import RESOLUTION, BodyPairs, CollisionChecker, LateCheckError
+
+if TYPE_CHECKING:
+    from .manifold import Manifold
 
 _AT_ONCE = 512
-"""Number of samples after which the time is looked at."""
+"""Number of samples between two looks at the clock."""
+_ROUNDING = 1e-6
+_TOUCHING = 5e-5
+"""Depth up to which a contact is called a touch [m]."""
 
 
 class SceneJudge:
@@ -72,8 +83,109 @@ class SceneJudge:
         return self._query.least_distance(self._coordinates, samples, radius)
 
 
-def describe_contacts(found: Sequence[DistanceResult], most: int = 3) -> str:
-    """Return the names of touching pairs of bodies, and how deep they penetrate [mm]."""
-    pairs = [f"'{f.a}' and '{f.b}' ({-1e3 * f.distance:.1f} mm deep)" for f in list(found)[:most]]
-    more = f" and {len(found) - most} more pairs" if len(found) > most else ""
+class PathChecks:
+    """Checks of configurations in the surroundings of a path, wherever things are placed now."""
+
+    def __init__(
+        self,
+        model: ModelView,
+        state: State,
+        checker: CollisionChecker,
+        judge: SceneJudge,
+        manifold: Manifold | None,
+        touching: BodyPairs,
+        restore: Callable[[], None],
+        lock: CallLock,
+    ) -> None:
+        self.model, self.state, self._version = model, state, model.version
+        self._checker, self._judge, self._manifold = checker, judge, manifold
+        self._targets = None if manifold is None else manifold.targets
+        self._touching, self._restore, self._lock = touching, restore, lock
+
+    def clearance(self, points: Array) -> float:
+        """Return the least signed distance of bodies along a polyline (N, n) by the scene [m]."""
+        self.ensure_current()
+        with self._lock:
+            self._judge.place(self.state)
+            return self._judge.clearance(points, 1 / RESOLUTION)
+
+    def ensure_current(self) -> None:
+        """Ensure that the model is the one for which the path was planned."""
+        if self.model.version != self._version:
+            raise InvalidValueError("The model has been edited since this path was planned. Plan it again.")
+
+    @contextmanager
+    def placed(self, points: Array) -> Iterator[None]:
+        """Place the checker for a path, with limits about its points (N, n), while the context lasts."""
+        checker = self._checker
+        with self._lock:
+            limits = checker.lower.copy(), checker.upper.copy()
+            checker.place(self.state)
+            if self._manifold is not None and self._targets is not None:
+                self._manifold.place(self.state, self._targets)
+            narrow = points.astype(np.float32)
+            checker.lower[:] = narrow.min(axis=0) - _ROUNDING
+            checker.upper[:] = narrow.max(axis=0) + _ROUNDING
+            try:
+                with checker.excepting(self._touching):
+                    yield
+            finally:
+                checker.lower[:], checker.upper[:] = limits
+                self._restore()
+
+    def valid(self, Q: Array, residual: float) -> npt.NDArray[np.bool_]:
+        """Return flags (N,) of configurations (N, n) that are free and meet holds up to a residual."""
+        flags = self._checker.valid(np.ascontiguousarray(Q, dtype=np.float32))
+        if self._manifold is not None:
+            flags &= self._manifold.residuals(Q) <= residual
+        return flags
+
+    def find_collision(self, points: Array) -> int | None:
+        """Return the first edge of a polyline (N, n) that is not certainly free; None if all are."""
+        result = self._checker.find_collision(np.ascontiguousarray(points, dtype=np.float32))
+        return None if result is None else result[0]
+
+
+def describe_contacts(contacts: Sequence[DistanceResult], limit: int = 3) -> str:
+    """Name touching pairs of bodies, with the depth of their penetration."""
+    pairs = [f"'{c.a}' and '{c.b}' ({_describe_depth(-c.distance)})" for c in contacts[:limit]]
+    more = f" and {len(contacts) - limit} more pairs" if len(contacts) > limit else ""
     return ", ".join(pairs) + more
+
+
+def _describe_depth(depth: float) -> str:
+    return f"{1e3 * depth:.1f} mm deep" if depth >= _TOUCHING else "touching"
+
+
+def densify(points: Array, step: float) -> Array:
+    """Return the points of a polyline (N, n) with others between them, at most a step apart."""
+    if len(points) < 2:
+        return points
+    counts = np.maximum(np.ceil(_segment_lengths(points) / step), 1).astype(int)
+    ends = np.cumsum(counts)
+    shares = (np.arange(ends[-1]) - np.repeat(ends - counts, counts)) / np.repeat(counts, counts)
+    at = np.append(np.repeat(np.arange(len(counts)), counts) + shares, len(counts))
+    return _interpolate(points, np.arange(float(len(points))), at)
+
+
+def sample_path(points: Array, step: float) -> Array:
+    """Return samples of a polyline (N, n), at most a step apart: its points and others, or some of many."""
+    lengths = _segment_lengths(points)
+    count = int(np.ceil(lengths.sum() / step)) + 1
+    if len(points) <= 4 * count:
+        return densify(points, step)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    return _interpolate(points, along, np.linspace(0.0, along[-1], count))
+
+
+def _segment_lengths(points: Array) -> Array:
+    return np.asarray(np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)))
+
+
+def _interpolate(points: Array, along: Array, at: Array) -> Array:
+    """Return rows of a polyline (N, n) with knots at (N,), at places (M,) from the first to the last."""
+    lengths = along[1:] - along[:-1]
+    slopes = np.zeros(points.shape)
+    slopes[:-1] = (points[1:] - points[:-1]) / np.where(lengths > 0.0, lengths, 1.0)[:, None]
+    k = np.searchsorted(along, at, side="right") - 1
+    return np.asarray(slopes[k] * (at - along[k])[:, None] + points[k])

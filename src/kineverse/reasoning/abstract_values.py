@@ -43,8 +43,8 @@ def enclose_loop(term: Term, inputs: list[TaylorSeries]) -> TaylorSeries:
 
 def find_implicit_functions(terms: Iterable[Term]) -> set[ImplicitFunction]:
     """Return the implicit functions among terms, including those in their equations."""
-    found = {term.data[0].function for term in terms if term.op == "implicit"}
-    return found.union(*map(_nested_loops, found))
+    result = {term.data[0].function for term in terms if term.op == "implicit"}
+    return result.union(*map(_nested_loops, result))
 
 
 @lru_cache(256)
@@ -222,9 +222,7 @@ def _unary(term: Term, a: AbstractValue, sign: Signs, live: frozenset[Symbol]) -
     turn = sign(term.args[0]) if op == ca.OP_FABS else None
     if op == ca.OP_NEG or turn == -1:
         return AbstractValue(
-            interval_negate(a.range),
-            None if a.polynomial is None else a.polynomial.scale(-1),
-            live,
+            interval_negate(a.range), None if a.polynomial is None else a.polynomial.scale(-1), live
         )
     if op == ca.OP_ASSIGN or turn is not None:
         return a
@@ -264,9 +262,7 @@ def _product(a: AbstractValue, b: AbstractValue, same: bool, live: frozenset[Sym
     if a.polynomial is not None and b.polynomial is not None:
         exact = a.polynomial.multiply(b.polynomial)
     return AbstractValue(
-        interval_square(a.range) if same else interval_multiply(a.range, b.range),
-        exact,
-        live,
+        interval_square(a.range) if same else interval_multiply(a.range, b.range), exact, live
     )
 
 
@@ -323,8 +319,8 @@ def _piecewise(term: Term, x: AbstractValue, values: dict[int, AbstractValue], s
         for k in range(first, last + 1):
             start = -math.inf if k == 0 else starts[k]
             spans.append((pieces[k], max(low, start) - starts[k], min(high, ends[k]) - starts[k]))
-    found = [interval_polynomial(p, round_outwards(a, b)) for p, a, b in spans if a <= b]
-    span = (min(f[0] for f in found), max(f[1] for f in found)) if found else REALS
+    result = [interval_polynomial(p, round_outwards(a, b)) for p, a, b in spans if a <= b]
+    span = (min(f[0] for f in result), max(f[1] for f in result)) if result else REALS
     return AbstractValue(span, None, x.live)
 
 

@@ -249,16 +249,16 @@ def merge_boxes(
     boxes, smaller ones remain. If only a part of the set is ``wanted``, boxes that do not contribute to that
     part are removed.
     """
-    found = _join_adjacent(list(boxes))
-    matter = found if wanted is None else _join_adjacent(list(wanted))
-    if len(found) <= _JOINED_AT_MOST:
-        found = _prime_boxes(found)
-    found.sort(key=lambda b: (-len(b), str(b)))
-    for box in list(found):
-        others = [other for other in found if other is not box]
+    result = _join_adjacent(list(boxes))
+    matter = result if wanted is None else _join_adjacent(list(wanted))
+    if len(result) <= _JOINED_AT_MOST:
+        result = _prime_boxes(result)
+    result.sort(key=lambda b: (-len(b), str(b)))
+    for box in list(result):
+        others = [other for other in result if other is not box]
         if not subtract_boxes(intersect_boxes([box], matter), others):
-            found = others
-    return tuple(sorted((box.to_floats() for box in found), key=lambda b: (len(b), str(b))))
+            result = others
+    return tuple(sorted((box.to_floats() for box in result), key=lambda b: (len(b), str(b))))
 
 
 def _join_adjacent(boxes: list[IntervalBox]) -> list[IntervalBox]:

@@ -21,8 +21,7 @@ from .boxes import Interval, IntervalBox, Number
 from .domain import Domain
 from .polynomial import LinearForm, Polynomial, linear_form_expression
 
-NEGLIGIBLE = 1e-12
-"""Largest constant that is taken for 0 with a rounding error."""
+NEGLIGIBLE = 1e-12  # largest constant that is taken for 0 with a rounding error
 _SAME = 1e-12
 _CLOSE_ROOTS = 1e-9
 
@@ -204,7 +203,7 @@ class Case:
 
     def doubts(self, roots: tuple[Term, ...]) -> list[Term]:
         """Return the deciding terms below the roots whose signs are unknown, inner ones first."""
-        found: dict[int, Term] = {}
+        result: dict[int, Term] = {}
         seen: set[int] = set()
         stack = list(roots)
         while stack:
@@ -215,10 +214,10 @@ class Case:
             seen.add(term.index)
             for decider in term.deciders:
                 if self.sign(decider) is None:
-                    found[decider.index] = decider
+                    result[decider.index] = decider
                 stack.append(decider)
             stack += live_arguments(term, self.values, self.sign)
-        return [found[index] for index in sorted(found)]
+        return [result[index] for index in sorted(result)]
 
     def split(self, term: Term) -> list[Case] | str:
         """Return the cases in which a term has a constant sign, or the reason why there is no such split."""
@@ -241,9 +240,9 @@ class Case:
         side = self.interval(axis)
         if p is not None:
             coefficients = p.coefficients()
-            found = exact.roots(coefficients, side)
+            result = exact.roots(coefficients, side)
             return self._divide(
-                term, axis, found, _CLOSE_ROOTS, lambda x: exact.evaluate_polynomial(coefficients, x)
+                term, axis, result, _CLOSE_ROOTS, lambda x: exact.evaluate_polynomial(coefficients, x)
             )
         order = reachable_terms((term,))
 

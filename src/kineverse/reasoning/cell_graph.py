@@ -21,7 +21,7 @@ from .boxes import Interval, IntervalBox
 from .find_interlocks import constant_limits
 from .interlock_records import Interlock, Interlocks, Undecided
 
-Way: TypeAlias = Literal["up", "down", "enter"]
+Direction: TypeAlias = Literal["up", "down", "enter"]
 Box: TypeAlias = Mapping[Symbol, Interval]
 
 
@@ -29,7 +29,7 @@ Box: TypeAlias = Mapping[Symbol, Interval]
 class MoveRule:
     """Restriction of moves within a box of positions."""
 
-    way: Way  # "up", "down": within the box, the coordinate cannot increase, or decrease
+    direction: Direction  # "up", "down": within the box, the coordinate cannot increase, or decrease
     coordinate: Symbol | None  # restricted coordinate; for "enter" the one that is exempt, or None
     box: Box  # intervals of positions
     lock: Interlock | Undecided  # interlock that says so, or the constraint that could not be read
@@ -84,20 +84,20 @@ class _BoxReader:
 
 
 def relevant_rules(rules: Iterable[MoveRule], goals: Iterable[Symbol]) -> tuple[list[Symbol], list[MoveRule]]:
-    """Return the coordinates on which the way to goals depends, sorted, and the rules about them."""
+    """Return the coordinates on which goals depend, sorted, and the rules about them."""
     about: dict[Symbol, list[MoveRule]] = {}
     for rule in rules:
-        for symbol in rule.symbols if rule.way == "enter" else (rule.coordinate,):
+        for symbol in rule.symbols if rule.direction == "enter" else (rule.coordinate,):
             if symbol is not None:
                 about.setdefault(symbol, []).append(rule)
-    found, waiting = set[Symbol](), list(goals)
+    result, waiting = set[Symbol](), list(goals)
     while waiting:
         symbol = waiting.pop()
-        if symbol not in found:
-            found.add(symbol)
+        if symbol not in result:
+            result.add(symbol)
             waiting += [other for rule in about.get(symbol, ()) for other in rule.symbols]
-    chosen = {id(rule): rule for symbol in found for rule in about.get(symbol, ())}
-    return sorted(found, key=lambda s: s.sort_key), [r for r in rules if id(r) in chosen]
+    chosen = {id(rule): rule for symbol in result for rule in about.get(symbol, ())}
+    return sorted(result, key=lambda s: s.sort_key), [r for r in rules if id(r) in chosen]
 
 
 def _lock_rules(lock: Interlock, reader: _BoxReader) -> Iterator[MoveRule]:
@@ -119,7 +119,7 @@ def _lock_rules(lock: Interlock, reader: _BoxReader) -> Iterator[MoveRule]:
 
 
 def _range_rules(lock: Interlock, symbol: Symbol, box: Box, exact: bool) -> Iterator[MoveRule]:
-    """Yield the rules of a range of a position: no way out, and no way to leave it outside."""
+    """Yield the rules of a range of a position: no exit, and no return from outside."""
     bounds = [bound for bound in (lock.lower, lock.upper) if bound is not None]
     others = [s for bound in bounds for s in _positions(bound)]
     if others:
@@ -127,26 +127,26 @@ def _range_rules(lock: Interlock, symbol: Symbol, box: Box, exact: bool) -> Iter
         return
     low = -math.inf if lock.lower is None else float(lock.lower)
     high = math.inf if lock.upper is None else float(lock.upper)
-    sides: tuple[tuple[Way, Interval, Interval, float], ...] = (
+    sides: tuple[tuple[Direction, Interval, Interval, float], ...] = (
         ("up", Interval(lower=high, lower_closed=True), Interval(lower=high), high),
         ("down", Interval(upper=low, upper_closed=True), Interval(upper=low), low),
     )
-    for way, at_bound, beyond, bound in sides:
+    for direction, at_bound, beyond, bound in sides:
         if math.isinf(bound):
             continue
         inner = _narrow(box, symbol, at_bound)
         if inner is not None:
-            yield MoveRule(way, symbol, inner, lock, exact)
+            yield MoveRule(direction, symbol, inner, lock, exact)
         outer = _narrow(box, symbol, beyond)
         if outer is not None:
             yield MoveRule("enter", symbol, outer, lock, exact)
 
 
 def _shut(held: Iterable[Symbol], box: Box, lock: Interlock | Undecided) -> Iterator[MoveRule]:
-    ways: tuple[Way, Way] = ("up", "down")
+    directions: tuple[Direction, Direction] = ("up", "down")
     for symbol in held:
-        for way in ways:
-            yield MoveRule(way, symbol, box, lock, False)
+        for direction in directions:
+            yield MoveRule(direction, symbol, box, lock, False)
 
 
 def _narrow(box: Box, symbol: Symbol, side: Interval) -> Box | None:
@@ -159,8 +159,7 @@ def _positions(expression: Expression) -> list[Symbol]:
     return list(dict.fromkeys(s for s in symbols if s.has_derivative))
 
 
-Move: TypeAlias = tuple[int, int]
-"""Number of a coordinate, and the cell to which it moves."""
+Move: TypeAlias = tuple[int, int]  # number of a coordinate, and the cell to which it moves
 
 
 class CellStep(NamedTuple):
@@ -198,20 +197,20 @@ class CellGraph:
         """Return the cell of a coordinate in a state."""
         return (state & self.field(coordinate)).bit_length() - 1 - self.first[coordinate]
 
-    def step(self, coordinate: int, cell: int, way: int) -> CellStep | None:
-        """Return the step from a cell, upward for ``way = 1`` and downward for -1."""
-        return self.steps[coordinate][way < 0][cell]
+    def step(self, coordinate: int, cell: int, direction: int) -> CellStep | None:
+        """Return the step from a cell, upward for ``direction = 1`` and downward for -1."""
+        return self.steps[coordinate][direction < 0][cell]
 
-    def sweep(self, state: int, coordinate: int, way: int) -> Iterator[tuple[int, int]]:
+    def sweep(self, state: int, coordinate: int, direction: int) -> Iterator[tuple[int, int]]:
         """Yield the cells in which a move in one direction may end, and the states there."""
-        steps, first = self.steps[coordinate][way < 0], self.first[coordinate]
+        steps, first = self.steps[coordinate][direction < 0], self.first[coordinate]
         cell = self.cell_of(state, coordinate)
         while True:
             step = steps[cell]
             if step is None or not all(map(state.__and__, step.needs)):
                 return
-            state ^= (1 << (first + cell)) | (1 << (first + cell + way))
-            cell += way
+            state ^= (1 << (first + cell)) | (1 << (first + cell + direction))
+            cell += direction
             if self.rests >> (first + cell) & 1:
                 yield cell, state
 
@@ -219,11 +218,11 @@ class CellGraph:
         """Yield the states along a move, and the steps taken from them."""
         coordinate, target = move
         cell = self.cell_of(state, coordinate)
-        way = 1 if target > cell else -1
+        direction = 1 if target > cell else -1
         while cell != target:
-            yield state, self.step(coordinate, cell, way)
-            state ^= self.bit(coordinate, cell) | self.bit(coordinate, cell + way)
-            cell += way
+            yield state, self.step(coordinate, cell, direction)
+            state ^= self.bit(coordinate, cell) | self.bit(coordinate, cell + direction)
+            cell += direction
 
     def apply(self, state: int, move: Move) -> int | None:
         """Return the state after a move, None if a rule blocks it."""
@@ -244,7 +243,7 @@ def make_graph(
     limits: Mapping[Symbol, Interval],
     start: Mapping[Symbol, float],
     goals: Mapping[Symbol, float],
-    still: Collection[Symbol] = (),
+    fixed: Collection[Symbol] = (),
 ) -> CellGraph:
     """Return the cells between the thresholds of rules, and the steps that the rules allow."""
     cells: list[tuple[Interval, ...]] = []
@@ -279,21 +278,21 @@ def make_graph(
     held: dict[Symbol, list[tuple[MoveRule, int]]] = {symbol: [] for symbol in coordinates}
     entered: dict[Symbol, list[tuple[MoveRule, int]]] = {symbol: [] for symbol in coordinates}
     for rule, mask in masks:
-        if rule.way != "enter" and rule.coordinate is not None:
+        if rule.direction != "enter" and rule.coordinate is not None:
             held[rule.coordinate].append((rule, mask))
-        elif rule.way == "enter":
+        elif rule.direction == "enter":
             for symbol in rule.box.keys() - {rule.coordinate}:
                 entered[symbol].append((rule, mask))
     steps = []
     for k, symbol in enumerate(coordinates):
         both = []
-        for way, name in ((1, "up"), (-1, "down")):
-            about = [(r, m) for r, m in held[symbol] if r.way == name]
+        for direction, name in ((1, "up"), (-1, "down")):
+            about = [(r, m) for r, m in held[symbol] if r.direction == name]
             both.append(
                 tuple(
                     None
-                    if symbol in still
-                    else _make_step(cells[k], n, way, whole[k], first[k], about, entered[symbol])
+                    if symbol in fixed
+                    else _make_step(cells[k], n, direction, whole[k], first[k], about, entered[symbol])
                     for n in range(len(cells[k]))
                 )
             )
@@ -312,7 +311,7 @@ def make_graph(
 def _make_step(
     cells: Sequence[Interval],
     cell: int,
-    way: int,
+    direction: int,
     whole: int,
     first: int,
     about: Iterable[tuple[MoveRule, int]],
@@ -323,7 +322,7 @@ def _make_step(
     Rules about the direction have to leave the coordinate free in its cell, and in the neighbour, unless that
     is a single position, at which the move ends.
     """
-    following = cell + way
+    following = cell + direction
     if not 0 <= following < len(cells):
         return None
     here, there = 1 << (first + cell), 1 << (first + following)

@@ -28,23 +28,23 @@ from .polynomial import Polynomial
 
 def express_bound(case: Case, term: Term, names: Mapping[int, Symbol]) -> Expression:
     """Return a term as an expression simplified for a case; ``names`` maps terms to symbols for them."""
-    found: dict[int, Expression] = {}
+    result: dict[int, Expression] = {}
     for part in reachable_terms((term,)):
         value = case.value(part)
         if value.polynomial is not None:
-            found[part.index] = _sum_of(value.polynomial)
+            result[part.index] = _sum_of(value.polynomial)
         elif part.index in names:
-            found[part.index] = names[part.index]
+            result[part.index] = names[part.index]
         elif part.op != "implicit" and part.op != ca.OP_CONST:
             chosen = live_arguments(part, case.values, case.sign)
-            found[part.index] = _step(part, chosen, found)
+            result[part.index] = _step(part, chosen, result)
         elif part.op == ca.OP_CONST:
-            found[part.index] = as_expression(part.data)
+            result[part.index] = as_expression(part.data)
         else:
             node, element = part.data
             whole = node.value
-            found[part.index] = whole if not whole.shape else whole.ravel()[element]
-    return found[term.index]
+            result[part.index] = whole if not whole.shape else whole.ravel()[element]
+    return result[term.index]
 
 
 def _sum_of(polynomial: Polynomial) -> Expression:
@@ -138,10 +138,7 @@ def _isolate_speed(constraint: Constraint) -> tuple[Expression, Expression, Expr
 
 
 def _collect_regions(
-    start: Case,
-    factor: Term,
-    side: tuple[Term, Term, Region, Region],
-    unknown: list[tuple[str, IntervalBox]],
+    start: Case, factor: Term, side: tuple[Term, Term, Region, Region], unknown: list[tuple[str, IntervalBox]]
 ) -> None:
     slack, opposite, blocks, forces = side
     if start.sign(factor) == 1:
@@ -149,13 +146,13 @@ def _collect_regions(
         if len(parts) > 1:
             # A product of these is 0 where one of them is, so that n conditions make n cases, and not 2ⁿ.
             doubts: list[tuple[str, IntervalBox]] = []
-            found = Region()
+            result = Region()
             for part in parts:
                 own = Case((factor, part), start.domain)
-                _collect_regions(own, factor, (part, opposite, found, forces), doubts)
+                _collect_regions(own, factor, (part, opposite, result, forces), doubts)
             if not doubts:
-                blocks.boxes += found.boxes
-                blocks.reported += found.reported
+                blocks.boxes += result.boxes
+                blocks.reported += result.reported
                 return
 
     def ask(case: Case) -> int | str | Unclear:
@@ -188,7 +185,7 @@ def _collect_regions(
 
 def _nonnegative_factors(case: Case, term: Term) -> list[Term]:
     """Return the factors of a product without constants if all are finite and >= 0, else the term."""
-    found: dict[int, Term] = {}
+    result: dict[int, Term] = {}
     positive, stack = True, [term]
     while stack:
         part = stack.pop()
@@ -202,8 +199,8 @@ def _nonnegative_factors(case: Case, term: Term) -> list[Term]:
         elif value.void or value.doubtful or value.range[0] < 0 or math.isinf(value.range[1]):
             return [term]
         else:
-            found[part.index] = part
-    return list(found.values()) if positive else [term]
+            result[part.index] = part
+    return list(result.values()) if positive else [term]
 
 
 def _ramp_reason(case: Case, terms: tuple[Term, ...]) -> str | None:
@@ -270,7 +267,7 @@ def find_position_effects(
     )
     form = Case((expression,), domain).value(expression).polynomial
     moves = bool(constraint.lower.symbols or constraint.upper.symbols)
-    found: list[PositionEffect] = []
+    result: list[PositionEffect] = []
     if form is not None and form.degree == 1 and all(s.has_derivative for s in form.symbols):
         for symbol in sorted(form.symbols, key=lambda s: s.sort_key):
             weight = form.terms[((symbol, 1),)]
@@ -282,14 +279,14 @@ def find_position_effects(
             low, high = (terms.divide(terms.subtract(end, other), scale) for end in (lower, upper))
             if weight < 0:
                 low, high = high, low
-            found += _find_effects(query, symbol, low, high)
+            result += _find_effects(query, symbol, low, high)
     elif moves:
-        found += _find_effects(query, constraint.expression, lower, upper)
+        result += _find_effects(query, constraint.expression, lower, upper)
     elif len(constraint.expression.symbols) > 1:
-        found += _joint_limit_effects(
+        result += _joint_limit_effects(
             query, constraint, terms.term(apply_substitution(constraint.expression, dependent))
         )
-    return found
+    return result
 
 
 def _joint_limit_effects(query: _Query, constraint: Constraint, expression: Term) -> list[PositionEffect]:
@@ -336,7 +333,7 @@ def _find_effects(query: _Query, held: Expression, low: Term, high: Term) -> lis
         if leaf.hold != "stays within" or _is_narrower(leaf, free):
             groups.setdefault((leaf.hold, leaf.lower, leaf.upper), []).append(leaf)
     empty = _merge_leaves([leaf for leaf in leaves if leaf.hold == "has no value"])
-    found = [PositionEffect(held, "has no value", empty, None, None, None)] if empty else []
+    result = [PositionEffect(held, "has no value", empty, None, None, None)] if empty else []
     _join_points(groups)
     for (hold, lower, upper), group in groups.items():
         where = _merge_leaves(group)
@@ -348,8 +345,8 @@ def _find_effects(query: _Query, held: Expression, low: Term, high: Term) -> lis
         if not any(leaf.tighter[1] for leaf in group) and not math.isinf(limit.upper):
             upper = as_expression(float(limit.upper))
         fixed = None if lower.symbols or upper.symbols else (float(lower), float(upper))
-        found.append(PositionEffect(held, hold, where, lower, upper, fixed))
-    return found
+        result.append(PositionEffect(held, hold, where, lower, upper, fixed))
+    return result
 
 
 def _merge_leaves(leaves: list[_Leaf]) -> tuple[IntervalBox, ...]:

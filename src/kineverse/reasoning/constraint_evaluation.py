@@ -26,12 +26,9 @@ from kineverse.symbols import Symbol
 
 from .boxes import IntervalBox
 
-SLOW = 1e-6
-"""Speed that constraints admit wherever a coordinate may move [m/s] or [rad/s]."""
-NOTHING = 1e-9
-"""Largest excess of a constraint that counts as satisfied; also a speed that is none."""
-BESIDE = SATURATED / SHARP_CONTRAST
-"""Distance from a threshold within which a position counts as at it [m] or [rad]: its ramp is no wider."""
+SLOW = 1e-6  # speed that constraints admit wherever a coordinate may move [m/s] or [rad/s]
+NOTHING = 1e-9  # largest excess of a constraint that counts as satisfied; also a speed that is none
+BESIDE = SATURATED / SHARP_CONTRAST  # distance at which a position is at a threshold [m] or [rad]
 _MOST_PIECES = 4096
 
 _NOT_MOVING: RealInterval = (0.0, 0.0)
@@ -78,7 +75,7 @@ class ConstraintRanges:
         return self._about.get(symbol, ())
 
     def refuses(self, speed: Symbol, forward: float, box: Box, start: Mapping[Symbol, float]) -> bool:
-        """Return whether constraints admit no slow speed anywhere in a box, but beside thresholds.
+        """Return whether constraints admit no slow speed anywhere in a box, but next to thresholds.
 
         If intervals do not decide it at once, the box is divided at the thresholds of these constraints. At
         one of them, a coordinate is at most at the start.
@@ -103,8 +100,8 @@ class ConstraintRanges:
         )
 
     def _symbols_within(self, names: Iterable[str]) -> list[Symbol]:
-        found = {s for name in names for s in self._row(name).symbols}
-        return sorted((s for s in found if not s.order), key=lambda s: s.sort_key)
+        result = {s for name in names for s in self._row(name).symbols}
+        return sorted((s for s in result if not s.order), key=lambda s: s.sort_key)
 
     def _pieces(
         self, symbol: Symbol, side: RealInterval, names: Iterable[str], start: float | None
@@ -121,13 +118,13 @@ class ConstraintRanges:
         """Return where comparisons in the bounds of a constraint change, as far as one position decides."""
         key = name, symbol
         if key not in self._cuts:
-            row, found = self._row(name), list[float]()
+            row, result = self._row(name), list[float]()
             terms = reachable_terms(tuple(t for t in (row.lower, row.upper) if isinstance(t, Term)))
             for decider in dict.fromkeys(d for t in terms for d in t.deciders):
                 own = {t.data for t in reachable_terms((decider,)) if t.op == ca.OP_PARAMETER}
                 if own == {symbol}:
-                    found += self._linear_root(decider, symbol)
-            self._cuts[key] = found
+                    result += self._linear_root(decider, symbol)
+            self._cuts[key] = result
         return self._cuts[key]
 
     def _linear_root(self, term: Term, symbol: Symbol) -> list[float]:

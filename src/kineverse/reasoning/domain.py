@@ -22,8 +22,7 @@ from kineverse.symbols import Symbol, position
 from .boxes import Interval, IntervalBox, wrap_to_turn
 from .polynomial import Monomial, Polynomial
 
-UnitSphere = tuple[Symbol, ...]
-"""Coordinates whose squares have the sum 1, such as a unit quaternion."""
+UnitSphere = tuple[Symbol, ...]  # coordinates whose squares have the sum 1, such as a unit quaternion
 
 _WHOLE = Interval(-1.0, 1.0, True, True)
 _ROUNDING = 1e-12
@@ -133,13 +132,13 @@ def _turn_counts(expression: Expression, moving: Mapping[Symbol, Fraction]) -> l
     """Return the increments of elements, in turns, after given turns of symbols; None if not certain."""
     terms = TermGraph({})
     roots = tuple(terms.elements(expression))
-    found: dict[int, TurnCount] = {}
+    result: dict[int, TurnCount] = {}
     for term in reachable_terms(roots):
-        args = [found[a.index] for a in term.args]
-        found[term.index] = (
+        args = [result[a.index] for a in term.args]
+        result[term.index] = (
             moving.get(term.data, UNCHANGED) if term.op == ca.OP_PARAMETER else _turn_count(term, args)
         )
-    return [found[term.index] for term in roots]
+    return [result[term.index] for term in roots]
 
 
 def _turn_count(term: Term, args: list[TurnCount]) -> TurnCount:

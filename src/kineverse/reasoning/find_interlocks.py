@@ -70,13 +70,13 @@ def find_effects(
         **{s: apply_substitution(e, periodic.wrapped) for s, e in dependent.items()},
         **periodic.wrapped,
     }
-    found = _restore_coordinates(_effects_by_order(bare, substitutions, given, within), periodic)
-    if not found.unknown:
-        return found
+    result = _restore_coordinates(_effects_by_order(bare, substitutions, given, within), periodic)
+    if not result.unknown:
+        return result
     by_name = _effects_by_order(bare, {}, given, domain)
     if dependent:
         because = f"{_names(dependent)} follows {_names(s for e in dependent.values() for s in e.symbols)}"
-        by_name.unknown += [(f"{because}, and {reason}", box) for reason, box in found.unknown]
+        by_name.unknown += [(f"{because}, and {reason}", box) for reason, box in result.unknown]
     return by_name
 
 
@@ -87,12 +87,12 @@ def _names(symbols: Iterable[Symbol]) -> str:
 def _effects_by_order(
     bare: Constraint, dependent: Mapping[Symbol, Expression], given: Mapping[Symbol, float], domain: Domain
 ) -> ConstraintEffects:
-    found = ConstraintEffects()
+    result = ConstraintEffects()
     if bare.order:
-        found.speed = find_speed_effect(bare, dependent, given, domain, found.unknown)
+        result.speed = find_speed_effect(bare, dependent, given, domain, result.unknown)
     else:
-        found.positions = find_position_effects(bare, dependent, given, domain, found.unknown)
-    return found
+        result.positions = find_position_effects(bare, dependent, given, domain, result.unknown)
+    return result
 
 
 def _find_periodic(
@@ -174,7 +174,7 @@ def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = N
     given = _given_values(constraints, values)
     domain = Domain(constant_limits(constraints), find_orientations(model.rates))
     order = list(constraints)
-    found: list[Interlock] = []
+    result: list[Interlock] = []
     undecided: list[Undecided] = []
     speed_effects: dict[str, SpeedEffect] = {}
     position_effects: dict[str, list[PositionEffect]] = {}
@@ -189,13 +189,13 @@ def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = N
             where = merge_boxes(box for other, box in effects.unknown if other == reason)
             undecided.append(Undecided(name, reason, where))
     for name, one in speed_effects.items():
-        found += _speed_interlocks(name, one)
-    found += _pair_interlocks(speed_effects)
+        result += _speed_interlocks(name, one)
+    result += _pair_interlocks(speed_effects)
     for name, many in position_effects.items():
-        found += [Interlock(k.held, k.hold, (name,), k.boxes, k.lower, k.upper) for k in many]
-    found += _contradicting_ranges(position_effects)
-    found.sort(key=lambda lock: [order.index(name) for name in lock.constraints])
-    return Interlocks(found, undecided)
+        result += [Interlock(k.held, k.hold, (name,), k.boxes, k.lower, k.upper) for k in many]
+    result += _contradicting_ranges(position_effects)
+    result.sort(key=lambda lock: [order.index(name) for name in lock.constraints])
+    return Interlocks(result, undecided)
 
 
 def constant_limits(constraints: Mapping[str, Constraint]) -> dict[Symbol, Interval]:
@@ -245,13 +245,13 @@ def _speed_interlocks(name: str, one: SpeedEffect) -> list[Interlock]:
         "cannot decrease": one.blocks_decrease - both,
         "has no value": void,
     }
-    found = {hold: region.cover() for hold, region in regions.items()}
-    return [Interlock(one.held, hold, (name,), where) for hold, where in found.items() if where]
+    result = {hold: region.cover() for hold, region in regions.items()}
+    return [Interlock(one.held, hold, (name,), where) for hold, where in result.items() if where]
 
 
 def _pair_interlocks(speed_effects: Mapping[str, SpeedEffect]) -> list[Interlock]:
     """Return the interlocks of two constraints that together block or contradict each other."""
-    found: list[Interlock] = []
+    result: list[Interlock] = []
     names = list(speed_effects)
     for first in names:
         for second in names:
@@ -265,14 +265,14 @@ def _pair_interlocks(speed_effects: Mapping[str, SpeedEffect]) -> list[Interlock
             )
             regions: dict[Hold, Region] = {"stands still": both - void, "has no value": void}
             holds = {hold: region.cover() for hold, region in regions.items()}
-            found += [Interlock(a.held, hold, pair, where) for hold, where in holds.items() if where]
-    return found
+            result += [Interlock(a.held, hold, pair, where) for hold, where in holds.items() if where]
+    return result
 
 
 def _contradicting_ranges(position_effects: Mapping[str, list[PositionEffect]]) -> list[Interlock]:
     """Return the interlocks of two constraints whose constant ranges leave one position, or none."""
     every = [(name, k) for name, many in position_effects.items() for k in many if k.range is not None]
-    found = []
+    result = []
     for i, (first, a) in enumerate(every):
         for second, b in every[i + 1 :]:
             assert a.range is not None
@@ -284,8 +284,8 @@ def _contradicting_ranges(position_effects: Mapping[str, list[PositionEffect]]) 
             if not where or low < high or (low == high and "stands still" in (a.hold, b.hold)):
                 continue
             if low > high:
-                found.append(Interlock(a.held, "has no value", (first, second), where))
+                result.append(Interlock(a.held, "has no value", (first, second), where))
             else:
                 bound = a.lower if low == a.range[0] else b.lower
-                found.append(Interlock(a.held, "stands still", (first, second), where, bound, bound))
-    return found
+                result.append(Interlock(a.held, "stands still", (first, second), where, bound, bound))
+    return result

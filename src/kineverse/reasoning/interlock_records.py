@@ -52,8 +52,8 @@ class Interlock:
     @property
     def keys(self) -> tuple[Symbol, ...]:
         """Coordinates, speeds and parameters in the conditions, sorted."""
-        found = {s for box in self.when for axis in box for s in axis.symbols}
-        return tuple(sorted(found, key=lambda s: s.sort_key))
+        result = {s for box in self.when for axis in box for s in axis.symbols}
+        return tuple(sorted(result, key=lambda s: s.sort_key))
 
     def __str__(self) -> str:
         how = f"{axis_name(self.held)} {self.hold}"
@@ -107,20 +107,20 @@ class Interlocks(Sequence[Interlock]):
     def locks_on(self, coordinate: Symbol | str) -> tuple[Interlock, ...]:
         """Return the interlocks on a coordinate or its derivatives, given by symbol or path."""
         path = coordinate.path if isinstance(coordinate, Symbol) else coordinate
-        return tuple(found for found in self if any(s.path == path for s in found.held.symbols))
+        return tuple(result for result in self if any(s.path == path for s in result.held.symbols))
 
     def keys(self, coordinate: Symbol | str) -> tuple[Symbol, ...]:
         """Return the other coordinates that the interlocks on one depend on, as positions, sorted."""
         path = coordinate.path if isinstance(coordinate, Symbol) else coordinate
-        found = {_position(key) for lock in self.locks_on(coordinate) for key in lock.keys}
-        found |= {
+        result = {_position(key) for lock in self.locks_on(coordinate) for key in lock.keys}
+        result |= {
             _position(s)
             for lock in self.locks_on(coordinate)
             for bound in (lock.lower, lock.upper)
             if bound is not None
             for s in bound.symbols
         }
-        return tuple(sorted((s for s in found if s.path != path), key=lambda s: s.sort_key))
+        return tuple(sorted((s for s in result if s.path != path), key=lambda s: s.sort_key))
 
     def as_data(self) -> dict[str, Any]:
         """Return the interlocks as data for JSON: lists, mappings, texts and numbers."""

@@ -17,7 +17,7 @@ from .interlock_records import Interlock, Interlocks
 _Point = dict[Symbol, float]
 _Range = tuple[float, float]
 _Limits = dict[Expression, _Range]
-TINY, ANY, BOTH_WAYS = 1e-12, (-math.inf, math.inf), ("stands still", "has no value")
+TINY, ANY, BOTH_SIDES = 1e-12, (-math.inf, math.inf), ("stands still", "has no value")
 
 
 def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: int = 0) -> list[str]:
@@ -62,10 +62,10 @@ def _compare(rows: dict[str, Constraint], found: Interlocks, limits: _Limits, po
             own = [k for k in claims if k.constraints == names]
             wrong = [k.hold for k in own if not _fits(k, limit, room, point)]
             yield from (f"{held} {hold}: not so by {', '.join(names)}" for hold in wrong)
-            for way, end in (("decrease", -room[0]), ("increase", room[1])) if speed else ():
+            for direction, end in (("decrease", -room[0]), ("increase", room[1])) if speed else ():
                 free = end > TINY or not unknown.isdisjoint(names)
-                if not (free or any(k.hold in (f"cannot {way}", *BOTH_WAYS) for k in claims)):
-                    yield f"{held} cannot {way}"
+                if not (free or any(k.hold in (f"cannot {direction}", *BOTH_SIDES) for k in claims)):
+                    yield f"{held} cannot {direction}"
             if not (own or speed or _same(limit, room, True)):
                 yield f"{held} is kept in {room} by {', '.join(names)}"
 

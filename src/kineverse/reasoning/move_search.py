@@ -14,14 +14,11 @@ from typing import Literal, TypeAlias
 from .cell_graph import CellGraph, CellStep, Move, MoveRule
 
 Verdict: TypeAlias = Literal["found", "refuted", "undecided"]
-Edge: TypeAlias = tuple[int, int, int, CellStep]
-"""Number of a coordinate, bits of a cell and of its neighbour, and the step between them."""
+Edge: TypeAlias = tuple[int, int, int, CellStep]  # coordinate, bits of a cell and its neighbour, step
 
-_EXHAUSTED_AT_MOST = 50_000
-"""Largest number of states for which the shortest sequence is searched."""
+_EXHAUSTED_AT_MOST = 50_000  # largest number of states for which the shortest sequence is searched
 _PRUNED_AT_MOST = 300
-_CLOCK = 64
-"""Expansions between two looks at the clock."""
+_CLOCK = 64  # expansions between two looks at the clock
 
 
 @dataclass(frozen=True)
@@ -113,10 +110,10 @@ class MoveSearch:
     def _edges(self) -> list[Edge]:
         graph, edges = self.graph, list[Edge]()
         for k, own in enumerate(graph.steps):
-            for way, steps in zip((1, -1), own, strict=True):
+            for direction, steps in zip((1, -1), own, strict=True):
                 for cell, step in enumerate(steps):
                     if step is not None and 0 not in step.needs:
-                        edges.append((k, graph.bit(k, cell), graph.bit(k, cell + way), step))
+                        edges.append((k, graph.bit(k, cell), graph.bit(k, cell + direction), step))
         return edges
 
     # -- moves that never harm -----------------------------------------------------------------------------
@@ -154,9 +151,9 @@ class MoveSearch:
         These are cells that serve others at least as well as all that are farther away from the best one on
         the same side; on the way to the best cell every state passes them. So whatever can be reached with
         the coordinate farther away can also be reached from there. All other cells may have to be left
-        backwards before there is a way to the best one.
+        backwards before the best one can be reached.
         """
-        graph, found = self.graph, list[frozenset[int]]()
+        graph, result = self.graph, list[frozenset[int]]()
         for k, best in enumerate(self._best):
             cells = range(len(graph.cells[k]))
             serves = [
@@ -169,8 +166,8 @@ class MoveSearch:
                     beyond = range(cell) if cell <= best else range(cell + 1, len(cells))
                     if cell == best or all(serves[cell] >= serves[other] for other in beyond):
                         fine.add(cell)
-            found.append(frozenset(fine))
-        return found
+            result.append(frozenset(fine))
+        return result
 
     def advance(self, state: int) -> tuple[int, list[Move]]:
         """Move all coordinates that have a best cell towards it, as far as that never harms."""
@@ -285,9 +282,9 @@ class MoveSearch:
             state |= graph.field(k) & every & beyond
         return state
 
-    def _moves(self, state: int, k: int, ways: Sequence[int]) -> Iterator[tuple[Move, int]]:
-        for way in ways:
-            for cell, after in self.graph.sweep(state, k, way):
+    def _moves(self, state: int, k: int, directions: Sequence[int]) -> Iterator[tuple[Move, int]]:
+        for direction in directions:
+            for cell, after in self.graph.sweep(state, k, direction):
                 yield (k, cell), after
 
     def prune(self, moves: Sequence[Move]) -> tuple[Move, ...]:
@@ -320,9 +317,9 @@ def find_circle(graph: CellGraph, reached: int) -> tuple[tuple[MoveRule, ...], b
         closing = next((k for k in concerned if k in seen), None)
         if closing is not None:
             return tuple(chain[seen[closing] :]), True
-        # Of several ways out, one that a lock closes tells more than one whose coordinate does not move.
-        found = ((k, _blocking_rule(graph, k, graph.field(k) & wanted, reached)) for k in concerned)
-        blocked = next(((k, one) for k, one in found if one is not None), None)
+        # Of several exits, one that a lock closes explains more than one whose coordinate does not move.
+        result = ((k, _blocking_rule(graph, k, graph.field(k) & wanted, reached)) for k in concerned)
+        blocked = next(((k, one) for k, one in result if one is not None), None)
         if blocked is None:
             break
         k, (rule, wanted) = blocked
@@ -335,15 +332,15 @@ def _blocking_rule(graph: CellGraph, k: int, wanted: int, reached: int) -> tuple
     """Return the rule that stops a coordinate on its way to a cell, and the mask that releases it."""
     target = wanted.bit_length() - 1 - graph.first[k]
     cell = graph.cell_of(graph.start, k)
-    way = 1 if target > cell else -1
+    direction = 1 if target > cell else -1
     while cell != target:
-        step = graph.step(k, cell, way)
+        step = graph.step(k, cell, direction)
         if step is None:
             return None
         for mask, rule in zip(step.needs, step.rules, strict=True):
             if not mask & reached:
                 return rule, mask
-        cell += way
+        cell += direction
     return None
 
 

@@ -29,10 +29,8 @@ if TYPE_CHECKING:
     from .unlocking_plan import UnlockingPlan, UnlockingStep
 
 
-SAMPLES = 21
-"""Number of positions along a move at which a constraint is evaluated that intervals do not decide."""
-_NARROWEST = 1e-7
-"""Width of an interval around a threshold that is not divided any further [m] or [rad]."""
+SAMPLES = 21  # positions along a move at which undecided constraints are evaluated
+_NARROWEST = 1e-7  # width of an interval around a threshold that is not divided any further [m] or [rad]
 _MOST_INTERVALS = 400
 
 _Point = dict[Symbol, float]
@@ -43,8 +41,8 @@ def plan_violations(model: ModelView, plan: UnlockingPlan, state: StateLike | No
 
     Each move is enclosed in intervals from its start to its target, which are halved until they decide.
     Within each, constraints on speeds have to admit a small speed of the one coordinate, but for 0.1 µm
-    around a threshold. Constraints on positions hold at the end of each move, and if they are violated on the
-    way, the violation decreases.
+    around a threshold. Constraints on positions hold at the end of each move, and if they are violated
+    meanwhile, the violation decreases.
 
     Parameters
     ----------
@@ -60,17 +58,17 @@ def plan_violations(model: ModelView, plan: UnlockingPlan, state: StateLike | No
     settle_point(model, point)
     for row in ranges.rows.values():
         point = {**{s: s.value or 0.0 for s in row.symbols if s not in point}, **point}
-    found: list[str] = []
+    result: list[str] = []
     for number, step in enumerate(plan.steps, 1):
         about = f"move {number}, {step.coordinate}"
         if abs(point[step.coordinate] - step.start) > NOTHING * (1 + abs(step.start)):
-            found.append(f"{about}: it begins at {step.start:g}, and not at {point[step.coordinate]:g}")
-        found += dict.fromkeys(f"{about}: {name}" for name in _check_step(model, ranges, point, step))
+            result.append(f"{about}: it begins at {step.start:g}, and not at {point[step.coordinate]:g}")
+        result += dict.fromkeys(f"{about}: {name}" for name in _check_step(model, ranges, point, step))
     if plan.verdict == "found":
         for symbol, value in plan.goal.items():
             if abs(point[symbol] - value) > NOTHING * (1 + abs(value)):
-                found.append(f"{symbol} ends at {point[symbol]:g}, and not at {value:g}")
-    return found
+                result.append(f"{symbol} ends at {point[symbol]:g}, and not at {value:g}")
+    return result
 
 
 def _check_step(
@@ -161,8 +159,7 @@ def _excess(row: Constraint, point: _Point) -> float:
 
 
 CellRange: TypeAlias = tuple[int, int]
-Region: TypeAlias = tuple[CellRange, ...]
-"""First and last cell of each coordinate."""
+Region: TypeAlias = tuple[CellRange, ...]  # first and last cell of each coordinate
 _Box: TypeAlias = dict[Symbol, RealInterval]
 
 
@@ -213,7 +210,7 @@ def refutation_gaps(model: ModelView, plan: UnlockingPlan, state: StateLike | No
         return ["there is no set of positions that no move leaves"]
     given = start_point(model, state)
     start = {s: given.get(s, 0.0) for s in known.coordinates}
-    check = _InvarianceCheck(ConstraintRanges(model), known, frozenset(plan.still), start)
+    check = _InvarianceCheck(ConstraintRanges(model), known, frozenset(plan.fixed), start)
     return list(check.run(plan.goal))
 
 
@@ -223,7 +220,7 @@ class _InvarianceCheck:
 
     ranges: ConstraintRanges
     known: InvariantSet
-    still: frozenset[Symbol]
+    fixed: frozenset[Symbol]
     start: Mapping[Symbol, float]
 
     def run(self, goal: Mapping[Symbol, float]) -> Iterator[str]:
@@ -239,13 +236,13 @@ class _InvarianceCheck:
         for n, region in enumerate(known.regions):
             following = known.following[n] if known.following else ()
             for k, symbol in enumerate(known.coordinates):
-                for way in () if symbol in self.still else (1, -1):
-                    into = self._neighbour(region, k, way)
+                for direction in () if symbol in self.fixed else (1, -1):
+                    into = self._neighbour(region, k, direction)
                     if into is None or into in index:
                         continue
                     if any(_covers(known.regions[m], into) for m in following):
                         continue
-                    if not self._is_blocked(region, into, k, way):
+                    if not self._is_blocked(region, into, k, direction):
                         cell = known.cells[k][into[k][0]]
                         yield f"{symbol} may get to {cell.describe(str(symbol))}"
 
@@ -269,42 +266,45 @@ class _InvarianceCheck:
                     return False
         return True
 
-    def _neighbour(self, region: Region, k: int, way: int) -> Region | None:
-        """Return the positions beside a region in one direction, None at the end of the range."""
-        cell = region[k][way > 0] + way
+    def _neighbour(self, region: Region, k: int, direction: int) -> Region | None:
+        """Return the positions next to a region in one direction, None at the end of the range."""
+        cell = region[k][direction > 0] + direction
         rests = self.known.rests[k]
         while 0 <= cell < len(rests) and not rests[cell]:
-            cell += way
+            cell += direction
         return (*region[:k], (cell, cell), *region[k + 1 :]) if 0 <= cell < len(rests) else None
 
-    def _is_blocked(self, region: Region, into: Region, k: int, way: int) -> bool:
+    def _is_blocked(self, region: Region, into: Region, k: int, direction: int) -> bool:
         """Return whether constraints stop a coordinate at the end of a region, wherever the others are."""
-        symbol, end = self.known.coordinates[k], region[k][way > 0]
+        symbol, end = self.known.coordinates[k], region[k][direction > 0]
         here = self._box((*region[:k], (end, end), *region[k + 1 :]))
         there = self._box(into)
         boxes = [here, there] if there[symbol][0] < there[symbol][1] else [here]
-        if any(self.ranges.refuses(symbol.derivative(), way, box, self.start) for box in boxes):
+        if any(self.ranges.refuses(symbol.derivative(), direction, box, self.start) for box in boxes):
             return True
         return any(
-            self._is_left(name, k, way, here, there)
+            self._is_left(name, k, direction, here, there)
             for name in self.ranges.about(symbol)
             if not self.ranges.rows[name].order
         )
 
-    def _is_left(self, name: str, k: int, way: int, here: _Box, there: _Box) -> bool:
+    def _is_left(self, name: str, k: int, direction: int, here: _Box, there: _Box) -> bool:
         """Return whether a constraint on positions is violated by a move, or farther away with it."""
         symbol, row, ranges = self.known.coordinates[k], self.ranges.rows[name], self.ranges
         if symbol not in row.expression.symbols:
             return ranges.excess(name, there)[0] > NOTHING >= ranges.excess(name, here)[1]
-        least, most = ranges.excesses(name, there)[way > 0]
+        least, most = ranges.excesses(name, there)[direction > 0]
         if row.expression != symbol or least <= NOTHING:
             return False
-        # Its own position may change the bound, unless that is constant beside the region.
+        # Its own position may change the bound, unless that is constant next to the region.
         room = there[symbol][1] - there[symbol][0] + NOTHING
-        return symbol not in (row.upper if way > 0 else row.lower).symbols or most - least <= room < math.inf
+        return (
+            symbol not in (row.upper if direction > 0 else row.lower).symbols
+            or most - least <= room < math.inf
+        )
 
     def _box(self, region: Region) -> _Box:
-        """Return the positions of a region, without those beside thresholds but with the start."""
+        """Return the positions of a region, without those next to thresholds but with the start."""
         box = {}
         for (first, last), symbol, cells in zip(
             region, self.known.coordinates, self.known.cells, strict=True

@@ -146,13 +146,13 @@ def roots(coefficients: list[Fraction], within: Interval) -> list[Fraction]:
     Intervals are bisected to a relative width of 2⁻⁶⁰; Sturm's theorem gives the number of roots in each.
     """
     if len(coefficients) == 2:
-        found = [-coefficients[0] / coefficients[1]]
+        result = [-coefficients[0] / coefficients[1]]
     else:
         chain = _sturm(coefficients)
         bound = 1 + max(abs(c / coefficients[-1]) for c in coefficients[:-1])
         # Bisection always starts from the same ends, so a root has the same value for every interval.
-        found = sorted(_isolate(chain, -bound, bound))
-    return [root for root in found if root in within or _is_near_closed_end(root, within)]
+        result = sorted(_isolate(chain, -bound, bound))
+    return [root for root in result if root in within or _is_near_closed_end(root, within)]
 
 
 def _is_near_closed_end(root: Fraction, within: Interval) -> bool:

@@ -36,15 +36,15 @@ def slope_ranges(
     order: Sequence[Term], values: dict[int, AbstractValue], sign: Signs, symbol: Symbol
 ) -> dict[int, RealInterval | None]:
     """Return the ranges of the derivatives of terms, None where there may be jumps."""
-    found: dict[int, RealInterval | None] = {}
+    result: dict[int, RealInterval | None] = {}
     for term in order:
         if symbol not in values[term.index].live:
-            found[term.index] = ZERO_INTERVAL
+            result[term.index] = ZERO_INTERVAL
         elif term.op == ca.OP_PARAMETER:
-            found[term.index] = (1.0, 1.0)
+            result[term.index] = (1.0, 1.0)
         else:
-            found[term.index] = _slope(term, values, sign, found)
-    return found
+            result[term.index] = _slope(term, values, sign, result)
+    return result
 
 
 def _slope(
@@ -99,7 +99,7 @@ def isolate_roots(
         span, rate = ranges(low, high)
         if not (_has_sign(span) or _is_monotone(rate)):
             return None
-    stack, found, evaluations = [(low, high)], list[float](), 0
+    stack, result, evaluations = [(low, high)], list[float](), 0
     while stack:
         a, b = stack.pop()
         evaluations += 1
@@ -110,14 +110,14 @@ def isolate_roots(
             zero = _crossing(ranges, a, b)
             if zero is None:
                 return None
-            found += zero
+            result += zero
             continue
         if evaluations > most or b - a < _CLOSE * max(1.0, abs(a), abs(b)):
             return None
         middle = _middle(a, b)
         stack += [(a, middle), (middle, b)]
-    found.sort()
-    return [z for k, z in enumerate(found) if not k or z - found[k - 1] > _CLOSE * max(1.0, abs(z))]
+    result.sort()
+    return [z for k, z in enumerate(result) if not k or z - result[k - 1] > _CLOSE * max(1.0, abs(z))]
 
 
 def _crossing(ranges: RangeFunction, low: float, high: float) -> list[float] | None:

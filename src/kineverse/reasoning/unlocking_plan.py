@@ -24,10 +24,8 @@ from .interlock_records import Interlock, Interlocks, Undecided
 from .move_search import MoveSearch, MoveSearchResult, Verdict, find_circle
 from .plan_verification import InvariantSet, Region, plan_violations, refutation_gaps
 
-BUDGET = 10.0
-"""Default budget of a plan [s]."""
-_BEYOND = 0.05
-"""Largest distance by which a move goes beyond a threshold [m] or [rad]."""
+BUDGET = 10.0  # default budget of a plan [s]
+_BEYOND = 0.05  # largest distance by which a move goes beyond a threshold [m] or [rad]
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ class UnlockingPlan:
         Positions to reach, by coordinate.
     verdict
         ``"found"``, if :func:`.plan_violations` finds nothing wrong with the steps; ``"refuted"``, if
-        :func:`.refutation_gaps` finds no way out of ``invariant``; otherwise ``"undecided"``.
+        :func:`.refutation_gaps` finds no exit from ``invariant``; otherwise ``"undecided"``.
     steps
         The moves, empty unless found.
     shortest
@@ -101,10 +99,10 @@ class UnlockingPlan:
         True if the last of these depends on the first one.
     unread
         Interlocks, and undecided constraints, that count as shut because they could not be read completely.
-    still
-        Coordinates that were said not to move.
+    fixed
+        Coordinates that do not move, as stated.
     explored
-        Number of combinations of intervals that were looked at.
+        Number of combinations of intervals that were examined.
     reason
         Reason why it is undecided.
     invariant
@@ -118,7 +116,7 @@ class UnlockingPlan:
     blocking: tuple[Interlock | Undecided, ...] = ()
     is_circle: bool = False
     unread: tuple[Interlock | Undecided, ...] = ()
-    still: tuple[Symbol, ...] = ()
+    fixed: tuple[Symbol, ...] = ()
     explored: int = 0
     reason: str = ""
     invariant: InvariantSet | None = field(default=None, repr=False)
@@ -133,7 +131,7 @@ class UnlockingPlan:
             "blocking": [str(lock) for lock in self.blocking],
             "circle": self.is_circle,
             "unread": [str(lock) for lock in self.unread],
-            "still": [str(s) for s in self.still],
+            "still": [str(s) for s in self.fixed],
             "explored": self.explored,
             "reason": self.reason,
         }
@@ -155,7 +153,7 @@ class UnlockingPlan:
     def _explain(self) -> str:
         if self.verdict == "undecided":
             return f"undecided, since {self.reason}"
-        without = f" without {_list_words(map(str, self.still))}" if self.still else ""
+        without = f" without {_list_words(map(str, self.fixed))}" if self.fixed else ""
         if not self.blocking:
             return f"cannot be reached{without}"
         how = "lock each other in a circle" if self.is_circle else "keep it out of reach"
@@ -168,7 +166,7 @@ def plan_unlocking(
     state: StateLike | None = None,
     *,
     found: Interlocks | None = None,
-    still: Collection[Symbol | str] = (),
+    fixed: Collection[Symbol | str] = (),
     budget: float = BUDGET,
 ) -> UnlockingPlan:
     """Return the order in which coordinates have to move so that a goal is reached, or a refutation.
@@ -194,7 +192,7 @@ def plan_unlocking(
         positions beyond limits count as at the limit.
     found
         Interlocks of the model if they are known, see :func:`.interlocks`.
-    still
+    fixed
         Coordinates that do not move, such as those that did not move when they should have.
     budget
         Time for the search [s], after which the verdict is ``"undecided"``. Reading the interlocks takes time
@@ -215,7 +213,7 @@ def plan_unlocking(
     limits = constant_limits(dict(model.constraints.items()))
     goals = {model.degree_of_freedom(name): value for name, value in goal.items()}
     goals = {s: _check_goal(s, value, limits.get(s, Interval())) for s, value in goals.items()}
-    fixed = tuple(model.degree_of_freedom(name) for name in still)
+    resting = tuple(model.degree_of_freedom(name) for name in fixed)
     known = interlocks(model) if found is None else found
     end = perf_counter() + budget
     coordinates, rules = relevant_rules(make_rules(model, known), goals)
@@ -223,13 +221,13 @@ def plan_unlocking(
     start = {s: _clip(float(given.get(s, 0.0)), limits.get(s, Interval())) for s in coordinates}
 
     def search(some: Sequence[MoveRule]) -> tuple[CellGraph, MoveSearchResult]:
-        graph = make_graph(coordinates, some, limits, start, goals, fixed)
+        graph = make_graph(coordinates, some, limits, start, goals, resting)
         return graph, MoveSearch(graph, lambda: perf_counter() > end).run()
 
     graph, result = search(rules)
     unread = tuple(dict.fromkeys(rule.lock for rule in rules if not rule.is_exact))
     plan = UnlockingPlan(
-        MappingProxyType(goals), result.verdict, unread=unread, still=fixed, explored=result.explored
+        MappingProxyType(goals), result.verdict, unread=unread, fixed=resting, explored=result.explored
     )
     if result.verdict == "found":
         steps = _make_steps(graph, result.moves, {s: given.get(s, 0.0) for s in coordinates}, goals)
@@ -299,12 +297,12 @@ def _make_steps(
     position, steps = dict(start), list[UnlockingStep]()
     for n, (k, cell) in enumerate(moves):
         symbol, side = graph.coordinates[k], graph.cells[k][cell]
-        way = 1 if cell > graph.cell_of(states[n], k) else -1
+        direction = 1 if cell > graph.cell_of(states[n], k) else -1
         ends = symbol in goals and goals[symbol] in side
-        target = goals[symbol] if ends else _inside(side, way)
+        target = goals[symbol] if ends else _inside(side, direction)
         last = following[n] == len(moves)
         releases = _released(graph, moves, states, n, following[n])
-        bound = side.lower if way > 0 else side.upper
+        bound = side.lower if direction > 0 else side.upper
         threshold = None if ends and last else float(bound)
         steps.append(UnlockingStep(symbol, position[symbol], target, threshold, releases))
         position[symbol] = target
@@ -325,19 +323,19 @@ def _released(
 ) -> tuple[Interlock, ...]:
     """Return the interlocks that would stop later moves if this one were not made."""
     k = moves[n][0]
-    before, found = states[n] & graph.field(k), dict[Interlock, None]()
+    before, result = states[n] & graph.field(k), dict[Interlock, None]()
     for later in range(n + 1, until):
         for at, step in graph.path(states[later] & ~graph.field(k) | before, moves[later]):
             if step is not None:
                 blocked = (r for m, r in zip(step.needs, step.rules, strict=True) if not m & at)
-                found |= dict.fromkeys(r.lock for r in blocked if isinstance(r.lock, Interlock))
-    return tuple(found)
+                result |= dict.fromkeys(r.lock for r in blocked if isinstance(r.lock, Interlock))
+    return tuple(result)
 
 
-def _inside(side: Interval, way: int) -> float:
+def _inside(side: Interval, direction: int) -> float:
     """Return a position within a cell, a little beyond the end where it is entered."""
     lower, upper = float(side.lower), float(side.upper)
-    return (lower if way > 0 else upper) + way * min(_BEYOND, (upper - lower) / 2)
+    return (lower if direction > 0 else upper) + direction * min(_BEYOND, (upper - lower) / 2)
 
 
 def _check_goal(symbol: Symbol, value: object, limit: Interval) -> float:

@@ -2,5 +2,4 @@
 
 from pathlib import Path
 
-FOLDER = Path(__file__).parent
-"""Folder of the descriptions, one ``.urdf`` each."""
+FOLDER = Path(__file__).parent  # folder of the descriptions, one .urdf each

@@ -30,9 +30,7 @@ def mobile_base(model: str, prefix: str | None) -> Joint | None:
 
 
 _REFERENCE = -0.165
-_STIFFNESS = {
-    "kitchen": {"oven_door": 15.1, "dishwasher_door": 30.6},
-}
+_STIFFNESS = {"kitchen": {"oven_door": 15.1, "dishwasher_door": 30.6}}
 
 
 def joint_spring(model: str, joint: str) -> tuple[tuple[str, float], ...]:

@@ -12,13 +12,7 @@ import numpy as np
 from kineverse.model.model_view import ModelView
 
 from . import lighting
-from .auto_camera import (
-    ClientCameras,
-    choose_camera,
-    find_extreme_points,
-    reframe,
-    weigh_drawables,
-)
+from .auto_camera import ClientCameras, choose_camera, find_extreme_points, reframe, weigh_drawables
 from .camera import Camera
 from .drawables import Drawable, Kind, choose_axis_length, collect_drawables
 from .poses import FramePoses, to_wxyz

@@ -1,7 +1,7 @@
-"""Overlaps of furniture that a motion made, beside those that were there at the start.
+"""Overlaps of furniture that a motion caused, other than those at the start.
 
-Shapes of furniture overlap in many models and mean nothing by it: a drawer in a solid box, a hinge in its
-frame. What counts is what was not there at the start. Shapes overlap from 0.5 mm on, and:
+In many models shapes of furniture overlap without meaning: a drawer in a solid box, a hinge in its
+frame. Only overlaps that were not there at the start count. Shapes overlap from 0.5 mm on, and:
 
 - Two bodies that overlap at the start are *made to overlap*, and count no more at all, if an articulation
   with limits joins them, or if they overlap in all of 200 random states. Where something between them has no
@@ -12,7 +12,7 @@ frame. What counts is what was not there at the start. Shapes overlap from 0.5 m
 - Everything else counts, a door and its own frame included, but for pairs of bodies that a rule of the scene
   or of the model excepts.
 
-Skills that look at the way, the kinematic world, judges, and the execution of unlocking plans share this
+Skills that look ahead, the kinematic world, judges, and the execution of unlocking plans share this
 rule. The default state excuses nothing but hulls: a drawer that stands fully out of a solid box at the start
 is in its way.
 """
@@ -28,12 +28,7 @@ import numpy.typing as npt
 from kineverse.errors import NoSolutionError
 from kineverse.geometry import Scene
 from kineverse.geometry.collision_filter import adjacent_pairs, apply_rules
-from kineverse.geometry.distance_queries import (
-    PairFlags,
-    PreparedQuery,
-    flag_between,
-    flag_relatively_moving,
-)
+from kineverse.geometry.distance_queries import PairFlags, PreparedQuery, flag_between, flag_relatively_moving
 from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
 from kineverse.model.body import Mesh
@@ -43,8 +38,7 @@ from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
-OVERLAP = 5e-4
-"""Depth from which on furniture overlaps, at the start and beyond the allowance [m]: less is resting."""
+OVERLAP = 5e-4  # depth from which on furniture overlaps, beyond the allowance [m]: less is resting
 
 _SAMPLES = 200
 
@@ -66,7 +60,7 @@ class Overlap(NamedTuple):
 
 
 class FurnitureOverlaps:
-    """Overlaps of furniture in a scene, beside those that were there at the start.
+    """Overlaps of furniture in a scene, other than those at the start.
 
     The start is the default state until :meth:`begin` is called.
     """
@@ -118,18 +112,18 @@ class FurnitureOverlaps:
 
         ``least`` is the excess from which on they count [m].
         """
-        found = [Overlap(r.a, r.b, -r.distance, allowed) for r, allowed in self.find_beyond(least)]
-        return sorted(found, key=lambda one: -one.excess)
+        result = [Overlap(r.a, r.b, -r.distance, allowed) for r, allowed in self.find_beyond(least)]
+        return sorted(result, key=lambda one: -one.excess)
 
     def find_beyond(self, excess: float) -> list[tuple[DistanceResult, float]]:
         """Return the pairs of shapes with a depth beyond their allowance by an excess [m], the deepest first.
 
         Each pair is there with its allowance [m].
         """
-        found = self._query()
-        allowed = self.allowances(found)
-        beyond = np.flatnonzero(-found.distances > allowed + excess).tolist()
-        return [(found[k], float(allowed[k])) for k in beyond]
+        result = self._query()
+        allowed = self.allowances(result)
+        beyond = np.flatnonzero(-result.distances > allowed + excess).tolist()
+        return [(result[k], float(allowed[k])) for k in beyond]
 
     @property
     def excepted(self) -> tuple[tuple[str, str], ...]:
@@ -174,7 +168,8 @@ class FurnitureOverlaps:
         home = model.default_state()
         scene.update(home)
         default = self._measure()
-        limited = ~flag_relatively_moving(model, scene.bodies, self._without_limits())
+        endless = [v for v in self._objects if not all(map(math.isfinite, model.limits(v.position)))]
+        limited = ~flag_relatively_moving(model, scene.bodies, endless)
         always = limited & adjacent_pairs(model, scene.bodies).astype(bool)
         most = {
             pair: math.inf if limited[pair] else depth + OVERLAP
@@ -198,21 +193,16 @@ class FurnitureOverlaps:
 
     def _deepest(self, depths: dict[int, float]) -> dict[tuple[int, int], float]:
         """Return the largest depths [m] by pair of bodies, of those by pair of shapes."""
-        found: dict[tuple[int, int], float] = {}
+        result: dict[tuple[int, int], float] = {}
         for code, depth in depths.items():
             pair = self._owners(code)
-            found[pair] = max(depth, found.get(pair, 0.0))
-        return found
-
-    def _without_limits(self) -> list[Symbol]:
-        """Return the speeds of the coordinates of furniture without limits."""
-        model = self.scene.model
-        return [v for v in self._objects if not all(map(math.isfinite, model.limits(v.position)))]
+            result[pair] = max(depth, result.get(pair, 0.0))
+        return result
 
     def _measure(self) -> dict[int, float]:
         """Return the depths of the pairs of shapes that overlap at the state of the scene [m]."""
-        found = self._query()
-        pairs = zip(self.encode(found).tolist(), (-found.distances).tolist(), strict=True)
+        result = self._query()
+        pairs = zip(self.encode(result).tolist(), (-result.distances).tolist(), strict=True)
         return {code: depth for code, depth in pairs if depth > OVERLAP}
 
     def encode(self, found: DistanceResults) -> Indices:

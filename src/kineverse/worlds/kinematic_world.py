@@ -1,7 +1,7 @@
-"""World without forces: what a robot touches gives way along the normal, and a held body follows the hand.
+"""Quasi-static world: touched bodies are displaced along the contact normal, a held body follows the hand.
 
 It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it; then
-it moves by the least that its limits, speed limits and locks allow, see :mod:`.object_motion`. So objects can
+it moves by the least that its limits, speed limits and locks allow, see :mod:`.quasistatic`. So objects can
 be pushed and not dragged, have no inertia, and nothing falls. What cannot give way is penetrated, and
 :meth:`KinematicWorld.contacts` reports it; so is furniture that never moves. What the robot moves stops at
 other furniture, beyond the overlaps of the start, see :mod:`.furniture_overlaps`. The robot goes exactly
@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from kineverse._checks import as_entries, finite_number
+from kineverse._checks import as_entries
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
@@ -35,25 +34,15 @@ from .kinematic_grip import TOUCH, KinematicGrip
 from .quasistatic import ObjectMotion
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
+from .speed_commands import ROUNDING, SpeedCommands, check_settings, find_robot_coordinates
 from .world import Contact, Observation
 
 logger = logging.getLogger(__name__)
 
-_SUBSTEP = 0.002
-"""Longest way of a body between two checks of its gaps, while it is near an object [m]."""
-_HELD_SUBSTEP = 0.01
-"""Longest way of a hand between two checks of what it holds [m]: thinner furniture is rare."""
+_SUBSTEP = 0.002  # longest motion of a body between two checks of its gaps, while it is near an object [m]
+_HELD_SUBSTEP = 0.01  # longest motion of a hand between two checks of what it holds [m]
 _MOST_SUBSTEPS = 10_000
-_UNKNOWN_WAY = 0.1
-_ROUNDING = 1e-9
-
-
-class _Command(NamedTuple):
-    """Speeds of the robot (n,) that act from one time until another [s]; those of fingers act on."""
-
-    speeds: Array
-    start: float
-    end: float
+_UNKNOWN_TRAVEL = 0.1
 
 
 class Event(NamedTuple):
@@ -97,8 +86,6 @@ class KinematicWorld:
     ----------
     timeout
         The parameter of this name.
-    refused
-        Number of commands since the last reset that were stale when they came.
 
     Raises
     ------
@@ -127,20 +114,12 @@ class KinematicWorld:
         scene: Scene | None = None,
         seed: int = 0,
     ) -> None:
-        numbers = {"grasp_tolerance": grasp_tolerance, "timeout": timeout, "delay": delay}
-        numbers |= {"slip[0]": slip[0], "slip[1]": slip[1]}
-        for field, value in numbers.items():
-            number = finite_number(value)
-            if number is None or number < 0 or (field == "timeout" and not number):
-                raise InvalidValueError(f"'{field}' of a world is a number from 0 on, not {value!r}.")
+        sizes = {"grasp_tolerance": grasp_tolerance, "delay": delay, "slip[0]": slip[0], "slip[1]": slip[1]}
+        check_settings({"timeout": timeout}, sizes)
         self.model, self.robot, self._version = model, robot, model.version
         self._is_robot = partial(is_of_robot, robot=robot)
-        self.timeout, self._delay = float(timeout), float(delay)
-        if not any(self._is_robot(s.path) for s in model.degrees_of_freedom):
-            prefixes = sorted({s.path.partition("/")[0] for s in model.degrees_of_freedom})
-            raise UnknownNameError(
-                f"No coordinate of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
-            )
+        self.timeout = float(timeout)
+        find_robot_coordinates(model, robot)
         left_out = as_entries("leave_out=", leave_out, str, "names of constraints")
         for name in left_out:
             if name not in model.constraints:
@@ -177,16 +156,18 @@ class KinematicWorld:
             )
         )
         own = [v for v in model.speeds if self._is_robot(v.path)]
-        self._speed_count = len(own)
-        # Speeds are given by symbol or by name; those of objects are known and not read.
-        self._column: dict[Symbol | str, int | None] = dict.fromkeys(model.speeds)
-        self._column |= {v: k for k, v in enumerate(own)}
-        self._column |= {str(v): k for v, k in self._column.items()}
-        self._finger = np.array([self._column[s.derivative()] for s in fingers], dtype=np.intp)
+        columns: dict[Symbol | str, int | None] = dict.fromkeys(model.speeds)
+        columns |= {v: k for k, v in enumerate(own)}
+        columns |= {str(v): k for v, k in columns.items()}
+        finger_speeds = {s.derivative() for s in fingers}
+        self._finger = np.array([columns[s.derivative()] for s in fingers], dtype=np.intp)
+        is_finger = np.array([v in finger_speeds for v in own], dtype=bool)
+        self._commands = SpeedCommands(columns, is_finger, self.timeout, float(delay), self._report)
         self._integrate = model.integrator(own)
         self._state: State | None = None
         self._contacts: tuple[Contact, ...] | None = None
-        self._watch_contacts()
+        bodies, scene = self._motion.robot_bodies, self._motion.scene
+        self._touching = scene.watch(bodies, [b for b in scene.bodies if b not in {*bodies}], TOUCH)
         self._sampler = SensorSampler(sensors or Sensors(), model, robot, seed)
         self.remarks = (*remarks, "objects have no friction and no inertia, and nothing falls")
         self.reset(model.default_state())
@@ -215,6 +196,11 @@ class KinematicWorld:
         return None if self._grip is None else self._grip.held
 
     @property
+    def refused(self) -> int:
+        """Number of commands since the last reset that were stale when they came."""
+        return self._commands.refused
+
+    @property
     def events(self) -> tuple[Event, ...]:
         """Holds that began or ended, and commands that were refused, since the last reset."""
         return tuple(self._events)
@@ -230,10 +216,9 @@ class KinematicWorld:
         return (*self._touched(), *map(_make_contact, deepest.values()))
 
     def _touched(self) -> tuple[Contact, ...]:
-        """Return the contacts of the robot."""
         if self._contacts is None:
-            found = (one if self._is_robot(one.a) else one.swap() for one in self._touching())
-            self._contacts = tuple(map(_make_contact, found))
+            result = (one if self._is_robot(one.a) else one.swap() for one in self._touching())
+            self._contacts = tuple(map(_make_contact, result))
         return self._contacts
 
     def observe(self) -> Observation:
@@ -243,7 +228,7 @@ class KinematicWorld:
     # -- what happens --------------------------------------------------------------------------------------
 
     def reset(self, state: StateLike) -> None:
-        """Start anew from a state, at time 0, with nothing in the gripper and all speeds zero.
+        """Start again from a state, at time 0, with nothing in the gripper and all speeds zero.
 
         Coordinates without a value have their default one.
 
@@ -255,97 +240,29 @@ class KinematicWorld:
         self._check_version()
         values = self.model.default_state().updated(_select(state, self.model))
         self._motion.reset(values.vector(self._motion.symbols))
-        self._time, self.refused = 0.0, 0
+        self._time = 0.0
         self._events: list[Event] = []
         if self._grip is not None:
             self._grip.reset()
-        self._last: Array = np.zeros(self._speed_count)
-        self._commands: deque[_Command] = deque()
-        self._active = _Command(self._last, 0.0, 0.0)
+        self._commands.reset()
         self._state = self._contacts = None
         self._sampler.reset()
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
-        """Advance by a duration with speeds of the robot.
+        """Advance by a duration with speeds of the robot, as :meth:`.World.apply`.
 
-        Speeds of anything else are not read. Fingers keep the last speed that was given, until they close on
-        something or reach a limit.
-
-        Parameters
-        ----------
-        speeds
-            Speeds of the robot by symbol or name [m/s], [rad/s]; an empty mapping stops it.
-        duration
-            Time [s].
-        stamp
-            Time of the state from which the speeds were computed [s]: beyond the age of the world's time-out
-            they are refused, or act no longer. None for speeds that act for the whole duration.
-
-        Raises
-        ------
-        InvalidValueError
-            For speeds that are not finite, a duration that is not positive, and a stamp that is no number.
-            Then nothing has changed.
-        UnknownNameError
-            For speeds that the model does not have.
+        Fingers keep the last speed that was given, until they close on something or reach a limit. Nothing
+        has changed after an error.
         """
         self._check_version()
-        length = finite_number(duration)
-        if length is None or length <= 0:
-            raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
-        taken = None if stamp is None else finite_number(stamp)
-        if stamp is not None and taken is None:
-            raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
-        vector, now = self._vector(speeds), self._time
-        until = now + length
-        if taken is not None:
-            if now - self.timeout <= taken + _ROUNDING <= now + 2 * _ROUNDING:
-                until = min(until, taken + self.timeout)
-            else:
-                self.refused += 1
-                self._report(f"speeds with the stamp {taken:g} s are refused")
-                vector = self._stopped(self._last)
-        self._last = vector
-        self._commands.append(_Command(vector, now + self._delay, until + self._delay))
+        end = self._commands.take(speeds, duration, stamp, self._time)
         self._state = self._contacts = None
-        end = now + length
-        while self._time < end - _ROUNDING:
-            while self._commands and self._commands[0].start <= self._time + _ROUNDING:
-                self._active = self._commands.popleft()
-            active = self._active
-            acts = self._time < active.end - _ROUNDING
-            changes = [end, *([active.end] if acts else ()), *(c.start for c in self._commands)]
-            until = min(t for t in changes if t > self._time + _ROUNDING)
-            self._move(active.speeds if acts else self._stopped(active.speeds), until - self._time)
+        while self._time < end - ROUNDING:
+            acting = self._commands.acting(self._time)
+            until = min(end, self._commands.next_change(self._time))
+            self._move(acting, until - self._time)
             self._time = until
         self._time = end
-
-    def _vector(self, speeds: StateLike) -> Array:
-        """Return the speeds of the robot (n,); those of fingers that are not given are the last ones."""
-        if not isinstance(speeds, Mapping):
-            raise InvalidValueError(f"Speeds are a mapping from symbols or names to numbers, not {speeds!r}.")
-        vector = self._stopped(self._last)
-        for key, value in speeds.items():
-            if key not in self._column:
-                if isinstance(speeds, State):
-                    continue  # a state may have further values
-                names = [name for name in self._column if isinstance(name, str)]
-                raise UnknownNameError(
-                    f"The model has no free speed '{key}'. {suggest(str(key), names, 'speed')}"
-                )
-            column = self._column[key]
-            if column is not None:
-                number = finite_number(value)
-                if number is None:
-                    raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
-                vector[column] = number
-        return vector
-
-    def _stopped(self, speeds: Array) -> Array:
-        """Return zero speeds, but for those of fingers."""
-        stopped = np.zeros(len(speeds))
-        stopped[self._finger] = speeds[self._finger]
-        return stopped
 
     def _move(self, speeds: Array, time: float) -> None:
         """Move robot and objects with constant speeds of the robot."""
@@ -358,23 +275,23 @@ class KinematicWorld:
         before = motion.travel()
         motion.place(self._integrate(start, arm, time))
         moved = motion.travel() - before
-        # The travel begins anew at some time.
-        moved[moved < 0.0] = _UNKNOWN_WAY
-        way = float(moved.max(initial=0.0)) + reach
+        # The travel restarts at some time.
+        moved[moved < 0.0] = _UNKNOWN_TRAVEL
+        travel = float(moved.max(initial=0.0)) + reach
         grips = grip is not None and (grip.held is not None or reach > 0.0)
         # What is not near now has not been touched on the way.
-        longest = motion.longest_way(moved, way)
+        longest = motion.longest_motion(moved, travel)
         count = 0 if longest is None else math.ceil((longest + reach) / _SUBSTEP)
         if grip is not None and grip.held is not None:
-            count = max(count, math.ceil(way / _HELD_SUBSTEP))
+            count = max(count, math.ceil(travel / _HELD_SUBSTEP))
         count = min(count, _MOST_SUBSTEPS)
         if count > 1:
             motion.place(start)
             for _ in range(count):
                 motion.place(self._integrate(motion.q, arm, time / count))
-                self._settle(time / count, way / count, grips)
+                self._settle(time / count, travel / count, grips)
         elif longest is not None or grips:
-            self._settle(time, way, grips)
+            self._settle(time, travel, grips)
 
     def _settle(self, time: float, moved: float, grips: bool) -> None:
         """Move fingers and objects after the rest of the robot has moved."""
@@ -384,15 +301,7 @@ class KinematicWorld:
             self._motion.resolve(time, moved)
         self._motion.settle()
 
-    def _watch_contacts(self) -> None:
-        """Prepare the query of contacts."""
-        motion, scene = self._motion, self._motion.scene
-        robot = set(motion.robot_bodies)
-        others = [b for b in scene.bodies if b not in robot]
-        self._touching = scene.watch(motion.robot_bodies, others, TOUCH)
-
     def _check_version(self) -> None:
-        """Raise InvalidValueError after an edit of the model."""
         if self.model.version != self._version:
             raise InvalidValueError(
                 "The model of this world was edited. Make another world, or this one of model.snapshot()."

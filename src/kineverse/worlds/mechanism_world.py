@@ -12,17 +12,15 @@ from collections.abc import Collection
 
 import numpy as np
 
-from kineverse._checks import finite_number
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
+from .speed_commands import check_duration, parse_speeds
 from .world import Contact, Observation
 
-_ALLOWED = 1e-7
-"""Violation of a constraint that counts as none, in its unit."""
+_ALLOWED = 1e-7  # violation of a constraint that counts as none, in its unit
 _NO_VALUE = 1e9
 _HALVINGS = 16
 
@@ -67,7 +65,11 @@ class MechanismWorld:
         self._checker = model.constraint_checker((*self._symbols, *self._columns))
         orders = [model.constraints[n].order if n in model.constraints else 0 for n in self._checker.names]
         self._about_speeds = np.array(orders, dtype=int) > 0
-        self._place = {key: k for k, v in enumerate(self._columns) for key in (v, str(v))}
+        self._place = {
+            key: None if v.position in self.jammed else k
+            for k, v in enumerate(self._columns)
+            for key in (v, str(v))
+        }
         self.reset(model.default_state())
 
     def __repr__(self) -> str:
@@ -85,7 +87,7 @@ class MechanismWorld:
         return State(values, stamp=self._time, source=self.name)
 
     def reset(self, state: StateLike) -> None:
-        """Start anew from a state, at time 0; coordinates without a value have their default one.
+        """Start again from a state, at time 0; coordinates without a value have their default one.
 
         Raises
         ------
@@ -96,28 +98,12 @@ class MechanismWorld:
         self._q, self._time = values.vector(self._symbols), 0.0
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
-        """Advance by a duration with speeds of the coordinates.
+        """Advance by a duration with speeds of the coordinates, as :meth:`.World.apply`.
 
-        Parameters
-        ----------
-        speeds
-            Speeds by symbol or name [m/s], [rad/s]; a missing one is zero.
-        duration
-            Time [s].
-        stamp
-            Time of the state from which the speeds were computed; it is not read.
-
-        Raises
-        ------
-        InvalidValueError
-            For speeds that are not finite, and a duration that is not positive.
-        UnknownNameError
-            For speeds that the model does not have.
+        The stamp is not read.
         """
-        length = finite_number(duration)
-        if length is None or length <= 0:
-            raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
-        v = self._vector(speeds)
+        length = check_duration(duration)
+        v = parse_speeds(speeds, self._place, np.zeros(len(self._columns)))
         after = self._advance(self._q, v, length)
         if after is None:
             after = self._q
@@ -134,22 +120,6 @@ class MechanismWorld:
         """Return the positions of all coordinates."""
         state = self.state
         return Observation(self._time, {s: state[s] for s in self.model.degrees_of_freedom})
-
-    def _vector(self, speeds: StateLike) -> Array:
-        """Return the speeds of all coordinates (n,); those of jammed ones are zero."""
-        v = np.zeros(len(self._columns))
-        for key, value in speeds.items():
-            place, number = self._place.get(key), finite_number(value)
-            if place is None:
-                known = map(str, self._columns)
-                raise UnknownNameError(
-                    f"The model has no free speed '{key}'. {suggest(str(key), known, 'speed')}"
-                )
-            if number is None:
-                raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
-            if self._columns[place].position not in self.jammed:
-                v[place] = number
-        return v
 
     def _advance_most(self, q: Array, v: Array, time: float) -> Array:
         """Return the configuration after the largest share of the speeds that the constraints allow."""
@@ -171,8 +141,8 @@ class MechanismWorld:
         after, rest = self._integrate(q, v, time), np.zeros(len(v))
         # Limits of speeds are those at the beginning of a step, before any coordinate has moved.
         moving, before, now = self._excesses(self._q, v), self._excesses(q, rest), self._excesses(after, rest)
-        found = np.where(self._about_speeds, moving, now - np.maximum(before, 0.0))
-        return after if bool(np.all(found <= _ALLOWED)) else None
+        result = np.where(self._about_speeds, moving, now - np.maximum(before, 0.0))
+        return after if bool(np.all(result <= _ALLOWED)) else None
 
     def _excesses(self, q: Array, v: Array) -> Array:
         """Return the excess of each constraint, a large one where it has no value."""

@@ -16,15 +16,11 @@ from kineverse.symbols import Symbol
 from .mujoco_servos import sampled_inertia
 from .mujoco_state import MujocoContacts, MujocoCoordinates
 
-TOUCH_FORCE = 1.0
-"""Normal force of each finger [N] above which a body between them is held."""
-_FINGER_MASS = 2.0
-"""Mass of a finger with its motor [kg]: with some grams, what ties fingers together does not carry force."""
+TOUCH_FORCE = 1.0  # normal force of each finger [N] above which a body between them is held
+_FINGER_MASS = 2.0  # of a finger with its motor [kg]: light ones do not carry the force of their ties
 _SMALLEST_LEVER = 0.02
-_STIFFNESS = 10.0
-"""Speed by the distance of a finger from its set point [1/s]."""
-_LEAD = 0.01
-"""Largest distance of the gap between the fingers from that of the set point [m]."""
+_STIFFNESS = 10.0  # speed by the distance of a finger from its set point [1/s]
+_LEAD = 0.01  # largest distance of the gap between the fingers from that of the set point [m]
 _STILL = 1e-6
 
 
@@ -58,7 +54,10 @@ class GripperDrive:
                 "free coordinate of one joint; give a Gripper with those that open and close the fingers."
             )
         self._gripper, self._force, self._step = gripper, force, step
-        self._map, self._closing = coordinates, np.array([_direction(gripper, s) for s in self.coordinates])
+        self._map, self._closing = (
+            coordinates,
+            np.sign([gripper.closed[s] - gripper.opened[s] for s in self.coordinates]),
+        )
         self._at = np.array([coordinates.address[s] for s in self.coordinates], dtype=int)
         self._dof = np.array([coordinates.dof[s] for s in self.coordinates], dtype=int)
         self._tips = [_deepest(compiled, names) for names in gripper.fingers]
@@ -85,7 +84,7 @@ class GripperDrive:
             drive.trntype, drive.biastype = engine.mjtTrn.mjTRN_JOINT, engine.mjtBias.mjBIAS_AFFINE
             drive.forcelimited, drive.forcerange = True, (-force, force)
             spec.joint(symbol.path).actfrclimited = False
-        self._tied: str | None = None
+        self.tied: str | None = None  # body that is tied to the hand
         self._tie_name = f"{gripper.hand}/tie" if tie else ""
         if tie:
             weld = spec.add_equality(name=self._tie_name, name1=gripper.hand, name2=gripper.fingers[0][0])
@@ -123,13 +122,13 @@ class GripperDrive:
 
     def drive(self, data: Any, rates: Array) -> None:
         """Set the controls for one time step at speeds of the fingers (n,)."""
-        way = rates * self._closing
-        if (way < -_STILL).any():
+        closing = rates * self._closing
+        if (closing < -_STILL).any():
             if self.is_gripping:
                 self.is_gripping = False
                 self._target = data.qpos[self._at].copy()
                 self._release(data)
-        elif not self.is_gripping and (way > _STILL).any() and self.pressed(data) is not None:
+        elif not self.is_gripping and (closing > _STILL).any() and self.pressed(data) is not None:
             self.is_gripping = True
             self._bind(data)
         if self.is_gripping:
@@ -142,14 +141,9 @@ class GripperDrive:
 
     def pressed(self, data: Any) -> str | None:
         """Return the body that both fingers press, the one with most force; None if there is none."""
-        found = {body: min(forces) for body, forces in self._contacts.grip(data).items()}
-        best = max(found, key=found.__getitem__, default=None)
-        return best if best is not None and found[best] > TOUCH_FORCE else None
-
-    @property
-    def tied(self) -> str | None:
-        """Body that is tied to the hand; None if there is none."""
-        return self._tied
+        result = {body: min(forces) for body, forces in self._contacts.grip(data).items()}
+        best = max(result, key=result.__getitem__, default=None)
+        return best if best is not None and result[best] > TOUCH_FORCE else None
 
     def _leverage(self, compiled: Any, data: Any) -> Array:
         """Return |∂y_1/∂q| + |∂y_2/∂q| by coordinate (n,), with all joints that follow."""
@@ -183,22 +177,15 @@ class GripperDrive:
         self._compiled.eq_obj2id[self._tie] = body
         self._compiled.eq_data[self._tie, :11] = [0, 0, 0, *position, *quaternion, 1]
         data.eq_active[self._tie] = 1
-        self._tied = name
+        self.tied = name
 
     def _release(self, data: Any) -> None:
-        """Loosen the tie, if there is one."""
-        self._tied = None
+        self.tied = None
         if self._tie >= 0:
             data.eq_active[self._tie] = 0
 
 
-def _direction(gripper: Gripper, symbol: Symbol) -> float:
-    """Return the sign of the speed with which a coordinate closes the fingers."""
-    return float(np.sign(gripper.closed[symbol] - gripper.opened[symbol]))
-
-
 def _is_below(compiled: Any, body: int, root: int) -> bool:
-    """Return whether a body is below another one in the tree."""
     while body not in (0, root):
         body = int(compiled.body_parentid[body])
     return bool(body == root)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,26 +17,21 @@ from kineverse.formats.mjcf.mujoco_api import capture_mujoco_warnings, mujoco
 from kineverse.formats.mjcf.writer import to_mjcf
 from kineverse.geometry.collision_filter import adjacent_pairs, allowed_pairs, apply_rules, read_rules
 from kineverse.geometry.distance_queries import flag_between, flag_relatively_moving
+from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 
 from .mujoco_state import MujocoCoordinates
 
-CURVE_TOLERANCE = 0.01
-"""Largest error of a frame [m], [rad] where a joint follows a curve, which MuJoCo has as a polynomial."""
+CURVE_TOLERANCE = 0.01  # largest error of a joint on a curve, which MuJoCo has as a polynomial [m], [rad]
 _DRAWER = 3.0, 5.0
 _DOOR = 1.0, 1.0
-_KNOB = 0.02, 0.02
-"""Friction [N], [N m] and damping [N s/m], [N m s] of furniture that states neither."""
+_KNOB = 0.02, 0.02  # friction [N], [N m] and damping [N s/m], [N m s] of furniture that states neither
 _KNOB_MASS = 1.0
-_DENSITY, _MESH_MASS = 500.0, 0.5
-"""Assumed density of bodies without inertia [kg/m³], and mass of a mesh [kg], whose volume is not known."""
+_DENSITY, _MESH_MASS = 500.0, 0.5  # assumed for bodies without inertia [kg/m³], and for a mesh [kg]
 _CONDIM = 6
-_STIFF_SOLIMP = (0.99, 0.999, 0.001)
-"""Impedance of limits, ties and friction in joints; MuJoCo's default gives way by some 10 %."""
-_RESTING = 1e-4
-"""Depth up to which shapes of furniture rest on each other, and collide [m]."""
-_SWEEP = 65
-"""Number of places between its limits where a joint is looked at."""
+_STIFF_SOLIMP = (0.99, 0.999, 0.001)  # MuJoCo's default impedance gives way by some 10 %
+_RESTING = 1e-4  # depth up to which shapes of furniture rest on each other, and collide [m]
+_SWEEP = 65  # number of places between its limits at which a joint is checked
 _FOLDER = Path("/")
 
 
@@ -191,7 +187,7 @@ def add_contact_rules(
     option = spec.option
     option.cone, option.impratio = engine.mjtCone.mjCONE_ELLIPTIC, 10.0
     option.integrator = engine.mjtIntegrator.mjINT_IMPLICITFAST
-    # Which bodies may touch is said for each pair; MuJoCo would leave out a door with a frame that moves.
+    # Pairs that may touch are listed one by one; MuJoCo would leave out a door with a frame that moves.
     option.disableflags |= engine.mjtDisableBit.mjDSBL_FILTERPARENT
     bodies = [body.name for body in spec.bodies if body.geoms and body.name in model.frames]
     furniture = np.array([not is_robot(name) for name in bodies], dtype=bool)
@@ -244,32 +240,22 @@ def exclude_overlaps(
     of shapes of furniture that overlap at the default state. Of two bodies of furniture, some of whose shapes
     overlap, the others collide. Excluded are also bodies that one joint keeps apart between its limits.
     """
-    engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
-    own = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
+    data, random = mujoco().MjData(compiled), np.random.default_rng(seed)
+    of_robot = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
 
-    def touching() -> dict[tuple[int, int], float]:
-        """Return the pairs of shapes that overlap, with their distances."""
-        engine.mj_kinematics(compiled, data)
-        engine.mj_comPos(compiled, data)
-        engine.mj_collision(compiled, data)
-        return {
-            (a, b): gap
-            for (a, b), gap in zip(
-                np.sort(data.contact.geom, axis=1).tolist(), data.contact.dist.tolist(), strict=True
-            )
-            if gap < 0.0
-        }
+    def find_overlaps() -> dict[tuple[int, int], float]:
+        return {(min(a, b), max(a, b)): gap for a, b, gap in _find_contacts(compiled, data) if gap < 0.0}
 
     def pairs_of_robot(found: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
         pairs = (sorted(compiled.geom_bodyid[list(pair)].tolist()) for pair in found)
-        return {(a, b) for a, b in pairs if own[a] and own[b]}
+        return {(a, b) for a, b in pairs if of_robot[a] and of_robot[b]}
 
     data.qpos[:] = coordinates.positions(coordinates.default)
-    at_home, move, sweep = touching(), coordinates.sampler(), coordinates.sweep()
+    at_home, move = find_overlaps(), coordinates.mover()
     always: set[tuple[int, int]] | None = None
     for _ in range(samples):
-        move(data, random)
-        here = pairs_of_robot(touching())
+        move(data, random.uniform)
+        here = pairs_of_robot(find_overlaps())
         always = here if always is None else always & here
         if not always:
             break
@@ -277,7 +263,7 @@ def exclude_overlaps(
     shapes: dict[tuple[int, int], set[tuple[int, int]]] = {}
     for (a, b), gap in at_home.items():
         one, other = compiled.geom_bodyid[[a, b]].tolist()
-        if gap < -_RESTING and not own[one] and not own[other]:
+        if gap < -_RESTING and not of_robot[one] and not of_robot[other]:
             pair = (a, b) if one < other else (b, a)
             shapes.setdefault((min(one, other), max(one, other)), set()).add(pair)
     for (one, other), overlapping in shapes.items():
@@ -289,9 +275,9 @@ def exclude_overlaps(
                 pair.condim, pair.friction[:2] = 3, geoms[0].friction[0]
     names = [(compiled.body(a).name, compiled.body(b).name) for a, b in sorted(bodies)]
     met = {*shapes}
-    for share in np.linspace(0.0, 1.0, _SWEEP):
-        sweep(data, float(share))
-        deep = (pair for pair, gap in touching().items() if gap < -_RESTING)
+    for share in np.linspace(0.0, 1.0, _SWEEP).tolist():
+        move(data, partial(_between, share=share))
+        deep = (pair for pair, gap in find_overlaps().items() if gap < -_RESTING)
         met |= {tuple(sorted(compiled.geom_bodyid[list(pair)].tolist())) for pair in deep}
     apart = [pair for pair in _limited_joints(model, compiled) if tuple(sorted(pair)) not in met]
     for a, b in (*names, *((compiled.body(a).name, compiled.body(b).name) for a, b in apart)):
@@ -299,22 +285,34 @@ def exclude_overlaps(
     return names
 
 
+def _between(lower: Array, upper: Array, share: float) -> Array:
+    return lower + share * (upper - lower)
+
+
+def _find_contacts(compiled: Any, data: Any) -> Iterator[tuple[int, int, float]]:
+    """Yield the pairs of shapes that MuJoCo's collision detection finds, with their distances [m]."""
+    engine = mujoco()
+    engine.mj_kinematics(compiled, data)
+    engine.mj_comPos(compiled, data)
+    engine.mj_collision(compiled, data)
+    for (a, b), gap in zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True):
+        yield a, b, gap
+
+
 def _limited_joints(model: ModelView, compiled: Any) -> list[tuple[int, int]]:
-    """Return the pairs of bodies that one joint with limits connects."""
     names = [compiled.body(k).name for k in range(compiled.nbody)]
     known = {name: k for k, name in enumerate(names) if name in model.frames and compiled.body_geomnum[k]}
-    found = []
+    result = []
     bodies = list(known)
     for i, k in np.argwhere(np.triu(adjacent_pairs(model, bodies), 1)).tolist():
         symbols = model.fk(bodies[i], bodies[k]).symbols
         limited = all(np.isfinite(model.limits(s)).all() for s in symbols)
         if len(symbols) == 1 and limited:
-            found.append((known[bodies[i]], known[bodies[k]]))
-    return found
+            result.append((known[bodies[i]], known[bodies[k]]))
+    return result
 
 
 def _geoms_of(compiled: Any, body: int) -> range:
-    """Return the indices of the shapes of a body."""
     first = int(compiled.body_geomadr[body])
     return range(first, first + int(compiled.body_geomnum[body]))
 
@@ -329,8 +327,7 @@ def _solref(spec: Any) -> tuple[float, float]:
     return 2.0 * float(spec.option.timestep), 1.0
 
 
-_STANDS = -0.01, 0.005
-"""Gaps between the floor and bodies that stand or roll on it [m]."""
+_STANDS = -0.01, 0.005  # gaps between the floor and bodies that stand or roll on it [m]
 
 
 def add_floor(
@@ -358,22 +355,19 @@ def add_floor(
     floor = compiled.body(name).id
 
     def touching() -> dict[str, float]:
-        engine.mj_kinematics(compiled, data)
-        engine.mj_comPos(compiled, data)
-        engine.mj_collision(compiled, data)
-        found: dict[str, float] = {}
-        bodies = compiled.geom_bodyid[data.contact.geom]
-        for (a, b), gap in zip(bodies.tolist(), data.contact.dist.tolist(), strict=True):
+        result: dict[str, float] = {}
+        for one, other, gap in _find_contacts(compiled, data):
+            a, b = compiled.geom_bodyid[[one, other]].tolist()
             if floor in (a, b):
-                other = compiled.body(a + b - floor).name
-                found[other] = min(gap, found.get(other, gap))
-        return found
+                touched = compiled.body(a + b - floor).name
+                result[touched] = min(gap, result.get(touched, gap))
+        return result
 
     data.qpos[:] = coordinates.positions(coordinates.default)
-    standing, move = touching(), coordinates.sampler()
+    standing, move = touching(), coordinates.mover()
     below = {b for b, gap in standing.items() if gap < _STANDS[0]}
     for _ in range(samples):
-        move(data, random)
+        move(data, random.uniform)
         below |= {b for b, gap in touching().items() if gap < _STANDS[0] and not is_robot(b)}
     geom.margin = 0.0
     if below:

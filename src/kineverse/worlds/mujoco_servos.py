@@ -25,29 +25,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import finite_number
 from kineverse.compilation import compile
-from kineverse.errors import ExpressionError, InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import as_expression
 from kineverse.formats.mjcf.mujoco_api import mujoco
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
-from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .mujoco_state import MujocoCoordinates
 
-BANDWIDTH = 80.0
-"""Bandwidth w [1/s]: a robot stands still some 50 ms after its speeds are zero."""
-_LEAD = 0.05
-"""Largest distance of a set point from its joint [m], [rad]; less for a servo of much inertia."""
-_ARMATURE = 0.1
-"""Part of the largest inertia that is added to a joint as that of its motor."""
+BANDWIDTH = 80.0  # bandwidth w [1/s]: a robot stands still some 50 ms after its speeds are zero
+_LEAD = 0.05  # largest distance of a set point from its joint [m], [rad]; less for a servo of much inertia
+_ARMATURE = 0.1  # part of the largest inertia that is added to a joint as that of its motor
 _ACCELERATION, _TRACTION = 20.0, 6.0
 """Acceleration that a servo without a stated effort can give to the largest inertia [m/s²], [rad/s²], and
 that of a base that slides along the floor: its wheels have some friction of 0.6."""
-_RAMP, _RESERVE = 0.05, 0.8
-"""Time from rest to the limit of a speed [s], and the part of the effort that an acceleration may take."""
+_RAMP, _RESERVE = 0.05, 0.8  # time from rest to the limit of a speed [s], part of the effort to accelerate
 _CONFIGURATIONS = 40
 _PLANAR = 3
 
@@ -61,8 +55,7 @@ class SpeedMap:
         rows = [dict(model.rates.row(c) or {c.derivative(): as_expression(1.0)}) for c in coordinates]
         self.speeds = tuple(dict.fromkeys(s for row in rows for s in row))
         column = {speed: k for k, speed in enumerate(self.speeds)}
-        self._known = {str(s): s for s in model.speeds}
-        self._column = column
+        self.columns = {key: column.get(s) for s in model.speeds for key in (s, str(s))}
         self._matrix: Array = np.zeros((len(rows), len(self.speeds)))
         varying = []
         for i, row in enumerate(rows):
@@ -81,27 +74,6 @@ class SpeedMap:
                 "MuJoCo has not as the position of one joint. Replace that part of the robot."
             )
         self._at = np.array([address[s] for s in inputs], dtype=int)
-
-    def vector(self, speeds: StateLike) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return the speeds of the robot in a mapping, (n,), and flags of the given ones, (n,)."""
-        if not isinstance(speeds, Mapping):
-            raise ExpressionError(f"Speeds are given as a mapping {{name: number}}, not as {speeds!r}.")
-        vector, given = np.zeros(len(self.speeds)), np.zeros(len(self.speeds), dtype=bool)
-        for key, value in speeds.items():
-            speed = self._known.get(str(key))
-            if speed is None:
-                if isinstance(speeds, State):
-                    continue  # a state may have further values
-                raise UnknownNameError(
-                    f"The model has no speed '{key}'. {suggest(str(key), self._known, 'speed')}"
-                )
-            number = finite_number(value)
-            if number is None:
-                raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
-            k = self._column.get(speed)
-            if k is not None:
-                vector[k], given[k] = number, True
-        return vector, given
 
     def columns_of(self, coordinates: Sequence[Symbol]) -> npt.NDArray[np.bool_]:
         """Return flags of the speeds (n,) that move some of the coordinates alone."""
@@ -230,11 +202,11 @@ class JointServos:
 def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int) -> Array:
     """Return the largest inertia about each joint in sampled configurations (n,); what follows counts."""
     engine = mujoco()
-    data, random, move = engine.MjData(compiled), np.random.default_rng(seed), coordinates.sampler()
+    data, random, move = engine.MjData(compiled), np.random.default_rng(seed), coordinates.mover()
     columns = np.ascontiguousarray(coordinates.followers[:, dofs].T)
     largest, product = np.zeros(len(dofs)), np.zeros(compiled.nv)
     for _ in range(_CONFIGURATIONS):
-        move(data, random)
+        move(data, random.uniform)
         engine.mj_kinematics(compiled, data)
         engine.mj_comPos(compiled, data)
         engine.mj_crb(compiled, data)
@@ -247,26 +219,26 @@ def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, 
 def _sampled_loads(
     compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int
 ) -> tuple[Array, Array]:
-    """Return the largest force of gravity on each joint, and the way of the farthest point that it moves.
+    """Return the largest force of gravity on each joint, and the motion of the farthest point that it moves.
 
     Both are the largest in sampled configurations, (n,): [N], [N m], and [m/m], [m/rad].
     """
     engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
-    move, columns = coordinates.sampler(), np.ascontiguousarray(coordinates.followers[:, dofs])
+    move, columns = coordinates.mover(), np.ascontiguousarray(coordinates.followers[:, dofs])
     weights, levers = np.zeros(len(dofs)), np.zeros(len(dofs))
     slide, turn = np.zeros((3, compiled.nv)), np.zeros((3, compiled.nv))
     roots = compiled.body_rootid[compiled.dof_bodyid[dofs]]
     own = np.flatnonzero(np.isin(compiled.body_rootid[compiled.geom_bodyid], roots)).tolist()
     for _ in range(_CONFIGURATIONS):
-        move(data, random)
+        move(data, random.uniform)
         engine.mj_forward(compiled, data)
         np.maximum(weights, np.abs(data.qfrc_gravcomp @ columns), out=weights)
         for geom in own:
             body = int(compiled.geom_bodyid[geom])
             engine.mj_jac(compiled, data, slide, turn, data.geom_xpos[geom], body)
-            ways = np.linalg.norm(slide @ columns, axis=0)
-            ways += compiled.geom_rbound[geom] * np.linalg.norm(turn @ columns, axis=0)
-            np.maximum(levers, ways, out=levers)
+            reaches = np.linalg.norm(slide @ columns, axis=0)
+            reaches += compiled.geom_rbound[geom] * np.linalg.norm(turn @ columns, axis=0)
+            np.maximum(levers, reaches, out=levers)
     return weights, levers
 
 

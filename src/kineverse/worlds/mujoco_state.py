@@ -88,8 +88,8 @@ class MujocoCoordinates:
             pose = rest @ _pose(place[:3], place[3:])
             qpos[at : at + 7] = [*pose[:3, 3], *to_quaternion(pose[:3, :3])[[3, 0, 1, 2]]]
         if self._loops is not None:
-            found = self._loops(values.vector(self._symbols))
-            for (at, symbol), value in zip(self._dependent, found, strict=True):
+            result = self._loops(values.vector(self._symbols))
+            for (at, symbol), value in zip(self._dependent, result, strict=True):
                 if not math.isfinite(value):
                     raise InvalidValueError(f"No loop closes in this state: '{symbol}' has no value.")
                 qpos[at] = float(value)
@@ -113,25 +113,15 @@ class MujocoCoordinates:
             values.update(zip(symbols, [*pose[:3, 3].tolist(), w, x, y, z], strict=True))
         return State({s: values[s] for s in self._symbols}, stamp=stamp, source="mujoco")
 
-    def sampler(self) -> Callable[[Any, np.random.Generator], None]:
-        """Return a function that sets an ``MjData`` to a random state within the limits.
+    def mover(self) -> Callable[[Any, Callable[[Array, Array], Array]], None]:
+        """Return a function that sets an ``MjData`` to values which a function takes from the ends of ranges.
 
         Coordinates without limits are within half a turn, loops stay where they are.
         """
         free, lower, upper = self._ranges()
 
-        def move(data: Any, random: np.random.Generator) -> None:
-            data.qpos[free] = random.uniform(lower, upper)
-            self.follow(data.qpos)
-
-        return move
-
-    def sweep(self) -> Callable[[Any, float], None]:
-        """Return a function that sets an ``MjData`` to a share of the range of all coordinates."""
-        free, lower, upper = self._ranges()
-
-        def move(data: Any, share: float) -> None:
-            data.qpos[free] = lower + share * (upper - lower)
+        def move(data: Any, draw: Callable[[Array, Array], Array]) -> None:
+            data.qpos[free] = draw(lower, upper)
             self.follow(data.qpos)
 
         return move
@@ -173,7 +163,7 @@ class MujocoContacts:
         The force is the size of the sum over all points of contact. Point, normal and distance are those of
         the deepest one.
         """
-        engine, found = mujoco(), dict[tuple[int, int], list[Any]]()
+        engine, result = mujoco(), dict[tuple[int, int], list[Any]]()
         wrench = np.zeros(6)
         for k in range(data.ncon):
             contact = data.contact[k]
@@ -185,9 +175,9 @@ class MujocoContacts:
             force, normal = frame.T @ wrench[:3], frame[0]
             if self._is_robot[b] or (b < a and not self._is_robot[a]):
                 a, b, force, normal = b, a, -force, -normal
-            known = found.get((a, b))
+            known = result.get((a, b))
             if known is None:
-                found[a, b] = [contact.pos.copy(), normal.copy(), contact.dist, force]
+                result[a, b] = [contact.pos.copy(), normal.copy(), contact.dist, force]
                 continue
             known[3] = known[3] + force
             if contact.dist < known[2]:
@@ -196,7 +186,7 @@ class MujocoContacts:
             Contact(
                 self._names[a], self._names[b], point, normal, float(distance), float(np.linalg.norm(force))
             )
-            for (a, b), (point, normal, distance, force) in found.items()
+            for (a, b), (point, normal, distance, force) in result.items()
         )
 
     def largest_force(self, data: Any) -> float:
@@ -235,9 +225,9 @@ class MujocoContacts:
             root = int(self._compiled.body_weldid[body])
             forces = pressed.setdefault((root > 0, root or body), {}).setdefault(body, np.zeros(2))
             forces[sides[k, finger] - 1] += data.efc_force[contact.efc_address[k]]
-        found = {}
+        result = {}
         for parts in pressed.values():
             most = max(parts, key=lambda body: float(parts[body].sum()))
             one, other = sum(parts.values(), np.zeros(2)).tolist()
-            found[self._names[most]] = one, other
-        return found
+            result[self._names[most]] = one, other
+        return result

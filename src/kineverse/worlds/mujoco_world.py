@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,15 +26,21 @@ from .mujoco_servos import BANDWIDTH, JointServos, SpeedMap, base_coordinates
 from .mujoco_state import MujocoContacts, MujocoCoordinates
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
+from .speed_commands import ROUNDING, SpeedCommands, check_settings, find_robot_coordinates
 from .world import Contact, Observation
 
 _MARGIN = 10.0
-_UNSTATED = 1.0
-"""Limit of a speed that states none [m/s], [rad/s]: walking pace."""
+_UNSTATED = 1.0  # limit of a speed that states none [m/s], [rad/s]: walking pace
 
 
 class SimulationBounds:
-    """Largest credible speeds and force of one ``MjModel``."""
+    """Largest credible speeds and force of one ``MjModel``: what is beyond them was made by the solver.
+
+    They follow from what the robot can do, with a wide margin. Its coordinates move at ten times their limits
+    at most. Another coordinate moves no point faster than twice the fastest point of the robot, as after an
+    elastic impact, plus a fall through the scene. The force on the robot stops it from the largest speed of
+    its base within a time step, plus ten times what all servos press at their farthest points.
+    """
 
     def __init__(
         self,
@@ -49,10 +54,10 @@ class SimulationBounds:
         self._names = [compiled.joint(int(k)).name for k in compiled.dof_jntid]
         data.qpos[:] = coordinates.positions(coordinates.default)
         engine.mj_forward(compiled, data)
-        own = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
+        of_robot = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
         limits, base = np.zeros(compiled.nv), np.zeros(compiled.nv)
         for symbol, dof in coordinates.dof.items():
-            if own[compiled.dof_bodyid[dof]]:
+            if of_robot[compiled.dof_bodyid[dof]]:
                 limit = float(np.abs(model.limits(symbol.derivative())).min())
                 limits[dof] = limit if 0.0 < limit < math.inf else _UNSTATED
         for symbol in base_coordinates(model) & coordinates.dof.keys():
@@ -62,15 +67,17 @@ class SimulationBounds:
         for geom in range(compiled.ngeom):
             body = int(compiled.geom_bodyid[geom])
             engine.mj_jac(compiled, data, slide, turn, data.geom_xpos[geom], body)
-            ways = np.linalg.norm(slide, axis=0) + np.linalg.norm(turn, axis=0) * compiled.geom_rbound[geom]
-            np.maximum(levers, ways, out=levers)
-            if own[body]:
-                fastest = max(fastest, float(limits @ ways))
+            reaches = (
+                np.linalg.norm(slide, axis=0) + np.linalg.norm(turn, axis=0) * compiled.geom_rbound[geom]
+            )
+            np.maximum(levers, reaches, out=levers)
+            if of_robot[body]:
+                fastest = max(fastest, float(limits @ reaches))
         fall = math.sqrt(2.0 * abs(float(compiled.opt.gravity[2])) * float(compiled.stat.extent))
         with np.errstate(divide="ignore"):
             others = (2.0 * fastest + fall) / levers
         self.speeds: Array = np.where(limits > 0.0, _MARGIN * limits, others)
-        mass = float(compiled.body_mass[own].sum())
+        mass = float(compiled.body_mass[of_robot].sum())
         reach = {s: max(float(levers[coordinates.dof[s]]), 1e-3) for s in efforts}
         pressed = sum(effort / reach[s] for s, effort in efforts.items())
         step = float(compiled.opt.timestep)
@@ -89,16 +96,7 @@ class SimulationBounds:
 
 logger = logging.getLogger(__name__)
 _SAMPLES = 60
-_ROUNDING = 1e-9
 _GRASPS = ("friction", "tie")
-
-
-class _Command(NamedTuple):
-    """Speeds of the robot that act from one time until another [s]."""
-
-    speeds: Array
-    start: float
-    end: float
 
 
 class MujocoWorld:
@@ -178,21 +176,13 @@ class MujocoWorld:
         seed: int = 0,
     ) -> None:
         positive = {"step": step, "grip": grip, "timeout": timeout, "bandwidth": bandwidth, "press": press}
-        for field, value in (*positive.items(), ("friction", friction), ("delay", delay)):
-            number = finite_number(value)
-            if number is None or number < 0 or (field in positive and not number):
-                raise InvalidValueError(f"'{field}' of a world is a positive number, not {value!r}.")
+        check_settings(positive, {"friction": friction, "delay": delay})
         if grasp not in _GRASPS:
             raise InvalidValueError(f"'grasp' of a world is 'friction' or 'tie', not {grasp!r}.")
         self.model, self.robot = model, robot
-        self._step, self.timeout, self._delay = float(step), float(timeout), float(delay)
+        self._step, self.timeout = float(step), float(timeout)
         self._remarks: dict[str, None] = {}
-        coordinates = [s for s in model.degrees_of_freedom if self._is_robot(s.path)]
-        if not coordinates:
-            prefixes = sorted({s.path.split("/")[0] for s in model.degrees_of_freedom})
-            raise UnknownNameError(
-                f"No coordinate of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
-            )
+        coordinates = find_robot_coordinates(model, robot)
         furniture = [s.path for s in model.degrees_of_freedom if not self._is_robot(s.path)]
         frictions = _friction_by_name(door_friction or {}, furniture)
         if gripper is None:
@@ -206,10 +196,20 @@ class MujocoWorld:
         mujoco_model.add_joint_friction(spec, compiled, furniture, frictions, self._remark)
         mujoco_model.add_tipping_springs(spec, model, self._remark)
         mujoco_model.add_contact_rules(spec, model, fingers, friction, self._is_robot, self._remark)
-        self._float_robot(spec)
+        for body in spec.bodies:
+            if self._is_robot(body.name):
+                body.gravcomp = 1.0
+        self._remark(f"gravity does not act on '{robot}': its servos are taken to carry the weight")
         compiled = mujoco_model.compile_world(spec)
         self._coordinates = MujocoCoordinates(model, compiled)
-        self._exclude_overlaps(spec, compiled, seed)
+        pairs = mujoco_model.exclude_overlaps(
+            spec, compiled, model, self._coordinates, self._is_robot, _SAMPLES, seed
+        )
+        if pairs:
+            self._remark(
+                "these pairs overlap at the default state, or of the robot always, and do not collide there: "
+                + ", ".join(f"{a} with {b}" for a, b in pairs)
+            )
         if floor:
             add_floor(spec, self._coordinates, self._is_robot, model.frames, _SAMPLES, seed, self._remark)
         else:
@@ -247,7 +247,8 @@ class MujocoWorld:
         if self._drive is not None:
             self._drive.connect(self._compiled, self._contacts, seed)
         self._map = SpeedMap(model, [*driven, *held], self._coordinates.address)
-        self._is_finger = self._map.columns_of(held)
+        is_finger = self._map.columns_of(held)
+        self._commands = SpeedCommands(self._map.columns, is_finger, self.timeout, float(delay), logger.info)
         self._count = len(driven)
         self._state: State | None = None
         self._sampler = SensorSampler(sensors or Sensors(), model, robot, seed)
@@ -280,7 +281,7 @@ class MujocoWorld:
     @property
     def refused(self) -> int:
         """Number of commands since the last reset that were stale when they came."""
-        return self._refused
+        return self._commands.refused
 
     @property
     def peak_force(self) -> float:
@@ -291,18 +292,16 @@ class MujocoWorld:
         return self._peak_force
 
     def reset(self, state: StateLike) -> None:
-        """Start anew from a state, at time 0, with nothing in the gripper and all speeds zero."""
+        """Start again from a state, at time 0, with nothing in the gripper and all speeds zero."""
         qpos = self._coordinates.positions(state)
         self._state = None
         engine, data = mujoco(), self._data
         engine.mj_resetData(self._compiled, data)
         data.qpos[:] = qpos
         engine.mj_forward(self._compiled, data)
-        self._ticks, self._end, self._refused, self._peak_force = 0, 0.0, 0, 0.0
+        self._ticks, self._end, self._peak_force = 0, 0.0, 0.0
         self._broken = ""
-        self._speeds = np.zeros(len(self._map.speeds))
-        self._commands: deque[_Command] = deque()
-        self._active: _Command | None = None
+        self._commands.reset()
         self._servos.reset(data)
         if self._drive is not None:
             self._drive.reset(data)
@@ -310,51 +309,20 @@ class MujocoWorld:
         self._sampler.reset()
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
-        """Advance by a duration with speeds of the robot.
+        """Advance by a duration with speeds of the robot, as :meth:`.World.apply`.
 
-        Speeds of anything else are not read. Fingers keep the last speed that was given. Once both touch one
-        body they press it with the world's force, until a speed opens them.
-
-        Parameters
-        ----------
-        speeds
-            Speeds of the robot by symbol or name [m/s], [rad/s]; an empty mapping stops it.
-        duration
-            Time [s]; the world stops at the first time step that is not before.
-        stamp
-            Time of the state from which the speeds were computed [s]: beyond the age of the world's time-out
-            they are refused, or act no longer. None for speeds that act for the whole duration.
+        The world stops at the first time step that is not before the end. Once both fingers touch one body
+        they press it with the world's force, until a speed opens them.
 
         Raises
         ------
-        InvalidValueError
-            For speeds that are not finite, a duration that is not positive, and a stamp that is no number.
-        UnknownNameError
-            For speeds that the model does not have.
         SimulationError
-            If speeds or forces are beyond reason, see :mod:`.mujoco_bounds`. The state is that before then,
-            and the world does not go on until it is reset.
+            If speeds or forces are beyond :class:`SimulationBounds`. The state is that before then, and the
+            world does not go on until it is reset.
         """
-        length = finite_number(duration)
-        if length is None or length <= 0:
-            raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
-        taken = None if stamp is None else finite_number(stamp)
-        if stamp is not None and taken is None:
-            raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
         if self._broken:
             raise SimulationError(self._broken)
-        vector, given = self._map.vector(speeds)
-        keep = self._is_finger & ~given
-        vector[keep] = self._speeds[keep]
-        now = self._end
-        if taken is not None and not now - self.timeout <= taken + _ROUNDING <= now + 2 * _ROUNDING:
-            self._refused += 1
-            logger.info("speeds of %g s are refused at %g s", taken, now)
-            vector = np.where(self._is_finger, self._speeds, 0.0)
-        self._speeds = vector
-        until = now + length if taken is None else min(now + length, taken + self.timeout)
-        self._commands.append(_Command(vector, now + self._delay, until + self._delay))
-        self._end = now + length
+        self._end = self._commands.take(speeds, duration, stamp, self._end)
         if self._drive is not None:
             self._drive.update_limits(self._data)
         self._peak_force, self._state = 0.0, None
@@ -362,7 +330,7 @@ class MujocoWorld:
         handler = engine.get_mju_user_warning()
         engine.set_mju_user_warning(warnings.append)  # else to the terminal, and to a file
         try:
-            while self.time < self._end - _ROUNDING:
+            while self.time < self._end - ROUNDING:
                 before = self._data.qpos.copy()
                 self._advance()
                 force = self._contacts.largest_force(self._data)
@@ -388,7 +356,7 @@ class MujocoWorld:
         engine.mj_forward(self._compiled, data)
         self._broken = (
             f"The simulation is not to be trusted: {problem} at {now:.3f} s. The state is that before. "
-            "A start without overlaps, or a smaller time step (step=), may help; reset() begins anew."
+            "A start without overlaps, or a smaller time step (step=), may help; reset() starts again."
         )
         logger.warning(self._broken)
         raise SimulationError(self._broken)
@@ -402,18 +370,8 @@ class MujocoWorld:
         return self._sampler.observe(self.time, self.state, self.contacts())
 
     def _advance(self) -> None:
-        """Simulate one time step."""
-        now, data = self.time, self._data
-        while self._commands and self._commands[0].start <= now + _ROUNDING:
-            self._active = self._commands.popleft()
-        active = self._active
-        if active is None:
-            speeds = np.zeros(len(self._map.speeds))
-        elif now < active.end - _ROUNDING:
-            speeds = active.speeds
-        else:
-            speeds = np.where(self._is_finger, active.speeds, 0.0)
-        rates = self._map.rates(speeds, data.qpos)
+        data = self._data
+        rates = self._map.rates(self._commands.acting(self.time), data.qpos)
         self._servos.drive(data, rates[: self._count])
         if self._drive is not None:
             self._drive.drive(data, rates[self._count :])
@@ -421,35 +379,15 @@ class MujocoWorld:
         self._ticks += 1
 
     def _is_robot(self, name: str) -> bool:
-        """Return whether a frame or coordinate is the robot's."""
         return is_of_robot(name, self.robot)
 
     def _remark(self, text: str) -> None:
-        """Add a remark once."""
         self._remarks[text] = None
-
-    def _float_robot(self, spec: Any) -> None:
-        """Take the weight of the robot away."""
-        for body in spec.bodies:
-            if self._is_robot(body.name):
-                body.gravcomp = 1.0
-        self._remark(f"gravity does not act on '{self.robot}': its servos are taken to carry the weight")
-
-    def _exclude_overlaps(self, spec: Any, compiled: Any, seed: int) -> None:
-        """Exclude what overlaps by design, of the robot and of furniture."""
-        pairs = mujoco_model.exclude_overlaps(
-            spec, compiled, self.model, self._coordinates, self._is_robot, _SAMPLES, seed
-        )
-        if pairs:
-            self._remark(
-                "these pairs overlap at the default state, or of the robot always, and do not collide there: "
-                + ", ".join(f"{a} with {b}" for a, b in pairs)
-            )
 
 
 def _friction_by_name(given: Mapping[Any, float], furniture: list[str]) -> dict[str, float]:
     """Return friction by the name of a coordinate of furniture, after checking it."""
-    found = {}
+    result = {}
     for key, value in given.items():
         number = finite_number(value)
         if str(key) not in furniture:
@@ -459,5 +397,5 @@ def _friction_by_name(given: Mapping[Any, float], furniture: list[str]) -> dict[
             )
         if number is None or number < 0:
             raise InvalidValueError(f"The friction of '{key}' is a number of N or N m, not {value!r}.")
-        found[str(key)] = number
-    return found
+        result[str(key)] = number
+    return result

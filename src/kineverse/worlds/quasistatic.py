@@ -9,7 +9,7 @@ with the rows A of the model's limits, locks and closures. An object is pushed a
 where nothing touches it. A contact jams if its normal is 60° or more off all motions that the object has at
 that point, as with a friction of 0.58: then it does not move the object. What was penetrated before comes
 free at 0.1 m/s at most. So a contact moves an object's point there by at most twice the sum of the robot's
-way and that way out. The slacks s are zero unless the object is blocked; then the penetration remains. The
+motion and that retreat. The slacks s are zero unless the object is blocked; then the penetration remains. The
 weights w are the squares of the speeds that coordinates give to points of bodies, so rotations and
 translations compare. The problem is linear in the neighbourhood of a configuration, and it is solved again
 where it led, until nothing changes (sequential quadratic programming).
@@ -52,30 +52,20 @@ from .quasistatic_constraints import (
     project_twists,
 )
 
-SKIN = 1e-6
-"""Gap to which objects are pushed [m]: below, normals of nearest points are not determined."""
+SKIN = 1e-6  # gap to which objects are pushed [m]: below, normals of nearest points are not determined
 
-_REACH = 0.005
-"""Distance beyond the robot's motion up to which gaps are rows [m]."""
+_REACH = 0.005  # distance beyond the robot's motion up to which gaps are rows [m]
 _ROUNDS = 10
-_STEADY = 2e-7
-"""Change of displacements below which a solution is final [m]."""
-_SLACK = 1e-7
-"""Reciprocal ρ of the weight of slacks, beside weights near 1 kg of least motion."""
-_HARD = 1e-10
-"""Reciprocal weight of exceeded limits, where solutions of curved problems are compared."""
-_HELD = 1e-7
-"""Weight of least motion beside the error of a hold."""
+_STEADY = 2e-7  # change of displacements below which a solution is final [m]
+_SLACK = 1e-7  # reciprocal ρ of the weight of slacks; weights of least motion are near 1 kg
+_HARD = 1e-10  # reciprocal weight of exceeded limits, where solutions of curved problems are compared
+_HELD = 1e-7  # weight of least motion relative to the error of a hold
 _LIGHTEST = 1e-4
-_DEEP = 1e-4
-"""Penetration of what does not yield, from which on its side is remembered [m]."""
-_RELEASE = 0.1
-"""Largest speed out of a penetration that was there before a motion [m/s]."""
-_FIRM = 100.0
-"""Weight of gaps between furniture beside those to the robot: it is the robot that penetrates."""
+_DEEP = 1e-4  # penetration of what does not yield, from which on its side is remembered [m]
+_RELEASE = 0.1  # largest speed out of a penetration that was there before a motion [m/s]
+_FIRM = 100.0  # weight of gaps between furniture relative to the robot: so it is the robot that penetrates
 
-Residual: TypeAlias = Callable[[], tuple[Array, Array]]
-"""Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""
+Residual: TypeAlias = Callable[[], tuple[Array, Array]]  # error of a hold (6,), Jacobian (6, n)
 
 
 class ObjectMotion:
@@ -151,7 +141,7 @@ class ObjectMotion:
         return weights
 
     def reset(self, q: Array) -> None:
-        """Begin anew at a configuration."""
+        """Start again at a configuration."""
         self._penetrated.clear()
         self._limits.reset()
         self.place(q)
@@ -165,12 +155,12 @@ class ObjectMotion:
         self.scene.update(self.q[self._inputs])
 
     def travel(self) -> Array:
-        """Return the ways that shapes of the robot have gone so far, at most (K,) [m]."""
+        """Return the distances that shapes of the robot have moved so far, at most (K,) [m]."""
         travel: Array = self.scene.collision_world.table.travel[self._robot_objects]
         return travel
 
-    def longest_way(self, moved: Array, radius: float) -> float | None:
-        """Return the longest way of a body in a pair within a radius [m]; None without such a pair."""
+    def longest_motion(self, moved: Array, radius: float) -> float | None:
+        """Return the longest motion of a body in a pair within a radius [m]; None without such a pair."""
         pairs, index = self.find_near(radius)
         if not len(index):
             return None
@@ -196,11 +186,11 @@ class ObjectMotion:
 
     def find_near(self, radius: float) -> tuple[DistanceResults, npt.NDArray[np.intp]]:
         """Return the pairs within a radius [m], and the indices of those that are not ignored."""
-        found = self._query(radius)
-        if not len(found):
-            return found, np.zeros(0, dtype=np.intp)
-        i, j = found.body_indices.T
-        return found, np.flatnonzero(~self._ignored[i, j])
+        result = self._query(radius)
+        if not len(result):
+            return result, np.zeros(0, dtype=np.intp)
+        i, j = result.body_indices.T
+        return result, np.flatnonzero(~self._ignored[i, j])
 
     def measure_gaps(self, radius: float) -> Gaps:
         """Return the gaps within a radius [m] with their derivatives.
@@ -297,14 +287,14 @@ class ObjectMotion:
             if better:
                 least, best = cost, v
                 self._note_penetrated(gaps)
-                found = v
+                result = v
                 if furniture is not None:
-                    found = self._solve(h, v, gaps, aims, furniture, rates, limits, pulled)
+                    result = self._solve(h, v, gaps, aims, furniture, rates, limits, pulled)
             else:
-                # The gaps bend too much, as of bodies that are jammed: half of the way.
-                found = 0.5 * (best + v)
-            change = float(np.max(np.abs(found - v) * np.sqrt(self.weights[: self.count]), initial=0.0)) * h
-            v = found
+                # The gaps bend too much, as of bodies that are jammed: half of the motion.
+                result = 0.5 * (best + v)
+            change = float(np.max(np.abs(result - v) * np.sqrt(self.weights[: self.count]), initial=0.0)) * h
+            v = result
             self.place(self._integrate(start, v, h))
             if change <= _STEADY:
                 break
@@ -316,15 +306,15 @@ class ObjectMotion:
 
     def _cost(
         self,
-        way: Array,
+        motion: Array,
         gaps: Gaps,
         aims: Array,
         furniture: FurnitureGaps | None,
         pulled: tuple[Array, Array] | None,
     ) -> float:
-        """Return twice the cost of a motion by some way of the objects (n,)."""
+        """Return twice the cost of a motion by some motion of the objects (n,)."""
         depths = np.minimum(gaps.distances - np.minimum(aims, 0.0), 0.0)[~gaps.jammed]
-        moved = float(self.weights[: self.count] @ way**2)
+        moved = float(self.weights[: self.count] @ motion**2)
         if pulled is not None:
             moved = _HELD * moved + float(pulled[0] @ pulled[0])
         squares = float(depths @ depths)
@@ -383,11 +373,11 @@ class ObjectMotion:
         x, _, flag, _ = self._daqp.solve(
             H, f, rows, most, least, sense, rho_soft=_SLACK, primal_tol=1e-10, sing_tol=1e-14
         )
-        found = np.zeros(n)
+        result = np.zeros(n)
         if flag >= 1 and np.isfinite(x).all():
             _clip_to_bounds(x, rows[:hard], least[:hard], most[:hard])
-            found[use] = x
-        return found
+            result[use] = x
+        return result
 
 
 _SOFT, _UNBOUNDED = 8, 1e9

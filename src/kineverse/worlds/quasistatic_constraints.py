@@ -1,4 +1,8 @@
-"""Constraints of a quasi-static step: gaps between bodies, and limits, locks and closures of objects."""
+"""Constraints of a quasi-static step: gaps between bodies, and limits, locks and closures of objects.
+
+What a robot moves pushes other furniture along, and stops where that cannot yield. It does not push what
+its contact jams: where the normal is 60° or more off the motion that a coordinate causes there.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +21,14 @@ from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
-from kineverse.model.velocity_rows import Recovery, VelocityRows, velocity_rows
+from kineverse.model.velocity_constraints.velocity_rows import Recovery, VelocityRows, velocity_rows
 from kineverse.symbols import Symbol
 
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps
 
-JAM = 0.5
-"""Cosine of the angle between a normal and the motion that it causes, below which a contact jams."""
+JAM = 0.5  # cosine of the angle between a normal and the motion that it causes, below which a contact jams
 
-_PARALLEL = 1e-3
-"""Least eigenvalue of directions of motion that are not parallel."""
+_PARALLEL = 1e-3  # least eigenvalue of directions of motion that are not parallel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,11 +44,11 @@ class Gaps:
 
 def align_motion(normal: Array, point: Array, twists: Array) -> float:
     """Return the largest cosine of the angle between a normal and the motions of a point by twists (6, n)."""
-    ways = twists[:3] + np.cross(twists[3:].T, point).T
-    lengths = np.linalg.norm(ways, axis=0)
+    motions = twists[:3] + np.cross(twists[3:].T, point).T
+    lengths = np.linalg.norm(motions, axis=0)
     moves = (lengths > 0.0) & np.isfinite(lengths)
-    ways = ways[:, moves] / lengths[moves]
-    values, directions = np.linalg.eigh(ways @ ways.T)
+    motions = motions[:, moves] / lengths[moves]
+    values, directions = np.linalg.eigh(motions @ motions.T)
     return float(np.linalg.norm(normal @ directions[:, values > _PARALLEL]))
 
 
@@ -66,14 +68,12 @@ def project_twists(normals: Array, points: Array, twists: Array) -> Array:
     return np.asarray((wrench @ twists)[:, 0])
 
 
-_EXACT = 1e-6
-"""Excess of a limit that is a matter of rounding, and is taken back."""
+_EXACT = 1e-6  # excess of a limit that is a matter of rounding, and is taken back
 
 _HARMLESS = ("nothing that moves changes it", "it has no bounds")
 _STEP = Symbol("world/step", 0, "parameter", 0.01)
 
-Rows: TypeAlias = tuple[Array, Array, Array, Array]
-"""Matrix (m, n), lower and upper bounds, and signed excess of position constraints, (m,) each."""
+Rows: TypeAlias = tuple[Array, Array, Array, Array]  # matrix (m, n), bounds, excess (m,)
 
 
 class ObjectLimits:
@@ -117,7 +117,7 @@ class ObjectLimits:
         self.reset()
 
     def find_linked(self, moved: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], ...]:
-        """Return indices of speeds that share rows with some, directly or by others, and of these rows."""
+        """Return the indices of speeds linked to flagged ones by rows, and of these rows."""
         key = moved.tobytes()
         if key not in self._found:
             linked = moved | self._linked[moved].any(axis=0)
@@ -158,12 +158,7 @@ class ObjectLimits:
 class _CompiledRows:
     """Rows as a function of the model's symbols and the time of a step."""
 
-    def __init__(
-        self,
-        parts: Sequence[VelocityRows],
-        count: int,
-        place: Mapping[Symbol, int],
-    ) -> None:
+    def __init__(self, parts: Sequence[VelocityRows], count: int, place: Mapping[Symbol, int]) -> None:
         rows = [row for part in parts for row in part.rows]
         columns = parts[0].speeds
         self.pattern = np.array([[s in row.weights for s in columns] for row in rows], dtype=bool)
@@ -208,11 +203,9 @@ def _link_columns(count: int, patterns: Sequence[npt.NDArray[np.bool_]]) -> npt.
     return linked
 
 
-RESTING = OVERLAP / 2
-"""Depth beyond the allowance at which furniture stops [m]: shapes that rest on each other slide freely."""
+RESTING = OVERLAP / 2  # depth beyond the allowance at which furniture stops [m]: resting shapes slide freely
 
-_REACH = 0.001
-"""Largest gap of pairs that have met [m]."""
+_REACH = 0.001  # largest gap of pairs that have met [m]
 
 Flags = npt.NDArray[np.bool_]
 
@@ -220,7 +213,7 @@ Flags = npt.NDArray[np.bool_]
 class FurnitureGaps(NamedTuple):
     """Gaps of pairs of shapes of furniture that meet."""
 
-    distances: Array  # (K,) ways to where the shapes stop [m]
+    distances: Array  # (K,) distances to where the shapes stop [m]
     rows: Array  # (K, n) derivatives by the displacement of objects
     jammed: Flags  # (K,) flags of contacts that move nothing
     moved: Flags  # (n,) flags of coordinates that move, those that are pushed along included
@@ -263,8 +256,8 @@ class FurnitureContacts:
             jammed, driven = np.zeros(len(index), dtype=bool), self._link(driven)
             for k in np.flatnonzero(distances < 0.0).tolist():
                 relative, point = of_b[k] - of_a[k], pairs.points_b[index[k]]
-                ways = np.linalg.norm(relative[:3] + np.cross(relative[3:].T, point).T, axis=0)
-                yields = driven | (np.abs(rows[k]) >= JAM * ways)
+                motions = np.linalg.norm(relative[:3] + np.cross(relative[3:].T, point).T, axis=0)
+                yields = driven | (np.abs(rows[k]) >= JAM * motions)
                 jammed[k] = not rows[k, yields].any()
                 if not jammed[k]:
                     rows[k, ~yields] = 0.0

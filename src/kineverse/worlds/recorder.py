@@ -36,8 +36,7 @@ from kineverse.state import State, StateLike
 
 from .world import Contact, Observation, World
 
-PROFILE = "kineverse"
-"""Profile in the header of a recording."""
+PROFILE = "kineverse"  # profile in the header of a recording
 
 _NUMBER: dict[str, Any] = {"type": "number"}
 _TEXT: dict[str, Any] = {"type": "string"}
@@ -81,8 +80,7 @@ TOPICS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Topics, with the name of the schema and the properties of its messages."""
 
-_FLUSH = 0.5
-"""Longest time of the world that is lost if the process is killed [s]."""
+_FLUSH = 0.5  # longest time of the world that is lost if the process is killed [s]
 
 
 class RecordedStep(Protocol):
@@ -182,10 +180,10 @@ class Recorder:
 
     def write_contacts(self, stamp: float, contacts: Iterable[Contact]) -> None:
         """Write the contacts at a time [s]."""
-        found = [
+        result = [
             {**{name: _plain(getattr(one, name)) for name in _CONTACT["properties"]}} for one in contacts
         ]
-        self._write("/contacts", stamp, {"contacts": found})
+        self._write("/contacts", stamp, {"contacts": result})
 
     def write_observation(self, stamp: float, observation: Observation) -> None:
         """Write readings that arrived at a time [s]; they keep their own stamp."""
@@ -212,11 +210,11 @@ class Recorder:
         vectors
             By name, the origin (3,) in the world [m], and the vector (3,).
         """
-        found = {
+        result = {
             str(name): {"origin": _plain(origin), "vector": _plain(vector)}
             for name, (origin, vector) in vectors.items()
         }
-        self._write("/controller", stamp, {"vectors": found})
+        self._write("/controller", stamp, {"vectors": result})
 
     def write_outcome(self, outcome: Any) -> None:
         """Write the result of the skill: a dataclass, or a mapping."""

@@ -35,11 +35,9 @@ from kineverse.symbols import Symbol, parse_symbol_name
 from .recorder import TOPICS, import_mcap
 from .world import Contact, Observation
 
-MAX_CHUNK = 1 << 28
-"""Largest chunk [byte], uncompressed."""
+MAX_CHUNK = 1 << 28  # largest chunk [byte], uncompressed
 
-MAX_TOTAL = 1 << 30
-"""Largest content of a file [byte], uncompressed."""
+MAX_TOTAL = 1 << 30  # largest content of a file [byte], uncompressed
 
 _MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 1, 2, 3, 4, 5, 6, 12, 15
@@ -106,7 +104,8 @@ class McapFile:
                 f"a chunk states {chunk.uncompressed_size} bytes; at most {MAX_CHUNK} are read"
             )
         plain = self._decompress(chunk)
-        if len(plain) != chunk.uncompressed_size or not _matches(plain, chunk.uncompressed_crc):
+        checksum = chunk.uncompressed_crc
+        if len(plain) != chunk.uncompressed_size or (checksum and zlib.crc32(plain) != checksum):
             raise self._damaged(f"a chunk's content does not match its checksum, after {self._last()}")
         self._total += len(plain)
         if self._total > MAX_TOTAL:
@@ -147,8 +146,8 @@ class McapFile:
             channel = self._parse(records.Channel.read, body, "channel")
             self._channels[channel.id] = channel
         elif code == _METADATA:
-            found = self._parse(records.Metadata.read, body, "metadata")
-            self.metadata[found.name] = dict(found.metadata)
+            result = self._parse(records.Metadata.read, body, "metadata")
+            self.metadata[result.name] = dict(result.metadata)
         elif code == _MESSAGE:
             if len(body) < 22:
                 raise self._damaged("a message is too short")
@@ -174,12 +173,7 @@ class McapFile:
         return FormatError(f"{self._name}: a damaged MCAP file: {reason}.")
 
 
-def _matches(data: bytes, checksum: int) -> bool:
-    return not checksum or zlib.crc32(data) == checksum
-
-
-MAX_VALUES = 1 << 26
-"""Most numbers of one table of values over time."""
+MAX_VALUES = 1 << 26  # most numbers of one table of values over time
 
 Entry = TypeVar("Entry")
 
@@ -224,7 +218,7 @@ class Recorded:
     """Things that were recorded at some times."""
 
     times: Array  # (T,) not decreasing [s]
-    entries: tuple[Any, ...]  # T things
+    entries: tuple[Any, ...]  # T records
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -322,9 +316,9 @@ def read_run_recording(
             by_topic[message.topic].append(message)
     if not by_topic["/model"]:
         topics = sorted({message.topic for message in file.messages})
-        found = f"its topics are {', '.join(topics[:12])}" if topics else "it has no messages"
+        text = f"its topics are {', '.join(topics[:12])}" if topics else "it has no messages"
         raise FormatError(
-            f"{path.name}: no recording of a world, which has a /model of the schema kineverse.Model; {found}"
+            f"{path.name}: no recording of a world, which has a /model of the schema kineverse.Model; {text}"
             f"{'' if file.complete else '; the file was cut'}."
         )
     model = _read_model(by_topic["/model"][0].data, path, root)
@@ -463,12 +457,12 @@ class _Decoder:
         return {name: self._array(rows, key, (4, 4)) for name, rows in members.items()}
 
     def contacts(self, content: dict[str, Any]) -> tuple[Contact, ...]:
-        found = []
+        result = []
         for one in self._member(content, "contacts", list):
             if not isinstance(one, dict):
                 self._refuse(f"{one!r:.60} is no contact")
             force = one.get("force")
-            found.append(
+            result.append(
                 Contact(
                     self.text(one, "a"),
                     self.text(one, "b"),
@@ -478,7 +472,7 @@ class _Decoder:
                     math.nan if force is None else self._number(force, "force"),
                 )
             )
-        return tuple(found)
+        return tuple(result)
 
     def observation(self, content: dict[str, Any]) -> Observation:
         touching = self._member(content, "touching", list)
@@ -492,9 +486,9 @@ class _Decoder:
         )
 
     def vectors(self, content: dict[str, Any]) -> dict[str, tuple[Array, Array]]:
-        found = {}
+        result = {}
         for name, one in self._member(content, "vectors", dict).items():
             if not isinstance(one, dict):
                 self._refuse(f"{one!r:.60} is no vector")
-            found[name] = tuple(self._array(one.get(key), key, (3,)) for key in ("origin", "vector"))
-        return found  # type: ignore[return-value]
+            result[name] = tuple(self._array(one.get(key), key, (3,)) for key in ("origin", "vector"))
+        return result  # type: ignore[return-value]

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 _BANDS = ("#e8eef7", "#ffffff", "#f7efe2", "#ffffff")
-_MOST = 10
-"""Most lines of one plot; those that change most are shown."""
+_MOST = 10  # most lines of one plot; those that change most are shown
 
 _STILL = 1e-6
 

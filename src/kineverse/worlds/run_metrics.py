@@ -43,12 +43,7 @@ from .furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 
 class LimitJudge:
-    """Largest excess of any constraint of a model in successive states.
-
-    Positions are those of the states, speeds are differences of successive states by time; commanded speeds
-    stand in where no coordinate is the integral of a speed. A limit of a speed that depends on the state,
-    such as a lock, is violated if it was at the begin and at the end of a step.
-    """
+    """Largest excess of any constraint of a model in successive states, see *limit violation* above."""
 
     violation: float  # largest excess since the last reset, in the unit of its constraint
     limit: str  # the constraint's name
@@ -105,18 +100,16 @@ class LimitJudge:
         return np.where(np.isnan(self._checker.excess), np.inf, self._checker.excess)
 
 
-CONTACT_GAP = 1e-3
-"""Largest gap of a contact of a push [m]."""
+CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
 
 _STILL = 5e-3
-_TOUCHING = 1e-6
-"""Depth up to which links of a robot touch and do not overlap [m]."""
+_TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap [m]
 
 
 class JudgedOverlap(NamedTuple):
     """Overlap that came in a run."""
 
-    a: str  # bodies
+    a: str  # names of the bodies
     b: str
     depth: float  # largest depth [m]
     value: float  # value of the judged coordinate at which it came [m], [rad]; NaN without a coordinate
@@ -141,7 +134,7 @@ class Judge:
     handle
         Body that is grasped or pushed. Contacts with all bodies that move with it are counted.
     coordinate
-        Coordinate of the object, whose value tells where an overlap came.
+        Coordinate of the object, whose value is noted where an overlap occurs.
     start
         Earlier state in which furniture may have overlapped, such as the one before it was opened.
     scene
@@ -181,8 +174,8 @@ class Judge:
         self._every = as_count("every=", every, 1)
         self._symbols = model.symbols
         self._scene = scene or Scene(model)
-        self._own = [b for b in self._scene.bodies if is_of_robot(b, robot)]
-        if not self._own:
+        self._robot_bodies = [b for b in self._scene.bodies if is_of_robot(b, robot)]
+        if not self._robot_bodies:
             prefixes = {name.partition("/")[0] for name in model.frames}
             raise UnknownNameError(
                 f"No body of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
@@ -194,7 +187,7 @@ class Judge:
         self._speed_place |= {str(v): k for k, v in enumerate(self._robot_speeds)}
         self._scene_values = self._indices(self._scene.inputs)
         self._coordinate, self._start = coordinate, start
-        self._penetrations = self._scene.watch(self._own, radius=0.0)
+        self._penetrations = self._scene.watch(self._robot_bodies, radius=0.0)
         self._furniture = FurnitureOverlaps(self._scene, robot)
         self._first_overlapping: tuple[tuple[str, str], ...] = ()
         self._gripping: dict[str, set[str]] = {}
@@ -233,7 +226,7 @@ class Judge:
         - ``grasp_error`` [m] and ``grasp_rotation`` [rad], NaN if nothing was held
         - ``contact_losses``
         - ``jitter`` [m/s], [rad/s] and ``reversals`` [1/s], NaN without commands
-        - ``distance`` and ``hand_distance``, the ways of the robot's root and of the hand [m]
+        - ``distance`` and ``hand_distance``, the distances of the robot's root and of the hand [m]
         - ``excepted``, pairs of bodies that do not count
         """
         rms = math.sqrt(self._squares / self._seconds) if self._seconds else math.nan
@@ -251,8 +244,8 @@ class Judge:
             "contact_losses": self._losses,
             "jitter": rms,
             "reversals": self._reversals / elapsed if self._commanded and elapsed > 0 else math.nan,
-            "distance": float(self._way[0]),
-            "hand_distance": float(self._way[-1]) if self.gripper is not None else math.nan,
+            "distance": float(self._distances[0]),
+            "hand_distance": float(self._distances[-1]) if self.gripper is not None else math.nan,
             "excepted": self.excepted,
         }
 
@@ -277,16 +270,11 @@ class Judge:
         self._signs = np.zeros(len(self._robot_speeds))
         self._touched = False
         self._held: str | None = None
-        self._way = np.zeros(2)
+        self._distances = np.zeros(2)
         self._places = np.zeros((0, 3))
 
     def update(
-        self,
-        state: State,
-        speeds: StateLike | None = None,
-        *,
-        held: str | None = None,
-        pushing: bool = False,
+        self, state: State, speeds: StateLike | None = None, *, held: str | None = None, pushing: bool = False
     ) -> None:
         """Measure a state, the first one of a run or the one after a step.
 
@@ -319,7 +307,7 @@ class Judge:
         if commanded is not None:
             self._measure_jitter(commanded)
         self._measure_hold(values, held)
-        self._measure_way(values)
+        self._measure_distance(values)
         searches = self._steps % self._every == 0
         if searches or self._touches is not None:
             self._scene.update(values[self._scene_values])
@@ -356,19 +344,18 @@ class Judge:
             )
         motion = FrameDependence(self.model, self.model.speeds)
         group = [b for b in bodies if motion.moving_ancestors(b) == motion.moving_ancestors(handle)]
-        rules = [Rule(a, b, True) for a in self._own for b in group if a != b]
-        self._touches = self._scene.watch(self._own, group, gap, rules=rules)
+        rules = [Rule(a, b, True) for a in self._robot_bodies for b in group if a != b]
+        self._touches = self._scene.watch(self._robot_bodies, group, gap, rules=rules)
 
     def _begin(self) -> None:
         """Except what overlaps at the first state: pairs of the robot, and of furniture as far as it does."""
-        own = set(self._own)
-        found = ((pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_TOUCHING)
-        self._first_overlapping = tuple((a, b) for a, b in found if a in own and b in own)
+        robot = set(self._robot_bodies)
+        result = ((pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_TOUCHING)
+        self._first_overlapping = tuple((a, b) for a, b in result if a in robot and b in robot)
         self._furniture.begin(*(() if self._start is None else (self._start,)))
         self._select_pairs()
 
     def _select_pairs(self) -> None:
-        """Set the flags of excepted pairs."""
         number = {b: k for k, b in enumerate(self._scene.bodies)}
         self._is_excepted = np.zeros((len(number),) * 2, dtype=bool)
         for a, b in self.excepted:
@@ -376,20 +363,20 @@ class Judge:
                 self._is_excepted[number[a], number[b]] = self._is_excepted[number[b], number[a]] = True
 
     def _followed(self) -> tuple[str, ...]:
-        """Return the frames whose ways are measured: the root of what moves of the robot, and the hand."""
+        """Return the frames whose paths are measured: the root of what moves of the robot, and the hand."""
         motion = FrameDependence(self.model, self._robot_speeds)
-        moved = [b for b in self._own if motion.moves(b)] or self._own
+        moved = [b for b in self._robot_bodies if motion.moves(b)] or self._robot_bodies
         root = min(moved, key=lambda b: len(motion.moving_ancestors(b)))
         return (root,) if self.gripper is None else (root, self.gripper.hand)
 
     def _select_speeds(self, speeds: StateLike) -> Array:
         """Return the commanded speeds of the robot; 0 for missing ones."""
-        found = np.zeros(len(self._robot_speeds))
+        result = np.zeros(len(self._robot_speeds))
         for v, value in speeds.items():
             k = self._speed_place.get(v)
             if k is not None:
-                found[k] = value
-        return found
+                result[k] = value
+        return result
 
     # -- measurements --------------------------------------------------------------------------------------
 
@@ -424,18 +411,18 @@ class Judge:
         turned = float(rotation_angle(pose[:3, :3] @ self._pose[:3, :3].T))
         self._slip, self._turn = max(self._slip, apart), max(self._turn, turned)
 
-    def _measure_way(self, values: Array) -> None:
+    def _measure_distance(self, values: Array) -> None:
         places = np.array(self._place(values[self._place_values]))
         if self._first is not None:
-            self._way[: len(places)] += np.linalg.norm(places - self._places, axis=1)
+            self._distances[: len(places)] += np.linalg.norm(places - self._places, axis=1)
         self._places = places
 
     def _measure_penetration(self, state: State, stamp: float) -> None:
-        found = self._penetrations()
-        for k in range(len(found)):
-            i, j = found.body_indices[k].tolist()
+        result = self._penetrations()
+        for k in range(len(result)):
+            i, j = result.body_indices[k].tolist()
             if not self._is_excepted[i, j]:
-                pair = found[k]
+                pair = result[k]
                 self._note_overlap(pair.a, pair.b, -pair.distance, state, stamp)
         for one in self._furniture.find(0.0):
             self._note_overlap(one.a, one.b, one.excess, state, stamp)

@@ -29,11 +29,9 @@ from kineverse.symbols import Symbol
 from .sensors import Sensors
 from .world import Contact, Observation
 
-_INSET = 0.9
-"""Points lie at this fraction of the way from the middle of a shape to its corners."""
+_INSET = 0.9  # points lie at this fraction of the distance from the middle of a shape to its corners
 
-_MOST_SHAPES = 8
-"""Largest number of shapes of a body whose points are tried."""
+_MOST_SHAPES = 8  # largest number of shapes of a body whose points are tried
 
 
 class LineOfSight:
@@ -67,18 +65,17 @@ class LineOfSight:
             return True
         world_T_body = self._scene.pose(body)
         for point in self._points[body] @ world_T_body[:3, :3].T + world_T_body[:3, 3]:
-            way = point - eye
-            distance = float(np.linalg.norm(way))
+            ray = point - eye
+            distance = float(np.linalg.norm(ray))
             if distance == 0.0:
                 return True
-            hit = self._scene.ray(eye, way, distance)
+            hit = self._scene.ray(eye, ray, distance)
             if hit is None or hit.body == body:
                 return True
         return False
 
 
 def _start(model: ModelView, hidden: Iterable[str]) -> Scene:
-    """Return a scene at the default state without some bodies."""
     scene = Scene(model, leave_out=hidden)
     scene.update(model.default_state())
     scene.collision_world.prepare()
@@ -87,19 +84,19 @@ def _start(model: ModelView, hidden: Iterable[str]) -> Scene:
 
 def _inner_points(world: CollisionWorld, body: str) -> Array:
     """Return points (n, 3) inside of the shapes of a body, in its frame [m]."""
-    found: list[Array] = []
+    result: list[Array] = []
     for k in world.members[world.body_index(body)][:_MOST_SHAPES]:
         origin, solid = world.objects[k].shape.origin.matrix, world.solid(k)
         rotation, middle = origin[:3, :3], origin[:3, 3]
         if solid.core is None:
-            found.append(middle)
+            result.append(middle)
             continue
         corners = np.array(
             [support((solid, rotation, middle), rotation @ corner / np.sqrt(3.0)) for corner in _CORNERS]
         )
         middle = corners.mean(axis=0)
-        found += [middle, *(middle + _INSET * (corners - middle))]
-    return np.array(found)
+        result += [middle, *(middle + _INSET * (corners - middle))]
+    return np.array(result)
 
 
 _CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -142,21 +139,13 @@ class SensorSampler:
 
     def __init__(self, sensors: Sensors, model: ModelView, robot: str, seed: int = 0) -> None:
         self.sensors, self._seed = sensors, seed
-        own = [name for name in model.frames if is_of_robot(name, robot)]
-        if not own:
-            prefixes = {name.partition("/")[0] for name in model.frames}
-            raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
-        self.marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
-        found = sensors.camera or find_camera(own)
-        if found is None and (sensors.field_of_view is not None or sensors.sight):
+        seen = find_observed_frames(model, robot, sensors)
+        if not seen.has_camera and (sensors.field_of_view is not None or sensors.sight):
             raise InvalidValueError(
                 f"What is visible depends on a camera, and no frame of '{robot}' is named like one. "
-                f"Name it by camera=. {suggest('head', own, 'frame')}"
+                f"Name it by camera=. {suggest('head', seen.robot, 'frame')}"
             )
-        self.camera = found or own[0]
-        for name in (self.camera, *self.marked):
-            if name not in model.frames:
-                raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
+        self.camera, self.marked = seen.camera, seen.marked
         self._robot = robot
         self._joints = tuple(s for s in model.symbols if is_of_robot(s.path, robot) and not s.order)
         base = find_robot_base(model, robot)
@@ -164,7 +153,7 @@ class SensorSampler:
         self._encoded = tuple(s for s in self._joints if s not in set(self._base))
         # Compiled for the first picture: many worlds are never observed.
         self._seen = [model.fk(name) for name in (self.camera, *self.marked)]
-        self._sight = LineOfSight(model, self.camera, own, self.marked) if sensors.sight else None
+        self._sight = LineOfSight(model, self.camera, seen.robot, self.marked) if sensors.sight else None
         self.reset()
 
     @cached_property
@@ -176,7 +165,7 @@ class SensorSampler:
         return compile_expressions(self._seen[0])
 
     def reset(self) -> None:
-        """Begin anew, with the noise of the same seed and nothing on its way."""
+        """Start again, with the noise of the same seed and no readings pending."""
         streams = np.random.SeedSequence(self._seed).spawn(3)
         self._encoder_noise, self._odometry_noise, self._camera_noise = map(np.random.default_rng, streams)
         self._coming: deque[Observation] = deque()
@@ -206,7 +195,7 @@ class SensorSampler:
         """
         if (now := finite_number(time)) is None or now < self._time:
             raise InvalidValueError(
-                f"Sensors were read at {self._time:.6g} s, and now at {time!r} s; reset() begins anew."
+                f"Sensors were read at {self._time:.6g} s, and now at {time!r} s; reset() starts again."
             )
         if now > self._time:
             self._coming.append(self._capture(now, state, contacts))
@@ -239,7 +228,7 @@ class SensorSampler:
         return Observation(now, joints, poses, frozenset(touching))
 
     def _read_odometry(self, base: Array) -> Array:
-        """Return the readings of the base's coordinates, which drift with the way."""
+        """Return the readings of the base's coordinates, which drift with the distance."""
         if self._last is None and not self._coming:
             self._true_base, self._read_base = base, base.copy()
             return base
@@ -248,8 +237,8 @@ class SensorSampler:
         if self._planar:
             # In the base's own axes: a wrong heading leads the position astray.
             step[:2] = rotation_z(-self._true_base[2])[:2, :2] @ step[:2]
-            way = math.sqrt(np.linalg.norm(step[:2]) + abs(step[2]))
-            step += way * noise * (self.sensors.odometry, self.sensors.odometry, self.sensors.turn)
+            distance = math.sqrt(np.linalg.norm(step[:2]) + abs(step[2]))
+            step += distance * noise * (self.sensors.odometry, self.sensors.odometry, self.sensors.turn)
             step[:2] = rotation_z(self._read_base[2])[:2, :2] @ step[:2]
         else:
             step += self.sensors.odometry * noise * np.sqrt(np.abs(step))
@@ -300,6 +289,29 @@ class SensorSampler:
                 yield from (name for name in (contact.a, contact.b) if is_of_robot(name, self._robot))
 
 
+class ObservedFrames(NamedTuple):
+    """Frames of a robot, that of its camera, and those with markers."""
+
+    robot: tuple[str, ...]
+    camera: str  # the robot's first frame if none is named like a camera
+    marked: tuple[str, ...]
+    has_camera: bool
+
+
+def find_observed_frames(model: ModelView, robot: str, sensors: Sensors) -> ObservedFrames:
+    """Return the frames that sensors concern, or raise UnknownNameError for those that do not exist."""
+    own = tuple(name for name in model.frames if is_of_robot(name, robot))
+    if not own:
+        prefixes = {name.partition("/")[0] for name in model.frames}
+        raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
+    camera = sensors.camera or find_camera(own)
+    marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
+    for name in (camera or own[0], *marked):
+        if name not in model.frames:
+            raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
+    return ObservedFrames(own, camera or own[0], marked, camera is not None)
+
+
 def find_marked_frames(model: ModelView, robot: str) -> tuple[str, ...]:
     """Return the bodies of articulated objects, and the bodies that carry them, in the order of the model.
 
@@ -308,17 +320,16 @@ def find_marked_frames(model: ModelView, robot: str) -> tuple[str, ...]:
     objects = [s for s in model.degrees_of_freedom if not is_of_robot(s.path, robot)]
     motion = FrameDependence(model, objects)
     bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}
-    found = {name for name in bodies if motion.moves(name)}
+    result = {name for name in bodies if motion.moves(name)}
     for name, frame in model.frames.items():
         if motion.moves_between(name, carrier := frame.parent):
             while carrier != WORLD and carrier not in bodies:
                 carrier = model.frames[carrier].parent
-            found.add(carrier)
-    return tuple(name for name in model.frames if name in found and not is_of_robot(name, robot))
+            result.add(carrier)
+    return tuple(name for name in model.frames if name in result and not is_of_robot(name, robot))
 
 
-_CAMERA_WORDS = (("head", "tilt"), ("camera",), ("head",))
-"""Words in the names of frames with a camera, the likeliest first."""
+_CAMERA_WORDS = (("head", "tilt"), ("camera",), ("head",))  # in names, the likeliest first
 
 
 def find_camera(frames: Sequence[str]) -> str | None:

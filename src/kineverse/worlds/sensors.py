@@ -13,8 +13,7 @@ from kineverse._checks import check_flag, finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
 
-NEAR = 0.5
-"""Distance from the camera within which the noise of positions is constant [m]."""
+NEAR = 0.5  # distance from the camera within which the noise of positions is constant [m]
 
 EXAMPLE = "3mm+3mm/m,0.5deg,30Hz,drop=0.1,outliers=0.05,delay=30ms"
 
@@ -49,7 +48,7 @@ class Sensors:
         Standard deviation of the encoders of joints [m], [rad].
     odometry
         Standard deviation of the base's position after one metre, or one radian, of motion [m]. The variance
-        grows with the way.
+        grows with the distance.
     turn
         Standard deviation of the base's heading after one metre, or one radian, of motion [rad].
     touch
@@ -143,14 +142,14 @@ class Sensors:
         """
         if not isinstance(text, str):
             raise InvalidValueError(f"Sensors are stated by a text such as {EXAMPLE!r}, not by {text!r}.")
-        found: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         entries = [] if text.strip() in ("", "none") else text.split(",")
         for entry in map(str.strip, entries):
             for name, value in _parse_entry(entry):
-                if name in found:
+                if name in result:
                     raise DuplicateNameError(f"Noise {text!r} states '{name}' twice, again in {entry!r}.")
-                found[name] = value
-        return cls(**found)
+                result[name] = value
+        return cls(**result)
 
     def __str__(self) -> str:
         """Return the settings as a text that :meth:`parse` reads; marked frames are not part of it."""
@@ -221,11 +220,11 @@ def _parse_entry(entry: str) -> list[tuple[str, Any]]:
             raise UnknownNameError(
                 f"Noise {entry!r} is unknown. {suggest(entry, (*_NAMED, *_WORDS), 'entry')}"
             )
-        found = [_parse_quantity(part.strip(), entry) for part in re.split(r"(?<![eE])\+", entry)]
-        for kind, _ in found:
-            if kind not in _UNNAMED or (len(found) > 1 and kind not in ("length", "slope")):
+        result = [_parse_quantity(part.strip(), entry) for part in re.split(r"(?<![eE])\+", entry)]
+        for kind, _ in result:
+            if kind not in _UNNAMED or (len(result) > 1 and kind not in ("length", "slope")):
                 raise _unreadable(entry)
-        return [(_UNNAMED[kind], number) for kind, number in found]
+        return [(_UNNAMED[kind], number) for kind, number in result]
     if key not in _NAMED:
         raise UnknownNameError(f"Noise {entry!r}: there is no '{key}'. {suggest(key, _NAMED, 'entry')}")
     name, unit = _NAMED[key]

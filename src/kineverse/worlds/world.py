@@ -96,7 +96,7 @@ class World(Protocol):
         """Frame of the body in the robot's gripper; None if it holds nothing."""
 
     def reset(self, state: StateLike) -> None:
-        """Start anew from a state, at time 0, with nothing in the gripper."""
+        """Start again from a state, at time 0, with nothing in the gripper."""
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
         """Advance by a duration with speeds of the robot.

@@ -257,7 +257,7 @@ class _QuerySearch:
             Goal(hand[:3, 3] - self._point.expression, name="position"),
             Keep(_CONE, approach @ self._direction.expression, np.inf, name="approach"),
         )
-        self._solver = InverseKinematics(model, tasks, still=arm.base)
+        self._solver = InverseKinematics(model, tasks, fixed=arm.base)
         self._known = {*self._solver.inputs, *arm.base, *arm.symbols}
         self._home = home = model.default_state().updated(state)
         scene = Scene(model)

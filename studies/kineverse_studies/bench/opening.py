@@ -87,7 +87,7 @@ class Opening:
             If there is none among the solutions that were tried.
         """
         solver = InverseKinematics(
-            self.model, self.tasks[:1], still=[DOOR], scene=scene, margin=2 * MARGIN if scene else 0.0
+            self.model, self.tasks[:1], fixed=[DOOR], scene=scene, margin=2 * MARGIN if scene else 0.0
         )
         for seed in range(_SEEDS):
             found = solver.solve(starts=_STARTS, seed=seed)

@@ -42,7 +42,7 @@ def with_entry(poses: np.ndarray, value: float) -> np.ndarray:
             NOISE,
             "Pose 0 of the child has a number of 1e.200",
         ),
-        (SEEN.parent, SEEN.child, 1e-18 * NOISE, "known to 1e-11"),
+        (SEEN.parent, SEEN.child, 1e-18 * NOISE, "deviation of 1e-11"),
     ],
 )
 def test_identify_refuses_invalid_poses(

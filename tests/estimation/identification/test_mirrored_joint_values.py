@@ -28,7 +28,7 @@ def test_mirrored_joint_values_are_corrected(family: str) -> None:
         family, count=40, position=1e-3, orientation=math.radians(5.0), seed=3, extent=0.4, radius=0.5
     )
     problem = check_observations(seen.parent, seen.child, seen.covariance, seen.covariance)
-    assert problem.softened()
+    assert problem.softened
     motion = GroupMotion(JOINT_FAMILIES[family], 6, seen.left, seen.right)
     joint_prior = JointValuePrior(np.zeros(1), np.full(1, 0.12**-2.0), marginal=True)
     good = levenberg_marquardt(problem, motion, seen.values, seen.true_parent, joint_prior)

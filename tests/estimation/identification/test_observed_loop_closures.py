@@ -242,7 +242,7 @@ def test_a_loop_of_balls_is_reported_and_left_open() -> None:
     poses = seen(truth, ["crank", "rod", "rocker"], values, 0)
     graph = identify_graph(poses, noise=NOISE, families=("rigid", "revolute", "spherical", "planar", "free"))
     assert connected(graph) == ring("world", "crank", "rod", "rocker")
-    with pytest.raises(kv.errors.ModelError, match="cannot follow others, as those of a ball"):
+    with pytest.raises(kv.errors.ModelError, match="cannot depend on others, as those of a ball"):
         graph.model()
     assert {"crank", "rod", "rocker"} == set(graph.model(close=False).frames)
 

@@ -47,7 +47,7 @@ def precise(family: str, whole: bool) -> Observations:
     seen = recording(family, count=12, position=0.001, orientation=0.1, seed=1)
     child = seen.child if whole else seen.child[:, :3, 3]
     result = check_observations(seen.parent, child, seen.covariance, seen.covariance)
-    assert len(result.softened()) > 1
+    assert len(result.softened) > 1
     return result
 
 

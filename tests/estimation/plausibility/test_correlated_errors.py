@@ -20,8 +20,7 @@ from kineverse.estimation import (
 )
 from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.observations import check_observations
-from kineverse.estimation.plausibility.known_motion import KnownJoint
-from kineverse.estimation.plausibility.residuals import compute_residuals
+from kineverse.estimation.plausibility.residuals import KnownJoint, compute_residuals
 from kineverse.lie import exp_so3
 from kineverse_studies.experiments.stream.observations import (
     DOOR,

@@ -14,9 +14,8 @@ from kineverse.estimation import Plausibility, PlausibilityMonitor, check_plausi
 from kineverse.estimation.identification.observations import check_tracks, exact_track, pair_tracks
 from kineverse.estimation.plausibility.consistency import ConsistencyTests, TimedResiduals
 from kineverse.estimation.plausibility.e_process import SequentialTest
-from kineverse.estimation.plausibility.known_motion import KnownJoint
 from kineverse.estimation.plausibility.report import find_testable_joints
-from kineverse.estimation.plausibility.residuals import KnownResiduals, compute_residuals
+from kineverse.estimation.plausibility.residuals import KnownJoint, KnownResiduals, compute_residuals
 
 Array = npt.NDArray[np.float64]
 SOME = ("rigid", "prismatic", "revolute", "free")
@@ -54,7 +53,7 @@ def add_consistency(model: kv.Model, observations: dict[str, Array]) -> dict[str
     judged = {joint: KnownJoint(model, joint.child, joint.parent) for joint in found.joints}
     each = {}
     for joint, served in judged.items():
-        times = np.flatnonzero(known[joint.parent].seen & known[joint.child].seen)
+        times = np.flatnonzero(known[joint.parent].observed & known[joint.child].observed)
         each[joint] = TimedResiduals(
             times, compute_residuals(served, pair_tracks(known[joint.parent], known[joint.child], times))
         )
@@ -82,7 +81,7 @@ def test_limit_set_by_another_coordinate_is_tested() -> None:
         if not explained:
             assert report["drawer"].implausible_since is not None
             assert report["drawer"].replacement is None
-            assert "together with what limits" in report["drawer"].reason
+            assert "together with the limits" in report["drawer"].reason
         # Without observations of the door the limit is unknown.
         alone = check_plausibility(model, {"drawer": observations["drawer"]}, noise=NOISE, families=SOME)
         assert alone["drawer"].explains
@@ -266,7 +265,7 @@ def test_bars_of_a_linkage_are_tested_together_and_replaced(served_linkage: kv.M
     report = check_plausibility(served, observations, noise=NOISE, families=SOME)
     assert [verdict.tag for verdict in report.implausible] == ["rocker"]
     assert report["rocker"].replacement is None
-    assert "by itself it explains what is seen" in report["rocker"].reason
+    assert "it explains the poses alone" in report["rocker"].reason
 
 
 def test_monitor_applies_consistency_tests() -> None:

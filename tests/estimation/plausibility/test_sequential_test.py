@@ -12,8 +12,7 @@ from kineverse.estimation import PlausibilityMonitor, check_plausibility, identi
 from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.plausibility.alternatives import log_displacement_gain, log_evidence
 from kineverse.estimation.plausibility.e_process import SequentialTest
-from kineverse.estimation.plausibility.known_motion import KnownJoint
-from kineverse.estimation.plausibility.residuals import SIZES, KnownResiduals, compute_residuals
+from kineverse.estimation.plausibility.residuals import SIZES, KnownJoint, KnownResiduals, compute_residuals
 
 DOOR, TAG = "kitchen/fridge_door", "joint kitchen/fridge_door"
 HANDLE, FRIDGE = "kitchen/fridge_door_handle", "kitchen/fridge"

@@ -20,8 +20,7 @@ from .mechanism import DARK, PALE, STEEL, WOOD, Mechanism, MechanismPart, box_sh
 
 Point: TypeAlias = tuple[float, float]
 
-_CLEARANCE = 0.007
-"""Distance of the front edges of the walls behind those of the cupboard [m]."""
+_CLEARANCE = 0.007  # distance of the front edges of the walls behind those of the cupboard [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +35,7 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
 
         B = A + (e1, e2)·panel_hinge,      C = B + (f1, f2)·arm_end,      |C - D| = arm
 
-    C is the intersection of two circles, about B and about D. With c = |arm_end|, d = |D - B| and
+    C is the intersection of two circles, about B and about D. With ``c = |arm_end|``, ``d = |D - B|`` and
     w = (D - B)/d:
 
         C - B = m w + h (w_z, -w_x),       m = (c² + d² - arm²)/2d,       h = √(c² - m²)
@@ -167,7 +166,6 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
         }
 
     def _arm_end_from(self, bx: Expression, bz: Expression) -> tuple[Expression, Expression]:
-        """Return C - B."""
         c = math.hypot(*self.arm_end)
         to_x, to_z = self.arm_pivot[0] - bx, self.arm_pivot[1] - bz
         square = to_x**2 + to_z**2
@@ -227,7 +225,7 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
 
         base_T_door = translation(0, 0, l (1 - cos α)) · rotation_y(α)
 
-    Surprise first: the coordinate is α, and not the papers' position a = l cos α, which is l when closed and
+    Note that the coordinate is α, and not the papers' position a = l cos α, which is l when closed and
     0 when open. There α = arccos(a/l) has an infinite slope at a = l, exactly where the door is locked. With
     ``form="published"`` the coordinate is a, and the height is l - a, because the a that Eq. 12 prints is not
     0 at the floor when closed.
@@ -253,7 +251,7 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
     play
         Largest distance of a from l at which the bolt still catches [m].
     speed
-        Limit of |q̇| while it is unlocked [rad/s], or as published [m/s].
+        Limit of ``|q̇|`` while it is unlocked [rad/s], or as published [m/s].
 
     Raises
     ------

@@ -38,7 +38,7 @@ class HingedDoor(Mechanism):
 
     main: ClassVar[str] = "door"
 
-    width: float = 0.8  # dimensions of the door [m]
+    width: float = 0.8  # [m]
     height: float = 2.0
     thickness: float = 0.04
     door: Limits = Limits(0.0, 1.9, 1.5)  # limits of q
@@ -157,8 +157,8 @@ class SprungDoor(HingedDoor):
 
     catch: float  # displacement of the bolt or the button that opens the lock [m]
     play: float = 0.003  # largest angle at which the door counts as shut [rad]
-    stiffness: float = 300.0  # [N/m], [m]
-    rest: float = -0.01
+    stiffness: float = 300.0  # of the spring, stiffness·(rest - b) on a coordinate b [N/m]
+    rest: float = -0.01  # [m]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -39,7 +39,7 @@ class ScissorLift(Mechanism, document_kind="ScissorLift"):
 
         slider at L cos q,      crossing i = 1 … n at (L/2 cos q, L (i - ½) sin q),      height n L sin q
 
-    Surprise first: the coordinate is not the height h. As functions of the angle all of these are smooth
+    Note that the coordinate is not the height h. As functions of the angle all of these are smooth
     everywhere. As functions of the height they have infinite slopes when the arms stand upright,
     dq/dh = 1/(n L cos q); there the slider is at its end as well. So limits of the height are limits of the
     angle, arcsin(h/(n L)).

@@ -28,8 +28,8 @@ class ScrewAndNut(Mechanism, document_kind="ScrewAndNut"):
         base_T_screw = rotation_z(q),       base_T_nut = translation(0, 0, s)
         s = t - p q/2π  for p > 0,          s = -p q/2π  for p < 0
 
-    both from q = 0 to 2πt/|p|. Surprise first: turned to the left, as seen from its end at +z, a right-handed
-    screw pulls the nut *towards* z = 0. So the nut of a right-handed screw starts at the far end.
+    both from q = 0 to ``2πt/|p|``. Turned to the left, as seen from its end at +z, a right-handed screw pulls
+    the nut *towards* z = 0. So the nut of a right-handed screw starts at the far end.
 
     Frames are ``base``, ``screw`` and ``nut``.
 
@@ -42,7 +42,7 @@ class ScrewAndNut(Mechanism, document_kind="ScrewAndNut"):
     radius
         Radius of the screw [m].
     velocity
-        Limit of |q̇| [rad/s]; None for no limit.
+        Limit of ``|q̇|`` [rad/s]; None for no limit.
 
     Raises
     ------

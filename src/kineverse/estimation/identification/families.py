@@ -28,9 +28,9 @@ VX, VY, VZ, WX, WY, WZ = range(6)
 
 @dataclass(frozen=True, slots=True)
 class Parametrisation:
-    """Components of the joint values and of the parameters."""
+    """Components of (v, ω) that are joint values or parameters."""
 
-    joints: tuple[int, ...]  # components of (v, ω) that are joint values
+    joints: tuple[int, ...]  # joint values
     left: tuple[int, ...]  # components of the twist that moves L, in the axes of L
     right: tuple[int, ...]  # components of the twist that moves R, applied on its left
 
@@ -39,73 +39,30 @@ class Parametrisation:
 class JointFamily:
     """Joint family."""
 
-    name: str  # name of the family, as in result["revolute"]
-    poses: Parametrisation  # parametrisation for observed poses of the child
-    positions: Parametrisation  # parametrisation for observed positions only
+    name: str
+    poses: Parametrisation  # for observed poses of the child
+    positions: Parametrisation  # for observed positions only
     pitch: bool = False  # True if the joint translates along z by a pitch [m/rad] as it rotates
     reach: int = 0  # number of components of the child's position in the joint's frame that are a lever
-    slides: int = 0
+    slides: int = 0  # number of components of the sliding point
 
     def parametrisation(self, rows: int) -> Parametrisation:
         """Return the parametrisation for poses (6 rows) or positions (3 rows)."""
         return self.poses if rows == 6 else self.positions
 
 
-_LINE = (VX, VY, WX, WY)
-JOINT_FAMILIES: Mapping[str, JointFamily] = MappingProxyType(
-    {
-        group.name: group
-        for group in (
-            JointFamily(
-                "rigid",
-                Parametrisation((), (), (VX, VY, VZ, WX, WY, WZ)),
-                Parametrisation((), (), (VX, VY, VZ)),
-            ),
-            JointFamily(
-                "prismatic",
-                Parametrisation((VZ,), (WX, WY), (VX, VY, WX, WY, WZ)),
-                Parametrisation((VZ,), (WX, WY), (VX, VY)),
-            ),
-            JointFamily(
-                "revolute",
-                Parametrisation((WZ,), _LINE, (VX, VY, VZ, WX, WY)),
-                Parametrisation((WZ,), _LINE, (VX, VZ)),
-                reach=2,
-            ),
-            JointFamily(
-                "screw",
-                Parametrisation((WZ,), _LINE, (VX, VY, VZ, WX, WY)),
-                Parametrisation((WZ,), _LINE, (VX, VZ)),
-                pitch=True,
-                reach=2,
-            ),
-            JointFamily(
-                "cylindrical",
-                Parametrisation((VZ, WZ), _LINE, (VX, VY, WX, WY)),
-                Parametrisation((VZ, WZ), _LINE, (VX,)),
-                reach=2,
-            ),
-            JointFamily(
-                "spherical",
-                Parametrisation((WX, WY, WZ), (VX, VY, VZ), (VX, VY, VZ)),
-                Parametrisation((WY, WZ), (VX, VY, VZ), (VX,)),
-                reach=3,
-            ),
-            JointFamily(
-                "planar",
-                Parametrisation((VX, VY, WZ), (WX, WY), (VZ, WX, WY)),
-                Parametrisation((VX, VY), (WX, WY), (VZ,)),
-                slides=2,
-            ),
-            JointFamily(
-                "free",
-                Parametrisation((VX, VY, VZ, WX, WY, WZ), (), ()),
-                Parametrisation((VX, VY, VZ), (), ()),
-                slides=3,
-            ),
-        )
-    }
+_P, _V, _VW, _LINE = Parametrisation, (VX, VY, VZ), (VX, VY, VZ, WX, WY, WZ), (VX, VY, WX, WY)
+_FAMILIES = (
+    JointFamily("rigid", _P((), (), _VW), _P((), (), _V)),
+    JointFamily("prismatic", _P((VZ,), (WX, WY), (VX, VY, WX, WY, WZ)), _P((VZ,), (WX, WY), (VX, VY))),
+    JointFamily("revolute", _P((WZ,), _LINE, (*_V, WX, WY)), _P((WZ,), _LINE, (VX, VZ)), reach=2),
+    JointFamily("screw", _P((WZ,), _LINE, (*_V, WX, WY)), _P((WZ,), _LINE, (VX, VZ)), pitch=True, reach=2),
+    JointFamily("cylindrical", _P((VZ, WZ), _LINE, (VX, VY, WX, WY)), _P((VZ, WZ), _LINE, (VX,)), reach=2),
+    JointFamily("spherical", _P((WX, WY, WZ), _V, _V), _P((WY, WZ), _V, (VX,)), reach=3),
+    JointFamily("planar", _P((VX, VY, WZ), (WX, WY), (VZ, WX, WY)), _P((VX, VY), (WX, WY), (VZ,)), slides=2),
+    JointFamily("free", _P(_VW, (), ()), _P(_V, (), ()), slides=3),
 )
+JOINT_FAMILIES: Mapping[str, JointFamily] = MappingProxyType({family.name: family for family in _FAMILIES})
 """Families by name. ``rigid`` has no joint values, and ``free`` has no parameters."""
 
 PITCHES = 0.1
@@ -119,15 +76,15 @@ REACH = 1.0
 class GroupMotion:
     """Member of a joint family, parent_T_child = L · g(a) · R."""
 
-    group: JointFamily  # family
+    group: JointFamily
     rows: int  # 6, or 3 for positions only
     left: Array  # L and R, (4, 4)
     right: Array
-    pitch: float = 0.0  # pitch [m/rad]; 0 for families without one
+    pitch: float = 0.0  # [m/rad]; 0 for families without one
 
     @property
     def parametrisation(self) -> Parametrisation:
-        """Components of the joint values and of the parameters."""
+        """Components that are joint values or parameters."""
         return self.group.parametrisation(self.rows)
 
     @property
@@ -143,7 +100,7 @@ class GroupMotion:
 
     @property
     def slides(self) -> int:
-        """Number of unknown components of the sliding point, see :mod:`.ambiguities`."""
+        """Number of unknown components of the sliding point, see :mod:`.joint_values`."""
         return self.group.slides if self.rows == 6 else 0
 
     @property
@@ -164,32 +121,24 @@ class GroupMotion:
         l_R, r_p = self.left[:3, :3], self.right[:3, 3]
         parent_R_joint = l_R @ turn
         lever = parent_R_joint @ r_p
-        way = slide @ l_R.T
-        parent_T_child = transform(parent_R_joint @ self.right[:3, :3], self.left[:3, 3] + way + lever)
+        arm = slide @ l_R.T + lever
+        parent_T_child = transform(parent_R_joint @ self.right[:3, :3], self.left[:3, 3] + arm)
         moved = _columns(parent_R_joint, lever)
-        blocks = [_columns(np.broadcast_to(l_R, turn.shape), way + lever)[:, :, freedom.left]]
+        blocks = [_columns(np.broadcast_to(l_R, turn.shape), arm)[:, :, freedom.left]]
         blocks.append(moved[:, :, freedom.right])
         if self.group.pitch:
             along = np.zeros((len(values), 6, 1))
             along[:, :3, 0] = l_R[:, 2] * twist[:, WZ, None]
             blocks.append(along)
-        by_joints = self._by_joints(moved, twist)[:, :, freedom.joints]
-        rows = self.rows
-        return LinearisedPoses(parent_T_child, np.concatenate(blocks, axis=2)[:, :rows], by_joints[:, :rows])
-
-    def _by_joints(self, moved: Array, twist: Array) -> Array:
-        result = np.empty_like(moved)
+        by_joints = moved.copy()
         # Translations come before the rotation, so they are along the axes of L.
-        result[:, :3, :3] = self.left[:3, :3]
-        result[:, 3:, :3] = 0.0
-        joints = self.parametrisation.joints
-        if WX in joints or WY in joints:
-            result[:, :, 3:] = moved[:, :, 3:] @ right_jacobian(twist[:, 3:])
-        else:
-            result[:, :, 3:] = moved[:, :, 3:]
+        by_joints[:, :3, :3], by_joints[:, 3:, :3] = l_R, 0.0
+        if WX in freedom.joints or WY in freedom.joints:
+            by_joints[:, :, 3:] = moved[:, :, 3:] @ right_jacobian(twist[:, 3:])
         if self.group.pitch:
-            result[:, :3, WZ] += self.pitch * self.left[:3, 2]
-        return result
+            by_joints[:, :3, WZ] += self.pitch * l_R[:, 2]
+        by_joints, rows = by_joints[:, :, freedom.joints], self.rows
+        return LinearisedPoses(parent_T_child, np.concatenate(blocks, axis=2)[:, :rows], by_joints[:, :rows])
 
     def retract(self, step: Array) -> Self:
         """Return the motion after a step in the parameters."""
@@ -210,8 +159,7 @@ class GroupMotion:
         turning = [j >= WX for j in self.parametrisation.joints]
         step = step.copy()
         step[:, turning] = np.clip(step[:, turning], -0.5, 0.5)
-        result: Array = values + step
-        return result
+        return np.asarray(values + step)
 
     @property
     def name(self) -> str:
@@ -275,15 +223,11 @@ class GroupMotion:
 
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of the parameters, in their order."""
-        letters = "xyz"
-        left = [
-            f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in self.parametrisation.left
-        ]
-        right = [
-            f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}"
-            for j in self.parametrisation.right
-        ]
-        return (*left, *right, *(["pitch"] if self.group.pitch else []))
+        of_left = [f"{part}.{letter}" for part in ("point", "axis") for letter in "xyz"]
+        of_right = [f"child.{letter}" for letter in ("x", "y", "z", "rx", "ry", "rz")]
+        left, right = self.parametrisation.left, self.parametrisation.right
+        pitch = ["pitch"] if self.group.pitch else []
+        return (*(of_left[j] for j in left), *(of_right[j] for j in right), *pitch)
 
     def prior(self) -> ParameterPrior:
         """Return the Gaussian prior of levers and pitch."""
@@ -372,8 +316,7 @@ class Family:
         others = sorted(str(s) for s in self.transform.symbols if s not in known)
         if others:
             raise UnknownNameError(
-                f"The transform of the family '{self.name}' depends on {', '.join(others)}, and that is "
-                "neither a joint nor a parameter of it."
+                f"The family '{self.name}' depends on {', '.join(others)}: neither a joint nor a parameter."
             )
         object.__setattr__(self, "parameters", {s: FamilyParameter(*u) for s, u in self.parameters.items()})
         for symbol, (low, high) in self.joints.items():
@@ -382,8 +325,7 @@ class Family:
         for symbol, unknown in self.unknowns.items():
             if not (unknown.deviation > 0.0 and unknown.lower <= unknown.start <= unknown.upper):
                 raise InvalidValueError(
-                    f"The parameter '{symbol}' has a positive deviation, and a start within its bounds; not "
-                    f"{unknown}."
+                    f"'{symbol}' has a positive deviation, and a start within its bounds, not {unknown}."
                 )
 
     @property
@@ -402,7 +344,7 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class FamilyMotion:
-    """Member of a custom family. Lengths of its poses are in a unit [m], see :mod:`.scale`."""
+    """Member of a custom family. Lengths of its poses are in a unit [m], see :mod:`.normalisation`."""
 
     family: Family
     rows: int
@@ -426,7 +368,7 @@ class FamilyMotion:
 
     @property
     def kinds(self) -> tuple[int, ...]:
-        """Kind of each joint value: each has a range of its own."""
+        """Kind of each joint value, all different: each has its range."""
         return tuple(range(self.joints))
 
     def linearise(self, values: Array) -> LinearisedPoses:
@@ -460,8 +402,8 @@ class FamilyMotion:
     def log_prior(self, mean: Array) -> tuple[float, Array]:
         """Return the log prior of the parameters and of the mean joint values, and its precision.
 
-        The joints of :mod:`.families` also have a mean pose with the density 1. Here the parameters determine
-        the mean pose, so the density of a pose within reach is divided out.
+        Members of a group also have a mean pose with the density 1. Here the parameters determine the mean
+        pose, so the density of a pose within reach is divided out.
         """
         _, deviation = self._prior_moments()
         off = self.prior().residuals
@@ -480,10 +422,9 @@ class FamilyMotion:
 
     def expression(self, joints: Sequence[Expression]) -> Expression:
         """Return the pose of the child in the parent as an expression of other joint symbols."""
-        values = dict(zip(self.family.parameters, self.parameters.tolist(), strict=True))
-        return self.family.transform.substitute(
-            {**dict(zip(self.family.joints, joints, strict=True)), **values}
-        )
+        values = dict(zip(self.family.joints, joints, strict=True))
+        values |= zip(self.family.parameters, self.parameters.tolist(), strict=True)
+        return self.family.transform.substitute(values)
 
     def _prior_moments(self) -> tuple[Array, Array]:
         unknowns = self.family.unknowns.values()
@@ -494,12 +435,10 @@ def family_starts(
     family: Family, observations: Observations, unit: float
 ) -> Iterator[tuple[FamilyMotion, Array]]:
     """Yield initial members of a family, at its start and around it, with the nearest joint values."""
-    motion = FamilyMotion(
-        family, observations.rows, np.array([u.start for u in family.unknowns.values()]), unit
-    )
+    start = np.array([u.start for u in family.unknowns.values()])
+    motion = FamilyMotion(family, observations.rows, start, unit)
     # A fixed seed makes the result reproducible.
-    random = np.random.default_rng(0)
-    _, deviation = motion._prior_moments()
+    random, (_, deviation) = np.random.default_rng(0), motion._prior_moments()
     for k in range(_MEMBERS if motion.size else 1):
         member = motion.retract(random.normal(0.0, deviation)) if k else motion
         yield member, _nearest(member, observations)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from kineverse.lie import Array, inverse, log_so3, mean_rotation, rotation_along_z, transform
+from kineverse.lie import Array, inverse, log_so3, mean_rotation, rotation_along_z, transform, translation
 
 from .families import JOINT_FAMILIES, GroupMotion, JointFamily
 from .least_squares import InitialGuess
@@ -53,7 +52,7 @@ class MotionStatistics:
     @cached_property
     def axis_rotations(self) -> list[_AxisRotation]:
         """Rotations about the candidate axes, the starts of revolute, screw and cylindrical joints."""
-        return [rotation_guess for plane in self.planes for rotation_guess in _find_rotations(self, *plane)]
+        return [rotation for plane in self.planes for rotation in _find_rotations(self, *plane)]
 
     @cached_property
     def planes(self) -> list[tuple[Array, Array]]:
@@ -90,9 +89,14 @@ def initial_guesses(name: str, statistics: MotionStatistics) -> Iterator[Initial
                 values[:, 2] = statistics.turns @ frame[:, 2]
             yield start(frame, mean[:3, 3], values[:, : len(group.parametrisation(rows).joints)])
     elif name == "spherical":
-        yield from _guess_about_point(statistics, group.parametrisation(rows).joints, start)
+        yield _guess_about_point(group, statistics)
     else:
-        yield from _guess_about_axis(group, statistics)
+        for rotation in statistics.axis_rotations:
+            left, right, angles, along, slope = rotation
+            if name == "screw" and rows == 6 and (many := _guess_screw_revolutions(group, rotation)):
+                yield many
+            values = angles[:, None] if name != "cylindrical" else np.column_stack([along, angles])
+            yield InitialGuess(GroupMotion(group, rows, left, right, slope if group.pitch else 0.0), values)
 
 
 class _AxisRotation(NamedTuple):
@@ -113,10 +117,18 @@ def _find_rotations(statistics: MotionStatistics, frame: Array, places: Array) -
             left = transform(frame, centre + frame[:, :2] @ place)
             yield _AxisRotation(left, inverse(left) @ statistics.mean, angles, along, _slope(angles, along))
         return
-    for place in (_fit_centre(flat), *_short_arc_centres(flat)):
+    # The centre of the circle through noisy points is biased towards them. If the arc is no higher than the
+    # noise, no step leads from there to the circle on which the points lie. So centres on both sides are
+    # tried, too.
+    directions = _principal_directions(flat)
+    deviation = math.sqrt(float(np.mean((flat @ directions[0]) ** 2)))
+    offsets = [sign * radius * deviation for radius in ARC_RADII for sign in (1.0, -1.0)]
+    for place in (_fit_centre(flat), *(offset * directions[1] for offset in offsets)):
         lever = flat - place
         # At joint value 0 the child lies on the x axis of L.
-        middle = _mean_direction(lever)
+        middle = lever.mean(axis=0)
+        length = np.linalg.norm(middle)
+        middle = middle / length if length > 0 else np.array([1.0, 0.0])
         turned = np.column_stack([middle, [-middle[1], middle[0]]])
         x, y = (lever @ turned).T
         left = transform(np.column_stack([frame[:, :2] @ turned, frame[:, 2]]), centre + frame[:, :2] @ place)
@@ -125,61 +137,36 @@ def _find_rotations(statistics: MotionStatistics, frame: Array, places: Array) -
         yield _AxisRotation(left, right, angles, along, _slope(angles, along))
 
 
-def _short_arc_centres(flat: Array) -> Iterator[Array]:
-    """Yield centres on both sides of points (N, 2) along an arc.
-
-    The centre of the circle through noisy points is biased towards them. If the arc is no higher than the
-    noise, no step leads from there to the circle on which the points lie.
-    """
-    along, across = _principal_directions(flat)
-    deviation = math.sqrt(float(np.mean((flat @ along) ** 2)))
-    for radius in ARC_RADII:
-        yield radius * deviation * across
-        yield -radius * deviation * across
-
-
 def _slope(angles: Array, along: Array) -> float:
     off = angles - angles.mean()
     variance = float(off @ off)
     return float(off @ along) / variance if variance > 0.0 else 0.0
 
 
-def _guess_about_axis(group: JointFamily, statistics: MotionStatistics) -> Iterator[InitialGuess]:
-    rows = statistics.rows
-    for rotation_guess in statistics.axis_rotations:
-        left, right, angles, along, slope = rotation_guess
-        if group.name == "screw" and rows == 6 and (many := _guess_screw_revolutions(group, rotation_guess)):
-            yield many
-        values = angles[:, None] if group.name != "cylindrical" else np.column_stack([along, angles])
-        yield InitialGuess(GroupMotion(group, rows, left, right, slope if group.pitch else 0.0), values)
-
-
-def _guess_screw_revolutions(group: JointFamily, rotation_guess: _AxisRotation) -> InitialGuess | None:
+def _guess_screw_revolutions(group: JointFamily, rotation: _AxisRotation) -> InitialGuess | None:
     """Return a screw whose revolutions are counted along its displacement, or None for less than one."""
-    order = np.argsort(rotation_guess.along, kind="stable")
-    angles = rotation_guess.angles[order]
+    order = np.argsort(rotation.along, kind="stable")
+    angles = rotation.angles[order]
     if np.abs(np.diff(angles)).max() <= math.pi:
         return None
     unwrapped = np.empty_like(angles)
     unwrapped[order] = np.unwrap(angles)
     if np.ptp(unwrapped) <= math.tau:
         return None
-    slope, offset = np.polyfit(unwrapped, rotation_guess.along, 1)
-    right = rotation_guess.right.copy()
+    slope, offset = np.polyfit(unwrapped, rotation.along, 1)
+    right = rotation.right.copy()
     right[2, 3] += offset
-    return InitialGuess(GroupMotion(group, 6, rotation_guess.left, right, float(slope)), unwrapped[:, None])
+    return InitialGuess(GroupMotion(group, 6, rotation.left, right, float(slope)), unwrapped[:, None])
 
 
-def _guess_about_point(statistics, joints, start) -> Iterator[InitialGuess]:  # type: ignore[no-untyped-def]
-    count = len(statistics.poses)
+def _guess_about_point(group: JointFamily, statistics: MotionStatistics) -> InitialGuess:
     p, mean = statistics.positions, statistics.mean
     if statistics.rows == 6:
         # p = c + R q, linear in the centre c and the lever q.
         rotations = statistics.poses[:, :3, :3]
-        matrix = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), rotations], axis=2).reshape(-1, 6)
-        centre = _solve_ridge(matrix, (p - mean[:3, 3]).ravel())[:3] + mean[:3, 3]
-        yield start(np.eye(3), centre, statistics.turns)
-        return
+        matrix = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), rotations], axis=2).reshape(-1, 6)
+        left = translation(_solve_ridge(matrix, (p - mean[:3, 3]).ravel())[:3] + mean[:3, 3])
+        return InitialGuess(GroupMotion(group, 6, left, inverse(left) @ mean), statistics.turns)
     centre = _fit_centre(p - mean[:3, 3]) + mean[:3, 3]
     lever = p - centre
     radius = float(np.mean(np.linalg.norm(lever, axis=1)))
@@ -189,22 +176,13 @@ def _guess_about_point(statistics, joints, start) -> Iterator[InitialGuess]:  # 
     turn = np.linalg.norm(local[:, 1:], axis=1)
     angle = np.arctan2(turn, local[:, 0]) / np.where(turn > 0, turn, 1.0)
     values = np.column_stack([-local[:, 2] * angle, local[:, 1] * angle])
-    result = start(frame, centre, values)
-    right = np.eye(4)
-    right[0, 3] = radius
-    yield InitialGuess(replace(result.motion, right=right), result.values)
+    right = translation(np.array([radius, 0.0, 0.0]))
+    return InitialGuess(GroupMotion(group, 3, transform(frame, centre), right), values)
 
 
 def _principal_directions(centred: Array) -> Array:
     """Return the principal directions (3, 3) as rows, the largest spread first."""
-    result: Array = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].T
-    return result
-
-
-def _mean_direction(lever: Array) -> Array:
-    middle = lever.mean(axis=0)
-    length = np.linalg.norm(middle)
-    return middle / length if length > 0 else np.array([1.0, 0.0])
+    return np.asarray(np.linalg.eigh(centred.T @ centred)[1][:, ::-1].T)
 
 
 def _fit_centre(points: Array) -> Array:
@@ -227,7 +205,6 @@ def _fit_pivot(flat: Array, angles: Array) -> Array:
 
 
 def _solve_ridge(matrix: Array, target: Array) -> Array:
-    """Return the least-squares solution x of A x = b, with a small ridge term."""
     normal = matrix.T @ matrix
     normal.flat[:: len(normal) + 1] += 1e-6
     return np.asarray(np.linalg.solve(normal, matrix.T @ target), dtype=np.float64)

@@ -26,17 +26,9 @@ Families: TypeAlias = "Iterable[str | Family] | Mapping[str | Family, float] | s
 """Names of families, or custom families. A mapping assigns prior weights."""
 
 WEIGHTS: Mapping[str, float] = MappingProxyType(
-    {
-        "rigid": 1.0,
-        "prismatic": 1.0,
-        "revolute": 1.0,
-        "screw": 0.01,
-        "cylindrical": 0.01,
-        "spherical": 0.01,
-        "planar": 0.01,
-        "free": 0.0001,
-        CURVE: 0.01,
-    }
+    dict.fromkeys(("rigid", "prismatic", "revolute"), 1.0)
+    | dict.fromkeys(("screw", "cylindrical", "spherical", "planar"), 0.01)
+    | {"free": 0.0001, CURVE: 0.01}
 )
 """Prior weights of the families. A screw, cylindrical, spherical or planar joint contains simpler joints as
 special cases and is rarer, and so is a curve; a free joint is rarer still."""
@@ -70,14 +62,14 @@ def identify(
     families
         Families to compare; None for all of :data:`WEIGHTS`. A mapping also assigns prior weights.
     noise
-        Covariance of the parts that have none of their own. If no covariance is given at all, the sizes of
-        position and orientation noise are unknown and integrated out, see :mod:`.unknown_noise`.
+        Default covariance of both parts. Without any covariance, the sizes of position and orientation noise
+        are unknown and integrated out, see :mod:`.noise_estimation`.
     outliers
         Outlier model, or True for the default :class:`.Outliers`. Fewer than half of the observations may be
         outliers.
     sequential
         True if the observations are in temporal order, with less than half a revolution from one to the
-        next. Revolutions are counted then, see :mod:`.unwrapping`.
+        next. Revolutions are counted then.
     correlation_time
         Number of observations τ that are worth one independent observation. The log likelihood is divided
         by it, and the covariances of parameters are multiplied by it. 1 stands for independent errors.
@@ -103,9 +95,8 @@ def identify(
         raise InvalidValueError(
             f"The correlation time is a number of observations, at least 1, not {correlation_time!r}."
         )
-    data = prepare_data(
-        observations, stated, as_outliers(outliers), sequential, observation_weight=1.0 / correlation_time
-    )
+    weight = 1.0 / correlation_time
+    data = prepare_data(observations, stated, as_outliers(outliers), sequential, observation_weight=weight)
     return weigh_and_check(data, solve_joints(data, weights), weights).result
 
 
@@ -116,13 +107,11 @@ def resolve_noise(
     noise: npt.ArrayLike | None,
 ) -> tuple[npt.ArrayLike, npt.ArrayLike, bool]:
     """Return the covariances of parent and child, and True if they were stated."""
-    if noise is not None or (
-        child_covariance is not None and (parent_covariance is not None or not has_parent)
-    ):
-        missing: npt.ArrayLike = np.eye(6) if noise is None else noise
-        parent, child = (missing if c is None else c for c in (parent_covariance, child_covariance))
-        return parent, child, True
-    if parent_covariance is not None or child_covariance is not None:
+    parent = noise if parent_covariance is None else parent_covariance
+    child = noise if child_covariance is None else child_covariance
+    if child is not None and (parent is not None or not has_parent):
+        return np.eye(6) if parent is None else parent, child, True
+    if parent is not None or child is not None:
         raise InvalidValueError(
             "One part has a covariance and the other has none. Give both, or the same for both as noise."
         )
@@ -136,16 +125,15 @@ def family_weights(families: Families) -> dict[str | Family, float]:
         families = WEIGHTS
     elif isinstance(families, (str, Family)):
         families = [families]
-    given = dict(families) if isinstance(families, Mapping) else dict.fromkeys(families)
-    if not given:
+    weights = dict(families) if isinstance(families, Mapping) else dict.fromkeys(families)
+    if not weights:
         raise InvalidValueError("There is no family to try.")
-    for name, weight in given.items():
+    result: dict[str | Family, float] = {}
+    for name, weight in weights.items():
         if isinstance(name, str) and name not in WEIGHTS:
             raise UnknownNameError(f"There is no family {name!r}. {suggest(str(name), WEIGHTS, 'family')}")
         if weight is not None and not (math.isfinite(weight) and weight > 0.0):
             raise InvalidValueError(f"The weight of the family {name!r} is positive, not {weight!r}.")
-    result: dict[str | Family, float] = {}
-    for name, weight in given.items():
-        usual = name.weight if isinstance(name, Family) else WEIGHTS[name]
-        result[name] = usual if weight is None else float(weight)
+        default = name.weight if isinstance(name, Family) else WEIGHTS[name]
+        result[name] = default if weight is None else float(weight)
     return result

@@ -7,7 +7,7 @@ elsewhere, so the joints of this module have a mount: joint_T_child = motion(q) 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,13 +26,14 @@ from kineverse.articulations import (
     Screw,
 )
 from kineverse.articulations.limits import FREE
+from kineverse.expressions.expression import Expression
 from kineverse.lie import Array, mean_rotation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Operation, Writes
 from kineverse.model.read_recorder import ReadRecorder
 from kineverse.spatial import translation
-from kineverse.symbols import position
+from kineverse.symbols import Symbol, position
 
 from .curve import CurveMotion
 from .families import Family, FamilyMotion, GroupMotion
@@ -87,25 +88,13 @@ class SlidingPoint(Joint, document_kind="SlidingPoint"):
     Coordinates are ``name/x``, ``name/y`` and, in space, ``name/z`` [m].
     """
 
-    ranges: tuple[tuple[float, float], ...]  # range seen of each coordinate [m]; home is in the middle
+    ranges: tuple[tuple[float, float], ...]  # observed range of each coordinate [m]; home is in the middle
     limited: bool = True  # True if the coordinates are limited to the range
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the coordinates and their limits."""
-        self.check_free(model)
         names = [f"{self.name}/{axis}" for axis, _ in zip("xyz", self.ranges, strict=False)]
-        q = tuple(position(name) for name in names)
-        constraints: dict[str, Constraint] = {}
-        for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
-            if self.limited:
-                constraints.update(Limits(low, high).constraints(name, coordinate))
-        home = tuple(0.5 * (low + high) for low, high in self.ranges)
-        place = translation(*q, *([0.0] * (3 - len(q))))
-        return Writes(
-            frames={self.child: (self.parent, (self.origin, place))},
-            constraints=constraints,
-            articulations={self.name: self.record(q, home, tuple(c.derivative() for c in q))},
-        )
+        return _writes(self, model, names, lambda q: translation(*q, *([0.0] * (3 - len(q)))))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,25 +104,33 @@ class FamilyJoint(Joint, document_kind="FamilyJoint"):
     A single coordinate is ``name``. Several are named like the joints of the family, below ``name``.
     """
 
-    motion: FamilyMotion  # member of the family
-    ranges: tuple[tuple[float, float], ...]  # range seen of its joint values; home is in the middle
+    motion: FamilyMotion
+    ranges: tuple[tuple[float, float], ...]  # observed range of its joint values; home is in the middle
     limited: bool = True  # True if the joint values are limited to the range
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the coordinates and their limits."""
-        self.check_free(model)
-        names = family_coordinates(self.motion, self.name)
-        q = tuple(position(name) for name in names)
-        home = tuple(0.5 * (low + high) for low, high in self.ranges)
-        constraints: dict[str, Constraint] = {}
-        for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
-            if self.limited:
-                constraints.update(Limits(low, high).constraints(name, coordinate))
-        return Writes(
-            frames={self.child: (self.parent, (self.origin, self.motion.expression(q)))},
-            constraints=constraints,
-            articulations={self.name: self.record(q, home, tuple(c.derivative() for c in q))},
-        )
+        return _writes(self, model, family_coordinates(self.motion, self.name), self.motion.expression)
+
+
+def _writes(
+    joint: SlidingPoint | FamilyJoint,
+    model: ReadRecorder,
+    names: Sequence[str],
+    pose: Callable[[tuple[Symbol, ...]], Expression],
+) -> Writes:
+    joint.check_free(model)
+    q = tuple(position(name) for name in names)
+    home = tuple(0.5 * (low + high) for low, high in joint.ranges)
+    constraints: dict[str, Constraint] = {}
+    for name, coordinate, (low, high) in zip(names, q, joint.ranges, strict=True):
+        if joint.limited:
+            constraints.update(Limits(low, high).constraints(name, coordinate))
+    return Writes(
+        frames={joint.child: (joint.parent, (joint.origin, pose(q)))},
+        constraints=constraints,
+        articulations={joint.name: joint.record(q, home, tuple(c.derivative() for c in q))},
+    )
 
 
 def family_coordinates(motion: FamilyMotion, name: str) -> tuple[str, ...]:
@@ -153,57 +150,41 @@ def joint_operation(
     """Return the operation that writes a member of a family."""
     names: dict[str, Any] = {"name": name, "parent": parent, "child": child}
     if isinstance(motion, CurveMotion):
-        motion = _as_family_motion(motion, ranges[0])
+        # The only member of a custom family, whose operation documents can hold.
+        s = position("s")
+        family = Family(motion.name, motion.expression(s), {s: ranges[0]})
+        motion = FamilyMotion(family, motion.rows, np.zeros(0))
     if isinstance(motion, FamilyMotion):
         return FamilyJoint(**names, motion=motion, ranges=tuple(ranges), limited=limited)
     if not isinstance(motion, GroupMotion):
         raise TypeError(f"A {type(motion).__name__} is no joint.")
-    family = motion.name
-    if motion.rows == 3 and family in ("planar", "free"):
+    if motion.rows == 3 and motion.name in ("planar", "free"):
         place = motion.left.copy()
         place[:3, 3] += place[:3, :3] @ motion.right[:3, 3]
         return SlidingPoint(**names, origin=rigid_pose(place), ranges=tuple(ranges), limited=limited)
     limits = [Limits(low, high) if limited else FREE for low, high in ranges]
-    origin, mount = rigid_pose(motion.left), rigid_pose(motion.right)
-    whole = rigid_pose(motion.left @ motion.right)
+    bounds: dict[str, Any] = {"lower": limits[0].lower, "upper": limits[0].upper} if limits else {}
+    mounted = {**names, "origin": rigid_pose(motion.left), "mount": rigid_pose(motion.right)}
+    names["origin"] = rigid_pose(motion.left @ motion.right)
     # The z axis of L in the axes of the child, at joint value 0.
-    x, y, z = (float(c) for c in motion.right[2, :3])
-    axis = x, y, z
-    if family == "rigid":
-        return Fixed(**names, origin=whole)
-    if family == "prismatic":
-        return Prismatic(**names, origin=whole, axis=axis, lower=limits[0].lower, upper=limits[0].upper)
-    if family == "revolute":
-        return MountedRevolute(
-            **names, origin=origin, mount=mount, axis=_Z, lower=limits[0].lower, upper=limits[0].upper
-        )
-    if family == "screw":
-        pitch = 2.0 * np.pi * motion.pitch
-        return MountedScrew(
-            **names,
-            origin=origin,
-            mount=mount,
-            axis=_Z,
-            lower=limits[0].lower,
-            upper=limits[0].upper,
-            pitch=pitch,
-        )
-    if family == "cylindrical":
-        slide, turn = limits
-        return MountedCylindrical(**names, origin=origin, mount=mount, axis=_Z, slide=slide, turn=turn)
-    if family == "spherical":
-        return MountedBall(**names, origin=origin, mount=mount)
-    if family == "planar":
-        most = max(max(-low, high) for low, high in ranges[:2]) if limited else None
-        least = None if most is None else -most
-        return Planar(**names, origin=whole, axis=axis, lower=least, upper=most)
-    return Floating(**names, origin=whole)
-
-
-def _as_family_motion(motion: CurveMotion, ends: tuple[float, float]) -> FamilyMotion:
-    """Return a curve as the only member of a custom family, whose operation documents can hold."""
-    s = position("s")
-    return FamilyMotion(Family(motion.name, motion.expression(s), {s: ends}), motion.rows, np.zeros(0))
+    axis = tuple(float(c) for c in motion.right[2, :3])
+    match motion.name:
+        case "rigid":
+            return Fixed(**names)
+        case "prismatic":
+            return Prismatic(**names, axis=axis, **bounds)
+        case "revolute":
+            return MountedRevolute(**mounted, axis=_Z, **bounds)
+        case "screw":
+            return MountedScrew(**mounted, axis=_Z, **bounds, pitch=2.0 * np.pi * motion.pitch)
+        case "cylindrical":
+            return MountedCylindrical(**mounted, axis=_Z, slide=limits[0], turn=limits[1])
+        case "spherical":
+            return MountedBall(**mounted)
+        case "planar":
+            most = max(max(-low, high) for low, high in ranges[:2]) if limited else None
+            return Planar(**names, axis=axis, lower=None if most is None else -most, upper=most)
+    return Floating(**names)
 
 
 def rigid_pose(matrix: Array) -> Pose:

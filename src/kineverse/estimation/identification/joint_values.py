@@ -40,32 +40,30 @@ def solve_per_observation(solution: Solution[FamilyMember]) -> PerObservation:
     covariances = invert_matrices(weighted @ by_joints + LITTLE * np.eye(by_joints.shape[2]))
     change = multiply_vectors(covariances, multiply_vectors(weighted, solution.residuals))
     left = solution.residuals - multiply_vectors(by_joints, change)
-    log = -0.5 * float(np.sum(left * multiply_vectors(weights, left))) + 0.5 * sum_log_determinants(
-        math.tau * covariances
-    )
-    return PerObservation(
-        solution.values + change,
-        covariances,
-        log - 0.5 * sum_log_determinants(math.tau * solution.covariance),
-    )
+    log = -0.5 * float(np.sum(left * multiply_vectors(weights, left)))
+    log += 0.5 * sum_log_determinants(math.tau * covariances)
+    log -= 0.5 * sum_log_determinants(math.tau * solution.covariance)
+    return PerObservation(solution.values + change, covariances, log)
 
 
 @dataclass(frozen=True)
 class JointRanges:
-    """Width and mean of the range of joint values."""
+    """Width and mean of the range of joint values.
+
+    Joint values are Gaussian with a mean μ and a width s, one width for all translations and one for all
+    rotations. Let â_k be the maximum of the likelihood of observation k alone and C_k its covariance. Then
+    â_k is distributed as N(μ, s² + C_k).
+    """
 
     deviations: Array  # s and μ of each joint value, (k,)
     mean: Array
-    log_density: float  # [m], [rad]
+    log_density: float  # log ∫ Π N(â_k; μ, s² + C_k) p(s) ds at this μ, p(s) uniform in log s over the grid
 
 
 def fit_joint_ranges(
     motion: FamilyMember, per_observation: PerObservation, weight: float = 1.0
 ) -> JointRanges:
-    """Return the most likely widths and means of the joint values.
-
-    Each observation's log likelihood counts with the weight.
-    """
+    """Return the most likely widths and means, for a weight of each observation's log likelihood."""
     kinds = np.array(motion.kinds)
     deviations, occam = np.zeros(len(kinds)), 0.0
     variances = np.einsum("nii->ni", per_observation.covariances)
@@ -75,13 +73,11 @@ def fit_joint_ranges(
         occam += part
     total = per_observation.covariances + np.diag(deviations**2)
     weights = invert_matrices(total)
-    mean: Array = np.linalg.solve(
-        weights.sum(axis=0), multiply_vectors(weights, per_observation.values).sum(axis=0)
-    )
+    weighted = multiply_vectors(weights, per_observation.values).sum(axis=0)
+    mean: Array = np.linalg.solve(weights.sum(axis=0), weighted)
     off = per_observation.values - mean
-    log = -0.5 * float(np.sum(off * multiply_vectors(weights, off))) - 0.5 * sum_log_determinants(
-        math.tau * total
-    )
+    log = -0.5 * float(np.sum(off * multiply_vectors(weights, off)))
+    log -= 0.5 * sum_log_determinants(math.tau * total)
     return JointRanges(deviations, mean, weight * log + occam)
 
 
@@ -127,9 +123,12 @@ def optimise_sliding_point(solution: Solution[FamilyMember]) -> Solution[FamilyM
         right = multiply_vectors(weighted, per_observation.values).sum(axis=0)
         right[joints:] -= motion.right[:slides, 3] / REACH**2
         change = np.linalg.solve(normal, right)[joints:]
-        solution = _shift_sliding_point(solution, motion, change)
-        assert isinstance(solution.motion, GroupMotion)  # the shift keeps the type
-        motion = solution.motion
+        displacement = np.concatenate([change, np.zeros(3 - slides)])
+        values, moved = solution.values.copy(), motion.right.copy()
+        values[:, :slides] -= (_rotations(motion, values) @ displacement)[:, :slides]
+        moved[:3, 3] += displacement
+        motion = replace(motion, right=moved)
+        solution = replace(solution, motion=motion, values=values, linear=motion.linearise(values))
         if np.abs(change).max() <= SLIDING_TOLERANCE:
             break
     return solution
@@ -145,9 +144,9 @@ def sliding_point_twists(motion: FamilyMember, values: Array) -> Array:
 
 
 class ChildOriginMotion(NamedTuple):
-    """Motion in terms of the translation of the child's own origin, for display."""
+    """Motion in terms of the translation of the child's origin, for display."""
 
-    motion: FamilyMember  # motion with the sliding point at the origin of the child
+    motion: FamilyMember  # with the sliding point at the origin of the child
     covariance: Array  # covariance of its parameters
     values: Array  # joint values and their covariances, (N, k) and (N, k, k)
     covariances: Array
@@ -180,28 +179,12 @@ def slide_child_origin(
             if component < WX <= other:
                 lever = middle if column < ends else place
                 moved[ends + row, column] = -skew(lever)[component, other - WX]
-    return ChildOriginMotion(
-        replace(motion, left=left, right=right),
-        moved @ covariance @ moved.T,
-        values,
-        by @ covariances @ np.swapaxes(by, 1, 2),
-    )
-
-
-def _shift_sliding_point(
-    solution: Solution[FamilyMember], motion: GroupMotion, change: Array
-) -> Solution[FamilyMember]:
-    displacement = np.zeros(3)
-    displacement[: len(change)] = change
-    values, right = solution.values.copy(), motion.right.copy()
-    values[:, : len(change)] -= (_rotations(motion, values) @ displacement)[:, : len(change)]
-    right[:3, 3] += displacement
-    motion = replace(motion, right=right)
-    return replace(solution, motion=motion, values=values, linear=motion.linearise(values))
+    motion = replace(motion, left=left, right=right)
+    covariances = by @ covariances @ np.swapaxes(by, 1, 2)
+    return ChildOriginMotion(motion, moved @ covariance @ moved.T, values, covariances)
 
 
 def _rotations(motion: GroupMotion, values: Array) -> Array:
-    """Return Exp(w), (N, 3, 3)."""
     twist = np.zeros((len(values), 6))
     twist[:, list(motion.parametrisation.joints)] = values
     return exp_so3(twist[:, WX:])
@@ -223,46 +206,29 @@ class SingleObservation(NamedTuple):
 def choose_mirrored_values(
     observations: Observations, solution: Solution[FamilyMember]
 ) -> Solution[FamilyMember]:
-    """Return the solution with the more probable of two mirrored joint values for each observation.
-
-    Only observations with precise positions have the ambiguity.
-    """
+    """Choose the more probable of two mirrored joint values for each observation with precise positions."""
     motion = solution.motion
     if (
         not isinstance(motion, GroupMotion)
         or motion.joints != 1
-        or not motion.size
-        or not observations.softness
+        or not (motion.size and observations.softness)
     ):
         return solution
     for _ in range(MIRROR_TURNS):
-        start = _exchange_mirrored(observations, solution, motion)
-        if start is None:
+        prior, values, parent = solution.joint_prior, solution.values.copy(), solution.parent.copy()
+        current = evaluate_each_observation(observations, motion, values, parent, prior)
+        others = mirrored_values(motion, values, prior)
+        mirrored = evaluate_each_observation(observations, motion, others, parent, prior)
+        is_better = mirrored.log_density > current.log_density + BETTER
+        if not is_better.any():
             break
-        values, parent = start
-        better = levenberg_marquardt(observations, motion, values, parent, solution.joint_prior)
-        if not (better.cost < solution.cost and isinstance(better.motion, GroupMotion)):
+        values[is_better] = mirrored.values[is_better]
+        parent[is_better, :3, :3] = mirrored.orientation[is_better]
+        trial = levenberg_marquardt(observations, motion, values, parent, prior)
+        if trial.cost >= solution.cost:
             break
-        solution, motion = better, better.motion
+        solution, motion = trial, trial.motion
     return solution
-
-
-def _exchange_mirrored(
-    observations: Observations, solution: Solution[FamilyMember], motion: GroupMotion
-) -> tuple[Array, Array] | None:
-    """Return joint values and parent poses, mirrored where that is more probable; None if it is nowhere."""
-    joint_prior, parent = solution.joint_prior, solution.parent
-    current = evaluate_each_observation(observations, motion, solution.values, parent, joint_prior)
-    mirrored = evaluate_each_observation(
-        observations, motion, mirrored_values(motion, solution.values, joint_prior), parent, joint_prior
-    )
-    better = mirrored.log_density > current.log_density + BETTER
-    if not better.any():
-        return None
-    values, parent = solution.values.copy(), parent.copy()
-    values[better] = mirrored.values[better]
-    parent[better, :3, :3] = mirrored.orientation[better]
-    return values, parent
 
 
 def evaluate_each_observation(
@@ -286,23 +252,19 @@ def evaluate_each_observation(
         lever = multiply_vectors(orientation, linear.pose[:, :3, 3])
         back = np.swapaxes(orientation, 1, 2)
         of_parent = log_so3(observations.parent[:, :3, :3] @ back)
-        errors, by_rotation = (
-            [displacement - lever, of_parent],
-            [skew(lever), -_inverse_left_jacobian(of_parent)],
-        )
-        by_joint = [-multiply_vectors(orientation, linear.by_joints[:, :3, 0]), np.zeros_like(lever)]
+        errors = [displacement - lever, of_parent]
+        by_rotation = [skew(lever), -_inverse_left_jacobian(of_parent)]
+        by_joint = [-orientation @ linear.by_joints[:, :3], np.zeros((len(lever), 3, 1))]
         if rows == 6:
             child = observations.child[:, :3, :3] @ np.swapaxes(linear.pose[:, :3, :3], 1, 2)
             of_child = log_so3(child @ back)
+            inverse_jacobian = _inverse_left_jacobian(of_child)
             errors.append(of_child)
-            by_rotation.append(-_inverse_left_jacobian(of_child))
-            by_joint.append(
-                -multiply_vectors(_inverse_left_jacobian(of_child) @ orientation, linear.by_joints[:, 3:, 0])
-            )
+            by_rotation.append(-inverse_jacobian)
+            by_joint.append(-inverse_jacobian @ orientation @ linear.by_joints[:, 3:])
         error = multiply_vectors(whitening, np.concatenate(errors, axis=1))
-        by = whitening @ np.concatenate(
-            [np.concatenate(by_rotation, axis=1), np.concatenate(by_joint, axis=1)[:, :, None]], axis=2
-        )
+        slopes = [np.concatenate(parts, axis=1) for parts in (by_rotation, by_joint)]
+        by = whitening @ np.concatenate(slopes, axis=2)
         off = values[:, 0] - joint_prior.mean[0]
         information = np.swapaxes(by, 1, 2) @ by
         information[:, 3, 3] += joint_prior.precision[0]
@@ -366,6 +328,11 @@ def _inverse_left_jacobian(turns: Array) -> Array:
     return np.eye(3) + 0.5 * skew(turns)
 
 
+# A pose determines an angle only up to whole revolutions. In a sequence, the joint is assumed to rotate by
+# less than half a revolution from one observation to the next. If the lead of a screw is small compared with
+# the noise, only the count of revolutions reveals it.
+
+
 def find_revolving_joint(motion: MotionModel) -> int | None:
     """Return the index of the joint value that is an angle about a fixed axis; None if there is none."""
     if not isinstance(motion, GroupMotion):
@@ -413,17 +380,13 @@ def log_unwrapping_gain(solution: Solution[FamilyMember]) -> float:
     values = known.values
     middle = math.atan2(float(np.sin(values).mean()), float(np.cos(values).mean()))
     within = values - math.tau * np.round((values - middle) / math.tau)
-    before = fit_joint_ranges(solution.motion, known)
-    after = fit_joint_ranges(solution.motion, replace(known, values=within))
-    gain = after.log_density - before.log_density
-    # The evidence integrates over the mean, which is less certain with more revolutions.
-    gain += _spread(after.deviations, known.covariances) - _spread(before.deviations, known.covariances)
-    return max(0.0, gain)
-
-
-def _spread(deviations: Array, covariances: Array) -> float:
-    """Return the logarithm of the standard deviation of the mean joint value."""
-    return -0.5 * math.log(float(np.sum(1.0 / (deviations[0] ** 2 + covariances[:, 0, 0]))))
+    logs = []
+    for each in (known, replace(known, values=within)):
+        ranges = fit_joint_ranges(solution.motion, each)
+        precision = float(np.sum(1.0 / (ranges.deviations[0] ** 2 + known.covariances[:, 0, 0])))
+        # The evidence integrates over the mean, which is less certain with more revolutions.
+        logs.append(ranges.log_density - 0.5 * math.log(precision))
+    return max(0.0, logs[1] - logs[0])
 
 
 def is_screw(motion: FamilyMember) -> bool:

@@ -66,15 +66,15 @@ class InitialGuess(NamedTuple):
 class Solution(Generic[M_co]):
     """Maximum of the likelihood and the quadratic approximation around it."""
 
-    motion: M_co  # motion with its parameters
+    motion: M_co
     values: Array  # joint values, (N, k)
     cost: float  # twice the negative logarithm of likelihood and prior, without constants
     residuals: Array  # residuals e_B - M e_A of the child's pose in the parent, in the parent's axes, (N, m)
     covariance: Array  # their covariance S, (N, m, m)
-    linear: LinearisedPoses  # derivatives at the solution
+    linear: LinearisedPoses
     parent: Array  # most likely true poses of the parent, (N, 4, 4)
-    joint_prior: JointValuePrior  # prior of the joint values
-    converged: bool  # True if the steps became small. Else the solution is the best one so far
+    joint_prior: JointValuePrior
+    converged: bool  # True if the steps became small; else the solution is the best one so far
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class _Point(Generic[M_co]):
     parent: Array
     linear: LinearisedPoses
     prior: ParameterPrior
-    own: Array
+    parent_errors: Array
     residuals: Array
     lever: Array
     parent_covariance: Array | None
@@ -105,9 +105,8 @@ def levenberg_marquardt(
 ) -> Solution[M]:
     """Return the maximum of the likelihood, from a start."""
     joint_prior = joint_prior or JointValuePrior.vague(motion.joints)
-    point = _linearise(
-        observations, motion, values, observations.parent if parent is None else parent, joint_prior
-    )
+    parent = observations.parent if parent is None else parent
+    point = _linearise(observations, motion, values, parent, joint_prior)
     damping, converged, before = 0.0, False, 0.0
     for _ in range(steps):
         reduced = _step(observations, point, damping, joint_prior)
@@ -129,17 +128,8 @@ def levenberg_marquardt(
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e8:
                 break
-    return Solution(
-        point.motion,
-        point.values,
-        point.cost,
-        point.residuals,
-        point.covariance,
-        point.linear,
-        point.parent,
-        joint_prior,
-        converged,
-    )
+    at_end = point.residuals, point.covariance, point.linear, point.parent
+    return Solution(point.motion, point.values, point.cost, *at_end, joint_prior, converged)
 
 
 def solve_from_best_start(
@@ -150,9 +140,9 @@ def solve_from_best_start(
         return levenberg_marquardt(observations, *starts[0])
     begun = [levenberg_marquardt(observations, *start, steps=FIRST_STEPS) for start in starts]
     best = min(begun, key=lambda solution: solution.cost)
-    return (
-        best if best.converged else levenberg_marquardt(observations, best.motion, best.values, best.parent)
-    )
+    if best.converged:
+        return best
+    return levenberg_marquardt(observations, best.motion, best.values, best.parent)
 
 
 def _linearise(
@@ -170,24 +160,23 @@ def _linearise(
         error = np.concatenate([error, turned], axis=1)
     covariance = _rotate_covariances(observations.child_covariance, p_R_w)
     cost = float(squared_errors(error, covariance).sum())
-    own, of_parent = np.zeros((len(observations), 6)), None
+    parent_errors, of_parent = np.zeros((len(observations), 6)), None
     lever = _lever(linear.pose[:, :3, 3], rows)
     residuals = error
     if observations.parent_covariance is not None:
         moved = (p_R_w @ (observations.parent[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
-        own = np.concatenate([moved, log_so3(p_R_w @ observations.parent[:, :3, :3])], axis=1)
+        parent_errors = np.concatenate([moved, log_so3(p_R_w @ observations.parent[:, :3, :3])], axis=1)
         of_parent = _rotate_covariances(observations.parent_covariance, p_R_w)
-        cost += float(squared_errors(own, of_parent).sum())
-        residuals = error - multiply_vectors(lever, own)
+        cost += float(squared_errors(parent_errors, of_parent).sum())
+        residuals = error - multiply_vectors(lever, parent_errors)
         covariance = covariance + lever @ of_parent @ np.swapaxes(lever, 1, 2)
     weights = invert_matrices(covariance)
     cost += float(prior.residuals @ prior.residuals)
     cost += float(np.sum(joint_prior.precision * (values - joint_prior.mean) ** 2))
     if joint_prior.marginal:
         cost += _log_determinants(covariance, linear, joint_prior)
-    return _Point(
-        motion, values, parent, linear, prior, own, residuals, lever, of_parent, weights, covariance, cost
-    )
+    at_point = parent_errors, residuals, lever, of_parent, weights, covariance, cost
+    return _Point(motion, values, parent, linear, prior, *at_point)
 
 
 def _step(
@@ -234,7 +223,7 @@ def _step(
     if point.parent_covariance is not None:
         rest = point.weights @ (point.residuals - left)[:, :, None]
         blame = point.parent_covariance @ np.swapaxes(point.lever, 1, 2) @ rest
-        error = point.own + blame[:, :, 0]
+        error = point.parent_errors + blame[:, :, 0]
         parent = parent @ transform(exp_so3(error[:, 3:]), error[:, :3])
         gain += float(np.sum(error**2 / np.einsum("nii->ni", point.parent_covariance)))
     if not (np.isfinite(step).all() and np.isfinite(values).all() and np.isfinite(parent).all()):
@@ -248,10 +237,8 @@ def _step(
 
 def _log_determinants(covariance: Array, linear: LinearisedPoses, joint_prior: JointValuePrior) -> float:
     """Return the sum of log |S + J_a P⁻¹ J_aᵀ|."""
-    by_joints = linear.by_joints
-    return sum_log_determinants(
-        covariance + (by_joints / joint_prior.precision) @ np.swapaxes(by_joints, 1, 2)
-    )
+    moved = (linear.by_joints / joint_prior.precision) @ np.swapaxes(linear.by_joints, 1, 2)
+    return sum_log_determinants(covariance + moved)
 
 
 def _log_determinant_gradient(point: _Point[M], gains: Array, joint_prior: JointValuePrior) -> Array:
@@ -259,14 +246,14 @@ def _log_determinant_gradient(point: _Point[M], gains: Array, joint_prior: Joint
     size = point.motion.size
     result = np.zeros(size)
     before = _log_determinants(point.covariance, point.linear, joint_prior)
-    own = point.covariance - _lever_covariance(point.lever, point.parent_covariance)
+    of_child = point.covariance - _lever_covariance(point.lever, point.parent_covariance)
     for i in range(size):
         step = np.zeros(size)
         step[i] = _DIFFERENCE
         values = point.values - _DIFFERENCE * multiply_vectors(gains, point.linear.by_parameters[:, :, i])
         linear = point.motion.retract(step).linearise(values)
         lever = _lever(linear.pose[:, :3, 3], point.residuals.shape[1])
-        covariance = own + _lever_covariance(lever, point.parent_covariance)
+        covariance = of_child + _lever_covariance(lever, point.parent_covariance)
         result[i] = (_log_determinants(covariance, linear, joint_prior) - before) / _DIFFERENCE
     return result
 

@@ -14,7 +14,6 @@ from kineverse.lie import Array
 
 from .joint_values import (
     JointRanges,
-    PerObservation,
     choose_mirrored_values,
     fit_joint_ranges,
     optimise_sliding_point,
@@ -44,18 +43,18 @@ class Evidence:
 
 
 def laplace_evidence(solution: Solution[FamilyMember], weight: float = 1.0) -> Evidence:
-    """Return the evidence of a family, by the quadratic approximation around its most likely member.
-
-    Each observation's log likelihood counts with the weight. It is below 1 if errors are correlated.
-    """
+    """Return the evidence by the quadratic approximation, for a weight of each observation's likelihood."""
     motion, size = solution.motion, solution.motion.size
     per_observation = solve_per_observation(solution)
-    ranges = (
-        fit_joint_ranges(motion, per_observation, weight)
-        if motion.joints
-        else JointRanges(np.zeros(0), np.zeros(0), 0.0)
-    )
-    values, covariances = _posterior_joint_values(per_observation, ranges)
+    values, covariances = per_observation.values, per_observation.covariances
+    ranges = JointRanges(np.zeros(0), np.zeros(0), 0.0)
+    if motion.joints:
+        ranges = fit_joint_ranges(motion, per_observation, weight)
+        # The posterior under the prior of the range.
+        variance = np.diag(ranges.deviations**2)
+        shrink = variance @ invert_matrices(covariances + variance)
+        values = ranges.mean + (shrink @ (values - ranges.mean)[:, :, None])[:, :, 0]
+        covariances = shrink @ covariances
     information = weight * _information(solution, ranges, values)
     prior = motion.prior().by_parameters
     information[:size, :size] += prior.T @ prior
@@ -78,24 +77,11 @@ def evidence_excess(solution: Solution[FamilyMember]) -> float:
     per_observation = solve_per_observation(solution)
     total = per_observation.covariances + np.diag(1.0 / joint_prior.precision)
     off = per_observation.values - joint_prior.mean
-    predicted = -0.5 * float(
-        np.sum(off * multiply_vectors(invert_matrices(total), off))
-    ) - 0.5 * sum_log_determinants(math.tau * total)
+    predicted = per_observation.log_likelihood - 0.5 * sum_log_determinants(math.tau * total)
+    predicted -= 0.5 * float(np.sum(off * multiply_vectors(invert_matrices(total), off)))
     prior = solution.motion.prior().residuals
-    reached = -0.5 * (solution.cost - float(prior @ prior)) - 0.5 * solution.residuals.size * math.log(
-        math.tau
-    )
-    return max(0.0, predicted + per_observation.log_likelihood - reached)
-
-
-def _posterior_joint_values(per_observation: PerObservation, ranges: JointRanges) -> tuple[Array, Array]:
-    """Return the posterior joint values and their covariances under the range prior."""
-    if not len(ranges.mean):
-        return per_observation.values, per_observation.covariances
-    variance = np.diag(ranges.deviations**2)
-    shrink = variance @ invert_matrices(per_observation.covariances + variance)
-    values: Array = ranges.mean + (shrink @ (per_observation.values - ranges.mean)[:, :, None])[:, :, 0]
-    return values, shrink @ per_observation.covariances
+    reached = -0.5 * (solution.cost - float(prior @ prior) + solution.residuals.size * math.log(math.tau))
+    return max(0.0, predicted - reached)
 
 
 def _information(solution: Solution[FamilyMember], ranges: JointRanges, values: Array) -> Array:
@@ -104,11 +90,9 @@ def _information(solution: Solution[FamilyMember], ranges: JointRanges, values: 
     by_joints = linear.by_joints
     moved = (by_joints * ranges.deviations**2) @ np.swapaxes(by_joints, 1, 2)
     weights = invert_matrices(solution.covariance + moved)
-    both = np.concatenate(
-        [linear.by_parameters, by_joints, sliding_point_twists(solution.motion, values)], axis=2
-    )
-    result: Array = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
-    return result
+    sliding = sliding_point_twists(solution.motion, values)
+    slopes = np.concatenate([linear.by_parameters, by_joints, sliding], axis=2)
+    return np.asarray((np.swapaxes(slopes, 1, 2) @ weights @ slopes).sum(axis=0))
 
 
 TURNS = 8
@@ -126,7 +110,7 @@ class Scored(NamedTuple):
 
 def maximum_likelihood(observations: Observations, starts: Sequence[InitialGuess]) -> Scored:
     """Return the maximum of the likelihood in a family, from the best of several starts."""
-    first, *softer = [*observations.softened(), observations]
+    first, *softer = [*observations.softened, observations]
     best = solve_from_best_start(first, starts)
     for narrower in softer:
         best = levenberg_marquardt(narrower, best.motion, best.values, best.parent)
@@ -138,15 +122,14 @@ def maximise_marginal_likelihood(observations: Observations, solution: Solution[
     if not solution.motion.joints or not solution.motion.size:
         return _score(solution)
     result = _iterate_ranges(observations, solution)
-    softened = observations.softened()
+    softened = observations.softened
     if solution.joint_prior.marginal or not softened:
         return _score(result)
     # With positions this precise the maximum of the likelihood is a poor start: its motion is distorted to
     # fit each joint value. A prior on the ranges during the continuation prevents that.
     for softer in (*softened, observations):
-        solution = levenberg_marquardt(
-            softer, solution.motion, solution.values, solution.parent, solution.joint_prior
-        )
+        start = solution.motion, solution.values, solution.parent, solution.joint_prior
+        solution = levenberg_marquardt(softer, *start)
         solution = _iterate_ranges(softer, choose_mirrored_values(softer, solution))
     return _score(max(result, solution, key=lambda each: laplace_evidence(each).log_evidence))
 
@@ -154,10 +137,7 @@ def maximise_marginal_likelihood(observations: Observations, solution: Solution[
 def continue_from(
     observations: Observations, start: InitialGuess, parent: Array, joint_prior: JointValuePrior, known: int
 ) -> Scored:
-    """Return the solution of more observations, starting from an earlier solution.
-
-    The joint values are integrated out if they were in the earlier solution.
-    """
+    """Return the solution of more observations than ``known``, continued from an earlier one."""
     motion, values, parent = start.motion, start.values.copy(), parent.copy()
     new = slice(known, len(observations))
     if known < len(observations):
@@ -166,9 +146,9 @@ def continue_from(
         )
         values[new], parent[new] = projected.values, projected.parent
     solution = levenberg_marquardt(observations, motion, values, parent, joint_prior)
-    return _score(
-        _iterate_ranges(observations, solution) if joint_prior.marginal else optimise_sliding_point(solution)
-    )
+    if joint_prior.marginal:
+        return _score(_iterate_ranges(observations, solution))
+    return _score(optimise_sliding_point(solution))
 
 
 def _iterate_ranges(observations: Observations, solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
@@ -182,11 +162,11 @@ def _iterate_ranges(observations: Observations, solution: Solution[FamilyMember]
         if before is not None and np.all(np.abs(np.log(widths / before)) < SETTLED):
             break
         before = widths
+        start = solution.motion, solution.values, solution.parent
         joint_prior = JointValuePrior(ranges.mean, widths**-2.0, marginal=True)
-        solution = levenberg_marquardt(
-            observations, solution.motion, solution.values, solution.parent, joint_prior
+        solution = choose_mirrored_values(
+            observations, levenberg_marquardt(observations, *start, joint_prior)
         )
-        solution = choose_mirrored_values(observations, solution)
     return solution
 
 

@@ -25,15 +25,13 @@ import numpy as np
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
-from .curve import CURVE
-from .curve_fit import FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
+from .curve import CURVE, FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
 from .families import Family, FamilyMotion
 from .least_squares import Solution
 from .marginal_likelihood import Scored
 from .model_selection import (
     SAME_RATIO,
     FamilySolution,
-    GoodnessOfFit,
     IdentificationData,
     measure_fit,
     solve_families,
@@ -69,7 +67,7 @@ _SCALE_SPREAD = math.log(1.6)
 # Size of a simple joint's residuals relative to those of a curve up to which correlated errors may explain
 # them.
 _CORRELATED = 2.0
-# Largest distance between neighbours along a curve, relative to its length, across which it is told.
+# Largest distance between neighbours along a curve, relative to its length, across which it is known.
 _GAP = 0.3
 # Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family,
 # and least probability of the curve, at which the joint values of that family are said to lie on a curve.
@@ -99,44 +97,40 @@ def weigh_and_check(
     before: FamilySolution | None = None,
 ) -> CheckedComparison:
     """Return the fits of all families with their probabilities, and the reason if the best is not sure."""
-    found = weigh_families(data, solutions, weights) if solutions else None
+    result = weigh_families(data, solutions, weights) if solutions else None
     curve, is_online = None, before is not None
-    is_sure = found is not None and not is_doubtful(data, found, solutions)
+    is_sure = result is not None and not is_doubtful(data, result, solutions)
     if CURVE in weights and not is_sure:
         curve = solve_curve(data, solutions, before)
         if curve is not None and not _is_explained(curve, solutions):
             solutions = {**solutions, CURVE: curve}
-            found = weigh_families(data, solutions, weights)
-    if found is None:
+            result = weigh_families(data, solutions, weights)
+    if result is None:
         raise InvalidValueError(
-            f"A curve takes {FEWEST_POSES} poses at least that are not equal, and there are "
+            f"A curve takes at least {FEWEST_POSES} poses that are not equal, and there are "
             f"{len(data.observations)}. Give more poses or other families."
         )
     reason = ""
     if not is_sure and data.stated:
-        name = _best_name(found, solutions)
+        name = _best_name(result, solutions)
         solution = solutions[name].scored.solution
         fit = measure_fit(solution, observation_weight=data.observation_weight)
+        compare = partial(_compare_refuted, data, solutions, weights, is_online)
         if fit.p_value < REFUTED and fit.factor > CALIBRATED:
             factor = _best_scale(data, solutions, weights, _REFUTED_SCALES)[1]
-            return CheckedComparison(_compare_refuted(data, solutions, weights, factor, "", is_online), curve)
+            return CheckedComparison(compare(factor, "none of these joints"), curve)
         if solution.motion.joints > 1 or name == CURVE:
             other, factor, logs = _best_scale(data, solutions, weights, _DOUBTED_SCALES)
             if other != name and factor > CALIBRATED:
                 if logs[other] - logs[name] > math.log(SURE / (1.0 - SURE)):
-                    best = solution.motion.name
-                    return CheckedComparison(
-                        _compare_refuted(data, solutions, weights, factor, best, is_online), curve
-                    )
-                reason = (
-                    f"with {factor:.1f} times the stated noise it would be "
-                    f"{solutions[other].scored.solution.motion.name}"
-                )
-    found = replace(found, reason=reason or next(_reasons(data, found, solutions), ""))
-    if CURVE not in found.probabilities and CURVE in weights and may_be_curve(data.observations):
+                    return CheckedComparison(compare(factor, solution.motion.name), curve)
+                family = solutions[other].scored.solution.motion.name
+                reason = f"with {factor:.1f} times the stated noise it would be {family}"
+    result = replace(result, reason=reason or next(_reasons(data, result, solutions), ""))
+    if CURVE not in result.probabilities and CURVE in weights and may_be_curve(data.observations):
         later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
-        found = replace(found, lazy_fits=(*found.lazy_fits, later))
-    return CheckedComparison(found, curve)
+        result = replace(result, lazy_fits=(*result.lazy_fits, later))
+    return CheckedComparison(result, curve)
 
 
 def without_curve(weights: Mapping[str | Family, float]) -> dict[str | Family, float]:
@@ -171,11 +165,8 @@ def solve_curve(
             if data.stated:
                 return NoiseSolution(continue_curve(some, known), STATED_NOISE)
             return adapt_noise(some, NoiseSolution(before.scored, before.noise), continue_curve)
-        orders = [
-            one.scored.solution.values[:, 0]
-            for one in solutions.values()
-            if one.scored.solution.motion.joints == 1 and np.array_equal(one.inliers, rows)
-        ]
+        others = [one.scored.solution for one in solutions.values() if np.array_equal(one.inliers, rows)]
+        orders = [other.values[:, 0] for other in others if other.motion.joints == 1]
         return _fit_to_noise(data, some, orders, competitor)
 
     solution = solve(everything)
@@ -208,7 +199,6 @@ def solve_curve(
 def _fit_to_noise(
     data: IdentificationData, observations: Observations, orders: Sequence[Array], competitor: float
 ) -> NoiseSolution:
-    """Return the most probable curve through observations, at the noise that suits it best."""
     latest: NoisePosterior | None = None
 
     def log_evidence(solution: Solution[FamilyMember]) -> float:
@@ -235,9 +225,9 @@ def _fit_to_noise(
     return adapt_noise(observations, near, continue_curve)
 
 
-def is_doubtful(data: IdentificationData, found: IdentificationResult, solutions: Solutions) -> bool:
+def is_doubtful(data: IdentificationData, result: IdentificationResult, solutions: Solutions) -> bool:
     """Return True if a curve or a larger noise may explain the observations better than the best family."""
-    solution = solutions[_best_name(found, solutions)].scored.solution
+    solution = solutions[_best_name(result, solutions)].scored.solution
     if solution.motion.joints > 1:
         return True
     fit = measure_fit(solution, observation_weight=data.observation_weight)
@@ -248,32 +238,30 @@ def _compare_refuted(
     data: IdentificationData,
     solutions: Solutions,
     weights: Mapping[str | Family, float],
+    is_online: bool,
     factor: float,
     otherwise: str,
-    is_online: bool,
 ) -> IdentificationResult:
     """Return the comparison at a larger size of the noise than was stated."""
-    larger = replace(
-        data, observations=scale_noise(data.observations, np.full(2, factor)), noise_factor=factor
-    )
+    scaled = scale_noise(data.observations, np.full(2, factor))
+    larger = replace(data, observations=scaled, noise_factor=factor)
     again = solve_joints(larger, weights)
     if CURVE in solutions:
         curve = solve_curve(larger, again, solutions[CURVE] if is_online else None)
         if curve is not None:
             again[CURVE] = curve
-    found = weigh_families(larger, again, weights)
-    misfit = factor * measure_fit(again[_best_name(found, again)].scored.solution).factor
+    result = weigh_families(larger, again, weights)
+    misfit = factor * measure_fit(again[_best_name(result, again)].scored.solution).factor
     reason = (
         f"residuals are {factor if math.isnan(misfit) else misfit:.1f} times the stated noise: either the "
-        f"noise is larger, or this is {otherwise or 'none of these joints'}"
+        f"noise is larger, or this is {otherwise}"
     )
-    return replace(found, reason=reason)
+    return replace(result, reason=reason)
 
 
-def _reasons(data: IdentificationData, found: IdentificationResult, solutions: Solutions) -> Iterator[str]:
-    """Yield the reasons for which the best family is not sure."""
-    name = _best_name(found, solutions)
-    if found.lazy_fits[0].probability < SURE:
+def _reasons(data: IdentificationData, result: IdentificationResult, solutions: Solutions) -> Iterator[str]:
+    name = _best_name(result, solutions)
+    if result.lazy_fits[0].probability < SURE:
         return
     solution = solutions[name].scored.solution
     joints, curve = solution.motion.joints, solutions.get(CURVE)
@@ -282,20 +270,20 @@ def _reasons(data: IdentificationData, found: IdentificationResult, solutions: S
         along = np.sort(solution.values[:, 0])
         if np.diff(along).max() > _GAP * np.ptp(along):
             yield "no pose is in its longest part, so these may be two motions, such as of swapped parts"
-        own = measure_fit(solution, covariance.mean(axis=0))
-        for one in solutions.values():
-            other_solution = one.scored.solution
-            if one is not curve and other_solution.motion.joints <= 1:
-                ratio = measure_fit(other_solution, covariance.mean(axis=0)).factor / own.factor
-                if ratio < _CORRELATED:
-                    yield (
-                        f"residuals of {other_solution.motion.name} are only {ratio:.1f} times as large, "
-                        "which errors that are correlated would explain"
-                    )
+        of_curve = measure_fit(solution, covariance.mean(axis=0))
+        for one in (one.scored.solution for one in solutions.values() if one is not curve):
+            ratio = math.inf
+            if one.motion.joints <= 1:
+                ratio = measure_fit(one, covariance.mean(axis=0)).factor / of_curve.factor
+            if ratio < _CORRELATED:
+                yield (
+                    f"residuals of {one.motion.name} are only {ratio:.1f} times as large, which correlated "
+                    "errors would explain"
+                )
     elif joints > 1 and curve is not None and not isinstance(solution.motion, FamilyMotion):
         fit = measure_fit(curve.scored.solution, covariance.mean(axis=0), data.observation_weight)
-        is_competitive = found.probabilities[CURVE] > _COMPETITIVE and _explains(fit, data.stated)
-        if is_competitive or _is_smooth(solution.values):
+        explains = fit.p_value > _FITTING if data.stated else fit.factor < _FITTING_FACTOR
+        if (explains and result.probabilities[CURVE] > _COMPETITIVE) or _is_smooth(solution.values):
             yield "its joint values lie on one curve"
     elif not data.stated and joints == 1 and curve is not None:
         fit = measure_fit(solution, observation_weight=data.observation_weight)
@@ -315,16 +303,8 @@ def _is_explained(curve: FamilySolution, solutions: Solutions) -> bool:
     return any(measure_fit(one, covariance).factor < 1.0 for one in simple)
 
 
-def _explains(fit: GoodnessOfFit, stated: bool) -> bool:
-    """Return True if a curve explains the observations as well as the noise allows."""
-    return fit.p_value > _FITTING if stated else fit.factor < _FITTING_FACTOR
-
-
 def _is_smooth(values: Array) -> bool:
-    """Return True if a few joint values (N, k), in their order, run along a smooth curve.
-
-    They are too few for a curve with as many knots as their path may need.
-    """
+    """Return True if joint values (N, k), too few to fit a curve, run along a smooth one in their order."""
     if len(values) > _FEW:
         return False
     steps = np.diff(values / np.maximum(values.std(axis=0), 1e-12), axis=0)
@@ -336,38 +316,25 @@ def _is_smooth(values: Array) -> bool:
 def _best_scale(
     data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float], scales: Array
 ) -> tuple[str | Family, float, dict[str | Family, float]]:
-    """Return the best family, its size of the noise relative to the stated one, and the log evidences.
-
-    They are the evidences of all families with their prior, for a noise of unknown size.
-    """
-    prior = -0.5 * (np.log(scales) / _SCALE_SPREAD) ** 2
-    weight = data.observation_weight
-    at_scales = {
-        name: prior
-        + _log_evidences(one.scored.solution, scales, weight)
-        + weight * one.log_prior
-        + math.log(weights[name])
-        for name, one in solutions.items()
-    }
+    """Return the best family for a noise of unknown size, its size, and the log evidences with priors."""
+    prior, factors = -0.5 * (np.log(scales) / _SCALE_SPREAD) ** 2, np.column_stack([scales, scales])
+    weight, at_scales = data.observation_weight, {}
+    for name, one in solutions.items():
+        covariance = one.scored.solution.covariance
+        parts = np.stack([covariance, 0.0 * covariance])
+        at_scales[name] = prior + solver.log_evidences(one.scored.solution, factors, parts, weight)
+        at_scales[name] += weight * one.log_prior + math.log(weights[name])
     logs = {name: float(np.logaddexp.reduce(each)) for name, each in at_scales.items()}
     best = max(logs, key=logs.__getitem__)
     return best, float(scales[int(np.argmax(at_scales[best]))]), logs
 
 
-def _best_name(found: IdentificationResult, solutions: Solutions) -> str | Family:
-    family = found.lazy_fits[0].family
+def _best_name(result: IdentificationResult, solutions: Solutions) -> str | Family:
+    family = result.lazy_fits[0].family
     return next(name for name, one in solutions.items() if one.scored.solution.motion.name == family)
 
 
-def _log_evidences(solution: Solution[FamilyMember], scales: Array, weight: float) -> Array:
-    """Return the log evidence for each size of the noise relative to the stated one."""
-    covariance = solution.covariance
-    factors, parts = np.column_stack([scales, scales]), np.stack([covariance, 0.0 * covariance])
-    return solver.log_evidences(solution, factors, parts, weight)
-
-
 def _classify(data: IdentificationData, one: NoiseSolution) -> RowIndices:
-    """Return the indices of the inliers under a curve."""
     assert data.outliers is not None
     rows, solution = data.observations.rows, one.scored.solution
     observations = scale_noise(data.observations, one.noise.factors)

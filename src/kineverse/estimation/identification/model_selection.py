@@ -1,9 +1,15 @@
-"""Selection of a joint family: evidence, its bounds for nested families, and goodness of fit."""
+"""Selection of a joint family: evidence, its bounds for nested families, and goodness of fit.
+
+A joint that hardly moves looks rigid, and a point on a long lever seems to move along a line. So the evidence
+of the wider family is at least that of the narrower one times the prior probability of members that look like
+it. Laplace's method misses them: it knows only the surroundings of the most likely member, which follows the
+noise.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
@@ -48,8 +54,8 @@ class GoodnessOfFit:
 
     factor: float  # size of the residuals relative to the noise; NaN if the family leaves none
     p_value: float  # probability of a χ² at least as large if family and noise are right
-    slow_p_value: float = 1.0
-    slow_share: float = 0.0  # share of these slow residuals in χ²
+    slow_p_value: float = 1.0  # the same for residuals that vary slowly along the joint value
+    slow_share: float = 0.0  # their share in χ²
 
 
 def measure_fit(
@@ -63,11 +69,15 @@ def measure_fit(
     curvature = weighted @ by_joints + LITTLE * np.eye(motion.joints)
     projected = weights - np.swapaxes(weighted, 1, 2) @ invert_matrices(curvature) @ weighted
     residuals = solution.residuals
-    left = residuals - multiply_vectors(
-        by_joints, multiply_vectors(invert_matrices(curvature), multiply_vectors(weighted, residuals))
-    )
+    change = multiply_vectors(invert_matrices(curvature), multiply_vectors(weighted, residuals))
+    left = residuals - multiply_vectors(by_joints, change)
     squares = float(np.sum(left * multiply_vectors(weights, left)))
-    free = residuals.size - solution.values.size - _determined_parameters(solution, projected)
+    # The effective number of parameters that the observations determine rather than the prior. The
+    # pseudoinverse leaves out directions that neither determines.
+    by_parameters, prior = solution.linear.by_parameters, motion.prior().by_parameters
+    information = (np.swapaxes(by_parameters, 1, 2) @ projected @ by_parameters).sum(axis=0)
+    inverse = np.linalg.pinv(information + prior.T @ prior, hermitian=True)
+    free = residuals.size - solution.values.size - float(np.sum(inverse * information))
     if free < 0.5:
         return GoodnessOfFit(math.nan, 1.0)
     factor = math.sqrt(squares / free)
@@ -80,7 +90,10 @@ def measure_fit(
     if motion.joints != 1 or not cosines or free < slow_freedom + 0.5:
         return GoodnessOfFit(factor, p_value)
     whitened = multiply_vectors(np.swapaxes(np.linalg.cholesky(weights), 1, 2), left)
-    slow = float(np.sum(_slow_parts(whitened, solution.values[:, 0], cosines) ** 2))
+    # Projections onto normalised slow cosines of the rank of the joint value.
+    rank = np.argsort(np.argsort(solution.values[:, 0], kind="stable"), kind="stable")
+    phases = math.pi * (rank[:, None] + 0.5) / len(rank) * np.arange(1, cosines + 1)
+    slow = float(np.sum((math.sqrt(2.0 / len(rank)) * np.cos(phases).T @ whitened) ** 2))
     rest = max(squares - slow, 1e-12 * squares, 1e-300)
     ratio = slow / slow_freedom / (rest / (free - slow_freedom))
     slow_p_value = f_distribution_tail(ratio, slow_freedom, free - slow_freedom)
@@ -99,24 +112,6 @@ def f_distribution_tail(ratio: float, above: float, below: float) -> float:
     return 0.5 * math.erfc(((1.0 - b) * root - (1.0 - a)) / math.sqrt(2.0 * (b * root**2 + a)))
 
 
-def _determined_parameters(solution: Solution[FamilyMember], projected: Array) -> float:
-    """Return the effective number of parameters that the observations determine rather than the prior."""
-    by_parameters, prior = solution.linear.by_parameters, solution.motion.prior().by_parameters
-    information = (np.swapaxes(by_parameters, 1, 2) @ projected @ by_parameters).sum(axis=0)
-    # The pseudoinverse leaves out directions that neither determines.
-    inverse = np.linalg.pinv(information + prior.T @ prior, hermitian=True)
-    return float(np.sum(inverse * information))
-
-
-def _slow_parts(whitened: Array, values: Array, cosines: int) -> Array:
-    """Return the projections of residuals (N, m) onto normalised slow cosines of the rank of a value."""
-    count = len(values)
-    rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
-    phases = math.pi * (rank[:, None] + 0.5) / count * np.arange(1, cosines + 1)
-    result: Array = math.sqrt(2.0 / count) * np.cos(phases).T @ whitened
-    return result
-
-
 Name = TypeVar("Name")
 
 UNSEEN = 0.05
@@ -128,19 +123,16 @@ def bound_log_evidences(
 ) -> dict[Name, float]:
     """Return log evidences, raised to the bounds by the families that are contained in others."""
     result = dict(logs)
-    by_family = {
-        solution.motion.name: (name, solution)
-        for name, solution in solutions.items()
-        if isinstance(solution.motion, GroupMotion)
-    }
-    rigid, line = by_family.get("rigid"), by_family.get("prismatic")
+    grouped = {name: one for name, one in solutions.items() if isinstance(one.motion, GroupMotion)}
+    names = {one.motion.name: name for name, one in grouped.items()}
     for family in ("prismatic", "revolute"):
-        if rigid is not None and family in by_family:
-            name = by_family[family][0]
-            result[name] = max(result[name], logs[rigid[0]] + math.log(UNSEEN))
-    if line is not None and "revolute" in by_family and line[1].motion.rows == 3:
-        name = by_family["revolute"][0]
-        result[name] = max(result[name], logs[line[0]] + log_probability_straight(line[1]))
+        if "rigid" in names and family in names:
+            name = names[family]
+            result[name] = max(result[name], logs[names["rigid"]] + math.log(UNSEEN))
+    if "prismatic" in names and "revolute" in names:
+        line, name = grouped[names["prismatic"]], names["revolute"]
+        if line.motion.rows == 3:
+            result[name] = max(result[name], logs[names["prismatic"]] + log_probability_straight(line))
     return result
 
 
@@ -166,7 +158,7 @@ def log_probability_straight(line: Solution[FamilyMember]) -> float:
 
 
 # A family is not refined if its log evidence is below that of the best by more than a constant and a term for
-# each observation. With noise that is large beside the motion, the unrefined evidence is this inaccurate.
+# each observation. With noise that is large compared with the motion, unrefined evidence is this inaccurate.
 _NEGLIGIBLE, _NEGLIGIBLE_EACH = 15.0, 0.5
 SAME_RATIO = 2.0
 """Factor by which the ratio of an estimated noise may differ from that of a solution that is kept."""
@@ -176,24 +168,24 @@ SAME_RATIO = 2.0
 class IdentificationData:
     """Observations and the assumptions under which families are compared."""
 
-    observations: Observations  # observations, with lengths in the unit
-    unit: float  # length scale [m], see scale
-    stated: bool  # True if the noise is known. Else the observations have the medians of unknown_noise
-    outliers: Outliers | None  # outlier model, with lengths in the unit; None if all observations are inliers
+    observations: Observations  # with lengths in the unit
+    unit: float  # length scale [m]
+    stated: bool  # True if the noise is known; else the observations have the medians of noise_estimation
+    outliers: Outliers | None  # with lengths in the unit; None if all observations are inliers
     sequential: bool  # True if the observations are in temporal order
-    noise_factor: float = 1.0
-    observation_weight: float = 1.0
+    noise_factor: float = 1.0  # size of the noise relative to the stated one
+    observation_weight: float = 1.0  # of the log likelihood of each observation
 
 
 @dataclass(frozen=True)
 class FamilySolution:
     """Solution of a family by its inliers."""
 
-    scored: Scored  # solution and the logarithm of its evidence
-    noise: NoisePosterior  # posterior of the noise; STATED_NOISE if it is stated
-    inliers: RowIndices  # indices of the inliers
+    scored: Scored
+    noise: NoisePosterior  # STATED_NOISE if it is stated
+    inliers: RowIndices
     count: int  # number of all observations
-    log_prior: float
+    log_prior: float  # of the inliers and the revolutions
 
     @property
     def log_evidence(self) -> float:
@@ -216,9 +208,7 @@ def prepare_data(
     scaled = convert_to_unit(observations, unit)
     if not stated:
         scaled = scale_noise(scaled, np.array([median_factor(unit), 1.0]))
-    return IdentificationData(
-        scaled, unit, stated, outliers, sequential, observation_weight=observation_weight
-    )
+    return IdentificationData(scaled, unit, stated, outliers, sequential, 1.0, observation_weight)
 
 
 def solve_with_inliers(
@@ -243,7 +233,6 @@ def solve_with_inliers(
 def _classify(
     data: IdentificationData, families: Iterable[str | Family], observations: Observations
 ) -> dict[str | Family, RowIndices]:
-    """Return the indices of the inliers under each family, for observations with some noise."""
     assert data.outliers is not None  # else there is nothing to classify
 
     def solve(some: Observations, name: str | Family) -> Scored:
@@ -256,28 +245,24 @@ def _classify(
 def _solve_inliers(
     data: IdentificationData, inliers: Mapping[str | Family, RowIndices]
 ) -> dict[str | Family, NoiseSolution]:
-    """Return the most likely member of each family by its inliers, at the most probable noise."""
-    found: dict[str | Family, NoiseSolution] = {}
-    for rows in {rows.tobytes(): rows for rows in inliers.values()}.values():
-        observations = data.observations.select(rows)
-        names = [name for name, own in inliers.items() if np.array_equal(own, rows)]
-        found |= _solve_noise(data, observations, names)
-    return {name: found[name] for name in inliers}
 
-
-def _solve_noise(
-    data: IdentificationData, observations: Observations, families: Iterable[str | Family]
-) -> dict[str | Family, NoiseSolution]:
-    statistics = MotionStatistics(observations)
-
-    def solve(name: str | Family, some: Observations) -> Scored:
+    def solve(name: str | Family, statistics: MotionStatistics, some: Observations) -> Scored:
         scored = solver.maximum_likelihood(some, _starts(some, name, statistics, data.unit))
-        return _unwrap(some, scored) if data.sequential else scored
+        # A screw is solved again with the revolutions of the observations.
+        start = unwrap_screw(some, scored.solution) if data.sequential else None
+        return scored if start is None else solver.maximum_likelihood(some, [start])
 
     solver.prepare()
-    if data.stated:
-        return {name: NoiseSolution(solve(name, observations), STATED_NOISE) for name in families}
-    return {name: solve_unknown_noise(observations, partial(solve, name)) for name in families}
+    solutions: dict[str | Family, NoiseSolution] = {}
+    for rows in {rows.tobytes(): rows for rows in inliers.values()}.values():
+        observations = data.observations.select(rows)
+        statistics = MotionStatistics(observations)
+        for name in (name for name, others in inliers.items() if np.array_equal(others, rows)):
+            if data.stated:
+                solutions[name] = NoiseSolution(solve(name, statistics, observations), STATED_NOISE)
+            else:
+                solutions[name] = solve_unknown_noise(observations, partial(solve, name, statistics))
+    return {name: solutions[name] for name in inliers}
 
 
 def score_solutions(
@@ -287,39 +272,30 @@ def score_solutions(
     weights: Mapping[str | Family, float],
     renew: bool = True,
 ) -> dict[str | Family, FamilySolution]:
-    """Return the solutions of families, scored against each other, from solutions of their inliers.
-
-    An unknown noise is estimated again if ``renew``.
-    """
-    observations, outliers, count = data.observations, data.outliers, len(data.observations)
-    observations_of = {
-        name: observations if len(rows) == count else observations.select(rows)
-        for name, rows in inliers.items()
-    }
+    """Score solutions of families against each other; an unknown noise is estimated again if ``renew``."""
+    count = len(data.observations)
     log_priors = dict.fromkeys(solutions, 0.0)
-    if outliers is not None:
-        log_priors = {
-            name: log_inlier_prior(outliers, count, len(some), observations.rows)
-            for name, some in observations_of.items()
-        }
-    if data.sequential:
-        log_priors = {
-            name: log_priors[name] + log_unwrapping_gain(one.scored.solution)
-            for name, one in solutions.items()
-        }
-    refine = adapt_noise if renew and not data.stated else _integrate_joint_values
+    for name, one in solutions.items():
+        if data.outliers is not None:
+            used = len(inliers[name])
+            log_priors[name] = log_inlier_prior(data.outliers, count, used, data.observations.rows)
+        if data.sequential:
+            log_priors[name] += log_unwrapping_gain(one.scored.solution)
     # The threshold is on evidence in which each observation has its weight.
-    logs = {name: math.log(weights[name]) / data.observation_weight + log_priors[name] for name in solutions}
-    compared = compare_families(observations_of, solutions, logs, refine, data.observation_weight)
-    return {
-        name: FamilySolution(*one, inliers[name], count, log_priors[name]) for name, one in compared.items()
+    weight, result = data.observation_weight, {}
+    logs = {
+        name: one.log_evidence + math.log(weights[name]) / weight + log_priors[name]
+        for name, one in solutions.items()
     }
-
-
-def _unwrap(observations: Observations, scored: Scored) -> Scored:
-    """Return the solution; a screw is solved again with the revolutions of the observations."""
-    start = unwrap_screw(observations, scored.solution)
-    return scored if start is None else solver.maximum_likelihood(observations, [start])
+    threshold = max(logs.values()) - _NEGLIGIBLE / weight
+    threshold -= _NEGLIGIBLE_EACH * max(map(len, inliers.values()))
+    refine = adapt_noise if renew and not data.stated else _integrate_joint_values
+    for name, one in solutions.items():
+        if logs[name] >= threshold:
+            rows = inliers[name]
+            one = refine(data.observations if len(rows) == count else data.observations.select(rows), one)
+        result[name] = FamilySolution(*one, inliers[name], count, log_priors[name])
+    return result
 
 
 def solve_families(
@@ -328,10 +304,8 @@ def solve_families(
     """Return the most likely member of each family, for observations in a unit of length [m]."""
     solver.prepare()
     statistics = MotionStatistics(observations)
-    return {
-        name: solver.maximum_likelihood(observations, _starts(observations, name, statistics, unit))
-        for name in families
-    }
+    starts = {name: _starts(observations, name, statistics, unit) for name in families}
+    return {name: solver.maximum_likelihood(observations, each) for name, each in starts.items()}
 
 
 def _starts(
@@ -340,29 +314,6 @@ def _starts(
     if isinstance(family, Family):
         return [InitialGuess(motion, values) for motion, values in family_starts(family, observations, unit)]
     return list(initial_guesses(family, statistics))
-
-
-def compare_families(
-    observations: Mapping[str | Family, Observations],
-    solutions: Mapping[str | Family, NoiseSolution],
-    log_priors: Mapping[str | Family, float],
-    refine: Callable[[Observations, NoiseSolution], NoiseSolution],
-    observation_weight: float = 1.0,
-) -> dict[str | Family, NoiseSolution]:
-    """Return the solutions, those of competitive families refined.
-
-    Each family has its own observations and a log prior.
-    """
-    logs = {name: one.log_evidence + log_priors[name] for name, one in solutions.items()}
-    threshold = (
-        max(logs.values())
-        - _NEGLIGIBLE / observation_weight
-        - _NEGLIGIBLE_EACH * max(len(some) for some in observations.values())
-    )
-    return {
-        name: refine(observations[name], one) if logs[name] >= threshold else one
-        for name, one in solutions.items()
-    }
 
 
 def _integrate_joint_values(observations: Observations, one: NoiseSolution) -> NoiseSolution:
@@ -381,31 +332,25 @@ def weigh_families(
 ) -> IdentificationResult:
     """Return the fits of all families with their posterior probabilities."""
     solutions = {name: _weigh_observations(data, one) for name, one in solutions.items()}
-    logs = bound_log_evidences(
-        {name: one.log_evidence + one.log_prior for name, one in solutions.items()},
-        {name: one.scored.solution for name, one in solutions.items()},
-    )
+    evidences = {name: one.log_evidence + one.log_prior for name, one in solutions.items()}
+    logs = bound_log_evidences(evidences, {name: one.scored.solution for name, one in solutions.items()})
     total: Array = np.array([logs[name] + math.log(weights[name]) for name in solutions])
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
     lazy_fits = [
         LazyFit(one.scored.solution.motion.name, p, partial(_fit, data, one, logs[name], p))
         for (name, one), p in zip(solutions.items(), probabilities, strict=True)
     ]
+    lazy_fits.sort(key=lambda lazy_fit: -lazy_fit.probability)
     best = list(solutions.values())[int(np.argmax(total))]
-    return IdentificationResult(
-        tuple(sorted(lazy_fits, key=lambda lazy_fit: -lazy_fit.probability)), best.noise.deviations(data.unit)
-    )
+    return IdentificationResult(tuple(lazy_fits), best.noise.deviations(data.unit))
 
 
 def _weigh_observations(data: IdentificationData, one: FamilySolution) -> FamilySolution:
-    """Return a solution in which each observation has its weight."""
     if data.observation_weight == 1.0:
         return one
-    observations = data.observations.select(one.inliers)
-    scored, noise = weigh_observations(
-        observations, NoiseSolution(one.scored, one.noise), data.observation_weight
-    )
-    return replace(one, scored=scored, noise=noise, log_prior=data.observation_weight * one.log_prior)
+    weight, observations = data.observation_weight, data.observations.select(one.inliers)
+    scored, noise = weigh_observations(observations, NoiseSolution(one.scored, one.noise), weight)
+    return replace(one, scored=scored, noise=noise, log_prior=weight * one.log_prior)
 
 
 def _fit(data: IdentificationData, one: FamilySolution, log_evidence: float, probability: float) -> Fit:

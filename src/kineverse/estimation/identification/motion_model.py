@@ -14,8 +14,8 @@ class LinearisedPoses(NamedTuple):
     """Relative poses and their derivatives."""
 
     pose: Array  # parent_T_child, (N, 4, 4)
-    by_parameters: Array  # (N, 6, n)
-    by_joints: Array  # same per unit of each joint value, (N, 6, k)
+    by_parameters: Array  # twists of the child in the parent's axes, (N, m, n)
+    by_joints: Array  # the same per unit of each joint value, (N, m, k)
 
 
 class ParameterPrior(NamedTuple):
@@ -74,11 +74,10 @@ class FamilyMember(MotionModel, Protocol):
         ...
 
     def log_prior(self, mean: Array) -> tuple[float, Array]:
-        """Return the prior of the parameters and of the mean joint values, for the evidence.
+        """Return the log prior of the parameters and of the mean joint values, for the evidence.
 
-        The first result is the logarithm of its density at this member. The second is a precision (n + k,)
-        that is added to the one of :meth:`prior`. It keeps directions finite on which there is no data. With
-        c sliding components it has the length n + k + c.
+        The second result is a precision (n + k + c,) with c sliding components that is added to the one of
+        :meth:`prior`. It keeps directions finite on which there are no data.
         """
         ...
 

@@ -27,16 +27,8 @@ if TYPE_CHECKING:
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm", *NO_UNDEFINED_FLAGS)
 _FAMILY = ("rows", "joints", "lefts", "rights", "pitches", "pitched", "reach", "slides")
 _SCALES = (
-    "reach_scale",
-    "pitch_scale",
-    "close",
-    "little",
-    "narrowest",
-    "settled",
-    "better",
-    "slid",
-    "weight",
-)
+    "reach_scale", "pitch_scale", "close", "little", "narrowest", "settled", "better", "slid", "weight"
+)  # fmt: skip
 _COUNTS = ("steps", "first_steps", "turns", "sliding_turns", "mirrored_turns", "mirrored_steps", "widths")
 # Largest number of parameters, and of all unknowns, of a family in C.
 _PARAMETERS, _UNKNOWNS = 12, 16
@@ -119,8 +111,7 @@ def problem_of(group: JointFamily, rows: int) -> Problem:
     problem.rows, problem.joints = rows, len(freedom.joints)
     problem.lefts, problem.rights = len(freedom.left), len(freedom.right)
     problem.pitches = problem.pitched = group.pitch
-    problem.reach = group.reach
-    problem.slides = group.slides if rows == 6 else 0
+    problem.reach, problem.slides = group.reach, group.slides if rows == 6 else 0
     for name, components in (("joint", freedom.joints), ("left", freedom.left), ("right", freedom.right)):
         getattr(problem, name)[: len(components)] = components
     problem.kind[: problem.joints] = [j >= 3 for j in freedom.joints]
@@ -144,10 +135,7 @@ def unpack_motion(motion: GroupMotion, packed: Array) -> GroupMotion:
 
 
 def evaluate_poses(motion: GroupMotion, values: Array) -> LinearisedPoses:
-    """Return the poses at joint values (N, k) and their derivatives, in C.
-
-    It is the kernel of :meth:`.families.GroupMotion.linearise`.
-    """
+    """Return the poses at joint values (N, k) and their derivatives, in C."""
     values = np.ascontiguousarray(values, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] != motion.joints:
         raise ShapeError(
@@ -157,12 +145,7 @@ def evaluate_poses(motion: GroupMotion, values: Array) -> LinearisedPoses:
     result = LinearisedPoses(
         np.empty((count, 4, 4)), np.empty((count, rows, motion.size)), np.empty((count, rows, motion.joints))
     )
-    moved = pack_motion(motion)
-    library.code.at(
-        ctypes.addressof(problem_of(motion.group, rows)),
-        count,
-        moved.ctypes.data,
-        values.ctypes.data,
-        *(array.ctypes.data for array in result),
-    )
+    arrays = (pack_motion(motion), values, *result)
+    problem = ctypes.addressof(problem_of(motion.group, rows))
+    library.code.at(problem, count, *(array.ctypes.data for array in arrays))
     return result

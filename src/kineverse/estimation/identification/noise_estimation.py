@@ -29,14 +29,13 @@ from .solver import solver
 UNKNOWN_NOISE = (0.005, math.radians(1.0))
 """Medians of the unknown standard deviations of positions [m] and orientations [rad].
 
-That of positions is a thousandth of the length scale of the data, see :mod:`.scale`, where that is more: of
-cranes, and in millimetres.
+That of positions is a thousandth of the length scale of the data, see :mod:`.normalisation`, where that is
+more: of cranes, and in millimetres.
 """
 
 _SHARE = 1e-3
-
+# Standard deviation of their logarithms: a factor of 5.
 _SPREAD = math.log(5.0)
-"""Standard deviation of their logarithms: a factor of 5."""
 
 # Factors on the medians for first solutions: ratios of position to orientation noise of 1, 16 and 1/16.
 _STARTS = ((1.0, 1.0), (4.0, 0.25), (0.25, 4.0))
@@ -65,13 +64,12 @@ class NoisePosterior(NamedTuple):
 
     logs: Array  # logarithms of the most probable factors on the medians, (d,)
     root: Array  # square root R of their covariance R Rᵀ, (d, d)
-    log_weight: float
+    log_weight: float  # log ratio of the evidence with the noise integrated out to that at these factors
 
     @property
     def factors(self) -> Array:
         """Most probable factors on the standard deviations of positions and orientations, (2,)."""
-        factors: Array = _factors(self.logs[None])[0]
-        return factors
+        return np.asarray(_factors(self.logs[None])[0])
 
     def deviations(self, unit: float) -> NoiseDeviations | None:
         """Return the most probable standard deviations [m], [rad]; None if the noise is stated."""
@@ -89,8 +87,8 @@ STATED_NOISE = NoisePosterior(np.zeros(0), np.zeros((0, 0)), 0.0)
 class NoiseSolution(NamedTuple):
     """Solution of a family at the noise that suits it best."""
 
-    scored: Scored  # solution and its evidence at this noise
-    noise: NoisePosterior  # posterior of the noise
+    scored: Scored  # at this noise
+    noise: NoisePosterior
 
     @property
     def log_evidence(self) -> float:
@@ -103,14 +101,7 @@ def scale_noise(observations: Observations, factors: Array) -> Observations:
     if (np.asarray(factors) == 1.0).all():
         return observations
     each = np.repeat(factors, 3)
-    scale = np.outer(each, each)
-    of_parent = observations.parent_covariance
-    return Observations(
-        observations.parent,
-        observations.child,
-        None if of_parent is None else of_parent * scale,
-        observations.child_covariance * scale[: observations.rows, : observations.rows],
-    )
+    return observations.scaled(np.outer(each, each))
 
 
 class _NoiseMode(NamedTuple):
@@ -150,11 +141,18 @@ class _NoiseSearch:
     def maximise(self, logs: Array, root: Array) -> _NoiseMode:
         """Return the maximum near some sizes, by Newton steps with a stencil of the width of the density."""
         stencil = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=self.dimensions)))
-        inverse = np.linalg.pinv(_quadratic_terms(stencil))
+        # Terms of a quadratic: 1, x, then x_i x_j for i <= j.
+        pairs = list(itertools.combinations_with_replacement(range(self.dimensions), 2))
+        products = [stencil[:, i] * stencil[:, j] for i, j in pairs]
+        inverse = np.linalg.pinv(np.column_stack([np.ones(len(stencil)), stencil, *products]))
         for _ in range(_STEPS):
             width = _DIFFERENCE * root
             density = self.log_density(logs + stencil @ width.T)
-            slope, curvature = _read_quadratic(inverse @ density, self.dimensions)
+            _, *coefficients = inverse @ density
+            slope, curvature = coefficients[: self.dimensions], np.zeros((self.dimensions,) * 2)
+            for (i, j), value in zip(pairs, coefficients[self.dimensions :], strict=True):
+                curvature[i, j] += value
+                curvature[j, i] += value
             bends, axes = np.linalg.eigh(-curvature / _DIFFERENCE**2)
             # The stencil grows by a factor of 2.5 at most along a direction in which the density is convex.
             bends = np.maximum(bends, 0.16)
@@ -166,7 +164,9 @@ class _NoiseSearch:
             if distance > 1.0 and self.log_density((logs + shift)[None])[0] < here:
                 # The quadratic does not hold so far from here.
                 shift = stencil[best] @ width.T
-            logs, root = logs + shift, _limit_width(root @ axes / np.sqrt(bends))
+            # The root is at most twice as wide as the prior in any direction.
+            left, widths, right = np.linalg.svd(root @ axes / np.sqrt(bends))
+            logs, root = logs + shift, left * np.minimum(widths, 2.0 * _SPREAD) @ right
             if distance < _SETTLED and bends[0] > _FLAT and bends[-1] < _SHARP:
                 break
         return _NoiseMode(logs, root, float(self.log_density(logs[None])[0]))
@@ -187,9 +187,9 @@ def estimate_noise(
 ) -> NoiseSolution:
     """Return a solution whose motion is kept at the most probable noise."""
     search = _NoiseSearch(observations, solution)
-    return _at_mode(
-        search, search.maximise_anywhere() if near is None else search.maximise(near.logs, near.root)
-    )
+    if near is None:
+        return _at_mode(search, search.maximise_anywhere())
+    return _at_mode(search, search.maximise(near.logs, near.root))
 
 
 def solve_unknown_noise(observations: Observations, solve: Callable[[Observations], Scored]) -> NoiseSolution:
@@ -234,10 +234,8 @@ def adapt_noise(
         elif rough:
             scored, rough = solver.maximise_marginal_likelihood(scaled, solution), False
         else:
-            start = InitialGuess(solution.motion, solution.values)
-            scored = solver.continue_from(
-                scaled, start, solution.parent, solution.joint_prior, len(observations)
-            )
+            start = InitialGuess(solution.motion, solution.values), solution.parent, solution.joint_prior
+            scored = solver.continue_from(scaled, *start, len(observations))
         solution, used = scored.solution, logs
         search = _NoiseSearch(observations, solution)
         mode = search.maximise(logs, root)
@@ -271,15 +269,7 @@ def _factors(logs: Array) -> Array:
     return factors
 
 
-def _limit_width(root: Array) -> Array:
-    """Return a square root of a covariance that is at most twice as wide as the prior in any direction."""
-    left, widths, right = np.linalg.svd(root)
-    result: Array = left * np.minimum(widths, 2.0 * _SPREAD) @ right
-    return result
-
-
 def _log_volume(root: Array) -> float:
-    """Return the logarithm of the determinant of a square root of a covariance."""
     return float(np.linalg.slogdet(root)[1])
 
 
@@ -301,20 +291,3 @@ def _covariance_parts(observations: Observations, solution: Solution[FamilyMembe
     if rows == 6:
         parts[1, :, range(3, 6), range(3, 6)] = both * turned
     return parts
-
-
-def _quadratic_terms(points: Array) -> Array:
-    """Return the terms of a quadratic at points (M, d): 1, x, then x_i x_j for i <= j, (M, n)."""
-    pairs = itertools.combinations_with_replacement(range(points.shape[1]), 2)
-    products = [points[:, i] * points[:, j] for i, j in pairs]
-    return np.column_stack([np.ones(len(points)), points, *products])
-
-
-def _read_quadratic(coefficients: Array, size: int) -> tuple[Array, Array]:
-    """Return gradient and Hessian at 0 of a quadratic with coefficients of :func:`_quadratic_terms`."""
-    curvature = np.zeros((size, size))
-    pairs = itertools.combinations_with_replacement(range(size), 2)
-    for (i, j), value in zip(pairs, coefficients[1 + size :], strict=True):
-        curvature[i, j] += value
-        curvature[j, i] += value
-    return coefficients[1 : 1 + size], curvature

@@ -1,4 +1,9 @@
-"""Normal form of observations and fits: unit of length, and gauge of the parameters."""
+"""Normal form of observations and fits: unit of length, and gauge of the parameters.
+
+The priors assume levers within a unit of length and pitches within a tenth of it. They have to hold for a
+crane as well as for a cupboard, and for poses in millimetres. So observations are scaled to a unit of their
+size, and fits are scaled back. All families share the unit, so their comparison does not depend on it.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +23,8 @@ from .result import Fit
 
 # For rotations of 15° or more, the lever is within four times the median distance from the middle.
 _TIMES = 4.0
-# Standard deviation, in units of length, that is added to all stated ones: floating point cannot hold a noise
-# that is smaller beside motions of the size of the unit.
+# Standard deviation, in units of length, that is added to all stated ones: floating point cannot hold a
+# smaller noise of motions of the size of the unit.
 _ROUNDING = 1e-7
 
 
@@ -41,16 +46,12 @@ def convert_to_unit(observations: Observations, unit: float) -> Observations:
     of_parent = None if of_parent is None else of_parent * by + rounding
     rows = observations.rows
     of_child = observations.child_covariance * by[:rows, :rows] + rounding[:rows, :rows]
-    return Observations(
-        _scale_positions(observations.parent, 1.0 / unit),
-        _scale_positions(observations.child, 1.0 / unit),
-        of_parent,
-        of_child,
-    )
+    parent, child = (_scale_positions(p, 1.0 / unit) for p in (observations.parent, observations.child))
+    return Observations(parent, child, of_parent, of_child)
 
 
 def log_density(count: float, unit: float) -> float:
-    """Return the log ratio of densities of ``count`` poses, given a mean pose, in metres and in units."""
+    """Return the log ratio of densities of ``count`` poses about a mean pose, in metres and in units."""
     return 3.0 * (1 - count) * math.log(unit)
 
 
@@ -63,32 +64,25 @@ def convert_to_metres(fit: Fit, unit: float) -> Fit:
     motion = fit.motion
     if isinstance(motion, FamilyMotion):
         return replace(fit, residuals=residuals, motion=replace(motion, unit=motion.unit / unit))
+    frame = fit.frame
     if isinstance(motion, CurveMotion):
-        curve = motion.scaled(unit)
-        return replace(
-            fit,
-            parameters=curve.named_parameters(),
-            covariance=unit**2 * fit.covariance,
-            joint_values=unit * fit.joint_values,
-            deviations=unit * fit.deviations,
-            residuals=residuals,
-            motion=curve,
-        )
-    if not isinstance(motion, GroupMotion):
+        motion = motion.scaled(unit)
+        scale, slides = np.full(len(fit.covariance), unit), np.array([unit])
+    elif isinstance(motion, GroupMotion):
+        is_length = [
+            name == "pitch" or name.startswith("point.") or name in _PLACES for name in fit.coordinates
+        ]
+        scale = np.where(is_length, unit, 1.0)
+        slides = np.array([unit if j < WX else 1.0 for j in motion.parametrisation.joints])
+        frame, right = _scale_positions(motion.left, unit), _scale_positions(motion.right, unit)
+        motion = replace(motion, left=frame, right=right, pitch=unit * motion.pitch)
+    else:
         return replace(fit, residuals=residuals)
-    scale = np.array([unit if _is_length(name) else 1.0 for name in fit.coordinates])
-    slides = np.array([unit if j < WX else 1.0 for j in motion.parametrisation.joints])
-    motion = replace(
-        motion,
-        left=_scale_positions(motion.left, unit),
-        right=_scale_positions(motion.right, unit),
-        pitch=unit * motion.pitch,
-    )
     return replace(
         fit,
         parameters=motion.named_parameters(),
         covariance=fit.covariance * np.outer(scale, scale),
-        frame=motion.left,
+        frame=frame,
         joint_values=fit.joint_values * slides,
         deviations=fit.deviations * slides,
         residuals=residuals,
@@ -102,21 +96,11 @@ def _scale_positions(poses: Array, factor: float) -> Array:
     return result
 
 
-def _is_length(coordinate: str) -> bool:
-    """Return True if a coordinate of a joint is a length, or a length per revolution."""
-    return coordinate == "pitch" or coordinate.rpartition(".")[0] == "point" or coordinate in _PLACES
-
-
 _PLACES = ("child.x", "child.y", "child.z")
 
 
 def fix_gauge(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
-    """Return the same motion in a unique parametrisation.
-
-    The largest component of the axis is positive and the mean of the joint values is 0. The origin of the
-    joint's frame is the point of the axis nearest to the child at 0. For a prismatic joint it is the origin
-    of the child.
-    """
+    """Return the same motion with a canonical axis and origin, and joint values with mean 0."""
     motion = solution.motion
     if not isinstance(motion, GroupMotion):
         return solution
@@ -134,39 +118,22 @@ def fix_gauge(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
     left, right = orthonormalize(motion.left), orthonormalize(motion.right)
     motion = replace(motion, left=left @ transform(exp_so3(middle[3:]), middle[:3]), right=right)
     values = values - shift
-    motion = _fix_origin(motion)
-    axis = motion.left[:3, 2]
+    # Move the origin to the point nearest to the child.
+    along = motion.right[:3, 3] * ((1, 1, 1) if name == "prismatic" else (0, 0, 1))
+    left, right = motion.left @ translation(along), translation(-along) @ motion.right
+    axis = left[:3, 2]
     flip = bool(axis[np.argmax(np.abs(axis))] < 0.0)
+    turn = np.diag([1.0, -1.0, -1.0]) if flip else np.eye(3)
     if motion.rows == 6:
-        motion, values = _fix_rotation(motion, values, flip)
-    elif flip:
-        motion, values = _rotate_frame(motion, values, np.diag([1.0, -1.0, -1.0]))
+        # The orientation that depends on the axis alone.
+        turn = left[:3, :3].T @ rotation_along_z(-axis if flip else axis)
+    change = transform(turn, np.zeros(3))
+    motion = replace(motion, left=left @ change, right=change.T @ right)
+    joints, twist = list(motion.parametrisation.joints), np.zeros((len(values), 6))
+    twist[:, joints] = values
+    values = np.concatenate([twist[:, :3] @ turn, twist[:, 3:] @ turn], axis=1)[:, joints]
     joint_prior = replace(solution.joint_prior, mean=values[-1])
     values = values[:-1]
     return replace(
         solution, motion=motion, values=values, joint_prior=joint_prior, linear=motion.linearise(values)
     )
-
-
-def _fix_origin(motion: GroupMotion) -> GroupMotion:
-    """Move the origin of the joint's frame along the gauge freedom to the point nearest to the child."""
-    place = motion.right[:3, 3]
-    free = (1, 1, 1) if motion.group.name == "prismatic" else (0, 0, 1)
-    way = place * free
-    return replace(motion, left=motion.left @ translation(way), right=translation(-way) @ motion.right)
-
-
-def _fix_rotation(motion: GroupMotion, values: Array, flip: bool) -> tuple[GroupMotion, Array]:
-    """Rotate the joint's frame about its axis to the orientation that depends on the axis alone."""
-    canonical = rotation_along_z(-motion.left[:3, 2] if flip else motion.left[:3, 2])
-    return _rotate_frame(motion, values, motion.left[:3, :3].T @ canonical)
-
-
-def _rotate_frame(motion: GroupMotion, values: Array, turn: Array) -> tuple[GroupMotion, Array]:
-    change = transform(turn, np.zeros(3))
-    joints = list(motion.parametrisation.joints)
-    twist = np.zeros((len(values), 6))
-    twist[:, joints] = values
-    twist[:, :3], twist[:, 3:] = twist[:, :3] @ turn, twist[:, 3:] @ turn
-    left, right = motion.left @ change, change.T @ motion.right
-    return replace(motion, left=left, right=right), twist[:, joints]

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, ShapeError
-from kineverse.lie import Array, inverse
+from kineverse.lie import Array, inverse, translation
 
 _RIGID = 1e-4
 # Largest number and smallest standard deviation that double precision can handle.
@@ -49,22 +49,27 @@ class Observations:
         of_parent = None if self.parent_covariance is None else self.parent_covariance[rows]
         return Observations(self.parent[rows], self.child[rows], of_parent, self.child_covariance[rows])
 
-    def scaled(self, factor: float) -> Observations:
-        """Return the same observations with covariances that are larger by a factor."""
+    def scaled(self, factor: float | Array) -> Observations:
+        """Return the same observations with covariances times a factor, a number or (..., 6, 6)."""
+        rows, of_child = self.rows, np.asarray(factor)
+        if of_child.shape[-1:] == (6,):
+            of_child = of_child[..., :rows, :rows]
         of_parent = None if self.parent_covariance is None else factor * self.parent_covariance
-        return Observations(self.parent, self.child, of_parent, factor * self.child_covariance)
+        return Observations(self.parent, self.child, of_parent, of_child * self.child_covariance)
 
+    @cached_property
     def softened(self) -> tuple[Observations, ...]:
-        """Return the same observations with less precise positions, the least precise first.
+        """The same observations with less precise positions, the least precise first.
 
         They are the levels of a continuation. If positions are much more precise than orientation errors
         times the lever, the likelihood is a narrow and curved valley, which Gauss-Newton steps do not enter.
         """
-        return self._softened
+        each = (np.array([factor] * 3 + [1.0] * 3) for factor in self.softness)
+        return tuple(self.scaled(np.outer(factors, factors)) for factors in each)
 
     @cached_property
     def softness(self) -> tuple[float, ...]:
-        """Factors on the position errors of each level of :meth:`softened`."""
+        """Factors on the position errors of each level of :attr:`softened`."""
         if self.parent_covariance is None:
             return ()
         lever = float(np.sqrt(np.mean(np.sum(self.relative[:, :3, 3] ** 2, axis=1))))
@@ -76,17 +81,6 @@ class Observations:
             factors.append(factor)
             factor /= _THIN
         return tuple(factors)
-
-    @cached_property
-    def _softened(self) -> tuple[Observations, ...]:
-        of_parent, result = self.parent_covariance, []
-        for factor in self.softness:
-            each = np.array([factor] * 3 + [1.0] * 3)
-            scale = np.outer(each, each)
-            of_child = self.child_covariance * scale[: self.rows, : self.rows]
-            softer = None if of_parent is None else of_parent * scale
-            result.append(Observations(self.parent, self.child, softer, of_child))
-        return tuple(result)
 
 
 def check_observations(
@@ -105,14 +99,11 @@ def check_observations(
         )
     if len(b) < fewest:
         raise InvalidValueError(
-            f"There {'is one pose' if len(b) else 'are no poses'} of the child. How something moves takes "
-            "at least two to see."
+            f"There {'is one pose' if len(b) else 'are no poses'} of the child. A motion takes at least two."
         )
     if positions:
         _check_finite(b, "child")
-        matrices = np.tile(np.eye(4), (len(b), 1, 1))
-        matrices[:, :3, 3] = b
-        b = matrices
+        b = translation(b)
     else:
         check_rigid(b, "child")
     if parent is None:
@@ -128,15 +119,11 @@ def check_observations(
                 f"There are {len(a)} poses of the parent and {len(b)} of the child. They come in pairs."
             )
         check_rigid(a, "parent")
-    rows = 3 if positions else 6
     of_parent = None
     if parent is not None and parent_covariance is not None:
         of_parent = covariances(parent_covariance, len(b), 6, "parent")
-    given = _numbers(child_covariance, "The covariance of the child")
-    if positions and given.shape[-2:] == (6, 6):
-        given = given[..., :3, :3]
-    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
-    return Observations(a, b, of_parent, covariances(given, len(b), rows, "child"))
+    of_child = covariances(child_covariance, len(b), 3 if positions else 6, "child")
+    return Observations(np.ascontiguousarray(a), np.ascontiguousarray(b), of_parent, of_child)
 
 
 def check_rigid(poses: Array, part: str) -> None:
@@ -156,9 +143,11 @@ def check_rigid(poses: Array, part: str) -> None:
         )
 
 
-def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array:
-    """Return covariances (N, m, m) from a common one (m, m) or from one for each pose."""
-    matrices = _numbers(given, f"The covariance of the {part}")
+def covariances(common_or_each: npt.ArrayLike, count: int, rows: int, part: str) -> Array:
+    """Return covariances (N, m, m) from a common one or from one for each pose, of poses or of positions."""
+    matrices = _numbers(common_or_each, f"The covariance of the {part}")
+    if rows == 3 and matrices.shape[-2:] == (6, 6):
+        matrices = matrices[..., :3, :3]
     if matrices.shape not in ((rows, rows), (count, rows, rows)):
         raise ShapeError(
             f"The covariance of the {part} has shape ({rows}, {rows}), or ({count}, {rows}, {rows}) with one "
@@ -195,33 +184,32 @@ def _check_covariances(each: Array, part: str) -> None:
     least = float(np.sqrt(np.linalg.eigvalsh(each)[:, 0].min(initial=math.inf)))
     if least < _SMALLEST:
         raise InvalidValueError(
-            f"The covariance of the {part} says that something is known to {least:.2g} (metres or radians). "
-            f"Less than {_SMALLEST:.0g} is not told apart from what numbers lose."
+            f"The covariance of the {part} has a standard deviation of {least:.2g} (metres or radians). "
+            f"Below {_SMALLEST:.0g} it is lost in rounding."
         )
 
 
-def _numbers(given: npt.ArrayLike, what: str) -> Array:
+def _numbers(values: npt.ArrayLike, label: str) -> Array:
     try:
-        if np.iscomplexobj(given):
+        if np.iscomplexobj(values):
             raise TypeError
-        return np.asarray(given, dtype=np.float64)
+        return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ShapeError(f"{what} are no array of numbers.") from None
+        raise ShapeError(f"{label} are no array of numbers.") from None
 
 
-def _check_finite(rows: Array, part: str, what: str = "Pose") -> None:
-    wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if len(wrong):
-        raise InvalidValueError(
-            f"{what} {int(wrong[0])} of the {part} is not finite. Leave out what was not seen."
-        )
-    wrong = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) > _LARGEST)
-    if len(wrong):
-        most = float(np.abs(rows[wrong[0]]).max())
-        raise InvalidValueError(
-            f"{what} {int(wrong[0])} of the {part} has a number of {most:.2g}. None is expected above "
-            f"{_LARGEST:.0g}: lengths are in metres, angles in radians."
-        )
+def _check_finite(rows: Array, part: str, label: str = "Pose") -> None:
+    largest = np.abs(rows).max(axis=1, initial=0.0)
+    wrong = np.flatnonzero(~(largest <= _LARGEST))
+    if not len(wrong):
+        return
+    k, most = int(wrong[0]), float(largest[wrong[0]])
+    if not math.isfinite(most):
+        raise InvalidValueError(f"{label} {k} of the {part} is not finite. Leave out what was not observed.")
+    raise InvalidValueError(
+        f"{label} {k} of the {part} has a number of {most:.2g}. None is expected above {_LARGEST:.0g}: "
+        "lengths are in metres, angles in radians."
+    )
 
 
 PosesLike: TypeAlias = "npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]"
@@ -235,7 +223,7 @@ class PoseTrack:
 
     poses: Array  # (N, 4, 4). The rotations of a point are arbitrary
     covariances: Array | None  # (N, 6, 6), or (N, 3, 3) of a point; None for exact poses
-    seen: npt.NDArray[np.bool_]  # mask of the times with an observation, (N,)
+    observed: npt.NDArray[np.bool_]  # mask of the times with an observation, (N,)
 
     @property
     def is_point(self) -> bool:
@@ -249,78 +237,61 @@ def check_tracks(
     """Check the observations of frames over time and return them as tracks."""
     if not isinstance(observations, Mapping):
         raise ShapeError("Observations are a mapping from names of frames to poses of shape (N, 4, 4).")
-    found = {name: _track(name, given, noise, points) for name, given in observations.items()}
-    counts = {name: len(track.poses) for name, track in found.items()}
+    tracks = {name: _track(name, poses, noise, points) for name, poses in observations.items()}
+    counts = {name: len(track.poses) for name, track in tracks.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{count} of '{name}'" for name, count in counts.items())
         raise ShapeError(
-            f"There are poses at different numbers of times: {listed}. Where something was not seen, its "
-            "pose is NaN."
+            f"There are poses at different numbers of times: {listed}. A pose that was not observed is NaN."
         )
-    return found
+    return tracks
 
 
-def _track(name: str, given: Any, noise: npt.ArrayLike | None, points: bool) -> PoseTrack:
+def _track(name: str, observed: Any, noise: npt.ArrayLike | None, points: bool) -> PoseTrack:
     covariance = noise
-    if isinstance(given, tuple) and len(given) == 2:
-        given, covariance = given
-    try:
-        poses = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ShapeError(f"The poses of '{name}' are no array of numbers.") from None
+    if isinstance(observed, tuple) and len(observed) == 2:
+        observed, covariance = observed
+    poses = _numbers(observed, f"The poses of '{name}'").copy()
     is_point = points and poses.ndim == 2 and poses.shape[1] == 3
     if is_point:
-        positions, poses = poses, np.tile(np.eye(4), (len(poses), 1, 1))
-        poses[:, :3, 3] = positions
-        poses[np.isnan(positions).all(axis=1)] = np.nan
+        is_missing = np.isnan(poses).all(axis=1)
+        poses = translation(poses)
+        poses[is_missing] = np.nan
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         also = ", or (N, 3) of a point" if points else ""
         raise ShapeError(f"The poses of '{name}' are an array of shape (N, 4, 4){also}, not {poses.shape}.")
     if covariance is None:
         raise InvalidValueError(
-            f"How well '{name}' is seen is not known, and without that nothing can be judged: give a pair of "
-            "poses and their covariance, or noise=kv.estimation.pose_covariance(position, orientation)."
+            f"The noise of '{name}' is unknown: give a pair of poses and their covariance, or "
+            "noise=kv.estimation.pose_covariance(position, orientation)."
         )
     rows = 3 if is_point else 6
     if not len(poses):
         return PoseTrack(poses, np.zeros((0, rows, rows)), np.zeros(0, dtype=bool))
-    seen: npt.NDArray[np.bool_] = np.logical_not(np.isnan(poses).all(axis=(1, 2)))
-    poses[~seen] = np.eye(4)
+    mask: npt.NDArray[np.bool_] = np.logical_not(np.isnan(poses).all(axis=(1, 2)))
+    poses[~mask] = np.eye(4)
     check_rigid(poses, f"frame '{name}'")
     spread = np.array(covariance, dtype=np.float64)
-    if is_point and spread.shape[-2:] == (6, 6):
-        spread = spread[..., :3, :3]
-    if spread.ndim == 3 and len(spread) == len(seen):
-        spread[~seen] = np.eye(spread.shape[-1])
-    return PoseTrack(poses, covariances(spread, len(poses), rows, f"frame '{name}'"), seen)
+    if spread.ndim == 3 and len(spread) == len(mask):
+        spread[~mask] = np.eye(spread.shape[-1])
+    return PoseTrack(poses, covariances(spread, len(poses), rows, f"frame '{name}'"), mask)
 
 
 def exact_track(count: int) -> PoseTrack:
-    """Return the exact track of the observer's own frame."""
+    """Return the exact track of the observer's frame."""
     return PoseTrack(np.tile(np.eye(4), (count, 1, 1)), None, np.ones(count, dtype=bool))
 
 
 def pair_tracks(parent: PoseTrack, child: PoseTrack, rows: npt.NDArray[Any]) -> Observations:
     """Return the observations of two frames at some times."""
-    return Observations(
-        parent.poses[rows],
-        child.poses[rows],
-        None if parent.covariances is None else parent.covariances[rows],
-        _given(child)[rows],
-    )
-
-
-def _given(track: PoseTrack) -> Array:
-    assert track.covariances is not None  # only the observer is exact, and it is never a child
-    return track.covariances
+    assert child.covariances is not None  # only the observer is exact, and it is never a child
+    of_parent = None if parent.covariances is None else parent.covariances[rows]
+    return Observations(parent.poses[rows], child.poses[rows], of_parent, child.covariances[rows])
 
 
 def concatenate_tracks(parts: Sequence[PoseTrack]) -> PoseTrack:
     """Return tracks joined in time."""
-    return PoseTrack(
-        np.concatenate([part.poses for part in parts]),
-        None
-        if parts[0].covariances is None
-        else np.concatenate([part.covariances for part in parts if part.covariances is not None]),
-        np.concatenate([part.seen for part in parts]),
-    )
+    known = [part.covariances for part in parts if part.covariances is not None]
+    poses = np.concatenate([part.poses for part in parts])
+    observed = np.concatenate([part.observed for part in parts])
+    return PoseTrack(poses, np.concatenate(known) if known else None, observed)

@@ -72,44 +72,37 @@ class _InlierHypothesis:
 
 def find_inliers(
     observations: Observations,
-    found: Mapping[Name, Scored],
+    solutions: Mapping[Name, Scored],
     outliers: Outliers,
     stated: bool,
-    find: Callable[[Observations, Name], Scored],
+    solve: Callable[[Observations, Name], Scored],
 ) -> dict[Name, RowIndices]:
     """Return the indices of the inliers under each family."""
     everything = np.arange(len(observations))
     if len(observations) < _FEWEST:
-        return dict.fromkeys(found, everything)
+        return dict.fromkeys(solutions, everything)
     search = _InlierSearch(observations, outliers, stated)
-    hypotheses = {name: search.hypothesis(known.solution) for name, known in found.items()}
-    if all(search.is_settled(hypothesis) for hypothesis in hypotheses.values()):
-        return dict.fromkeys(found, everything)
-    hypotheses = {
-        name: hypothesis if search.is_settled(hypothesis) else search.anneal(hypothesis)
-        for name, hypothesis in hypotheses.items()
-    }
-    common = Counter(
-        tuple(hypothesis.inliers) for hypothesis in hypotheses.values() if hypothesis.has_enough_inliers
-    ).most_common(_SHARED)
+    hypotheses = {name: search.hypothesis(one.solution) for name, one in solutions.items()}
+    unsettled = [name for name, hypothesis in hypotheses.items() if not search.is_settled(hypothesis)]
+    if not unsettled:
+        return dict.fromkeys(solutions, everything)
+    for name in unsettled:
+        hypotheses[name] = search.anneal(hypotheses[name])
+    supported = Counter(tuple(h.inliers) for h in hypotheses.values() if h.has_enough_inliers)
+    common = [np.flatnonzero(inliers) for inliers, _ in supported.most_common(_SHARED)]
+    # Evenly spaced rows.
     subsets = [
-        _thinned(rows)
-        for rows in (densest_half(observations), *(np.flatnonzero(inliers) for inliers, _ in common))
+        rows[np.unique(np.linspace(0, len(rows) - 1, _MOST).round().astype(int))]
+        for rows in (densest_half(observations), *common)
     ]
     for name, hypothesis in hypotheses.items():
         if not search.is_settled(hypothesis):
-            others = [search.grow(find(observations.select(rows), name).solution, rows) for rows in subsets]
-            hypotheses[name] = max([hypothesis, *others], key=lambda w: (w.has_enough_inliers, w.log_density))
+            others = [search.grow(solve(observations.select(rows), name).solution, rows) for rows in subsets]
+            hypotheses[name] = max([hypothesis, *others], key=lambda h: (h.has_enough_inliers, h.log_density))
     return {
         name: np.flatnonzero(hypothesis.inliers) if hypothesis.has_enough_inliers else everything
         for name, hypothesis in hypotheses.items()
     }
-
-
-def _thinned(rows: RowIndices) -> RowIndices:
-    """Return evenly spaced rows, at most :data:`_MOST`."""
-    chosen: RowIndices = rows[np.unique(np.linspace(0, len(rows) - 1, _MOST).round().astype(int))]
-    return chosen
 
 
 def densest_half(observations: Observations) -> RowIndices:
@@ -130,17 +123,14 @@ def densest_half(observations: Observations) -> RowIndices:
 
 def log_inlier_prior(outliers: Outliers, count: int, inliers: int, rows: int) -> float:
     """Return log((1 - ε)^r (ε u)^(n - r)) for r inliers among n observations and the outlier density u."""
-    return inliers * math.log(1.0 - outliers.fraction) + (count - inliers) * _log_outlier_density(
-        outliers, rows
-    )
+    log_outliers = (count - inliers) * _log_outlier_density(outliers, rows)
+    return inliers * math.log(1.0 - outliers.fraction) + log_outliers
 
 
 def is_inlier(squares: Array, log_scale: Array, outliers: Outliers, rows: int = 6) -> npt.NDArray[np.bool_]:
     """Return the mask of observations that are more probable as inliers than as outliers."""
-    inliers: npt.NDArray[np.bool_] = math.log(
-        1.0 - outliers.fraction
-    ) - 0.5 * squares - log_scale > _log_outlier_density(outliers, rows)
-    return inliers
+    log_inlier = math.log(1.0 - outliers.fraction) - 0.5 * squares - log_scale
+    return np.asarray(log_inlier > _log_outlier_density(outliers, rows))
 
 
 def _log_outlier_density(outliers: Outliers, rows: int) -> float:
@@ -166,9 +156,8 @@ class _InlierSearch:
         log_outlier = _log_outlier_density(self.outliers, self.observations.rows)
         log = float(np.sum(np.maximum(log_inlier, log_outlier)))
         inliers = log_inlier > log_outlier
-        return _InlierHypothesis(
-            inliers, solution, log, np.where(inliers, 1.0, 1.0 / np.maximum(squares, 1.0))
-        )
+        next_weights = np.where(inliers, 1.0, 1.0 / np.maximum(squares, 1.0))
+        return _InlierHypothesis(inliers, solution, log, next_weights)
 
     def anneal(self, hypothesis: _InlierHypothesis) -> _InlierHypothesis:
         """Return the hypothesis that graduated non-convexity reaches from a first one."""
@@ -176,9 +165,8 @@ class _InlierSearch:
         squares, _ = self._whitened_errors(solution, weights)
         tolerance = max(1.0, 2.0 * float(squares.max()) / quantile)
         while True:
-            weights = np.maximum(
-                (tolerance * quantile / (squares + tolerance * quantile)) ** 2, _LEAST_WEIGHT
-            )
+            tolerated = tolerance * quantile
+            weights = np.maximum((tolerated / (squares + tolerated)) ** 2, _LEAST_WEIGHT)
             solution = self._solve(solution.motion, solution.values, solution.parent, weights, _FEW_STEPS)
             squares, _ = self._whitened_errors(solution, weights)
             if tolerance == 1.0:
@@ -189,10 +177,8 @@ class _InlierSearch:
     def grow(self, subset: Solution[FamilyMember], rows: RowIndices) -> _InlierHypothesis:
         """Return the hypothesis that the solution of some of the observations leads to."""
         observations = self.observations
-        distances = np.sum(
-            (observations.relative[:, None] - observations.relative[None, rows])[:, :, :3] ** 2, axis=(2, 3)
-        )
-        values = subset.values[np.argmin(distances, axis=1)]
+        apart = (observations.relative[:, None] - observations.relative[None, rows])[:, :, :3]
+        values = subset.values[np.argmin(np.sum(apart**2, axis=(2, 3)), axis=1)]
         parent = observations.parent.copy()
         parent[rows] = subset.parent
         weights = np.full(len(observations), _LEAST_WEIGHT)
@@ -201,7 +187,6 @@ class _InlierSearch:
         return self._iterate(self.hypothesis(solution, weights))
 
     def _iterate(self, hypothesis: _InlierHypothesis) -> _InlierHypothesis:
-        """Alternate between solving by the inliers and classifying, until the inliers stay the same."""
         for _ in range(_ROUNDS):
             if not hypothesis.has_enough_inliers:
                 break
@@ -215,14 +200,9 @@ class _InlierSearch:
     def _solve(
         self, motion: FamilyMember, values: Array, parent: Array, weights: Array, steps: int = STEPS
     ) -> Solution[FamilyMember]:
-        observations, by = self.observations, (1.0 / weights)[:, None, None]
-        of_parent = None if observations.parent_covariance is None else observations.parent_covariance * by
-        weighted = Observations(
-            observations.parent, observations.child, of_parent, observations.child_covariance * by
-        )
-        return solver.solve(
-            weighted, InitialGuess(motion, values), parent, JointValuePrior.vague(motion.joints), steps
-        )
+        weighted = self.observations.scaled((1.0 / weights)[:, None, None])
+        vague = JointValuePrior.vague(motion.joints)
+        return solver.solve(weighted, InitialGuess(motion, values), parent, vague, steps)
 
     def _whitened_errors(
         self, solution: Solution[FamilyMember], weights: Array | None

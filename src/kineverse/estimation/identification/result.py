@@ -33,8 +33,8 @@ SURE = 0.95
 class NoiseDeviations(NamedTuple):
     """Standard deviations of the noise."""
 
-    position: float  # standard deviation of each coordinate of a position [m]
-    orientation: float  # standard deviation of each component of the rotation vector of an orientation [rad]
+    position: float  # of each coordinate of a position [m]
+    orientation: float  # of each component of the rotation vector of an orientation [rad]
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,7 @@ class Fit:
     @property
     def poses(self) -> Array:
         """Poses of the child in the parent at the joint values, (N, 4, 4)."""
-        poses: Array = self.motion.linearise(self.joint_values).pose
-        return poses
+        return np.asarray(self.motion.linearise(self.joint_values).pose)
 
     @property
     def rms(self) -> tuple[float, float]:
@@ -157,21 +156,13 @@ class Fit:
             If there is no such coordinate.
         """
         if coordinate not in self.coordinates:
-            raise UnknownNameError(
-                f"A {self.family} fit has no coordinate {coordinate!r}. "
-                f"{suggest(coordinate, self.coordinates, 'coordinate')}"
-            )
+            hint = suggest(coordinate, self.coordinates, "coordinate")
+            raise UnknownNameError(f"A {self.family} fit has no coordinate {coordinate!r}. {hint}")
         k = self.coordinates.index(coordinate)
         return math.sqrt(float(self.covariance[k, k]))
 
     def operation(
-        self,
-        name: str,
-        parent: str,
-        child: str | None = None,
-        *,
-        as_point: bool = False,
-        limits: bool = True,
+        self, name: str, parent: str, child: str | None = None, *, as_point: bool = False, limits: bool = True
     ) -> Operation:
         """Return the joint as an operation, with the observed range as its limits.
 
@@ -182,8 +173,8 @@ class Fit:
         as_point
             True if the child is a point, so that the orientation of its frame does not matter.
         limits
-            False for a joint without limits. The range seen is not the range of the joint: with limits, a
-            controller pulls no further than was seen. Beyond its ends a curve continues straight.
+            False for a joint without limits. The observed range is not the range of the joint: with limits, a
+            controller pulls no further than was observed. Beyond its ends a curve continues straight.
 
         Raises
         ------
@@ -192,13 +183,12 @@ class Fit:
         """
         if self.rows == 3 and isinstance(self.motion, (GroupMotion, CurveMotion)) and not as_point:
             raise InvalidValueError(
-                f"Only positions of the child were seen, so how it is turned on '{name}' is not known. If "
+                f"Only positions of the child were observed, so its orientation on '{name}' is unknown. If "
                 "that does not matter, say as_point=True."
             )
         ranges = [(float(low), float(high)) for low, high in self.range]
-        return joint_operation(
-            self.motion, ranges, name, parent, name if child is None else child, limited=limits
-        )
+        child = name if child is None else child
+        return joint_operation(self.motion, ranges, name, parent, child, limited=limits)
 
     def __str__(self) -> str:
         words = [f"{self.family}, {self.probability:.1%}"]
@@ -225,7 +215,7 @@ class IdentificationResult:
     Attributes
     ----------
     lazy_fits
-        Families, their probabilities, and the functions that compute the fits.
+        Families, their probabilities, and functions that compute the fits.
     noise
         Estimated standard deviations of the noise under the most probable family; None if the noise was
         stated.
@@ -304,7 +294,7 @@ def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, pro
     if "pitch" in names and isinstance(motion, GroupMotion):
         covariance[-1] *= math.tau  # [m/rad] to [m/revolution]
         covariance[:, -1] *= math.tau
-    reason = _untested_reason(solution) or _undetermined_reason(names, covariance)
+    reason = _undetermined_reason(solution, names, covariance)
     return Fit(
         family=motion.name,
         probability=probability,
@@ -323,24 +313,18 @@ def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, pro
     )
 
 
-def _untested_reason(solution: Solution[FamilyMember]) -> str:
-    """Return the reason why a fit is no test: it has as many unknowns as measured numbers. Else empty."""
-    motion, seen = solution.motion, solution.residuals.size
-    if not isinstance(motion, GroupMotion) or not motion.size or not motion.joints:
-        return ""
+def _undetermined_reason(solution: Solution[FamilyMember], names: tuple[str, ...], covariance: Array) -> str:
+    """Return the reason why the parameters are not tested or not determined, or an empty string."""
+    motion, measured = solution.motion, solution.residuals.size
     unknown = motion.size + solution.values.size
-    return (
-        "" if unknown < seen else f"{seen} numbers were seen and it has {unknown} unknowns, so it always fits"
-    )
-
-
-def _undetermined_reason(names: tuple[str, ...], covariance: Array) -> str:
-    """Return the reason why the parameters are not determined, or an empty string."""
+    if isinstance(motion, GroupMotion) and motion.size and motion.joints and unknown >= measured:
+        return f"it has {unknown} unknowns for {measured} measured numbers, so it always fits"
     turns = [i for i, name in enumerate(names) if name.startswith("axis.")]
-    if not turns:
-        return ""
-    worst = math.sqrt(float(np.linalg.eigvalsh(covariance[np.ix_(turns, turns)])[-1]))
-    return "" if worst <= _WELL_KNOWN else f"its axis is known to {math.degrees(worst):.0f}° only"
+    if turns:
+        worst = math.sqrt(float(np.linalg.eigvalsh(covariance[np.ix_(turns, turns)])[-1]))
+        if worst > _WELL_KNOWN:
+            return f"its axis is known to {math.degrees(worst):.0f}° only"
+    return ""
 
 
 def project_observations(
@@ -364,11 +348,7 @@ def complete_fit(
     stated: bool = True,
     sequential: bool = False,
 ) -> Fit:
-    """Return a fit of some observations, extended to all of them.
-
-    The motion stays as it is. The other observations get joint values, deviations and residuals, and are
-    classified as inliers or outliers.
-    """
+    """Return a fit of some observations, extended to all; outliers among the others are classified."""
     others: npt.NDArray[np.int_] = np.setdiff1d(np.arange(len(observations)), used)
     if not len(others):
         return fit

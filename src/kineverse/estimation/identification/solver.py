@@ -68,14 +68,15 @@ class SolutionBuffer:
         return buffer
 
     @property
-    def log_evidence(self) -> float:
-        """Logarithm of the evidence."""
-        return float(self.numbers[_LOG])
+    def scored(self) -> Scored:
+        """Solution in the buffer and its log evidence."""
+        return Scored(self.solution, float(self.numbers[_LOG]))
 
     @property
     def solution(self) -> Solution[GroupMotion]:
         """Solution in the buffer. Its arrays share the memory."""
         head, joints = self.numbers, self._values.shape[1]
+        mean, precision = head[_MEAN : _MEAN + joints], head[_PRECISION : _PRECISION + joints]
         return Solution(
             motion=unpack_motion(self._motion, head),
             values=self._values,
@@ -84,11 +85,7 @@ class SolutionBuffer:
             covariance=self._covariances,
             linear=self._linear,
             parent=self._parents,
-            joint_prior=JointValuePrior(
-                head[_MEAN : _MEAN + joints],
-                head[_PRECISION : _PRECISION + joints],
-                bool(head[_MARGINAL]),
-            ),
+            joint_prior=JointValuePrior(mean, precision, bool(head[_MARGINAL])),
             converged=bool(head[_CONVERGED]),
         )
 
@@ -117,7 +114,7 @@ _KEPT = 4_000_000
 
 
 class IdentificationSolver:
-    """Stages of :mod:`.maximum_likelihood` and :mod:`.evidence`, in C once it is compiled, else in numpy."""
+    """Stages of :mod:`.marginal_likelihood`, in C once it is compiled, else in numpy."""
 
     @property
     def is_native(self) -> bool:
@@ -136,46 +133,38 @@ class IdentificationSolver:
         joint_prior: JointValuePrior,
         steps: int = least_squares.STEPS,
     ) -> Solution[FamilyMember]:
-        """Run :func:`.optimise.levenberg_marquardt`."""
+        """Run :func:`.least_squares.levenberg_marquardt`."""
         motion = start.motion
         if not _has_kernel(motion):
-            return least_squares.levenberg_marquardt(
-                observations, motion, start.values, parent, joint_prior, steps
-            )
-        problem, buffer = (
-            _problem(observations, motion),
-            SolutionBuffer(motion, joint_prior, start.values, parent),
-        )
+            return least_squares.levenberg_marquardt(observations, *start, parent, joint_prior, steps)
+        problem = _problem(observations, motion)
+        buffer = SolutionBuffer(motion, joint_prior, start.values, parent)
         problem.steps = steps
         _run(library.code.solve, problem, buffer)
         return buffer.solution
 
     def maximum_likelihood(self, observations: Observations, starts: Sequence[InitialGuess]) -> Scored:
-        """Run :func:`.maximum_likelihood.maximum_likelihood`."""
+        """Run :func:`.marginal_likelihood.maximum_likelihood`."""
         motions = [start.motion for start in starts if _has_kernel(start.motion)]
         if len(motions) < len(starts):
             return marginal_likelihood.maximum_likelihood(observations, starts)
-        motion = motions[0]
-        buffer = SolutionBuffer(
-            motion, JointValuePrior.vague(motion.joints), starts[0].values, observations.parent
-        )
-        begin, values = (
-            np.array([pack_motion(m) for m in motions]),
-            np.array([start.values for start in starts]),
-        )
-        given = len(starts), begin.ctypes.data, values.ctypes.data
-        _run(library.code.likeliest, _problem(observations, motion), buffer, given)
-        return Scored(buffer.solution, buffer.log_evidence)
+        motion, vague = motions[0], JointValuePrior.vague(motions[0].joints)
+        buffer = SolutionBuffer(motion, vague, starts[0].values, observations.parent)
+        packed = np.array([pack_motion(m) for m in motions])
+        values = np.array([start.values for start in starts])
+        arguments = len(starts), packed.ctypes.data, values.ctypes.data
+        _run(library.code.likeliest, _problem(observations, motion), buffer, arguments)
+        return buffer.scored
 
     def maximise_marginal_likelihood(
         self, observations: Observations, solution: Solution[FamilyMember]
     ) -> Scored:
-        """Run :func:`.maximum_likelihood.maximise_marginal_likelihood`."""
+        """Run :func:`.marginal_likelihood.maximise_marginal_likelihood`."""
         if not _is_kernel_solution(solution):
             return marginal_likelihood.maximise_marginal_likelihood(observations, solution)
         buffer = SolutionBuffer.from_solution(solution)
         _run(library.code.refine, _problem(observations, solution.motion), buffer)
-        return Scored(buffer.solution, buffer.log_evidence)
+        return buffer.scored
 
     def continue_from(
         self,
@@ -185,42 +174,32 @@ class IdentificationSolver:
         joint_prior: JointValuePrior,
         known: int,
     ) -> Scored:
-        """Run :func:`.maximum_likelihood.continue_from`."""
+        """Run :func:`.marginal_likelihood.continue_from`."""
         motion = start.motion
         if not _has_kernel(motion):
             return marginal_likelihood.continue_from(observations, start, parent, joint_prior, known)
-        problem, buffer = (
-            _problem(observations, motion),
-            SolutionBuffer(motion, joint_prior, start.values, parent),
-        )
+        problem = _problem(observations, motion)
+        buffer = SolutionBuffer(motion, joint_prior, start.values, parent)
         problem.given.fresh = len(observations) - known
         _run(library.code.carry_on, problem, buffer)
-        return Scored(buffer.solution, buffer.log_evidence)
+        return buffer.scored
 
     def evidence(self, solution: Solution[FamilyMember], weight: float = 1.0) -> Evidence:
-        """Run :func:`.evidence.laplace_evidence`."""
+        """Run :func:`.marginal_likelihood.laplace_evidence`."""
         if not _is_kernel_solution(solution):
             return laplace_evidence(solution, weight)
-        logs, *rest = _evaluate_evidence(solution, np.ones((1, 2)), weight=weight)
-        values, covariances, information = rest
-        return Evidence.from_information(
-            float(logs[0]), information, solution.motion.size, values, covariances
-        )
+        logs, *of_joints, information = _evaluate_evidence(solution, np.ones((1, 2)), weight=weight)
+        return Evidence.from_information(float(logs[0]), information, solution.motion.size, *of_joints)
 
     def log_evidences(
         self, solution: Solution[FamilyMember], factors: Array, parts: Array, weight: float = 1.0
     ) -> Array:
         """Return the log evidence for each of several sizes of the noise."""
-        if not _is_kernel_solution(solution):
-            return np.array(
-                [
-                    laplace_evidence(
-                        replace(solution, covariance=np.tensordot(each**2, parts, axes=1)), weight
-                    ).log_evidence
-                    for each in factors
-                ]
-            )
-        return _evaluate_evidence(solution, factors, parts, weight)[0]
+        if _is_kernel_solution(solution):
+            return _evaluate_evidence(solution, factors, parts, weight)[0]
+        covariances = (np.tensordot(each**2, parts, axes=1) for each in factors)
+        scaled = (replace(solution, covariance=covariance) for covariance in covariances)
+        return np.array([laplace_evidence(each, weight).log_evidence for each in scaled])
 
 
 solver = IdentificationSolver()
@@ -238,14 +217,12 @@ def _run(
     stage: Callable[..., None],
     problem: Problem,
     buffer: SolutionBuffer,
-    given: Sequence[int] = (),
+    arguments: Sequence[int] = (),
     results: Sequence[Array] = (),
 ) -> None:
-    """Run a C stage with the arguments problem, given values, work memory, solution and results."""
-    where = ctypes.addressof(problem)
-    memory = _memory.reserve(library.code.memory_of(where))
-    addresses = (array.ctypes.data for array in (memory, buffer.numbers, *results))
-    stage(where, *given, *addresses)
+    address = ctypes.addressof(problem)
+    memory = _memory.reserve(library.code.memory_of(address))
+    stage(address, *arguments, *(array.ctypes.data for array in (memory, buffer.numbers, *results)))
     raise_signal()
 
 
@@ -260,14 +237,14 @@ def _evaluate_evidence(
     shapes = (len(factors),), (count, joints), (count, joints, joints), (unknowns, unknowns)
     results = tuple(np.empty(shape) for shape in shapes)
     factors = np.ascontiguousarray(factors)
-    given = len(factors), factors.ctypes.data, 0 if parts is None else parts.ctypes.data
-    _run(library.code.rate, problem, SolutionBuffer.from_solution(solution), given, results)
+    arguments = len(factors), factors.ctypes.data, 0 if parts is None else parts.ctypes.data
+    _run(library.code.rate, problem, SolutionBuffer.from_solution(solution), arguments, results)
     return results
 
 
 def _problem(observations: Observations, motion: GroupMotion) -> Problem:
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))
-    problem.given = _given(observations)
+    problem.given = _observations_structure(observations)
     return problem
 
 
@@ -282,29 +259,20 @@ def _family(group: JointFamily, rows: int) -> Problem:
 _structures: WeakKeyDictionary[Observations, Given] = WeakKeyDictionary()
 
 
-def _given(observations: Observations) -> Given:
+def _observations_structure(observations: Observations) -> Given:
     """Return the C structure of observations. All families share it, so it is cached."""
-    given = _structures.get(observations)
-    if given is None:
-        given = Given(
-            count=len(observations),
-            known=observations.parent_covariance is None,
-            softer=len(observations.softness),
-        )
-        arrays = {
-            "parent": observations.parent,
-            "child": observations.child,
-            "parent_covariance": observations.parent_covariance,
-            "child_covariance": observations.child_covariance,
-            "softness": np.array(observations.softness),
-        }
+    structure = _structures.get(observations)
+    if structure is None:
+        is_known, softer = observations.parent_covariance is None, len(observations.softness)
+        structure = Given(count=len(observations), known=is_known, softer=softer)
         # The structure holds bare addresses, so it has to keep the arrays alive.
-        given.arrays = [np.ascontiguousarray(a) for a in arrays.values() if a is not None]
-        there = iter(given.arrays)
-        for name, array in arrays.items():
-            setattr(given, name, None if array is None else next(there).ctypes.data)
-        _structures[observations] = given
-    return given
+        structure.arrays = []
+        for name in ("parent", "child", "parent_covariance", "child_covariance", "softness"):
+            if (array := getattr(observations, name)) is not None:
+                structure.arrays.append(np.ascontiguousarray(array, dtype=np.float64))
+                setattr(structure, name, structure.arrays[-1].ctypes.data)
+        _structures[observations] = structure
+    return structure
 
 
 class _Memory(threading.local):

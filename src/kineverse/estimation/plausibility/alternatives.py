@@ -1,10 +1,10 @@
 """Comparison of the served joint with its alternatives.
 
-As in :mod:`..identification.marginal_likelihood`, the prior of joint values is a Gaussian of unknown
-mean and width, here truncated at the limits. So the amplitude of a motion is no evidence: a door that moved a
-little is not compared with one that moved all the way. Identified joints have an improper prior of their mean
-pose. Here the pose is uniform in a cube of 2 m and over all rotations, so that both densities have the same
-unit.
+As in :mod:`kineverse.estimation.identification.marginal_likelihood`, the prior of joint values is a Gaussian
+of unknown mean and width, here truncated at the limits. So the amplitude of a motion is no evidence: a door
+that moved a little is not compared with one that moved all the way. Identified joints have an improper prior
+of their mean pose. Here the pose is uniform in a cube of 2 m and over all rotations, so that both densities
+have the same unit.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from kineverse.estimation.identification.kinematic_graph.pairwise import (
 )
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
-from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult, project_observations
+from kineverse.estimation.identification.result import SURE, IdentificationResult, project_observations
 from kineverse.estimation.linear_algebra import (
     invert_matrices,
     log_determinants,
@@ -38,10 +38,9 @@ from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .known_motion import KnownJoint
 from .replacement import build_replacement, extend_fit, follows_another
 from .report import JointVerdict, TestableJoint
-from .residuals import SIZES, KnownResiduals, compute_residuals, orthogonal_residuals
+from .residuals import SIZES, KnownJoint, KnownResiduals, compute_residuals, orthogonal_residuals
 
 
 def reject_outliers(residuals: KnownResiduals, outliers: Outliers | None) -> RowIndices:
@@ -53,11 +52,11 @@ def reject_outliers(residuals: KnownResiduals, outliers: Outliers | None) -> Row
     if residuals.one_sided.size:
         squares = squares + np.fmax(residuals.one_sided, 0.0).max(axis=1) ** 2
     log_scale = residuals.log_scale + 0.5 * log_determinants(math.tau * residuals.covariances)
-    right = all_rows[is_inlier(squares, log_scale, outliers)]
+    inliers = all_rows[is_inlier(squares, log_scale, outliers)]
     # More outliers than chance explains indicate a wrong model instead.
     expected = outliers.fraction * len(residuals)
-    usual = len(residuals) - len(right) <= expected + 2.0 * math.sqrt(expected)
-    return right if usual else all_rows
+    is_usual = len(residuals) - len(inliers) <= expected + 2.0 * math.sqrt(expected)
+    return inliers if is_usual else all_rows
 
 
 _WIDTHS = np.geomspace(1e-5, 10.0, 43)
@@ -66,18 +65,13 @@ _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
 def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool = False) -> float:
-    """Return the log density of the observed relative poses, with joint values integrated out.
-
-    Limits truncate the prior only for a single joint value. For several joint values, and for limits on
-    several coordinates, violations reduce the density by their distance.
-    """
+    """Return the log density of the observed relative poses, with joint values integrated out."""
     log = -float(np.sum(0.5 * np.sum(residuals.orthogonal**2, axis=1) + residuals.log_scale))
     log -= 0.5 * float(np.nansum(np.maximum(residuals.limit_excess, 0.0) ** 2))
     # The expected squared disagreement under a correct model is 1.
     known = np.isfinite(residuals.disagreement)
-    log -= 0.5 * float(
-        np.maximum(np.nansum(residuals.disagreement**2, axis=0) - known.sum(axis=0), 0.0).sum()
-    )
+    excess = np.nansum(residuals.disagreement**2, axis=0) - known.sum(axis=0)
+    log -= 0.5 * float(np.maximum(excess, 0.0).sum())
     widths = _STATIC_WIDTH if is_static else _WIDTHS
     if served.joints == 1:
         lower, upper = float(served.lower[0]), float(served.upper[0])
@@ -90,10 +84,7 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
 
 
 def log_displacement_gain(residuals: KnownResiduals) -> float:
-    """Return the log density ratio of a displaced joint, or child on it, to the served one.
-
-    ρ = G δ + noise with δ ~ N(0, s² I), with δ integrated out and averaged over several s.
-    """
+    """Return the log density ratio of ρ = G δ + noise, δ ~ N(0, s² I) for several s, to noise alone."""
     transposed = np.swapaxes(residuals.displacement_jacobian, 1, 2)
     information = np.sum(transposed @ residuals.displacement_jacobian, axis=0)
     pull = np.sum(transposed @ residuals.orthogonal[:, :, None], axis=0)[:, 0]
@@ -118,19 +109,16 @@ def _log_evidence_of_several(served: KnownJoint, residuals: KnownResiduals, widt
     information = weights.sum(axis=0)
     mean = np.linalg.solve(information, multiply_vectors(weights, residuals.values).sum(axis=0))
     off = residuals.values - mean
-    log -= 0.5 * (
-        float(np.sum(off * multiply_vectors(weights, off))) + sum_log_determinants(math.tau * total)
-    )
+    log -= 0.5 * float(np.sum(off * multiply_vectors(weights, off)))
+    log -= 0.5 * sum_log_determinants(math.tau * total)
     volume = 0.5 * sum_log_determinants(math.tau * invert_matrices(information)[None])
     return log + min(volume + float(_log_density(served).sum()), 0.0)
 
 
 def _log_density(served: KnownJoint) -> Array:
-    """Return the log density of the mean of each joint value, uniform within its limits."""
     width = served.upper - served.lower
     free = np.where(served.is_angle, 2.0 * math.pi, 20.0)
-    density: Array = -np.log(np.where(np.isfinite(width), np.maximum(width, 1e-6), free))
-    return density
+    return np.asarray(-np.log(np.where(np.isfinite(width), np.maximum(width, 1e-6), free)))
 
 
 def _log_mean(logs: Array) -> float:
@@ -158,11 +146,9 @@ def _log_evidence_by_width(
 
 
 def _log_mass(mean: Array, deviation: Array, lower: float, upper: float) -> Array:
-    """Return the log probability of a Gaussian inside limits."""
     scale = math.sqrt(2.0) * deviation
     mass = 0.5 * (_erf((upper - mean) / scale) - _erf((lower - mean) / scale))
-    result: Array = np.log(np.maximum(mass, 1e-300))
-    return result
+    return np.asarray(np.log(np.maximum(mass, 1e-300)))
 
 
 PRIOR: Mapping[str, float] = MappingProxyType({"served": 0.8, "elsewhere": 0.05, "rigid": 0.1, "other": 0.05})
@@ -176,7 +162,7 @@ _KEPT = 60
 _UNRELATED = 0.5
 # Least number of independent observations for a certain verdict.
 _LEAST_INDEPENDENT = 1.5
-# Number of looks that tell as much as one from which on this is worth saying.
+# Number of looks that are worth one, from which on this is worth saying.
 _CORRELATED = 2.0
 # Factor on covariances that changes no verdict.
 _ALMOST_ONE = 1.1
@@ -186,42 +172,30 @@ _ALMOST_ONE = 1.1
 class JointObservations:
     """Observations of a tested joint."""
 
-    joint: TestableJoint  # tested joint
-    served: KnownJoint  # its motion in the served model
-    observations: Observations  # observations of both frames
-    residuals: KnownResiduals  # residuals under the served joint
+    joint: TestableJoint
+    served: KnownJoint  # motion in the served model
+    observations: Observations  # of both frames
+    residuals: KnownResiduals
     times: npt.NDArray[np.int_]  # numbers of the observations, (N,)
     stamps: Array  # their times [s], (N,)
 
     def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the observations."""
+        poses, residuals = self.observations.select(rows), self.residuals.select(rows)
         return JointObservations(
-            self.joint,
-            self.served,
-            self.observations.select(rows),
-            self.residuals.select(rows),
-            self.times[rows],
-            self.stamps[rows],
+            self.joint, self.served, poses, residuals, self.times[rows], self.stamps[rows]
         )
 
     def decorrelate(self, looks: float) -> JointObservations:
-        """Return evenly spaced observations with errors that may be taken as independent.
-
-        If ``looks`` observations tell as much as one with independent errors, N of them tell as much as N /
-        ``looks``. Some more are kept, because they show more of the motion, with accordingly larger
-        covariances.
-        """
+        """Return evenly spaced observations with larger covariances, as independent ones."""
         count = len(self.times)
         kept = min(max(math.ceil(count / looks), _KEPT), count)
         factor = max(looks * kept / count, 1.0)
         result = self if kept == count else self.select(np.linspace(0, count - 1, kept).round().astype(int))
         if factor < _ALMOST_ONE:
             return result
-        return replace(
-            result,
-            observations=result.observations.scaled(factor),
-            residuals=result.residuals.scaled(factor),
-        )
+        poses, residuals = result.observations.scaled(factor), result.residuals.scaled(factor)
+        return replace(result, observations=poses, residuals=residuals)
 
 
 def judge_joint(
@@ -235,56 +209,45 @@ def judge_joint(
     """Compare a joint with its alternatives, given the change point of the sequential test."""
     if implausible_since is None:
         recent = data
-        right = reject_outliers(data.residuals, outliers)
+        rows = reject_outliers(data.residuals, outliers)
     else:
         recent = data.select(slice(int(np.searchsorted(data.times, implausible_since)), None))
-        right = np.arange(len(recent.times))
-        if outliers is not None and len(right) >= 2:
-            right = identify_observations(recent.observations, families, outliers).best.inliers
-    inliers = recent.select(right)
+        rows = np.arange(len(recent.times))
+        if outliers is not None and len(rows) >= 2:
+            rows = identify_observations(recent.observations, families, outliers).best.inliers
+    inliers = recent.select(rows)
     alternative = None
-    if len(right) >= 2 and implausible_since is not None:
+    if len(rows) >= 2 and implausible_since is not None:
         # The residuals under the rejected joint are no errors.
         alternative = identify_observations(inliers.observations, families)
-        looks = _measure_looks(inliers, alternative.best, correlation)
+        fit = alternative.best
+        solution = project_observations(fit.motion, fit.joint_values, inliers.observations)
+        size = inliers.observations.rows - fit.joint_values.shape[1]
+        looks = correlation.measure(orthogonal_residuals(solution), size, inliers.stamps)
     else:
-        found = data.residuals
-        looks = correlation.measure(found.whitened, found.orthogonal.shape[1], data.stamps)
+        whitened, size = data.residuals.whitened, data.residuals.orthogonal.shape[1]
+        looks = correlation.measure(whitened, size, data.stamps)
     independent = inliers.decorrelate(looks)
-    if len(right) >= 2 and (alternative is None or independent is not inliers):
+    if len(rows) >= 2 and (alternative is None or independent is not inliers):
         alternative = identify_observations(independent.observations, families)
     probabilities = _probabilities(independent, alternative)
     operation, reason = None, ""
     if implausible_since is not None and _is_unrelated(recent, alternative):
         alternative, probabilities = None, {}
-        reason = "successive poses are unrelated, as if all were outliers; see how the frames are observed"
+        reason = "successive poses are unrelated, as if all were outliers; check how the frames are observed"
     elif implausible_since is not None:
-        reason = _indecision_reason(data.joint, probabilities, alternative)
-        if not reason:
+        static = alternative is not None and alternative.best.family == "rigid"
+        if data.joint.moves and static and probabilities["rigid"] < SURE:
+            reason = "it has hardly moved since, so its replacement is not known yet"
+        else:
             operation, reason = _propose_replacement(model, data, independent, alternative)
     else:
-        reason = _ambiguity_reason(probabilities, len(right), looks)
+        reason = _ambiguity_reason(probabilities, len(rows), looks)
     squares = np.mean(inliers.residuals.pose_residuals**2, axis=0)
     rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
-    outlier_times = tuple(np.setdiff1d(recent.times, inliers.times).tolist())
-    return JointVerdict(
-        data.joint,
-        probabilities,
-        rms,
-        len(data.times),
-        implausible_since,
-        alternative,
-        operation,
-        reason,
-        outlier_times,
-    )
-
-
-def _measure_looks(data: JointObservations, fit: Fit, correlation: CorrelationSettings) -> float:
-    """Return the number of observations that tell as much as one, from the residuals of a fit."""
-    solution = project_observations(fit.motion, fit.joint_values, data.observations)
-    size = data.observations.rows - fit.joint_values.shape[1]
-    return correlation.measure(orthogonal_residuals(solution), size, data.stamps)
+    left_out = tuple(np.setdiff1d(recent.times, inliers.times).tolist())
+    verdict = JointVerdict(data.joint, probabilities, rms, len(data.times), implausible_since, alternative)
+    return replace(verdict, replacement=operation, reason=reason, outliers=left_out)
 
 
 def _probabilities(data: JointObservations, alternative: IdentificationResult | None) -> dict[str, float]:
@@ -308,63 +271,47 @@ def _probabilities(data: JointObservations, alternative: IdentificationResult | 
 
 
 def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: float) -> str:
-    """Return the reason why a joint that fits is not certain."""
-    correlated = f"errors are correlated, {count} observations tell as much as {count / looks:.1f}"
+    correlated = f"errors are correlated, {count} observations are worth {count / looks:.1f}"
     if probabilities["served"] >= SURE and count > 1:
         return "" if count >= _LEAST_INDEPENDENT * looks else correlated
     if count < _LEAST_COUNT:
-        return f"both were seen {count} time{'s' if count > 1 else ''} only"
+        return f"both were observed only {count} time{'s' if count > 1 else ''}"
     other = max((name for name in probabilities if name != "served"), key=lambda name: probabilities[name])
-    reason = f"it may be {other} as well"
-    if other in ("elsewhere", "rigid"):
-        reason = "it may sit a bit elsewhere as well" if other == "elsewhere" else "it hardly moved"
+    special = {"elsewhere": "it may sit a bit elsewhere as well", "rigid": "it hardly moved"}
+    reason = special.get(other, f"it may be {other} as well")
     if looks >= _CORRELATED:
         reason += f"; {correlated}"
     return reason
-
-
-def _indecision_reason(
-    joint: TestableJoint, probabilities: Mapping[str, float], alternative: IdentificationResult | None
-) -> str:
-    """Return the reason why the observations since a rejection tell nothing of a replacement."""
-    static = alternative is not None and alternative.best.family == "rigid"
-    if joint.moves and static and probabilities["rigid"] < SURE:
-        return "it hardly moved since, so what it is instead is not known yet"
-    return ""
 
 
 def _propose_replacement(
     model: Model, data: JointObservations, recent: JointObservations, alternative: IdentificationResult | None
 ) -> tuple[Operation | None, str]:
     if alternative is None or len(recent.times) < _LEAST_COUNT:
-        return None, "it was seen too seldom since to say what it is instead"
+        return None, "there are too few observations since for a replacement"
     if alternative.best.family == "free":
-        return (
-            None,
-            "no joint explains what is seen since; the part is loose, or the errors are larger than stated",
-        )
+        return None, "no joint explains the poses since; the part is loose, or errors are larger than stated"
     if not alternative.best.is_determined or not alternative.best.probability >= SURE:
-        return None, f"what it is instead is not known yet, {alternative}"
+        return None, f"its replacement is not known yet, {alternative}"
     probabilities = _probabilities(recent, alternative)
     if probabilities["served"] == max(probabilities.values()):
-        return None, "no other joint explains better what is seen; the errors are larger than stated"
+        return None, "no other joint explains the poses better; the errors are larger than stated"
     if not follows_another(model, data.joint) and _explains_alone(model, recent, alternative):
         # Another joint would not resolve the contradiction.
-        return None, "by itself it explains what is seen, but not together with what limits or moves it"
+        return None, "it explains the poses alone, but not together with the limits or joints it depends on"
     try:
         used = np.searchsorted(data.times, recent.times)
         rows, fit = extend_fit(alternative.best, data.observations, used)
         coordinates = data.served.solve_unbounded(data.observations, data.residuals.coordinates)[rows]
-        operation = build_replacement(
-            model, data.joint, data.served, coordinates, data.residuals.other_values[rows], fit
-        )
+        others = data.residuals.other_values[rows]
+        operation = build_replacement(model, data.joint, data.served, coordinates, others, fit)
     except KineverseError as error:
-        return None, f"what it is instead is no operation. {error}"
+        return None, f"its replacement is no operation. {error}"
     try:
         with model.copy().edit() as edit:
             edit.replace(data.joint.tag, operation)
     except KineverseError as error:
-        return None, f"what it is instead cannot take its place. {error}"
+        return None, f"its replacement does not fit into the model. {error}"
     return operation, ""
 
 

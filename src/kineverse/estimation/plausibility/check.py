@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_tolerance, finite_number
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError
 from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
@@ -30,9 +31,8 @@ from kineverse.model.model import Model, Snapshot
 from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
 from .e_process import SequentialTest
-from .known_motion import KnownJoint
 from .report import JointVerdict, Plausibility, TestableJoint, find_testable_joints
-from .residuals import compute_residuals
+from .residuals import KnownJoint, compute_residuals
 
 # Number of observations that are compared.
 _COMPARED = 50
@@ -47,9 +47,8 @@ def find_exchanged_frames(
 ) -> dict[TestableJoint, str]:
     """Return the joints that fit after two frames are exchanged, with that as the reason."""
     known = [joint for joint in served_joints if {joint.parent, joint.child} <= tracks.keys()]
-    frames = dict.fromkeys(
-        f for joint in known if joint in implausible_since for f in (joint.parent, joint.child) if f != exact
-    )
+    rejected = [joint for joint in known if joint in implausible_since]
+    frames = dict.fromkeys(f for joint in rejected for f in (joint.parent, joint.child) if f != exact)
     since = min(implausible_since.values(), default=0) - first
     for a, b in combinations(frames, 2):
         exchanged = {**tracks, a: tracks[b], b: tracks[a]}
@@ -58,18 +57,17 @@ def find_exchanged_frames(
             continue
         if all(_fits(served_joints[joint], exchanged, joint, since) for joint in involved):
             reason = f"the poses of '{a}' and '{b}' seem to be exchanged: with each other's the joint fits"
-            return dict.fromkeys([joint for joint in involved if joint in implausible_since], reason)
+            return dict.fromkeys([joint for joint in involved if joint in rejected], reason)
     return {}
 
 
 def _fits(served: KnownJoint, tracks: Mapping[str, PoseTrack], joint: TestableJoint, since: int) -> bool:
-    """Return True if a joint explains most observations from one on."""
     parent, child = tracks[joint.parent], tracks[joint.child]
-    seen = np.flatnonzero(parent.seen & child.seen)
-    seen = seen[seen >= since][:_COMPARED]
-    if not len(seen):
+    rows = np.flatnonzero(parent.observed & child.observed)
+    rows = rows[rows >= since][:_COMPARED]
+    if not len(rows):
         return False
-    residuals = compute_residuals(served, pair_tracks(parent, child, seen))
+    residuals = compute_residuals(served, pair_tracks(parent, child, rows))
     return float(np.median(np.sum(residuals.orthogonal**2, axis=1))) < CHI_SQUARED_6
 
 
@@ -100,7 +98,7 @@ def check_plausibility(
     Parameters
     ----------
     model
-        The served model; or a tracker, with its model, recent poses and the covariances that it was given.
+        The served model; or a tracker, with its model, recent poses and their covariances.
     observations
         Poses over time by name of the frame, (N, 4, 4), or pairs of poses and covariance, (6, 6) or (N, 6,
         6), in order of time; missing poses are NaN throughout.
@@ -109,8 +107,8 @@ def check_plausibility(
     noise
         Default covariance of a pose, (6, 6), see :mod:`kineverse.estimation.noise`.
     relative_to
-        Frame in which poses are given. Its pose is taken as exactly known. It is compared with other frames
-        where nothing else on its part is observed. None for an observer that is no part of the model.
+        Frame in which poses are expressed. Its pose is taken as exactly known. It is compared with other
+        frames where nothing else on its part is observed. None for an observer that is no part of the model.
     families
         Joint families of the alternatives, see :func:`~kineverse.estimation.identify`.
     false_alarms
@@ -134,8 +132,13 @@ def check_plausibility(
         If ``strict``, and a joint does not explain the observations.
     """
     check_false_alarms(false_alarms)
-    check_decorrelation_time(decorrelation_time)
+    if decorrelation_time is not None:
+        as_tolerance(decorrelation_time, "The decorrelation time [s]")
     outlier_model = as_outliers(outliers)
+    checked: object = model.model if isinstance(model, Tracker) else model
+    checked = checked.model() if isinstance(checked, Snapshot) else checked
+    if not isinstance(checked, Model):
+        raise InvalidValueError(f"A model or a tracker is checked, not {checked!r:.80}.")
     if isinstance(model, Tracker):
         if observations is None:
             recent = model.recent
@@ -144,7 +147,6 @@ def check_plausibility(
                 for name, poses in recent.poses.items()
             }
             times, relative_to = recent.times, recent.relative_to
-    checked = _checked_model(model)
     observations = {} if observations is None else observations
     tracks = check_tracks(observations, noise)
     stamps = _check_times(times, max((len(track.poses) for track in tracks.values()), default=0))
@@ -157,30 +159,27 @@ def check_plausibility(
     served_joints: dict[TestableJoint, KnownJoint] = {}
     for joint in testable.joints:
         parent, child = tracks[joint.parent], tracks[joint.child]
-        seen = np.flatnonzero(parent.seen & child.seen)
-        if not len(seen):
-            reasons[joint] = undetermined_verdict(
-                joint, 0, f"'{joint.parent}' and '{joint.child}' were never seen together"
-            )
+        rows = np.flatnonzero(parent.observed & child.observed)
+        if not len(rows):
+            never = f"'{joint.parent}' and '{joint.child}' were never observed together"
+            reasons[joint] = undetermined_verdict(joint, 0, never)
             continue
         try:
             served = KnownJoint(checked, joint.child, joint.parent)
-            residuals[joint] = TimedResiduals(
-                seen, compute_residuals(served, pair_tracks(parent, child, seen))
-            )
-            served_joints[joint] = served
+            known = compute_residuals(served, pair_tracks(parent, child, rows))
         except KineverseError as error:
-            reasons[joint] = undetermined_verdict(joint, len(seen), f"its pose cannot be computed. {error}")
+            reasons[joint] = undetermined_verdict(joint, len(rows), f"its pose cannot be computed. {error}")
+            continue
+        served_joints[joint], residuals[joint] = served, TimedResiduals(rows, known)
     tested = ConsistencyTests(checked, served_joints, relative_to).apply(residuals)
     data: dict[TestableJoint, JointObservations] = {}
     implausible_since: dict[TestableJoint, int] = {}
     for joint, served in served_joints.items():
-        seen = residuals[joint].times
-        poses = pair_tracks(tracks[joint.parent], tracks[joint.child], seen)
-        data[joint] = JointObservations(joint, served, poses, tested[joint], seen, stamps[seen])
-        since = _test(
-            data[joint], false_alarms, pair_outliers(outlier_model, joint, relative_to), correlation
-        )
+        rows = residuals[joint].times
+        poses = pair_tracks(tracks[joint.parent], tracks[joint.child], rows)
+        data[joint] = JointObservations(joint, served, poses, tested[joint], rows, stamps[rows])
+        fitting = pair_outliers(outlier_model, joint, relative_to)
+        since = _test(data[joint], false_alarms, fitting, correlation)
         if since is not None:
             implausible_since[joint] = since
     exchanged = find_exchanged_frames(implausible_since, served_joints, tracks, relative_to)
@@ -204,9 +203,7 @@ def check_plausibility(
 def check_false_alarms(probability: float) -> None:
     """Check a probability of false alarms."""
     if not 0.0 < probability < 1.0:
-        raise InvalidValueError(
-            f"The probability of a false alarm is between 0 and 1, and not {probability}."
-        )
+        raise InvalidValueError(f"The probability of a false alarm is between 0 and 1, not {probability}.")
 
 
 def undetermined_verdict(
@@ -219,7 +216,6 @@ def undetermined_verdict(
 def _test(
     data: JointObservations, false_alarms: float, outliers: Outliers | None, correlation: CorrelationSettings
 ) -> int | None:
-    """Return the first observation that a joint does not explain; None if it is not rejected."""
     residuals = data.residuals
     looks = correlation.measure(residuals.whitened, residuals.orthogonal.shape[1], data.stamps)
     test = SequentialTest(false_alarms, outliers.fraction if outliers else 0.0)
@@ -237,54 +233,30 @@ def pair_outliers(
     return replace(outliers, fraction=1.0 - (1.0 - outliers.fraction) ** 2)
 
 
-def check_decorrelation_time(time: float | None) -> None:
-    """Check a correlation time."""
-    if time is not None and not (math.isfinite(time) and time >= 0.0):
-        raise InvalidValueError(
-            "The decorrelation time is a number of seconds, 0 for independent errors, or None to measure it, "
-            f"not {time!r}."
-        )
-
-
 def check_time(at: object, last: float) -> float:
     """Return a time stamp as a number."""
-    try:
-        time = float(at)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        time = math.nan
-    if not math.isfinite(time):
+    if (time := finite_number(at)) is None:
         raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
     if time <= last:
         raise InvalidValueError(
             f"The time {time:.9g} is not later than {last:.9g}, that of the observation before. Sort the "
-            "observations by time, and leave out what comes twice."
+            "observations by time, and leave out repeated ones."
         )
     return time
-
-
-def _checked_model(given: Model | Snapshot | Tracker) -> Model:
-    """Return the model to check."""
-    model = given.model if isinstance(given, Tracker) else given
-    if isinstance(model, Snapshot):
-        model = model.model()
-    if not isinstance(model, Model):
-        raise InvalidValueError(f"A model or a tracker is checked, not {model!r:.80}.")
-    return model
 
 
 def _check_times(times: npt.ArrayLike | None, count: int) -> Array:
     if times is None:
         return np.arange(float(count))
     try:
-        given = list(np.asarray(times, dtype=np.float64))
+        stamps = np.array(times, dtype=np.float64)
     except (TypeError, ValueError):
         raise ShapeError("The times are no array of numbers.") from None
-    if np.shape(given) != (count,):
+    if stamps.shape != (count,):
         raise ShapeError(
-            f"There are {count} observations, and the times are of shape {np.shape(given)}. Each observation "
+            f"There are {count} observations, and the times are of shape {stamps.shape}. Each observation "
             "has one time."
         )
-    last = -math.inf
-    for k, at in enumerate(given):
-        given[k] = last = check_time(at, last)
-    return np.array(given)
+    for before, at in zip([-math.inf, *stamps], stamps.tolist(), strict=False):
+        check_time(at, before)
+    return stamps

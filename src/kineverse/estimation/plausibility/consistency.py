@@ -1,8 +1,8 @@
 """Consistency tests between coupled coordinates.
 
-A limit g(q) <= 0 may depend on several coordinates: a drawer opens only as far as the door beside it. At the
+A limit g(q) <= 0 may depend on several coordinates: a drawer opens only as far as the door next to it. At the
 estimated values it is violated by z = g / σ standard deviations, with σ² = ∇gᵀ C ∇g. One coordinate may also
-move several parts, as the fingers of a gripper or the bars of a linkage. Each part is observed on its own,
+move several parts, as the fingers of a gripper or the bars of a linkage. Each part is observed by itself,
 and the estimates of the coordinate differ by z standard deviations. If the model is right, z is at most
 standard normal, to first order. Where the uncertainty of g is unknown, as at a jump of a bound, z is NaN and
 is ignored.
@@ -26,9 +26,8 @@ from kineverse.model.operation import ARTICULATIONS
 from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
-from .known_motion import KnownJoint, is_own_limit
 from .report import TestableJoint
-from .residuals import KnownResiduals
+from .residuals import KnownJoint, KnownResiduals, is_own_limit
 
 # Range of the linearity test in standard deviations, and the accepted relative nonlinearity.
 _RANGE, _NONLINEAR = 2.0, 0.5
@@ -39,7 +38,7 @@ class TimedResiduals:
     """Residuals of one joint, with the numbers of their observations."""
 
     times: npt.NDArray[np.int_]  # numbers of the observations, (N,)
-    residuals: KnownResiduals  # residuals under the served joint
+    residuals: KnownResiduals
 
 
 class ConsistencyTests:
@@ -57,12 +56,10 @@ class ConsistencyTests:
 
     def is_equal(self, joint: TestableJoint, other: ConsistencyTests) -> bool:
         """Return True if a joint has the same consistency tests as in another set."""
-        mine, yours = self._limits[joint], other._limits.get(joint)
-        return (
-            yours is not None
-            and mine.slacks == yours.slacks
-            and self._shared_coordinates(joint) == other._shared_coordinates(joint)
-        )
+        mine, theirs = self._limits[joint], other._limits.get(joint)
+        if theirs is None or mine.slacks != theirs.slacks:
+            return False
+        return self._shared_coordinates(joint) == other._shared_coordinates(joint)
 
     def apply(self, residuals: Mapping[TestableJoint, TimedResiduals]) -> dict[TestableJoint, KnownResiduals]:
         """Return the residuals of each joint with the results of the tests added."""
@@ -100,10 +97,7 @@ class ConsistencyTests:
         when: npt.NDArray[np.int_],
         residuals: Mapping[TestableJoint, TimedResiduals],
     ) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        """Return values (N, m) and covariances (N, m, m) of other coordinates; NaN where unknown.
-
-        The third result is True for coordinates whose joint shares an observed frame with this one.
-        """
+        """Return values (N, m), covariances and shared frames of other coordinates; NaN where unknown."""
         values = np.full((len(when), len(others)), np.nan)
         covariances = np.zeros((len(when), len(others), len(others)))
         shared = np.zeros(len(others), dtype=bool)
@@ -121,7 +115,7 @@ class ConsistencyTests:
 
 
 class _Limits:
-    """Limits of a joint that are more than bounds on one of its own coordinates."""
+    """Limits of a joint that are more than bounds on one of its coordinates."""
 
     def __init__(
         self, model: Model, joint: TestableJoint, served: KnownJoint, sources: Mapping[Symbol, TestableJoint]
@@ -145,41 +139,39 @@ class _Limits:
         if not slacks:
             return
         inputs = (*served.coordinates, *self.others)
-        # Parameters have their own values.
-        given = {s: s.value or 0.0 for slack in slacks for s in slack.symbols if s not in inputs}
-        stacked = array([slack.substitute(given) if given else slack for slack in slacks])
+        # Parameters have their values.
+        parameters = {s: s.value or 0.0 for slack in slacks for s in slack.symbols if s not in inputs}
+        stacked = array([slack.substitute(parameters) if parameters else slack for slack in slacks])
         gradient, none = stacked.gradient(heuristic=False), as_expression(np.zeros(len(slacks)))
         self._function = compile([stacked, *(gradient.get(x.derivative(), none) for x in inputs)], inputs)
 
     def excess(
         self,
         served: KnownJoint,
-        own_residuals: KnownResiduals,
+        residuals: KnownResiduals,
         values: Array,
         covariances: Array,
         shared: npt.NDArray[np.bool_],
     ) -> Array:
         """Return the violation of each limit in standard deviations, (N, c)."""
-        count, m = len(own_residuals), len(self.others)
+        count, m = len(residuals), len(self.others)
         if not self.slacks:
             return np.zeros((count, 0))
-        own = own_residuals.values if served.is_plain else own_residuals.coordinates
-        points = np.concatenate([own, values[:, :m]], axis=1)
+        q = residuals.values if served.is_plain else residuals.coordinates
+        points = np.concatenate([q, values[:, :m]], axis=1)
         slack, *slopes = self._evaluate(points)
-        n = own.shape[1]
-        by_joints = served.per_joint(own, np.stack(slopes[:n], axis=2))
+        n = q.shape[1]
+        by_joints = served.per_joint(q, np.stack(slopes[:n], axis=2))
         by_others = np.stack(slopes[n:], axis=2) if m else np.zeros((count, len(self.slacks), 0))
-        spread = _variances(by_joints, own_residuals.covariances)
-        others = _variances(by_others, covariances[:, :m, :m])
+        spread, others = (
+            np.einsum("ncj,njk,nck->nc", by, covariance, by)
+            for by, covariance in ((by_joints, residuals.covariances), (by_others, covariances[:, :m, :m]))
+        )
         z = _deviations(slack, spread, others, bool(shared[:m].any()))
         # First-order propagation is valid only where the limit is nearly linear within the uncertainty.
-        within = np.sqrt(np.einsum("nii->ni", covariances[:, :m, :m]))
-        if served.is_plain:
-            within = np.concatenate(
-                [np.sqrt(np.einsum("nii->ni", own_residuals.covariances)), within], axis=1
-            )
-        else:
-            within = np.concatenate([np.zeros((count, n)), within], axis=1)
+        of_joint = np.einsum("nii->ni", residuals.covariances) if served.is_plain else np.zeros((count, n))
+        of_others = np.einsum("nii->ni", covariances[:, :m, :m])
+        within = np.sqrt(np.concatenate([of_joint, of_others], axis=1))
         total = np.sqrt(spread + others)
         for k in range(points.shape[1]):
             for step in (-_RANGE, _RANGE):
@@ -190,8 +182,7 @@ class _Limits:
         return z
 
     def _evaluate(self, points: Array) -> Sequence[Array]:
-        """Return slacks and their slopes; NaN where the model has no value."""
-        found = [np.full((len(points), len(self.slacks)), np.nan) for _ in range(1 + points.shape[1])]
+        results = [np.full((len(points), len(self.slacks)), np.nan) for _ in range(1 + points.shape[1])]
         waiting = [np.flatnonzero(np.isfinite(points).all(axis=1))]
         while waiting:
             rows = waiting.pop()
@@ -203,75 +194,60 @@ class _Limits:
                 if len(rows) > 1:
                     waiting += np.array_split(rows, 2)
                 continue
-            for result, part in zip(found, parts, strict=True):
+            for result, part in zip(results, parts, strict=True):
                 result[rows] = part
-        return found
+        return results
 
 
 def _sources(model: Model, served_joints: Mapping[TestableJoint, KnownJoint]) -> dict[Symbol, TestableJoint]:
-    """Return the joint that estimates each coordinate: its own if observed, else one that moves with it."""
+    """Return the joint that estimates each coordinate: its joint if observed, else one that moves with it."""
     sources: dict[Symbol, TestableJoint] = {}
-    for only_own in (True, False):
+    for only_written in (True, False):
         for joint, served in served_joints.items():
-            writes = model.history.entry(joint.tag).writes
-            own = {
-                x for (kind, _), value in writes.items() if kind == ARTICULATIONS for x in value.coordinates
-            }
+            cells = model.history.entry(joint.tag).writes.items()
+            written = {x for (kind, _), value in cells if kind == ARTICULATIONS for x in value.coordinates}
             for x in served.coordinates if served.is_plain else ():
-                if x in own or not only_own:
+                if x in written or not only_written:
                     sources.setdefault(x, joint)
     return sources
 
 
 def _disagreement(
-    served: KnownJoint, own_residuals: KnownResiduals, k: int, other: Array, variance: Array, shared: bool
+    served: KnownJoint, residuals: KnownResiduals, k: int, other: Array, variance: Array, shared: bool
 ) -> Array:
     """Return the difference of coordinate k from its estimate by others, in standard deviations, (N,).
 
     Poses are compared, starting from the estimate by others: a bar that follows a crank has the same pose
-    twice per turn, which leaves its own estimate ambiguous.
+    twice per turn, which leaves its estimate from its pose ambiguous.
     """
-    there = own_residuals.values.copy()
+    there = residuals.values.copy()
     there[:, k] = other
     try:
-        here, expected = served.linearise(own_residuals.values), served.linearise(there)
+        here, expected = served.linearise(residuals.values), served.linearise(there)
         back = np.asarray(np.linalg.pinv(np.nan_to_num(expected.by_joints)), dtype=np.float64)
-        own = back @ here.by_joints
-        spread = (own @ own_residuals.covariances @ np.swapaxes(own, 1, 2))[:, k, k]
-        z = _deviations(
-            multiply_vectors(back, pose_difference(here.pose, expected.pose))[:, k], spread, variance, shared
-        )
+        by_joints = back @ here.by_joints
+        spread = (by_joints @ residuals.covariances @ np.swapaxes(by_joints, 1, 2))[:, k, k]
+        off = multiply_vectors(back, pose_difference(here.pose, expected.pose))[:, k]
+        z = _deviations(off, spread, variance, shared)
         # In a singular linkage first-order propagation fails, for either value.
         enough = _NONLINEAR * _RANGE * np.sqrt(spread + variance)
-        sides = (own_residuals.values, here, own_residuals.covariances[:, k, k]), (there, expected, variance)
-        for values, linear, own_variance in sides:
-            for step in (-_RANGE * np.sqrt(own_variance), _RANGE * np.sqrt(own_variance)):
+        sides = (residuals.values, here, residuals.covariances[:, k, k]), (there, expected, variance)
+        for values, linear, of_side in sides:
+            for step in (-_RANGE * np.sqrt(of_side), _RANGE * np.sqrt(of_side)):
                 moved = values.copy()
                 moved[:, k] += step
-                off = (
-                    pose_difference(served.linearise(moved).pose, linear.pose)
-                    - step[:, None] * linear.by_joints[:, :, k]
-                )
-                z[~(np.abs(multiply_vectors(back, off)[:, k]) <= enough)] = np.nan
+                bent = pose_difference(served.linearise(moved).pose, linear.pose)
+                bent -= step[:, None] * linear.by_joints[:, :, k]
+                z[~(np.abs(multiply_vectors(back, bent)[:, k]) <= enough)] = np.nan
     except KineverseError:
-        return np.full(len(own_residuals), np.nan)
+        return np.full(len(residuals), np.nan)
     return z
 
 
-def _variances(slopes: Array, covariances: Array) -> Array:
-    """Return the variances (N, c) of quantities with slopes (N, c, n); NaN slopes stay."""
-    variances: Array = np.einsum("ncj,njk,nck->nc", slopes, covariances, slopes)
-    return variances
-
-
-def _deviations(off: Array, own: Array, other: Array, shared: bool) -> Array:
-    """Return values in standard deviations; NaN where undefined.
-
-    If both estimates share an observed frame, their standard deviations are added, which bounds any
-    correlation.
-    """
+def _deviations(off: Array, one: Array, other: Array, shared: bool) -> Array:
+    """Return values in standard deviations, added up if a frame is shared; NaN where undefined."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        deviation = np.sqrt(own) + np.sqrt(other) if shared else np.sqrt(own + other)
+        deviation = np.sqrt(one) + np.sqrt(other) if shared else np.sqrt(one + other)
         z: Array = off / deviation
     z[~np.isfinite(z)] = np.nan
     return z

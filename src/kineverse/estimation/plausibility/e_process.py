@@ -22,9 +22,10 @@ and min(L, c) divided by this bound is a fair bet again (Huber's censored ratio)
 observation and detects small deviations slowly; a large c detects gross ones at once. The capital is split
 among several c.
 
-If errors are correlated and m observations tell as much as an independent one, see :mod:`.correlation`, L is
-replaced by L^(1/m). By Hölder's inequality E[Π L_i^(1/m)] <= Π E[L_i]^(1/m) <= 1 for m observations of any
-dependence. The prior weights of change points then count independent observations.
+If errors are correlated and m observations are worth an independent one, see
+:mod:`kineverse.estimation.correlation`, L is replaced by L^(1/m). By Hölder's inequality E[Π L_i^(1/m)] <= Π
+E[L_i]^(1/m) <= 1 for m observations of any dependence. The prior weights of change points then count
+independent observations.
 """
 
 from __future__ import annotations
@@ -88,10 +89,8 @@ class SequentialTest:
                 weight, self.count - 1, orthogonal, squares, displacement_jacobian, looks
             )
             log = _HALF_SHRUNK * squares - len(orthogonal) * _LOG_GROWN
-            parts += [
-                (0.5, *displaced),
-                (0.3, *self._unconstrained.add(weight, self.count - 1, log / looks)),
-            ]
+            unconstrained = self._unconstrained.add(weight, self.count - 1, log / looks)
+            parts += [(0.5, *displaced), (0.3, *unconstrained)]
         if self._limited.any():
             z = np.maximum(one_sided[self._limited], -1e3)
             log = np.nan_to_num(_SLOPES[:, None] * z - 0.5 * _SLOPES[:, None] ** 2, nan=0.0).ravel()
@@ -109,10 +108,7 @@ class SequentialTest:
 
 
 class CorrelatedTest:
-    """Sequential test of one joint with errors that are correlated in time.
-
-    Where many observations tell as much as one, only some of them are tested, with the weight of all.
-    """
+    """Sequential test of one joint that skips correlated observations; others have the weight of all."""
 
     def __init__(
         self, false_alarms: float, outlier_fraction: float, correlation: CorrelationSettings
@@ -156,8 +152,7 @@ class _CensoredBet:
 
     def gains(self, log: Array) -> Array:
         """Return the log gain for each cut, (..., cuts), of log density ratios."""
-        gains: Array = np.minimum(log[..., None], self._cuts) - self._price
-        return gains
+        return np.asarray(np.minimum(log[..., None], self._cuts) - self._price)
 
     def stake(self, log: Array) -> Array:
         """Return the log gain for each stake and cut, (..., stakes, cuts)."""
@@ -216,11 +211,11 @@ class _DisplacementTest:
         spread += looks * np.eye(len(orthogonal))
         information = np.linalg.inv(spread)
         solved = (information @ error[..., None])[..., 0]
-        own = np.sum(error * solved, axis=2)
+        displaced = np.sum(error * solved, axis=2)
         log_volume = np.linalg.slogdet(spread)[1] - len(orthogonal) * math.log(looks)
-        self._logs += self._bet.gains(0.5 * (squares / looks - own - log_volume))
+        self._logs += self._bet.gains(0.5 * (squares / looks - displaced - log_volume))
         if self._bet.robust:
-            information *= (own <= CHI_SQUARED_6)[..., None, None]
+            information *= (displaced <= CHI_SQUARED_6)[..., None, None]
         gain = cross_covariance @ information
         self._means += (gain @ error[..., None])[..., 0]
         self._covariances -= gain @ np.swapaxes(cross_covariance, 2, 3)

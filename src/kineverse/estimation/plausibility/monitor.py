@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_tolerance
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
@@ -31,7 +32,6 @@ from kineverse.model.model import Model
 from .alternatives import JointObservations, judge_joint
 from .check import (
     FALSE_ALARMS,
-    check_decorrelation_time,
     check_false_alarms,
     check_time,
     find_exchanged_frames,
@@ -40,9 +40,8 @@ from .check import (
 )
 from .consistency import ConsistencyTests, TimedResiduals
 from .e_process import CorrelatedTest
-from .known_motion import KnownJoint
 from .report import JointVerdict, Plausibility, TestableJoint, TestableJoints, find_testable_joints
-from .residuals import KnownResiduals, compute_residuals
+from .residuals import KnownJoint, KnownResiduals, compute_residuals
 
 
 @dataclass
@@ -52,10 +51,8 @@ class _MonitoredJoint:
     joint: TestableJoint
     served: KnownJoint | None
     reason: str
-    # Begins with the first observation.
-    test: CorrelatedTest | None = None
-    # Numbers of the observations in the test.
-    numbers: list[int] = field(default_factory=list)
+    test: CorrelatedTest | None = None  # begins with the first observation
+    numbers: list[int] = field(default_factory=list)  # of the observations in the test
 
     @property
     def implausible_since(self) -> int | None:
@@ -66,7 +63,7 @@ class PlausibilityMonitor:
     """Online plausibility test of a model.
 
     The probability of ever rejecting a joint that is as served is at most ``false_alarms``, for any duration.
-    After an edit of the model, joints that it changed are tested anew.
+    After an edit of the model, the tests of the joints that it changed start again.
 
     Parameters
     ----------
@@ -99,7 +96,8 @@ class PlausibilityMonitor:
         keep: int = 500,
     ) -> None:
         check_false_alarms(false_alarms)
-        check_decorrelation_time(decorrelation_time)
+        if decorrelation_time is not None:
+            as_tolerance(decorrelation_time, "The decorrelation time [s]")
         self.model = model
         self.frames = tuple(dict.fromkeys(frames))
         self.false_alarms = false_alarms
@@ -147,10 +145,9 @@ class PlausibilityMonitor:
         """
         for name in observations:
             if name not in self.frames:
-                raise UnknownNameError(
-                    f"The frame {name!r} is not watched. {suggest(str(name), self.frames, 'frame')}"
-                )
-        tracks = {name: self._check(given, name) for name, given in observations.items()}
+                hint = suggest(str(name), self.frames, "frame")
+                raise UnknownNameError(f"The frame {name!r} is not watched. {hint}")
+        tracks = {name: self._check(pose, name) for name, pose in observations.items()}
         time = self._check_time(at)
         if self.model.version != self._version:
             self._find_joints()
@@ -170,24 +167,21 @@ class PlausibilityMonitor:
         if self.model.version != self._version:
             self._find_joints()
         first = self.count - len(self._recent)
-        residuals = {
-            monitored.joint: self._compute_residuals(monitored, first) for monitored in self._monitored
-        }
-        tested = self._consistency.apply(
-            {joint: known for joint, known in residuals.items() if known is not None}
-        )
+        residuals: dict[TestableJoint, TimedResiduals] = {}
+        for one in self._monitored:
+            times = self._times(one, first)
+            if one.served is not None and times:
+                known = compute_residuals(one.served, self._poses(one.joint, times, first))
+                residuals[one.joint] = TimedResiduals(np.array(times), known)
+        tested = self._consistency.apply(residuals)
         since = {m.joint: m.implausible_since for m in self._monitored if m.implausible_since is not None}
-        exchanged = find_exchanged_frames(
-            since,
-            {m.joint: m.served for m in self._monitored if m.served is not None},
-            self._recent_tracks() if since else {},
-            self._relative_to,
-            first,
+        served = {m.joint: m.served for m in self._monitored if m.served is not None}
+        tracks = self._recent_tracks() if since else {}
+        exchanged = find_exchanged_frames(since, served, tracks, self._relative_to, first)
+        verdicts = (
+            self._verdict(one, tested.get(one.joint), first, exchanged.get(one.joint, ""))
+            for one in self._monitored
         )
-        verdicts = [
-            self._verdict(monitored, tested.get(monitored.joint), first, exchanged.get(monitored.joint, ""))
-            for monitored in self._monitored
-        ]
         return Plausibility(tuple(verdicts), self._testable.untested, self.false_alarms)
 
     def _find_joints(self) -> None:
@@ -207,28 +201,26 @@ class PlausibilityMonitor:
         self._monitored = []
         for joint, reason in reasons.items():
             old, served = known.get(joint), served_joints.get(joint)
-            if (
-                old is not None
-                and old.served is not None
-                and served is not None
-                and served.is_equal(old.served)
-                and self._consistency.is_equal(joint, before)
-            ):
-                self._monitored.append(old)
-            else:
-                self._monitored.append(_MonitoredJoint(joint, served, reason))
+            new = _MonitoredJoint(joint, served, reason)
+            if old is not None and old.served is not None and served is not None:
+                if served.is_equal(old.served) and self._consistency.is_equal(joint, before):
+                    new = old
+            self._monitored.append(new)
 
-    def _check(self, given: PosesLike, name: str) -> PoseTrack:
-        if not isinstance(given, tuple) and self._covariances is not None:
+    def _check(self, observed: PosesLike, name: str) -> PoseTrack:
+        pose, *covariance = observed if isinstance(observed, tuple) and len(observed) == 2 else (observed,)
+        try:
+            matrix: Array = np.asarray(pose, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ShapeError(f"The pose of '{name}' is no array of numbers.") from None
+        if matrix.shape != (4, 4):
+            raise ShapeError(f"The pose of '{name}' is a 4×4 transform, not of shape {matrix.shape}.")
+        if not covariance and self._covariances is not None and _is_rigid(matrix):
             # The usual case in a fraction of the time.
-            try:
-                pose: Array = np.asarray(given, dtype=np.float64)
-            except (TypeError, ValueError):
-                pose = np.zeros(0)
-            if pose.shape == (4, 4) and _is_rigid(pose):
-                return PoseTrack(pose[None].copy(), self._covariances, _SEEN)
-        track = check_tracks({name: _one(given, name)}, self._noise)[name]
-        if not isinstance(given, tuple):
+            return PoseTrack(matrix[None].copy(), self._covariances, _SEEN)
+        poses = (matrix[None], covariance[0]) if covariance else matrix[None]
+        track = check_tracks({name: poses}, self._noise)[name]
+        if not covariance:
             self._covariances = track.covariances
         return track
 
@@ -240,10 +232,8 @@ class PlausibilityMonitor:
         if self._last is None:
             return 0.0 if at is None else check_time(at, -math.inf)
         if (at is not None) != self._stamped:
-            raise InvalidValueError(
-                "Either all observations have a time (at=), or none: the first "
-                f"{'had one' if self._stamped else 'had none'}."
-            )
+            first = "had one" if self._stamped else "had none"
+            raise InvalidValueError(f"Either all observations have a time (at=), or none: the first {first}.")
         return self._last + 1.0 if at is None else check_time(at, self._last)
 
     def _add(self, tracks: Mapping[str, PoseTrack], at: float) -> None:
@@ -253,52 +243,37 @@ class PlausibilityMonitor:
             if monitored.served is None or not {joint.parent, joint.child} <= tracks.keys():
                 continue
             parent, child = tracks[joint.parent], tracks[joint.child]
-            if parent.seen[0] and child.seen[0]:
+            if parent.observed[0] and child.observed[0]:
                 now = np.array([0])
-                residuals[joint] = TimedResiduals(
-                    now, compute_residuals(monitored.served, pair_tracks(parent, child, now))
-                )
+                known = compute_residuals(monitored.served, pair_tracks(parent, child, now))
+                residuals[joint] = TimedResiduals(now, known)
         tested = self._consistency.apply(residuals)
         for monitored in self._monitored:
             if monitored.joint in tested:
                 monitored.numbers.append(self.count)
                 if monitored.test is None:
                     outliers = self._pair_outliers(monitored.joint)
-                    monitored.test = CorrelatedTest(
-                        self.false_alarms, outliers.fraction if outliers else 0.0, self._correlation
-                    )
+                    fraction = outliers.fraction if outliers else 0.0
+                    monitored.test = CorrelatedTest(self.false_alarms, fraction, self._correlation)
                 monitored.test.add(tested[monitored.joint], self.count, at)
 
     def _pair_outliers(self, joint: TestableJoint) -> Outliers | None:
         return pair_outliers(self._outliers, joint, self._relative_to)
 
     def _recent_tracks(self) -> dict[str, PoseTrack]:
-        """Return the recent poses by name of the frame, with gaps."""
-        names = {name for tracks in self._recent for name in tracks}
-        return {
-            name: concatenate_tracks(
-                [tracks.get(name, _missing(name, self._recent)) for tracks in self._recent]
-            )
-            for name in names
-        }
-
-    def _compute_residuals(self, monitored: _MonitoredJoint, first: int) -> TimedResiduals | None:
-        """Return the residuals of a joint in the recent observations; None if there are none."""
-        times = self._times(monitored, first)
-        if monitored.served is None or not times:
-            return None
-        return TimedResiduals(
-            np.array(times), compute_residuals(monitored.served, self._poses(monitored.joint, times, first))
-        )
+        result = {}
+        for name, any_track in {name: t for tracks in self._recent for name, t in tracks.items()}.items():
+            gap = replace(any_track, observed=np.zeros(1, dtype=bool))
+            result[name] = concatenate_tracks([tracks.get(name, gap) for tracks in self._recent])
+        return result
 
     def _times(self, monitored: _MonitoredJoint, first: int) -> list[int]:
         return [number for number in monitored.numbers if number >= first]
 
     def _poses(self, joint: TestableJoint, times: Iterable[int], first: int) -> Observations:
         kept = [self._recent[number - first] for number in times]
-        parent, child = (
-            concatenate_tracks([one[name] for one in kept]) for name in (joint.parent, joint.child)
-        )
+        names = (joint.parent, joint.child)
+        parent, child = (concatenate_tracks([one[name] for one in kept]) for name in names)
         return pair_tracks(parent, child, np.arange(len(kept)))
 
     def _verdict(
@@ -306,33 +281,16 @@ class PlausibilityMonitor:
     ) -> JointVerdict:
         joint = monitored.joint
         if monitored.served is None or residuals is None:
-            never = f"'{joint.parent}' and '{joint.child}' were not seen together"
+            never = f"'{joint.parent}' and '{joint.child}' were not observed together"
             return undetermined_verdict(joint, 0, monitored.reason or never)
-        times = self._times(monitored, first)
+        times, since = self._times(monitored, first), monitored.implausible_since
         if exchanged:
-            return undetermined_verdict(joint, len(times), exchanged, monitored.implausible_since)
-        data = JointObservations(
-            joint,
-            monitored.served,
-            self._poses(joint, times, first),
-            residuals,
-            np.array(times),
-            np.array([self._stamps[number - first] for number in times]),
-        )
-        return judge_joint(
-            self.model,
-            data,
-            monitored.implausible_since,
-            self._families,
-            self._pair_outliers(joint),
-            self._correlation,
-        )
-
-
-def _missing(name: str, recent: Iterable[Mapping[str, PoseTrack]]) -> PoseTrack:
-    """Return a gap in the track of a frame."""
-    like = next(tracks[name] for tracks in recent if name in tracks)
-    return replace(like, seen=np.zeros(1, dtype=bool))
+            return undetermined_verdict(joint, len(times), exchanged, since)
+        poses = self._poses(joint, times, first)
+        stamps = np.array([self._stamps[number - first] for number in times])
+        data = JointObservations(joint, monitored.served, poses, residuals, np.array(times), stamps)
+        outliers = self._pair_outliers(joint)
+        return judge_joint(self.model, data, since, self._families, outliers, self._correlation)
 
 
 _SEEN = np.ones(1, dtype=bool)
@@ -357,14 +315,3 @@ def _is_rigid(pose: Array) -> bool:
 _DIAGONAL = np.diag_indices(3)
 # Tolerance of a rotation, and the farthest position, that need no further check.
 _RIGID, _FAR = 1e-6, 1e6
-
-
-def _one(given: PosesLike, name: str) -> PosesLike:
-    pose, *covariance = given if isinstance(given, tuple) and len(given) == 2 else (given,)
-    try:
-        matrix: Array = np.asarray(pose, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ShapeError(f"The pose of '{name}' is no array of numbers.") from None
-    if matrix.shape != (4, 4):
-        raise ShapeError(f"The pose of '{name}' is a 4×4 transform, not of shape {matrix.shape}.")
-    return (matrix[None], covariance[0]) if covariance else matrix[None]

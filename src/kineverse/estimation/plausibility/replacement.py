@@ -36,15 +36,15 @@ from kineverse.model.rates import to_plain
 from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol
 
-from .known_motion import KnownJoint
 from .report import TestableJoint
+from .residuals import KnownJoint
 
 
 @dataclass(frozen=True)
 class JointValue:
     """Value of a joint as an expression of its coordinate."""
 
-    coordinate: Symbol  # coordinate of the served joint
+    coordinate: Symbol
     value: Expression  # joint value, as an expression of the coordinate
     follows: Expression | None  # expression that the joint follows, if it has no coordinate of its own
     is_derived: bool  # True if the value is not the coordinate itself
@@ -55,8 +55,7 @@ class JointValue:
         """Return the joint values at values of the coordinate, (N,)."""
         if not self.is_derived:
             return coordinates
-        moved: Array = np.asarray(compile(self.value, [self.coordinate]).batch(coordinates[:, None]))
-        return moved
+        return np.asarray(compile(self.value, [self.coordinate]).batch(coordinates[:, None]))
 
 
 def find_joint_value(
@@ -81,11 +80,8 @@ def find_joint_value(
 
 def follows_another(model: Model, joint: TestableJoint) -> bool:
     """Return True if an operation records an expression that its joint follows, as a mimic joint does."""
-    writes = model.history.entry(joint.tag).writes
-    return any(
-        kind == ARTICULATIONS and value.child == joint.frame and value.follows is not None
-        for (kind, _), value in writes.items()
-    )
+    records = _records(model.history.entry(joint.tag).writes, joint)
+    return any(record.follows is not None for record in records.values())
 
 
 def extend_fit(fit: Fit, observations: Observations, used: RowIndices) -> tuple[RowIndices, Fit]:
@@ -109,9 +105,9 @@ _FOLLOWS, _GEARED = 3.0, 4.0
 class ReplacedJoint(Operation, document_kind="Relearned"):
     """Identified joint, with the other writes of the operation that it replaces."""
 
-    joint: Operation  # operation of the joint
+    joint: Operation
     record: str | None = None  # name of the articulation's record; that of the joint if None
-    kept: tuple[tuple[tuple[str, str], Any], ...] = ()
+    kept: tuple[tuple[tuple[str, str], Any], ...] = ()  # cells of the old operation, with their values
     frame: str = ""  # frame that the joint places
     before: Pose = Pose()  # pose of the joint in its parent
     after: Pose = Pose()  # of the frame in the joint's child
@@ -124,10 +120,8 @@ class ReplacedJoint(Operation, document_kind="Relearned"):
             factors = (self.before, *placed.factors, self.after)
             writes[FRAMES, self.frame] = Frame(placed.parent, factors)
         if self.record is not None:
-            writes = {
-                (kind, self.record if kind == ARTICULATIONS else name): value
-                for (kind, name), value in writes.items()
-            }
+            cells = writes.items()
+            writes = {(k, self.record if k == ARTICULATIONS else name): value for (k, name), value in cells}
         return Writes.from_cells({**dict(self.kept), **writes})
 
     def default_tag(self) -> str:
@@ -145,9 +139,8 @@ def build_replacement(
     records = _records(writes, joint)
     record = next(iter(records), None)
     if not isinstance(fit.motion, GroupMotion):
-        operation = fit.operation(
-            _name(records, joint, served, fit.joint_values.shape[1]), joint.base, joint.frame
-        )
+        name = _name(records, joint, served, fit.joint_values.shape[1])
+        operation = fit.operation(name, joint.base, joint.frame)
         kept = _remaining_writes(writes, joint, served, False, records)
         places = rigid_pose(base_T_parent), rigid_pose(inverse(frame_T_child))
         return ReplacedJoint(operation, record, kept, joint.frame, *places)
@@ -161,17 +154,14 @@ def build_replacement(
             coordinates = coordinates + _turn_about_axis(served, coordinates, motion, values)
         known = others[:, 0] if others.shape[1] else coordinates[:, 0]
         old = before.evaluate(np.where(np.isfinite(known), known, coordinates[:, 0]))
-        motion, values, slope = _align_values(
-            motion, values, old, same_kind, before.is_derived and bool(others.shape[1])
-        )
+        geared = before.is_derived and bool(others.shape[1])
+        motion, values, slope = _align_values(motion, values, old, same_kind, geared)
         same_kind = same_kind and slope == 1.0
         if before.follows is not None:
             off = values[:, 0] - slope * old
             if float(np.std(off)) < _FOLLOWS * float(np.sqrt(np.mean(fit.deviations**2))):
                 position = before.follows if slope == 1.0 else slope * before.follows
-    limits = [
-        (float(low), float(high)) for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
-    ]
+    limits = list(zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True))
     if same_kind and before is not None:
         # The old limits stay, widened to the observed range.
         (low, high), *_ = limits
@@ -190,22 +180,18 @@ def build_replacement(
 
 
 def _records(writes: WrittenValues, joint: TestableJoint) -> dict[str, Articulation]:
-    return {
-        name: value
-        for (kind, name), value in writes.items()
-        if kind == ARTICULATIONS and value.child == joint.frame
-    }
+    records = {name: value for (kind, name), value in writes.items() if kind == ARTICULATIONS}
+    return {name: value for name, value in records.items() if value.child == joint.frame}
 
 
 def _name(records: Mapping[str, Articulation], joint: TestableJoint, served: KnownJoint, joints: int) -> str:
-    """Return the name of the new joint: that of the old coordinate if each has exactly one of its own."""
-    named = next(iter(records), joint.frame)
+    name = next(iter(records), joint.frame)
     if joints != 1 or len(served.coordinates) != 1:
-        return named
-    own = [x for value in records.values() for x in value.coordinates]
-    if len(own) == 1:
-        return own[0].path
-    return named if records else served.coordinates[0].path
+        return name
+    written = [x for value in records.values() for x in value.coordinates]
+    if len(written) == 1:
+        return written[0].path
+    return name if records else served.coordinates[0].path
 
 
 def _remaining_writes(
@@ -216,17 +202,17 @@ def _remaining_writes(
     records: Mapping[str, Articulation],
 ) -> tuple[tuple[tuple[str, str], Any], ...]:
     """Return the writes that do not concern the pose between both frames."""
-    own = {*served.coordinates, *(x for value in records.values() for x in value.coordinates)}
+    replaced = {*served.coordinates, *(x for value in records.values() for x in value.coordinates)}
     kept = []
     for (kind, name), value in writes.items():
         if (kind == FRAMES and name == joint.frame) or (kind == ARTICULATIONS and name in records):
             continue
-        if kind == RATES and value[0] in own:
+        if kind == RATES and value[0] in replaced:
             continue
         if kind == CONSTRAINTS:
             about = {s.position for s in value.expression.symbols}
             # Position limits are new; speed limits and locks stay if the unit is the same.
-            if about <= own and not (same_kind and any(s.order for s in value.symbols)):
+            if about <= replaced and not (same_kind and any(s.order for s in value.symbols)):
                 continue
         kept.append(((kind, name), value))
     return tuple(kept)
@@ -253,11 +239,7 @@ def _turn_about_axis(served: KnownJoint, coordinates: Array, motion: GroupMotion
 def _align_values(
     motion: GroupMotion, values: Array, old: Array, same_kind: bool, geared: bool
 ) -> tuple[GroupMotion, Array, float]:
-    """Align joint values with the old ones: same direction and zero; also return the ratio of both.
-
-    The ratio is 1 for joints of the same kind, unless ``geared`` says that other joints observed the old
-    values.
-    """
+    """Align joint values with the old ones; also return the ratio of both, 1 for the same kind."""
     new = values[:, 0]
     slope = float(np.mean((old - old.mean()) * (new - new.mean())))
     if slope < 0.0:
@@ -280,5 +262,4 @@ def _align_values(
 
 def _constant(model: Model, frame: str, relative_to: str) -> Array:
     transform = model.fk(frame, relative_to)
-    values: Array = transform({s: s.value or 0.0 for s in transform.symbols})
-    return values
+    return np.asarray(transform({s: s.value or 0.0 for s in transform.symbols}))

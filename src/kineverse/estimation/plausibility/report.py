@@ -19,11 +19,11 @@ from kineverse.model.operation import Operation
 class TestableJoint:
     """Pair of observed frames with one operation between them."""
 
-    tag: str  # tag of the tested operation
+    tag: str  # of the tested operation
     parent: str  # observed frames
     child: str
     base: str  # frame to which the operation attaches
-    frame: str  # the frame that it places there. Between them are only frames of the same operation
+    frame: str  # the frame that it places there; between them are only frames of the same operation
     moves: bool  # True if the child moves relative to the parent
 
 
@@ -40,9 +40,8 @@ def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str
     frames = list(dict.fromkeys(observed))
     for name in frames if relative_to is None else [*frames, relative_to]:
         if name != WORLD and name not in model.frames:
-            raise UnknownNameError(
-                f"There is no frame {name!r}. {suggest(name, [*model.frames, WORLD], 'frame')}"
-            )
+            hint = suggest(name, [*model.frames, WORLD], "frame")
+            raise UnknownNameError(f"There is no frame {name!r}. {hint}")
     return _Finder(model, [f for f in frames if f != relative_to], relative_to).find()
 
 
@@ -90,12 +89,12 @@ class _Finder:
             if top in self.parts:
                 break
         else:
-            return "nothing that it could be compared with is seen"
+            return "no frame with which it could be compared is observed"
         part = self.parts[top]
         parent = self._nearest(self._chain(base), part, part[0])
         if len(tags) > 1:
             between = ", ".join(f"'{tag}'" for tag in tags)
-            return f"several operations are between it and '{parent}': {between}; see what is in between, too"
+            return f"several operations are between it and '{parent}': {between}; observe a frame in between"
         return TestableJoint(tags[0], parent, name, base, frame, True)
 
     def _nearest(self, chain: list[str], part: list[str], otherwise: str) -> str:
@@ -105,19 +104,15 @@ class _Finder:
         return self.model.history.writers(f"frames/{frame}")[-1]
 
     def _root(self, name: str) -> str:
-        """Return the root frame of a part."""
         while name != WORLD and not self._moves(name):
             name = self.model.frames[name].parent
         return name
 
     def _moves(self, name: str) -> bool:
-        return any(
-            isinstance(factor, Expression) and any(s.has_derivative for s in factor.symbols)
-            for factor in self.model.frames[name].factors
-        )
+        expressions = [f for f in self.model.frames[name].factors if isinstance(f, Expression)]
+        return any(symbol.has_derivative for factor in expressions for symbol in factor.symbols)
 
     def _chain(self, name: str) -> list[str]:
-        """Return the frame and all its ancestors, the world last."""
         return [*ancestors(name, self.model.frames.__getitem__), WORLD]
 
 
@@ -203,7 +198,7 @@ class Plausibility:
     Attributes
     ----------
     verdicts
-        One for each pair of frames; a second frame on the same part is a pair of its own.
+        One for each pair of frames; a second frame on the same part is another pair.
     untested
         Observed frames that test no single operation, with the reason in words.
     false_alarms
@@ -227,8 +222,8 @@ class Plausibility:
     def repair(self, model: Model) -> tuple[str, ...]:
         """Replace the rejected joints of a model by their replacements, in one edit.
 
-        Returns the tags of the replaced operations; none if no joint was rejected. A joint stays as it is if
-        it was rejected and nothing is known to replace it, while others are replaced.
+        Returns the tags of the replaced operations; none if no joint was rejected. A rejected joint without a
+        replacement stays as it is, while others are replaced.
 
         Raises
         ------
@@ -258,13 +253,12 @@ class Plausibility:
         for verdict in self.implausible:
             alternative = verdict.reason or "nothing else is proposed"
             if verdict.replacement is not None and verdict.result is not None:
-                alternative = f"what is seen is {verdict.result}"
+                alternative = f"the observations show {verdict.result}"
             lines.append(f"\n  '{verdict.tag}' {verdict.verdict}: {alternative}")
-        advice = (
-            "Replace these operations by their proposals" if self.replacements else "See more of the motion"
-        )
+        proposed = "Replace these operations by their proposals"
+        advice = proposed if self.replacements else "Observe more of the motion"
         raise ImplausibleError(
-            f"The model does not explain what is seen. {advice}, or look whether the noise is as stated:"
+            f"The model does not explain the observations. {advice}, or check the stated noise:"
             + "".join(lines)
         )
 
@@ -285,4 +279,4 @@ class Plausibility:
     def __str__(self) -> str:
         lines = [str(verdict) for verdict in self.verdicts]
         lines += [f"'{frame}' tells nothing: {reason}" for frame, reason in self.untested.items()]
-        return "\n".join(lines) or "nothing was seen"
+        return "\n".join(lines) or "nothing was observed"

@@ -6,20 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 
+from kineverse.articulations.mechanisms.mechanism import BLUE, RED, box_shape, rod_shape, shift
 from kineverse.errors import InvalidValueError
 from kineverse.estimation.identification.curve import CURVE
 from kineverse.estimation.identification.joint_operations import joint_operation
 from kineverse.estimation.identification.result import Fit
-from kineverse.gallery import shapes
 from kineverse.lie import Array
 from kineverse.model.basic_operations import SetBody
-from kineverse.model.body import Body
+from kineverse.model.body import Body, Rgba, Shape, Sphere
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 from kineverse.spatial import translation
 
 from .recording import RecordedPair
+
+_ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
 
 _DOTS = 60
 """Largest number of observed poses drawn in the model."""
@@ -66,29 +68,33 @@ def _make_operation(fit: Fit, parent: str, child: str) -> Operation:
     return joint_operation(replace(fit.motion, right=right), limits, child, parent, child)
 
 
-def _parent_shapes(fit: Fit, positions: Array, size: float) -> shapes.Shapes:
+def _parent_shapes(fit: Fit, positions: Array, size: float) -> tuple[Shape, ...]:
     """Return the axis, and dots at observed positions, in the parent's frame."""
     indices = np.unique(np.linspace(0, len(positions) - 1, _DOTS).round().astype(int))
-    parts: shapes.Shapes = ()
-    for point in positions[indices]:
-        parts += shapes.sphere(0.008 * size, point, shapes.ORANGE)
+    parts = [Shape(Sphere(0.008 * size), shift(*map(float, positions[i])), color=_ORANGE) for i in indices]
     if "axis" in fit.parameters:
-        axis = np.asarray(fit.parameters["axis"])
+        half = 0.5 * size * np.asarray(fit.parameters["axis"])
         middle = _closest_point_on_axis(fit, positions.mean(axis=0))
-        parts += shapes.rod(middle - 0.5 * size * axis, middle + 0.5 * size * axis, 0.012 * size, shapes.RED)
-    return parts
+        parts.append(_rod(middle - half, middle + half, size, RED))
+    return tuple(parts)
 
 
-def _child_shapes(fit: Fit, size: float) -> shapes.Shapes:
+def _child_shapes(fit: Fit, size: float) -> tuple[Shape, ...]:
     """Return a box for the child, and a rod from it to its axis if there is one, in the child's frame."""
-    parts = shapes.box(np.full(3, 0.06 * size), color=shapes.BLUE)
+    side = 0.06 * size
+    parts = [box_shape((side, side, side), (0.0, 0.0, 0.0), BLUE)]
     if "point" in fit.parameters:
         reference = np.asarray(fit.parameters["reference"])
         rotation = reference[:3, :3] if fit.motion.rows == 6 else np.eye(3)
         arm = rotation.T @ (_closest_point_on_axis(fit, reference[:3, 3]) - reference[:3, 3])
         if np.linalg.norm(arm) > 0.01 * size:
-            parts += shapes.rod(np.zeros(3), arm, 0.012 * size, shapes.BLUE)
-    return parts
+            parts.append(_rod(np.zeros(3), arm, size, BLUE))
+    return tuple(parts)
+
+
+def _rod(start: Array, end: Array, size: float, color: Rgba) -> Shape:
+    (a, b, c), (x, y, z) = start.tolist(), end.tolist()
+    return rod_shape((a, b, c), (x, y, z), 0.012 * size, color)
 
 
 def _closest_point_on_axis(fit: Fit, position: Array) -> Array:

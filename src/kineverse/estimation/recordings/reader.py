@@ -21,12 +21,9 @@ from kineverse.lie import Array, exp_so3, quaternion, rpy, transform
 from .recording import Indices, RecordedTrack, Recording
 
 POSITION = ("x", "y", "z")
+_RPY, _VECTOR = ("roll", "pitch", "yaw"), ("rx", "ry", "rz")
 ORIENTATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "quaternion": ("qx", "qy", "qz", "qw"),
-        "rpy": ("roll", "pitch", "yaw"),
-        "rotation vector": ("rx", "ry", "rz"),
-    }
+    {"quaternion": ("qx", "qy", "qz", "qw"), "rpy": _RPY, "rotation vector": _VECTOR}
 )
 """Representations of an orientation, with their columns."""
 
@@ -40,9 +37,7 @@ _LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _ANGLES = {"rad": 1.0, "deg": math.pi / 180.0, "°": math.pi / 180.0}
 _TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
-    {TIME: _TIMES}
-    | dict.fromkeys(POSITION, _LENGTHS)
-    | dict.fromkeys(ORIENTATIONS["rpy"] + ORIENTATIONS["rotation vector"], _ANGLES)
+    {TIME: _TIMES} | dict.fromkeys(POSITION, _LENGTHS) | dict.fromkeys(_RPY + _VECTOR, _ANGLES)
 )
 """Units of each quantity; the first is the default."""
 
@@ -62,8 +57,8 @@ _WITH_UNIT = re.compile(r"(?P<name>.*?)\s*(?:[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\]
 class PartColumns:
     """Columns of one part."""
 
-    position: tuple[int, ...]  # columns of x, y and z
-    orientation: tuple[int, ...] = ()  # columns of the orientation; empty if there is none
+    position: tuple[int, ...]  # x, y and z
+    orientation: tuple[int, ...] = ()
     form: str = ""  # one of ORIENTATIONS, or ""
 
 
@@ -71,8 +66,8 @@ class PartColumns:
 class Columns:
     """Columns of a table by meaning."""
 
-    names: tuple[str, ...]  # names as given
-    parts: Mapping[str, PartColumns]  # columns of each part by name; the name is "" if columns name no part
+    names: tuple[str, ...]
+    parts: Mapping[str, PartColumns]  # by name of the part, which is "" if columns name no part
     time: int | None = None
     part: int | None = None  # of the part's name; None if there are none
     factors: Mapping[int, float] = field(default_factory=dict)
@@ -90,7 +85,7 @@ def parse_columns(names: Sequence[str], where: str) -> Columns:
             ignored += [name] if name not in ("", SKIP) else []
             continue
         if (part, quantity) in places:
-            raise FormatError(f"{where}: the column '{name}' is there twice.")
+            raise FormatError(f"{where}: there are two columns '{name}'.")
         places[part, quantity] = index
         if factor != 1.0:
             factors[index] = factor
@@ -100,13 +95,10 @@ def parse_columns(names: Sequence[str], where: str) -> Columns:
         raise FormatError(
             f"{where}: no column is a position; the columns are {_format_list(names)}. {COLUMN_HELP}"
         )
-    if row_part is not None and set(owners) != {""}:
-        raise FormatError(
-            f"{where}: a part is named in each row, and in the names of columns too "
-            f"('{next(filter(None, owners))}'); one or the other."
-        )
-    if "" in owners and len(owners) > 1:
-        named = next(filter(None, owners))
+    named = next(filter(None, owners), "")
+    if row_part is not None and named:
+        raise FormatError(f"{where}: parts are named in rows and in columns ('{named}'); one or the other.")
+    if "" in owners and named:
         raise FormatError(f"{where}: some columns belong to a part ('{named}'), others such as 'x' to none.")
     parts = {part: _parse_part(part, places, where, ignored) for part in owners}
     return Columns(tuple(names), parts, time, row_part, factors, tuple(ignored))
@@ -117,11 +109,9 @@ def _parse_column(name: str, where: str) -> tuple[str, str, float]:
     match = _WITH_UNIT.fullmatch(name.strip())
     assert match is not None  # all parts of the pattern are optional
     part, quantity = "", match["name"]
-    found = re.fullmatch(r"(.*)[./:]([^./:]*)", match["name"])
-    if found:
-        part, quantity = found[1].strip(), found[2].strip()
-    quantity = quantity.lower()
-    quantity = SYNONYMS.get(quantity, quantity)
+    if of_part := re.fullmatch(r"(.*)[./:]([^./:]*)", match["name"]):
+        part, quantity = of_part[1].strip(), of_part[2].strip()
+    quantity = SYNONYMS.get(quantity.lower(), quantity.lower())
     if quantity not in QUANTITIES or (part and quantity == PART):
         return "", "", 1.0
     if quantity == TIME:
@@ -142,18 +132,12 @@ def _parse_part(
     position = _find_columns(part, POSITION, places, where, ignored)
     if not position:
         raise FormatError(f"{where}: {_describe_owner(part)} an orientation, but no position x, y, z.")
-    forms = {
-        form: found
-        for form, names in ORIENTATIONS.items()
-        if (found := _find_columns(part, names, places, where, ignored))
-    }
+    columns = {form: _find_columns(part, q, places, where, ignored) for form, q in ORIENTATIONS.items()}
+    forms = [form for form, those in columns.items() if those]
     if len(forms) > 1:
-        raise FormatError(
-            f"{where}: {_describe_owner(part)} its orientation twice, as {' and '.join(forms)}."
-        )
-    for form, found in forms.items():
-        return PartColumns(position, found, form)
-    return PartColumns(position)
+        both = " and ".join(forms)
+        raise FormatError(f"{where}: {_describe_owner(part)} its orientation twice, as {both}.")
+    return PartColumns(position, columns[forms[0]], forms[0]) if forms else PartColumns(position)
 
 
 def _find_columns(
@@ -164,17 +148,12 @@ def _find_columns(
     ignored: Iterable[str],
 ) -> tuple[int, ...]:
     """Return the columns of quantities that belong together; none if all are missing."""
-    found = [places.get((part, quantity)) for quantity in quantities]
-    missing = [quantity for quantity, place in zip(quantities, found, strict=True) if place is None]
-    if len(missing) == len(quantities):
-        return ()
-    if missing:
-        others = list(ignored)
+    missing = [quantity for quantity in quantities if (part, quantity) not in places]
+    if missing and len(missing) < len(quantities):
+        others, absent = list(ignored), ", ".join(missing)
         hint = f" Not understood: {_format_list(others)}." if others else ""
-        raise FormatError(
-            f"{where}: {_describe_owner(part)} no column {', '.join(missing)}.{hint} {COLUMN_HELP}"
-        )
-    return tuple(place for place in found if place is not None)
+        raise FormatError(f"{where}: {_describe_owner(part)} no column {absent}.{hint} {COLUMN_HELP}")
+    return () if missing else tuple(places[part, quantity] for quantity in quantities)
 
 
 def _describe_owner(part: str) -> str:
@@ -194,9 +173,9 @@ class TextTable:
     """Text cells of a table file."""
 
     source: str  # name of the file in messages
-    head: tuple[str, ...] | None  # column names; None if the file begins with numbers
+    head: list[str] | None  # column names; None if the file begins with numbers
     lines: tuple[int, ...]  # line number of each row, counted from 1
-    cells: tuple[tuple[str, ...], ...]  # texts of each row, equally many in each
+    cells: tuple[list[str], ...]  # texts of each row, equally many in each
 
 
 def read_table(path: Path) -> TextTable:
@@ -207,30 +186,28 @@ def read_table(path: Path) -> TextTable:
     tab in a head, else spaces.
     """
     source = str(path)
-    found = [
-        (line, text)
-        for line, text in enumerate(_read_text(path, source).splitlines(), start=1)
-        if text.strip() and not text.lstrip().startswith(COMMENT)
-    ]
-    if not found:
+    lines = enumerate(_read_text(path, source).splitlines(), start=1)
+    texts = {line: text for line, text in lines if text.strip() and not text.lstrip().startswith(COMMENT)}
+    if not texts:
         raise FormatError(f"{source}: the file is empty; a row for each pose is expected.")
-    separator = next((mark for mark in ";,\t" if mark in found[0][1]), None)
-    if separator == "\t" and all(map(is_number, found[0][1].split())):
+    (top, first), *_ = texts.items()
+    separator = next((mark for mark in ";,\t" if mark in first), None)
+    if separator == "\t" and all(map(is_number, first.split())):
         separator = None  # numeric columns, aligned by tabs and spaces
-    first = _split_cells(found[0][1], separator)
-    has_head = not all(map(is_number, filter(None, first)))
-    split = [(line, _split_cells(text, separator)) for line, text in found]
-    for line, cells in split:
-        if len(cells) != len(first):
+    cells = {line: _split_cells(text, separator) for line, text in texts.items()}
+    head = None if all(map(is_number, filter(None, cells[top]))) else cells[top]
+    count = len(cells[top])
+    for line, each in cells.items():
+        if len(each) != count:
+            plural = "" if len(each) == 1 else "s"
             raise FormatError(
-                f"{source}, line {line}: {_count_text(len(cells))}, where line {found[0][0]} has "
-                f"{len(first)}."
+                f"{source}, line {line}: {len(each)} cell{plural}, where line {top} has {count}."
             )
-    body = split[1:] if has_head else split
-    if not body:
+    if head is not None:
+        del cells[top]
+    if not cells:
         raise FormatError(f"{source}: there are names of columns, but no row below them.")
-    head = tuple(first) if has_head else None
-    return TextTable(source, head, tuple(line for line, _ in body), tuple(tuple(cells) for _, cells in body))
+    return TextTable(source, head, tuple(cells), tuple(cells.values()))
 
 
 def is_number(text: str) -> bool:
@@ -247,25 +224,20 @@ def is_number(text: str) -> bool:
 
 def _read_text(path: Path, source: str) -> str:
     data = read_file(path)
+    wanted = "poses are read from a table in text"
     if b"\0" in data:
-        raise FormatError(f"{source}: this is no text, or not in UTF-8; poses are read from a table in text.")
+        raise FormatError(f"{source}: this is no text, or not in UTF-8; {wanted}.")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise FormatError(
-            f"{source}, line {line}: this is no text in UTF-8; poses are read from a table in text."
-        ) from None
+        raise FormatError(f"{source}, line {line}: this is no text in UTF-8; {wanted}.") from None
 
 
 def _split_cells(text: str, separator: str | None) -> list[str]:
     if separator is None:
         return text.split()
     return [cell.strip() for cell in next(csv.reader([text], delimiter=separator, skipinitialspace=True))]
-
-
-def _count_text(count: int) -> str:
-    return f"{count} cell{'' if count == 1 else 's'}"
 
 
 QUATERNION_TOLERANCE = 0.01
@@ -295,56 +267,54 @@ def read_recording(path: str | os.PathLike[str], columns: str | Sequence[str] | 
         time that does not increase. The message names the line.
     """
     table = read_table(Path(path))
-    named = columns.split(",") if isinstance(columns, str) else columns
-    given = _choose_columns(table, None if named is None else [name.strip() for name in named])
+    names = columns.split(",") if isinstance(columns, str) else columns
+    by_meaning = _choose_columns(table, None if names is None else [name.strip() for name in names])
     tracks = {
-        part or name: _build_track(table, given, where, rows)
-        for part, where in given.parts.items()
-        for name, rows in _rows_by_part(table, given, where).items()
+        part or name: _build_track(table, by_meaning, where, rows)
+        for part, where in by_meaning.parts.items()
+        for name, rows in _rows_by_part(table, by_meaning, where).items()
     }
-    empty = [name for name, track in tracks.items() if not len(track)]
-    if len(empty) == len(tracks):
-        raise FormatError(f"{table.source}: nothing was seen in any row.")
-    return Recording(table.source, {k: t for k, t in tracks.items() if len(t)}, given.ignored)
+    tracks = {name: track for name, track in tracks.items() if len(track)}
+    if not tracks:
+        raise FormatError(f"{table.source}: nothing was observed in any row.")
+    return Recording(table.source, tracks, by_meaning.ignored)
 
 
-def _choose_columns(table: TextTable, named: Sequence[str] | None) -> Columns:
+def _choose_columns(table: TextTable, names: Sequence[str] | None) -> Columns:
     count = len(table.cells[0])
-    if named is not None:
-        if len(named) != count:
+    if names is not None:
+        if len(names) != count:
             raise FormatError(
-                f"{table.source} has {count} columns, and {len(named)} names were given for them: "
-                f"{','.join(named)}. A column that is not wanted is called '-'."
+                f"{table.source} has {count} columns, and there are {len(names)} names: {','.join(names)}. A "
+                "column that is not wanted is called '-'."
             )
-        return parse_columns(named, "The names of the columns")
+        return parse_columns(names, "The names of the columns")
     if table.head is not None:
         return parse_columns(table.head, f"{table.source}, line 1" if table.lines[0] == 2 else table.source)
     if count not in UNNAMED_COLUMNS:
         raise FormatError(
             f"{table.source}: {count} columns without names. 3 are taken for {UNNAMED_COLUMNS[3]} and 7 for "
-            f"{UNNAMED_COLUMNS[7]}; otherwise say what they are (--columns). {COLUMN_HELP}"
+            f"{UNNAMED_COLUMNS[7]}; otherwise name them (--columns). {COLUMN_HELP}"
         )
     return parse_columns(UNNAMED_COLUMNS[count].split(","), table.source)
 
 
 def _rows_by_part(table: TextTable, columns: Columns, where: PartColumns) -> dict[str, Indices]:
-    """Return the rows in which each part was observed, by its name."""
-    seen: dict[str, list[int]] = {}
+    observed: dict[str, list[int]] = {}
+    needed = (*where.position, *where.orientation)
     for row, cells in enumerate(table.cells):
-        name = cells[columns.part] if columns.part is not None else ""
+        name, place = "" if columns.part is None else cells[columns.part], f"line {table.lines[row]}"
         if columns.part is not None and not name:
-            raise FormatError(f"{table.source}, line {table.lines[row]}: the name of the part is missing.")
-        filled = [bool(cells[k]) for k in (*where.position, *where.orientation)]
-        if any(filled) and not all(filled):
-            lacking = [k for k in (*where.position, *where.orientation) if not cells[k]]
-            raise FormatError(
-                f"{table.source}, line {table.lines[row]}: {columns.names[lacking[0]]} is missing; all "
-                "cells of a part that was not seen are left empty."
-            )
-        rows = seen.setdefault(name, [])
-        if all(filled):
+            raise FormatError(f"{table.source}, {place}: the name of the part is missing.")
+        rows, lacking = observed.setdefault(name, []), [k for k in needed if not cells[k]]
+        if not lacking:
             rows.append(row)
-    return {name: np.array(rows, dtype=np.intp) for name, rows in seen.items()}
+        elif len(lacking) < len(needed):
+            raise FormatError(
+                f"{table.source}, {place}: {columns.names[lacking[0]]} is missing; all cells of a part that "
+                "was not observed are empty."
+            )
+    return {name: np.array(rows, dtype=np.intp) for name, rows in observed.items()}
 
 
 def _build_track(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> RecordedTrack:
@@ -360,7 +330,6 @@ def _build_track(table: TextTable, columns: Columns, where: PartColumns, rows: I
 
 
 def _parse_numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: Indices) -> Array:
-    """Return the cells of some columns as numbers, (N, len(places))."""
     texts = [[table.cells[row][k] for k in places] for row in rows]
     try:
         numbers = np.array(texts, dtype=np.float64).reshape(len(rows), len(places))
@@ -372,17 +341,15 @@ def _parse_numbers(table: TextTable, columns: Columns, places: Sequence[int], ro
         row, k = np.argwhere(~good)[0]
         text, name = texts[row][k], columns.names[places[k]]
         hint = " A decimal point is expected." if "," in text else ""
-        hint = " Leave all cells of a part empty that was not seen." if text.lower() == "nan" else hint
+        hint = " All cells of a part that was not observed are empty." if text.lower() == "nan" else hint
         raise FormatError(
             f"{table.source}, line {table.lines[rows[row]]}: {name} is '{text[:40]}', which is no finite "
             f"number.{hint}"
         )
-    scaled: Array = numbers * np.array([columns.factors.get(k, 1.0) for k in places])
-    return scaled
+    return np.asarray(numbers * np.array([columns.factors.get(k, 1.0) for k in places]))
 
 
 def _rotations(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> Array:
-    """Return (N, 3, 3)."""
     numbers = _parse_numbers(table, columns, where.orientation, rows)
     if where.form == "quaternion":
         lengths = np.linalg.norm(numbers, axis=1)
@@ -399,12 +366,9 @@ def _rotations(table: TextTable, columns: Columns, where: PartColumns, rows: Ind
 
 
 def _check_order(table: TextTable, times: Array, lines: Indices) -> None:
-    wrong = np.flatnonzero(np.diff(times) <= 0.0)
-    if not wrong.size:
-        return
-    k = int(wrong[0])
-    how = "the same time as" if times[k + 1] == times[k] else "earlier than"
-    raise FormatError(
-        f"{table.source}, line {lines[k + 1]}: {times[k + 1]:.10g} s is {how} line {lines[k]} of the same "
-        f"part ({times[k]:.10g} s). Rows are expected in the order of their times."
-    )
+    for k in np.flatnonzero(np.diff(times) <= 0.0).tolist():
+        how = "the same time as" if times[k + 1] == times[k] else "earlier than"
+        raise FormatError(
+            f"{table.source}, line {lines[k + 1]}: {times[k + 1]:.10g} s is {how} line {lines[k]} of the "
+            f"same part ({times[k]:.10g} s). Rows are expected in the order of their times."
+        )

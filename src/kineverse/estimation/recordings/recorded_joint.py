@@ -1,9 +1,9 @@
-"""Identification of the joint of a recorded pair, and of what the answer depends on.
+"""Identification of the joint of a recorded pair, and the sensitivity of the answer to assumptions.
 
 Errors of neighbouring rows are correlated. N rows with an autocorrelation time τ count as N / τ, see
-:mod:`.correlation`. The residuals of each family have a time of their own, because they contain the misfit of
-the family. The time of the most probable family is used, and the comparison is repeated until it agrees with
-the family that it makes most probable.
+:mod:`kineverse.estimation.correlation`. The residuals of each family have their own time, because they
+contain the misfit of the family. The time of the most probable family is used, and the comparison is repeated
+until it agrees with the family that it makes most probable.
 
 The answer is compared with those under other assumptions: the times of other families, half and twice the
 noise, and the noise of the residuals if another one is stated. An assumption about the noise counts if the
@@ -65,7 +65,7 @@ class ObservationNoise:
         Standard deviations of each coordinate [m] and about each axis [rad]; orientation is None if only
         positions are observed.
     given
-        True if they were given, False if estimated.
+        True if they are stated, False if estimated.
     """
 
     position: float
@@ -121,7 +121,7 @@ class RecordedJoint:
     fit
         Fit of the most probable family to all poses, outliers marked.
     objections
-        Assumptions that the observations allow as well, under which the answer is another one.
+        Assumptions that the observations allow as well, under which the answer is different.
     """
 
     found: IdentificationResult
@@ -181,27 +181,25 @@ def identify_recorded_joint(
         rows = comparison.sufficient_rows(times[name], first.found[name])
         best = comparison.assume(noise, times[name], rows)
     best = comparison.with_curve(noise, best, rows)
-    objections = tuple(
-        other for other in comparison.alternatives(noise, best, fits, times, rows) if objects(other, best)
-    )
+    others = comparison.alternatives(noise, best, fits, times, rows)
+    count = len(comparison.distinct)
     return RecordedJoint(
         best.found,
         best.noise,
         best.correlation_time,
-        len(pair.lines) - len(comparison.distinct),
-        max(1, round(len(comparison.distinct) / best.correlation_time)),
-        comparison.complete(best, rows),
-        objections,
+        repeated=len(pair.lines) - count,
+        judged=max(1, round(count / best.correlation_time)),
+        fit=comparison.complete(best, rows),
+        objections=tuple(other for other in others if objects(other, best)),
     )
 
 
 def objects(other: Assumption, made: Assumption) -> bool:
     """Return True if the answer under another assumption is not the one under the assumption made."""
     sure = [None if one.found.is_ambiguous else one.found.best.family for one in (other, made)]
-    if other.correlation_time == made.correlation_time:
-        return sure[0] != sure[1]
     # A longer correlation time always tells less.
-    return sure[0] != sure[1] and other.found.best.family != made.found.best.family
+    is_longer = other.correlation_time != made.correlation_time
+    return sure[0] != sure[1] and not (is_longer and other.found.best.family == made.found.best.family)
 
 
 class _Comparison:
@@ -216,8 +214,7 @@ class _Comparison:
         self.distinct: Indices = np.flatnonzero(~repeats)
         if len(self.distinct) == 1 < len(repeats):
             raise InvalidValueError(
-                f"All {len(repeats)} poses are the same in every digit. How something moves cannot be seen "
-                "while it stands still."
+                f"All {len(repeats)} poses are the same in every digit. A part at rest shows no motion."
             )
         if independent:
             self.distinct = np.arange(len(repeats))
@@ -233,7 +230,7 @@ class _Comparison:
     ) -> Assumption:
         """Identify the joint from some rows, which stand for all distinct rows with a correlation time."""
         some = self.pair.select(rows)
-        found = identify(
+        result = identify(
             some.parent_poses,
             some.child_poses,
             noise=None if noise is None else noise.covariance,
@@ -242,13 +239,13 @@ class _Comparison:
             sequential=self.pair.is_timed,
             correlation_time=max(1.0, time * len(rows) / len(self.distinct)),
         )
-        return Assumption(noise or estimated_noise(found, self.pair), time, found)
+        return Assumption(noise or estimated_noise(result, self.pair), time, result)
 
     def fits_of_estimated_noise(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, Fit]:
         """Return the fits of families that have residuals to all distinct rows."""
         # If the stated noise is too small, most observations are outliers.
-        found = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
-        return {fit.family: fit for fit in found if fit.family not in ("free", CURVE)}
+        result = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
+        return {fit.family: fit for fit in result if fit.family not in ("free", CURVE)}
 
     def correlation_time(self, fit: Fit) -> float:
         """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
@@ -260,11 +257,9 @@ class _Comparison:
         count = len(self.distinct)
         size = min(count, max(_ENOUGH_ROWS, math.ceil(_ROWS_PER_TIME * count / time)))
         # The subset must be dense enough to count revolutions.
-        while (
-            self.pair.is_timed
-            and size < count
-            and fit.select(spaced_indices(count, size)).largest_turn > MAX_ROTATION_STEP
-        ):
+        while self.pair.is_timed and size < count:
+            if fit.select(spaced_indices(count, size)).largest_turn <= MAX_ROTATION_STEP:
+                break
             size += 1
         return self.distinct[spaced_indices(count, size)]
 
@@ -280,7 +275,7 @@ class _Comparison:
         for time in sorted(set(times.values())):
             if time > _LONGER * best.correlation_time:
                 other = self.assume(stated, time, rows)
-                # Only a family whose own residuals have this time explains it.
+                # Only a family whose residuals have this time explains it.
                 if times.get(other.found.best.family, 0.0) == time:
                     yield other
         family = best.found.best.family
@@ -305,37 +300,22 @@ class _Comparison:
         pair, noise = self.pair, best.noise
         if len(rows) == len(pair.lines):
             return best.found.best
-        observations = check_observations(
-            pair.parent_poses, pair.child_poses, noise.covariance, noise.covariance
-        )
-        return complete_fit(
-            best.found.best,
-            observations,
-            rows,
-            outliers=Outliers(),
-            stated=noise.given,
-            sequential=pair.is_timed,
-        )
+        covariance = noise.covariance
+        observations = check_observations(pair.parent_poses, pair.child_poses, covariance, covariance)
+        return complete_fit(best.found.best, observations, rows, Outliers(), noise.given, pair.is_timed)
 
 
 def _residuals_across_motion(fit: Fit) -> Array:
-    """Return the residuals of inliers without the part along the motion of the joint.
-
-    Joint values follow the observations. What they leave over is no error, but follows the motion slowly.
-    """
+    """Return the residuals of inliers without the part along the motion, which joint values follow slowly."""
     residuals = fit.residuals[fit.inliers]
     by_joints = fit.motion.linearise(fit.joint_values[fit.inliers]).by_joints[:, : fit.rows]
     sizes = np.repeat(fit.rms, 3)[: fit.rows] + _TINY
     across, along = residuals / sizes, np.linalg.qr(by_joints / sizes[:, None])[0]
-    result: Array = across - np.einsum("nik,njk,nj->ni", along, along, across)
-    return result * sizes
+    return np.asarray(across - np.einsum("nik,njk,nj->ni", along, along, across)) * sizes
 
 
 def _is_noise(fit: Fit, best: Fit, time: float, best_time: float) -> bool:
-    """Return True if the best fit may be that of a family with fewer joint values whose residuals are noise.
-
-    Its residuals are then no smoother than those of the best fit, while the motion is.
-    """
+    """Return True if a fit with fewer joint values has residuals as little smooth as the best ones."""
     if fit.motion.joints >= best.motion.joints or time > _AS_SMOOTH * best_time:
         return False
     values = best.joint_values[best.inliers]
@@ -360,14 +340,14 @@ def residual_noise(fit: Fit) -> ObservationNoise:
     return ObservationNoise(position / root, orientation / root, True)
 
 
-def estimated_noise(found: IdentificationResult, pair: RecordedPair) -> ObservationNoise:
+def estimated_noise(result: IdentificationResult, pair: RecordedPair) -> ObservationNoise:
     """Return the noise that an identification without stated noise estimated."""
-    assert found.noise is not None  # it is estimated if it is not stated
-    position, orientation = found.noise
+    assert result.noise is not None  # it is estimated if it is not stated
+    position, orientation = result.noise
     return ObservationNoise(position, orientation if pair.has_orientation else None, False)
 
 
-def log_probability(found: IdentificationResult) -> float:
+def log_probability(result: IdentificationResult) -> float:
     """Return the log probability density of the observations, families weighed by their priors."""
-    best = found.best
+    best = result.best
     return best.log_evidence + math.log(WEIGHTS[best.family] / best.probability)

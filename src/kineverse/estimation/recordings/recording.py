@@ -114,7 +114,7 @@ class RecordedPair:
             If ``count`` is less than two.
         """
         if count < 2:
-            raise InvalidValueError(f"{count} of the poses: how something moves takes at least two to see.")
+            raise InvalidValueError(f"{count} of the poses: a motion takes at least two.")
         return self.select(spaced_indices(len(self.lines), count))
 
     def select(self, rows: Indices) -> RecordedPair:
@@ -161,9 +161,10 @@ class Recording:
         others = [name for name in self.tracks if name != parent]
         if child is None:
             if len(others) != 1:
+                listed = ", ".join(f"'{name}'" for name in others[:12]) or "none"
                 raise UnknownNameError(
-                    f"{self.source}: which part moves? There are {_format_list(others)}; name one as the "
-                    "child (--child on the command line)."
+                    f"{self.source}: which part moves? There are {listed}; name one as the child (--child on "
+                    "the command line)."
                 )
             child = others[0]
         track = self._track(child)
@@ -175,25 +176,23 @@ class Recording:
             )
         name = child or "part"
         if parent == WORLD and WORLD not in self.tracks:
-            return RecordedPair(
-                parent, name, None, track.poses, track.lines, is_timed=track.times is not None
-            )
+            is_timed = track.times is not None
+            return RecordedPair(parent, name, None, track.poses, track.lines, is_timed=is_timed)
         return self._synchronise(parent, name, self._track(parent), track)
 
     def _track(self, name: str) -> RecordedTrack:
         if list(self.tracks) == [""] and name != WORLD:
             return self.tracks[""]
         if name not in self.tracks:
-            raise UnknownNameError(
-                f"{self.source} has no part '{name}'. {suggest(name, self.tracks, 'part')}"
-            )
+            hint = suggest(name, self.tracks, "part")
+            raise UnknownNameError(f"{self.source} has no part '{name}'. {hint}")
         return self.tracks[name]
 
     def _synchronise(self, parent: str, child: str, a: RecordedTrack, b: RecordedTrack) -> RecordedPair:
         if not a.has_orientation:
             raise FormatError(
-                f"{self.source}: only positions of the parent '{parent}' were seen. How something moves in a "
-                "part's frame can only be told if its orientation is known."
+                f"{self.source}: only positions of the parent '{parent}' were observed. A motion in its "
+                "frame takes its orientation."
             )
         # Pair by time, else by row. In a table with one part per row, rows pair nothing.
         is_timed = a.times is not None and b.times is not None
@@ -203,12 +202,8 @@ class Recording:
             of_a = of_b = np.arange(len(a))
         if not len(of_a):
             raise FormatError(
-                f"{self.source}: '{parent}' and '{child}' were never seen at the same time; "
-                "a pose of both with the same time is expected."
+                f"{self.source}: '{parent}' and '{child}' were never observed at the same time; a pose of "
+                "both with the same time is expected."
             )
         unpaired = len(a) + len(b) - 2 * len(of_a)
         return RecordedPair(parent, child, a.poses[of_a], b.poses[of_b], b.lines[of_b], unpaired, is_timed)
-
-
-def _format_list(names: list[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names[:12]) or "none"

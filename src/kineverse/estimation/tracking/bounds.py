@@ -28,22 +28,14 @@ if TYPE_CHECKING:
 class StateBounds:
     """Constraints on the estimated coordinates."""
 
-    names: tuple[str, ...]  # names of all constraints in use
-    lower: Array  # bounds of single free coordinates
-    upper: Array  # in the order of the coordinates; ±inf where there are none
+    names: tuple[str, ...]  # all constraints in use
+    lower: Array  # bounds of single free coordinates, in their order; ±inf without
+    upper: Array
     curved: tuple[Constraint, ...]  # all other constraints, resolved
-
-    def by_symbol(self, tangent_space: TangentSpace) -> dict[Symbol, tuple[float, float]]:
-        """Return the bounds of single coordinates by symbol."""
-        bounds = zip(self.lower.tolist(), self.upper.tolist(), strict=True)
-        return dict(zip(tangent_space.coordinates, bounds, strict=True))
 
 
 def collect_bounds(model: ModelView, tangent_space: TangentSpace, inputs: frozenset[Symbol]) -> StateBounds:
-    """Collect the position limits: constraints without speeds on estimated coordinates and inputs alone.
-
-    Locks, which bound speeds, and constraints on unobserved coordinates are left out.
-    """
+    """Collect the position limits: constraints without speeds on estimated coordinates and inputs alone."""
     index = {x: i for i, x in enumerate(tangent_space.coordinates)}
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
     names, curved = [], []
@@ -55,92 +47,75 @@ def collect_bounds(model: ModelView, tangent_space: TangentSpace, inputs: frozen
         if any(s not in index for s in moving) or not any(s in index for s in constraint.expression.symbols):
             continue
         names.append(name)
-        if not _is_coordinate_bound(constraint, tangent_space):
-            curved += _split_moving_bounds(constraint, index)
-            continue
-        slope, offset = constraint.line or (1.0, 0.0)
-        low, high = sorted((float(b) - offset) / slope for b in (constraint.lower, constraint.upper))
-        i = index[constraint.expression.symbols[0]]
-        lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
+        below, middle, above = constraint.lower, constraint.expression, constraint.upper
+        bound_symbols = (*below.symbols, *above.symbols)
+        if (
+            constraint.line is not None
+            and not bound_symbols
+            and middle.symbols[0] not in tangent_space.by_speeds
+        ):
+            slope, offset = constraint.line
+            low, high = sorted((float(b) - offset) / slope for b in (below, above))
+            i = index[middle.symbols[0]]
+            lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
+        elif any(s in index for s in bound_symbols):
+            # Two constraints with the constant bound 0.
+            if below.symbols or np.isfinite(float(below)):
+                curved.append(Constraint(as_expression(0.0), middle - below, as_expression(np.inf)))
+            if above.symbols or np.isfinite(float(above)):
+                curved.append(Constraint(as_expression(-np.inf), middle - above, as_expression(0.0)))
+        else:
+            curved.append(constraint)
     return StateBounds(tuple(names), lower, upper, tuple(curved))
 
 
-def _split_moving_bounds(constraint: Constraint, moving: Mapping[Symbol, int]) -> list[Constraint]:
-    """Split a constraint whose bounds depend on estimated coordinates into two with constant bound 0."""
-    low, middle, high = constraint.lower, constraint.expression, constraint.upper
-    if not any(s in moving for s in (*low.symbols, *high.symbols)):
-        return [constraint]
-    sides = []
-    if low.symbols or np.isfinite(float(low)):
-        sides.append(Constraint(as_expression(0.0), middle - low, as_expression(np.inf)))
-    if high.symbols or np.isfinite(float(high)):
-        sides.append(Constraint(as_expression(-np.inf), middle - high, as_expression(0.0)))
-    return sides
-
-
-def _is_coordinate_bound(constraint: Constraint, tangent_space: TangentSpace) -> bool:
-    if constraint.line is None or constraint.lower.symbols or constraint.upper.symbols:
-        return False
-    return constraint.expression.symbols[0] not in tangent_space.by_speeds
-
-
 def arrange_state(
-    model: ModelView, observations: tuple[MeasurementModel, ...], given: frozenset[Symbol]
+    model: ModelView, observations: tuple[MeasurementModel, ...], measured: frozenset[Symbol]
 ) -> tuple[Layout, StateBounds]:
-    """Choose the estimated coordinates, and collect their limits."""
+    """Choose the estimated coordinates, other than those measured elsewhere, and collect their limits."""
     rates = model.rates
     values = [rates.resolve(to_plain(one.value)) for one in observations]
-    tangent_space = build_tangent_space(rates, values, given, model.default_state())
-    limits = collect_bounds(model, tangent_space, given)
+    tangent_space = build_tangent_space(rates, values, measured, model.default_state())
+    limits = collect_bounds(model, tangent_space, measured)
     dependencies = {s for value in values for s in value.symbols}
     dependencies |= {s for c in limits.curved for s in c.symbols}
-    dependencies |= {
-        s for x in tangent_space.coordinates if x in rates for e in rates[x].values() for s in e.symbols
-    }
+    for x in tangent_space.coordinates:
+        dependencies |= {s for e in rates.get(x, {}).values() for s in e.symbols}
     inputs = sorted(dependencies - set(tangent_space.coordinates), key=lambda s: s.sort_key)
     return build_layout(tangent_space, observations, limits.curved, inputs), limits
 
 
 def initial_point(
-    model: ModelView, tangent_space: TangentSpace, limits: StateBounds, given: Mapping[Symbol, float]
+    model: ModelView, tangent_space: TangentSpace, limits: StateBounds, start: Mapping[Symbol, float]
 ) -> Array:
-    """Return the initial state: given values, else the middle of the limits, else the default state."""
+    """Return the initial state: values by symbol, else the middle of the limits, else the default state."""
     default = model.default_state()
     values = []
     for x, low, high in zip(tangent_space.coordinates, limits.lower, limits.upper, strict=True):
         middle = (low + high) / 2 if np.isfinite(high - low) else default.get(x, 0.0)
-        values.append(given.get(x, float(middle)))
+        values.append(start.get(x, float(middle)))
     return np.clip(values, limits.lower, limits.upper)
 
 
 def initial_deviations(
     tangent_space: TangentSpace, limits: StateBounds, periodic: frozenset[Symbol]
 ) -> Array:
-    """Return the initial standard deviation of each tangent direction (t,).
-
-    Half the width of the limits. Without limits, π for periodic coordinates and rotations of quaternions,
-    else 10 m.
-    """
+    """Return half the width of the limits of each direction (t,); without limits, π for angles, else 10 m."""
     result = np.full(len(tangent_space.tangent), np.pi)
     for x, low, high in zip(tangent_space.coordinates, limits.lower, limits.upper, strict=True):
         if x in tangent_space.by_speeds:
             continue
         width = high - low
-        usual = np.pi if x in periodic else UNBOUNDED_DEVIATION
-        # Coinciding limits fix the coordinate; the information stays finite.
-        result[tangent_space.tangent.index(x.derivative())] = (
-            max(width / 2, LEAST_DEVIATION) if np.isfinite(width) else usual
-        )
+        deviation = np.pi if x in periodic else _UNBOUNDED_DEVIATION
+        if np.isfinite(width):
+            # Coinciding limits fix the coordinate; the information stays finite.
+            deviation = max(width / 2, _LEAST_DEVIATION)
+        result[tangent_space.tangent.index(x.derivative())] = deviation
     return result
 
 
-UNBOUNDED_DEVIATION = 10.0
-"""Initial standard deviation of a length without limits [m]."""
-
-LEAST_DEVIATION = 1e-9
-"""Initial standard deviation of a coordinate whose limits coincide."""
-
-
+# Initial standard deviation of a length without limits [m], and of a coordinate whose limits coincide.
+_UNBOUNDED_DEVIATION, _LEAST_DEVIATION = 10.0, 1e-9
 _FAR = 1e300
 
 
@@ -163,18 +138,18 @@ class GroupBounds:
     def __init__(self, number: int, layout: Layout, limits: StateBounds) -> None:
         group = layout.groups[number]
         by_speeds = layout.tangent_space.by_speeds
-        self._own = [k for k, x in enumerate(group.coordinates) if x not in by_speeds]
-        places = group.x[self._own]
+        self._free = [k for k, x in enumerate(group.coordinates) if x not in by_speeds]
+        places = group.x[self._free]
         self._lower, self._upper = limits.lower[places], limits.upper[places]
         self._curved = [layout.limit_slices[k] for k in group.limits]
-        self._rows = np.zeros((len(self._own), len(group.tangent)))
-        for row, k in enumerate(self._own):
+        self._rows = np.zeros((len(self._free), len(group.tangent)))
+        for row, k in enumerate(self._free):
             self._rows[row, group.tangent.index(group.coordinates[k].derivative())] = 1.0
 
     def rows(self, x: Array, out: Array) -> BoundRows:
         """Return the bounds on steps at a point x with evaluated limits ``out``."""
-        own = x[self._own]
-        rows, lower, upper = self._rows, self._lower - own, self._upper - own
+        free = x[self._free]
+        rows, lower, upper = self._rows, self._lower - free, self._upper - free
         if self._curved:
             curved = np.stack([out[where] for where in self._curved])
             rows = np.concatenate([rows, curved[:, 3:]])
@@ -186,13 +161,13 @@ class GroupBounds:
 
     def clip(self, x: Array) -> Array:
         """Clip a point to the bounds of single coordinates, against rounding errors; in place."""
-        x[self._own] = np.clip(x[self._own], self._lower, self._upper)
+        x[self._free] = np.clip(x[self._free], self._lower, self._upper)
         return x
 
     def remaining(self, x: Array, after: Array, step: Array) -> Array:
         """Return the tangent step that leads from x to the clipped point ``after``."""
         left = step.copy()
-        for row, k in zip(self._rows, self._own, strict=True):
+        for row, k in zip(self._rows, self._free, strict=True):
             left[row == 1.0] = after[k] - x[k]
         return left
 
@@ -211,15 +186,11 @@ class SpeedLocks:
         bounds = []
         for constraint in model.constraints_for(tangent_space.coordinates).values():
             speed = constraint.expression
-            low, high = tangent_space.resolve(constraint.lower), tangent_space.resolve(constraint.upper)
-            dependencies = {*low.symbols, *high.symbols}
-            if (
-                isinstance(speed, Symbol)
-                and str(speed) in process_model.speeds
-                and dependencies <= set(values)
-            ):
-                self._speeds.append(speed)
-                bounds += [low, high]
+            if isinstance(speed, Symbol) and str(speed) in process_model.speeds:
+                low, high = tangent_space.resolve(constraint.lower), tangent_space.resolve(constraint.upper)
+                if {*low.symbols, *high.symbols} <= set(values):
+                    self._speeds.append(speed)
+                    bounds += [low, high]
         self._bounds = compile(array(bounds), values) if bounds else None
         self._all = frozenset(process_model.speeds.values())
 
@@ -238,7 +209,12 @@ _LEAST = 1e-12
 def solve_bounded_qp(
     inverse: Array, gradient: Array, rows: Array, lower: Array, upper: Array
 ) -> Array | None:
-    """Minimise ½xᵀAx + gᵀx subject to lower <= rows x <= upper; return None if it is infeasible."""
+    """Minimise ½xᵀAx + gᵀx subject to lower <= rows x <= upper, given A⁻¹; return None if infeasible.
+
+    The dual method starts at the unconstrained minimum and adds violated bounds one by one, so most calls end
+    at once (Goldfarb and Idnani, A numerically stable dual method for solving strictly convex quadratic
+    programs, 1983).
+    """
     x = -inverse @ gradient
     normals = np.concatenate([rows, -rows])
     bounds = np.concatenate([lower, -upper])

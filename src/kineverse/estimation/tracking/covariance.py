@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,13 +25,9 @@ from kineverse.errors import KineverseError
 from kineverse.estimation.linear_algebra import inverse_spd, symmetric
 from kineverse.lie import Array
 
-from .bounds import GroupBounds
 from .information_state import InformationState
-from .observability import UnobservableDirections
-from .process_model import ProcessModel
-from .residuals import MeasurementReader, Measurements, Residuals
-from .state_space import Layout
-from .static_batch import StaticRecord
+from .observability import Components, StaticRecord
+from .residuals import Measurements
 
 # Step length and largest distance along the ridge, in deviations.
 _STRIDE, _FARTHEST = 0.5, 5.0
@@ -48,19 +44,9 @@ _LINEAR = 0.02
 
 
 class _CovarianceComputation:
-    """Components of the tracker from which covariances of groups are computed."""
-
-    def __init__(
-        self,
-        layout: Layout,
-        residuals: Residuals,
-        process_model: ProcessModel,
-        reader: MeasurementReader,
-        group_bounds: Sequence[GroupBounds],
-        unobservable: UnobservableDirections,
-    ) -> None:
-        self._layout, self._residuals, self._process_model = layout, residuals, process_model
-        self._reader, self._group_bounds, self._unobservable = reader, group_bounds, unobservable
+    def __init__(self, components: Components) -> None:
+        self._layout, self._residuals, self._process_model = components[:3]
+        self._reader, self._group_bounds, self._unobservable = components[3:]
 
 
 class RidgeCovariance(_CovarianceComputation):
@@ -68,8 +54,7 @@ class RidgeCovariance(_CovarianceComputation):
 
     def compute(self, number: int, belief: InformationState) -> Array:
         """Return the second moment of the posterior of a group about its estimate (t, t)."""
-        t = self._layout.groups[number].t
-        information = belief.information[np.ix_(t, t)]
+        information = belief.information[self._layout.groups[number].block]
         gaussian = inverse_spd(information)
         record = belief.records[number]
         if record is None:
@@ -77,7 +62,7 @@ class RidgeCovariance(_CovarianceComputation):
         directions, across = self._unobservable.directions(number, information)
         reading = record.as_measurements(self._layout, self._reader)
         posterior = _LocalPosterior(number, belief, record, across, reading)
-        if not len(directions) or self._evaluate(posterior, np.zeros(len(t))) is None:
+        if not len(directions) or self._evaluate(posterior, np.zeros(len(information))) is None:
             return gaussian
         result, is_straight = gaussian, True
         for k in range(len(directions)):
@@ -89,7 +74,12 @@ class RidgeCovariance(_CovarianceComputation):
             curvature = self._mixed_curvature(posterior, one, other)
             is_straight &= float(np.linalg.norm(curvature @ inverse)) < _RIDGE_CURVATURE
             result = result + np.outer(curvature, curvature)
-        return gaussian if is_straight else _floor_covariance(result, np.concatenate([directions, across]))
+        if is_straight:
+            return gaussian
+        # The standard deviation is at least half of each step.
+        values, vectors = np.linalg.eigh(symmetric(inverse.T @ result @ inverse))
+        wide = np.concatenate([directions, across]).T @ vectors * np.sqrt(np.maximum(values, 0.25))
+        return symmetric(wide @ wide.T)
 
     def _integrate_direction(self, posterior: _LocalPosterior, direction: Array) -> tuple[Array, bool]:
         """Return the covariance gained along one direction, and whether the ridge is straight there."""
@@ -123,7 +113,6 @@ class RidgeCovariance(_CovarianceComputation):
     def _walk_ridge(
         self, posterior: _LocalPosterior, top: _ManifoldPoint, ray: Array
     ) -> Iterator[tuple[_ManifoldPoint, float]]:
-        """Yield points along the ridge, with their relative density after marginalising across it."""
         stride, point, density = _STRIDE * ray, top, 1.0
         deviation = before = np.zeros_like(ray)
         for count in range(1, math.ceil(_FARTHEST / _STRIDE)):
@@ -156,7 +145,6 @@ class RidgeCovariance(_CovarianceComputation):
         return best
 
     def _evaluate(self, posterior: _LocalPosterior, step: Array) -> _ManifoldPoint | None:
-        """Return the posterior at the end of a step; None if it is infeasible."""
         group, inputs = self._layout.groups[posterior.number], posterior.record.inputs
         here, there = posterior.belief.x[group.x], posterior.belief.x.copy()
         try:
@@ -184,14 +172,6 @@ class RidgeCovariance(_CovarianceComputation):
         )
 
 
-def _floor_covariance(covariance: Array, steps: Array) -> Array:
-    """Return the covariance with a standard deviation of at least half of each step."""
-    inverse = np.linalg.inv(steps)
-    values, vectors = np.linalg.eigh(symmetric(inverse.T @ covariance @ inverse))
-    wide = steps.T @ vectors * np.sqrt(np.maximum(values, 0.25))
-    return symmetric(wide @ wide.T)
-
-
 @dataclass(frozen=True, eq=False)
 class _LocalPosterior:
     """Posterior of a group about its estimate, with steps of one deviation across the ridge (c, t)."""
@@ -204,10 +184,8 @@ class _LocalPosterior:
 
     def spread(self, point: _ManifoldPoint) -> Array:
         """Return the second moment of steps to the neighbourhood of a point."""
-        result: Array = (
-            np.outer(point.step, point.step) + self.across.T @ np.linalg.inv(point.across) @ self.across
-        )
-        return result
+        across: Array = self.across.T @ np.linalg.inv(point.across) @ self.across
+        return np.outer(point.step, point.step) + across
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,14 +216,21 @@ class CovarianceInflation(_CovarianceComputation):
         record = belief.records[number]
         if record is None:
             return
-        t = self._layout.groups[number].t
-        block = np.ix_(t, t)
+        t, block = self._layout.groups[number].t, self._layout.groups[number].block
         information = belief.information[block].copy()
         directions, _ = self._unobservable.directions(number, information)
         if len(directions):
             covariance = inverse_spd(information)
-            most, slopes = self._curvature(number, belief, directions, record, self._reader.empty())
-            missing = self._missing_covariance(number, covariance, most, slopes)
+            most, slopes = self._curvature(number, belief, directions, self._reader.empty())
+            # Predictions become as uncertain as they are curved.
+            lacking = []
+            for i, slope in slopes.items():
+                variance = float(np.einsum("ij,jk,ik->", slope, covariance, slope)) / len(slope)
+                lacking.append(np.full(len(slope), max(most[i] - variance, 0.0)))
+            scale = self._unobservable.deviations[t]
+            inverse = np.linalg.pinv(np.concatenate(list(slopes.values())) * scale, rcond=_RANK)
+            inverse *= scale[:, None]
+            missing = (inverse * np.concatenate(lacking)) @ inverse.T
             belief.information[block] = inverse_spd(covariance + missing)
             belief.vector[t] = belief.information[block] @ (covariance @ belief.vector[t])
         belief.records[number] = None
@@ -254,25 +239,19 @@ class CovarianceInflation(_CovarianceComputation):
         """Return True if the measurements of a group are linear within its belief."""
         record = belief.records[number]
         assert record is not None
-        t = self._layout.groups[number].t
-        directions, _ = self._unobservable.directions(number, belief.information[np.ix_(t, t)])
+        block = self._layout.groups[number].block
+        directions, _ = self._unobservable.directions(number, belief.information[block])
         reading = record.as_measurements(self._layout, self._reader)
-        most, _ = self._curvature(number, belief, directions, record, reading)
+        most, _ = self._curvature(number, belief, directions, reading)
         return max(most.values()) < _LINEAR**2
 
     def _curvature(
-        self,
-        number: int,
-        belief: InformationState,
-        directions: Array,
-        record: StaticRecord,
-        noise: Measurements,
+        self, number: int, belief: InformationState, directions: Array, noise: Measurements
     ) -> tuple[dict[int, float], dict[int, Array]]:
-        """Return the largest squared nonlinearity of each measurement, and its Jacobian, by number.
-
-        Both are in deviations of the measurement noise.
-        """
-        group, inputs = self._layout.groups[number], record.inputs
+        """Return the squared nonlinearity of each measurement, and its Jacobian, in deviations of noise."""
+        group, record = self._layout.groups[number], belief.records[number]
+        assert record is not None
+        inputs = record.inputs
         measured = list(record.means)
         here = self._residuals.evaluate(belief.x, inputs)
         as_predicted = noise._replace(values=self._reader.as_values(here))
@@ -293,17 +272,3 @@ class CovarianceInflation(_CovarianceComputation):
                 if np.isfinite(curvature).all():
                     most[i] = max(most[i], float(curvature @ curvature) / len(curvature))
         return most, slopes
-
-    def _missing_covariance(
-        self, number: int, covariance: Array, most: Mapping[int, float], slopes: Mapping[int, Array]
-    ) -> Array:
-        """Return the covariance to add (t, t), which makes predictions as uncertain as they are curved."""
-        lacking = []
-        for i, slope in slopes.items():
-            variance = float(np.einsum("ij,jk,ik->", slope, covariance, slope)) / len(slope)
-            lacking.append(np.full(len(slope), max(most[i] - variance, 0.0)))
-        scale = self._unobservable.deviations[self._layout.groups[number].t]
-        inverse = np.linalg.pinv(np.concatenate(list(slopes.values())) * scale, rcond=_RANK)
-        inverse *= scale[:, None]
-        missing: Array = (inverse * np.concatenate(lacking)) @ inverse.T
-        return missing

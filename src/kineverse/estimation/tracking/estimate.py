@@ -36,27 +36,15 @@ class TrackLoss:
     refuted: npt.NDArray[np.int64]  # number of updates in a row that refute the estimate (groups,)
     is_lost: Groups  # True for each lost group (groups,)
 
-    @staticmethod
-    def none(count: int) -> TrackLoss:
-        """Return the state of groups of which none is lost."""
-        return TrackLoss(np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
-
     @cached_property
     def is_clear(self) -> bool:
         """True if no group is lost or refuted."""
         return not (self.refuted.any() or self.is_lost.any())
 
     def after(self, measured: Groups, refuted: Groups, lost_after: int) -> TrackLoss:
-        """Return the state after an update with masks of measured and of refuted groups (groups,).
-
-        A group that is lost stays lost until measurements agree with it.
-        """
+        """Return the state after an update; a lost group stays lost until measurements agree with it."""
         count = np.where(measured, np.where(refuted, self.refuted + 1, 0), self.refuted)
         return TrackLoss(count, (self.is_lost | (count >= lost_after)) & (refuted | ~measured))
-
-    def with_restarted(self, groups: Groups) -> TrackLoss:
-        """Return the state after a restart of some groups; they stay lost."""
-        return TrackLoss(np.where(groups, 0, self.refuted), self.is_lost)
 
 
 def find_measured(layout: Layout, reading: Measurements) -> Groups:
@@ -67,11 +55,7 @@ def find_measured(layout: Layout, reading: Measurements) -> Groups:
 
 
 def find_refuted(layout: Layout, reading: Measurements, result: StepResult, has_outliers: bool) -> Groups:
-    """Return True for each group whose estimate an update refutes (groups,).
-
-    With an outlier model, all measurements of the group are rejected. Without one, the normalised innovation
-    squared exceeds its quantile of one in a million.
-    """
+    """Return True for each group without an accepted measurement, or with an extreme NIS (groups,)."""
     if has_outliers and not result.outliers:
         return np.zeros(len(layout.groups), dtype=bool)
     if not has_outliers:
@@ -87,10 +71,7 @@ def find_refuted(layout: Layout, reading: Measurements, result: StepResult, has_
 
 
 def chi_squared_quantile(dof: Array) -> Array:
-    """Return the quantiles of χ² that are exceeded once in a million, for degrees of freedom (n,).
-
-    Wilson and Hilferty, The distribution of chi-square, 1931.
-    """
+    """Return the quantiles of χ² exceeded once in a million (n,) (Wilson and Hilferty 1931)."""
     variance = 2.0 / (9.0 * np.maximum(dof, 1.0))
     return np.asarray(dof * (1.0 - variance + _QUANTILE * np.sqrt(variance)) ** 3)
 
@@ -99,11 +80,11 @@ def chi_squared_quantile(dof: Array) -> Array:
 class TrackerState:
     """State of a tracker between two steps."""
 
-    mixture: GaussianSum  # belief
-    result: StepResult  # result of the last update
-    loss: TrackLoss  # groups that are lost
-    inputs: Array  # values of the inputs
-    stamp: float | None = None  # time [s]; None if the tracker was given none
+    mixture: GaussianSum
+    result: StepResult  # of the last update
+    loss: TrackLoss
+    inputs: Array
+    stamp: float | None = None  # time [s]; None if unknown
     reading: Measurements | None = None  # latest measurements of this time, of each observation
 
 
@@ -124,7 +105,7 @@ class Estimate:
     rounds
         Number of model evaluations; at 50 the iteration stopped without convergence.
     stamp
-        Time [s]; None if the tracker was given none.
+        Time [s]; None if unknown.
     """
 
     def __init__(self, now: TrackerState, update_step: UpdateStep) -> None:
@@ -179,7 +160,7 @@ class Estimate:
     def refuted_groups(self) -> tuple[tuple[Symbol, ...], ...]:
         """Groups of coordinates whose prediction the last update refuted, be it a move or an error.
 
-        After ten such updates in a row, or as many as the tracker was told, the group is lost.
+        After ``lost_after`` such updates in a row, the group is lost.
         """
         return self._groups_where((self._loss.refuted > 0).tolist())
 
@@ -201,10 +182,9 @@ class Estimate:
     def information(self) -> Array:
         """Inverse of the covariance."""
         result = self._belief.information.copy()
-        for number, group in enumerate(self._layout.groups):
-            if self._belief.records[number] is not None:
-                block = group.block
-                result[block] = inverse_spd(self.covariance[block])
+        for group, record in zip(self._layout.groups, self._belief.records, strict=True):
+            if record is not None:
+                result[group.block] = inverse_spd(self.covariance[group.block])
         return result
 
     @cached_property
@@ -298,8 +278,8 @@ def collect_recent_poses(
                     measured[one.frame][row] = pose
                     weights.append(reading.whitening[layout.whitening_slices[i]].reshape(6, 6))
             white: Array = np.array(weights).reshape(-1, 6, 6)
-            given = np.linalg.inv(white.transpose(0, 2, 1) @ white)
-            mean = given.mean(axis=0) if weights else one.covariance
+            each = np.linalg.inv(white.transpose(0, 2, 1) @ white)
+            mean = each.mean(axis=0) if weights else one.covariance
             if one.is_stated or not np.allclose(mean, one.covariance, rtol=1e-9):
                 covariances[one.frame] = mean
     if observer in model.frames and len(times):
@@ -309,7 +289,7 @@ def collect_recent_poses(
             places = compile(place, layout.inputs).batch(inputs)
             turns = np.zeros((len(times), 6, 6))
             turns[:, :3, :3] = turns[:, 3:, 3:] = places[:, :3, :3]
-            measured = {name: places @ seen for name, seen in measured.items()}
+            measured = {name: places @ track for name, track in measured.items()}
             covariances = {name: turns @ one @ turns.mT for name, one in covariances.items()}
             observer = WORLD
     return RecentPoses(observer, measured, covariances, times if has_times else None)

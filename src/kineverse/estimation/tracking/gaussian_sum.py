@@ -22,8 +22,7 @@ from kineverse.symbols import Symbol
 
 from .covariance import RidgeCovariance
 from .information_state import InformationState
-from .process_model import ProcessModel
-from .residuals import MeasurementReader, Residuals
+from .observability import Components
 from .state_space import CoordinateGroup, Layout
 
 MOST_COMPONENTS = 8
@@ -50,10 +49,7 @@ class GaussianSum:
     """Gaussian sum with independent components for each group, the best first."""
 
     def __init__(
-        self,
-        layout: Layout,
-        beliefs: Sequence[InformationState],
-        alive: npt.NDArray[np.bool_],
+        self, layout: Layout, beliefs: Sequence[InformationState], alive: npt.NDArray[np.bool_]
     ) -> None:
         self._layout = layout
         self.beliefs, self.alive = tuple(beliefs), alive
@@ -91,27 +87,22 @@ class GaussianSum:
         candidates: Sequence[Candidate],
         should_merge: Callable[[CoordinateGroup, Candidate, Candidate], bool],
     ) -> tuple[GaussianSum, list[Candidate | None]]:
-        """Prune and merge candidates to new components; also return the best candidate of each group.
-
-        Groups without candidates keep their components.
-        """
-        kept: list[list[tuple[InformationState, Candidate | None]]] = []
+        """Prune and merge candidates to new components; also return the best candidate of each group."""
+        kept: list[list[InformationState]] = []
+        best: list[Candidate | None] = []
         for number, group in enumerate(self._layout.groups):
-            own = [c for c in candidates if number in c.groups]
-            own.sort(key=lambda c: -float(c.belief.evidence[number]))
+            ranked = [c for c in candidates if number in c.groups]
+            ranked.sort(key=lambda c: -float(c.belief.evidence[number]))
             chosen: list[Candidate] = []
-            for one in own:
-                deficit = own[0].belief.evidence[number] - one.belief.evidence[number]
+            for one in ranked:
+                deficit = ranked[0].belief.evidence[number] - one.belief.evidence[number]
                 if deficit > PRUNING_LOG_RATIO or len(chosen) == MOST_COMPONENTS:
                     break
                 if not any(should_merge(group, one, other) for other in chosen):
                     chosen.append(one)
-            before: list[tuple[InformationState, Candidate | None]] = [
-                (belief, None) for belief in self.components(number)
-            ]
-            kept.append([(c.belief, c) for c in chosen] or before)
-        after = self._assemble([[belief for belief, _ in components] for components in kept])
-        return after, [components[0][1] for components in kept]
+            kept.append([c.belief for c in chosen] or self.components(number))
+            best.append(chosen[0] if chosen else None)
+        return self._assemble(kept), best
 
     def components(self, number: int) -> list[InformationState]:
         """Return the components of a group, the best first."""
@@ -125,25 +116,18 @@ class GaussianSum:
         return self._assemble([source.components(number) for number, source in enumerate(sources)])
 
     def _assemble(self, components: Sequence[Sequence[InformationState]]) -> GaussianSum:
-        """Return the sum of the components of each group, the best first."""
         beliefs, alive = [], []
         for k in range(max(map(len, components))):
             belief = self.best.copy()
-            for number, (group, own) in enumerate(zip(self._layout.groups, components, strict=True)):
-                copy_group(own[min(k, len(own) - 1)], belief, number, group)
+            for n, (group, of_group) in enumerate(zip(self._layout.groups, components, strict=True)):
+                source = of_group[min(k, len(of_group) - 1)]
+                belief.x[group.x], belief.vector[group.t] = source.x[group.x], source.vector[group.t]
+                belief.information[group.block] = source.information[group.block]
+                belief.evidence[n] = source.evidence[n]
+                belief.records[n], belief.speeds[n] = source.records[n], source.speeds[n]
             beliefs.append(belief)
-            alive.append([k < len(own) for own in components])
+            alive.append([k < len(of_group) for of_group in components])
         return GaussianSum(self._layout, beliefs, np.array(alive))
-
-
-def copy_group(
-    source: InformationState, target: InformationState, number: int, group: CoordinateGroup
-) -> None:
-    """Copy the belief about one group."""
-    block = group.block
-    target.x[group.x], target.vector[group.t] = source.x[group.x], source.vector[group.t]
-    target.information[block], target.evidence[number] = source.information[block], source.evidence[number]
-    target.records[number], target.speeds[number] = source.records[number], source.speeds[number]
 
 
 # Candidates merge if their predictions differ by fewer deviations of the noise, and each coordinate of the
@@ -154,16 +138,9 @@ _SAME_PREDICTION, _NEAR = 0.3, 3.0
 class MergeCriterion:
     """Criterion for two candidates that are one component."""
 
-    def __init__(
-        self,
-        layout: Layout,
-        residuals: Residuals,
-        reader: MeasurementReader,
-        process_model: ProcessModel,
-        ridge_covariance: RidgeCovariance,
-    ) -> None:
-        self._layout, self._residuals, self._reader = layout, residuals, reader
-        self._process_model, self._ridge_covariance = process_model, ridge_covariance
+    def __init__(self, components: Components, ridge_covariance: RidgeCovariance) -> None:
+        self._layout, self._residuals, self._process_model, self._reader, *_ = components
+        self._ridge_covariance = ridge_covariance
 
     def should_merge(
         self,
@@ -180,34 +157,21 @@ class MergeCriterion:
         errors = self._residuals.errors(one.predicted, as_seen, group.observation_indices)
         if any(float(e @ e) >= _SAME_PREDICTION**2 for e, _ in errors.values()):
             return False
-        number = self._layout.groups.index(group)
-        apart = self._difference(group, other.belief, one.belief, inputs, periods)
+        number, here = self._layout.groups.index(group), other.belief.x[group.x]
+        change = one.belief.x[group.x] - here
+        for k, x in enumerate(group.coordinates):
+            if x in periods:
+                change[k] = math.remainder(change[k], periods[x])
+        # The tangent step between both states, to first order.
+        apart = np.linalg.pinv(self._process_model.basis(number, here, inputs)) @ change
         most = _NEAR**2 * len(apart)
         if float(apart @ other.belief.information[group.block] @ apart) < most:
             return True
         mine, theirs = one.belief.records[number], other.belief.records[number]
-        if (
-            mine is None
-            or theirs is None
-            or (min(mine.count, theirs.count) > 1 and mine.branch is not theirs.branch)
-        ):
+        if mine is None or theirs is None:
+            return False
+        if min(mine.count, theirs.count) > 1 and mine.branch is not theirs.branch:
             return False  # separate components of earlier updates
         if number not in other.covariances:
             other.covariances[number] = self._ridge_covariance.compute(number, other.belief)
         return float(apart @ inverse_spd(other.covariances[number]) @ apart) < most
-
-    def _difference(
-        self,
-        group: CoordinateGroup,
-        here: InformationState,
-        there: InformationState,
-        inputs: Array,
-        periods: Mapping[Symbol, float],
-    ) -> Array:
-        """Return the tangent step between the states of two beliefs, to first order."""
-        change = there.x[group.x] - here.x[group.x]
-        for k, x in enumerate(group.coordinates):
-            if x in periods:
-                change[k] = math.remainder(change[k], periods[x])
-        basis = self._process_model.basis(self._layout.groups.index(group), here.x[group.x], inputs)
-        return np.linalg.pinv(basis) @ change

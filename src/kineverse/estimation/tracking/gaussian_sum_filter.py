@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -21,11 +21,17 @@ from .gaussian_sum import Candidate, GaussianSum, MergeCriterion
 from .information_state import InformationState
 from .map_update import MapResult, MapSolver
 from .native import NativeInlierSolver, NativeMapSolver, native_library
-from .observability import StationaryPoints, UnobservableDirections, find_unexplained, move_origin
-from .process_model import ConstantVelocity, ProcessModel
+from .observability import (
+    Components,
+    StaticBatch,
+    StationaryPoints,
+    UnobservableDirections,
+    find_unexplained,
+    move_origin,
+)
+from .process_model import ConstantVelocity, ProcessModel, Speeds
 from .residuals import MeasurementReader, Measurements, Residuals
 from .state_space import Layout
-from .static_batch import StaticBatch
 
 
 @dataclass(slots=True, eq=False)
@@ -58,16 +64,12 @@ class UpdateStep:
         self.reader = MeasurementReader(layout)
         self.solver = MapSolver(layout, self.residuals, self.process_model, limits)
         self.unobservable = UnobservableDirections(layout)
-        self.static_batch = StaticBatch(
-            layout, self.residuals, self.reader, self.solver, self.unobservable, self._map_update
-        )
-        group_bounds = self.solver.group_bounds
-        parts = (layout, self.residuals, self.process_model, self.reader, group_bounds, self.unobservable)
-        self.ridge_covariance, self.inflation = RidgeCovariance(*parts), CovarianceInflation(*parts)
-        self.merge_criterion = MergeCriterion(
-            layout, self.residuals, self.reader, self.process_model, self.ridge_covariance
-        )
-        self.stationary_points = StationaryPoints(layout, self.process_model, self.unobservable, group_bounds)
+        shared = layout, self.residuals, self.process_model, self.reader
+        components = Components(*shared, self.solver.group_bounds, self.unobservable)
+        self.static_batch = StaticBatch(components, self.solver, self._map_update)
+        self.ridge_covariance, self.inflation = RidgeCovariance(components), CovarianceInflation(components)
+        self.merge_criterion = MergeCriterion(components, self.ridge_covariance)
+        self.stationary_points = StationaryPoints(components)
         self.native = (
             NativeMapSolver(layout, limits, self.function, self.process_model)
             if NativeMapSolver.suits(layout)
@@ -113,7 +115,7 @@ class UpdateStep:
             unexplained = sorted({*unexplained, *turned})
         if not candidates:
             return StepResult(after, result.nis, result.dof, (), result.rounds)
-        first = self._candidate(result.belief, None, result.nis, result.dof, unexplained, inputs)
+        first = self._candidate(result, unexplained, inputs)
         after, best = after.select(
             [first, *candidates], partial(self.merge_criterion.should_merge, inputs, self.periods)
         )
@@ -125,7 +127,6 @@ class UpdateStep:
     def _map_update(
         self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int] | None = None
     ) -> MapResult:
-        """Return the least-squares update of some groups; of all measured groups if None."""
         result = None
         if self.native is not None and self.native.is_ready:
             result = self.native.update(belief, reading, inputs)
@@ -136,28 +137,24 @@ class UpdateStep:
 
     def _restart(
         self,
-        before: InformationState,
+        old: InformationState,
         result: MapResult,
         reading: Measurements,
         inputs: Array,
         groups: list[int],
     ) -> list[Candidate]:
-        """Return candidates from restarts beside states where the measurement Jacobian vanishes."""
-        starts = self.stationary_points.restart_states(before, result.belief, groups, inputs)
+        starts = self.stationary_points.restart_states(old, result.belief, groups, inputs)
         return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
 
     def _try_other_turns(
         self,
-        before: InformationState,
+        old: InformationState,
         result: MapResult,
         reading: Measurements,
         inputs: Array,
         groups: list[int],
     ) -> list[Candidate]:
-        """Return candidates on other turns of counted coordinates.
-
-        The orientation of a pinion has a minimum on each turn. The place of its rack tells which is least.
-        """
+        """Return candidates on other turns of counted coordinates, such as a pinion on its rack."""
         candidates: list[Candidate] = []
         for x in self.counted:
             i = self.layout.tangent_space.coordinates.index(x)
@@ -168,71 +165,56 @@ class UpdateStep:
             place, off = result.belief.x.copy(), []
             for turn in (0.0, math.tau):
                 place[i] = result.belief.x[i] + turn
-                errors = self.residuals.errors(
-                    self.residuals.evaluate(place, inputs), reading, group.observation_indices
-                )
+                out = self.residuals.evaluate(place, inputs)
+                errors = self.residuals.errors(out, reading, group.observation_indices)
                 off.append(np.concatenate([error for error, _ in errors.values()]))
             change = off[1] - off[0]
             turns = round(-float(off[0] @ change) / max(float(change @ change), np.finfo(float).tiny))
             if turns:
                 place[i] = result.belief.x[i] + turns * math.tau
-                start = before.copy()
+                start = old.copy()
                 there = place[group.x]
-                move_origin(start, number, group, there, there - before.x[group.x], None)
+                move_origin(start, number, group, there, there - old.x[group.x], None)
                 candidates += self._restart_from(start, reading, inputs, [number])
         return candidates
 
     def _restart_from(
         self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
     ) -> list[Candidate]:
-        """Return the candidate of a restart from a state; none if the restart fails."""
         try:
-            return [self._update_from(start, reading, inputs, groups)]
+            if self.outliers is not None:
+                start = self.solver.find_robust_start(start, reading, inputs, groups)
+            result = self.solver.update(start, reading, inputs, groups, self.outliers or "gaussian")
+            candidate = self._relinearised(start, result, reading, inputs, groups)
         except KineverseError:
             return []
-
-    def _update_from(
-        self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
-    ) -> Candidate:
-        if self.outliers is not None:
-            start = self.solver.find_robust_start(start, reading, inputs, groups)
-        result = self.solver.update(start, reading, inputs, groups, self.outliers or "gaussian")
-        candidate = self._relinearised(start, result, reading, inputs, groups)
-        if self.outliers is None:
+        kept = [n for n in groups if self.outliers is None and start.records[n] is not None]
+        if kept:
             # The stored measurements belong to another branch: the present residuals decide.
-            errors = self.residuals.errors(
-                candidate.predicted, reading, np.flatnonzero(reading.mask).tolist()
-            )
-            for number in groups:
-                if start.records[number] is not None:
-                    squares = (
-                        float(e @ e) for i, (e, _) in errors.items() if self.layout.group_of[i] == number
-                    )
-                    candidate.nis[number] = sum(squares)
-        return candidate
+            candidate.nis[kept] = 0.0
+            measured = [i for i, n in enumerate(self.layout.group_of) if n in kept and reading.mask[i]]
+            for i, (e, _) in self.residuals.errors(candidate.predicted, reading, measured).items():
+                candidate.nis[self.layout.group_of[i]] += e @ e
+        return [candidate]
 
     def _relinearised(
         self,
-        before: InformationState,
+        old: InformationState,
         result: MapResult,
         reading: Measurements,
         inputs: Array,
         groups: list[int],
     ) -> Candidate:
-        self.static_batch.relinearise(before, result, reading, inputs, groups)
+        self.static_batch.relinearise(old, result, reading, inputs, groups)
         _require_finite(result.belief.numbers)
-        return self._candidate(result.belief, result.weights, result.nis, result.dof, groups, inputs)
+        return self._candidate(result, groups, inputs)
 
     def _forget_other_inputs(self, mixture: GaussianSum, inputs: Array) -> GaussianSum:
-        """Drop static records that were taken at other values of the inputs."""
-
         def changed(belief: InformationState) -> InformationState:
-            groups = [
-                number
-                for number, record in enumerate(belief.records)
-                if record is not None and not np.array_equal(record.inputs, inputs)
-            ]
-            return self._inflated(belief, groups)
+            records = enumerate(belief.records)
+            return self._inflated(
+                belief, [n for n, r in records if r and not np.array_equal(r.inputs, inputs)]
+            )
 
         return mixture.map(changed) if len(inputs) else mixture
 
@@ -245,12 +227,7 @@ class UpdateStep:
         return wide
 
     def predict(
-        self,
-        belief: InformationState,
-        inputs: Array,
-        dt: float,
-        speeds: Mapping[Symbol, float],
-        noise: Mapping[Symbol, float],
+        self, belief: InformationState, inputs: Array, dt: float, speeds: Speeds, noise: Speeds
     ) -> InformationState:
         """Predict a belief by ``dt`` seconds; it stays about the most probable point inside the limits."""
         if self.velocity is not None:
@@ -291,22 +268,16 @@ class UpdateStep:
         return result
 
     def _constrained(self, belief: InformationState, inputs: Array) -> InformationState:
-        """Return a predicted belief about the most probable point inside the limits."""
-        if self._is_at_mean(belief):
-            return belief
+        is_inside = (belief.x >= self.limits.lower).all() and (belief.x <= self.limits.upper).all()
+        if is_inside and not self.layout.limits:
+            if float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2:
+                return belief
         if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
             none = np.zeros(len(belief.vector))
             # C leaves out groups without motion; so little noise changes no number.
             if (result := self.native.predict(belief, none, none + np.finfo(float).tiny)) is not None:
                 return result
         return self.solver.constrain(belief, self.reader.empty(), inputs)
-
-    def _is_at_mean(self, belief: InformationState) -> bool:
-        """Return True if a belief is about its own mean and inside bounds of single coordinates."""
-        limits = self.limits
-        if self.layout.limits or (belief.x < limits.lower).any() or (belief.x > limits.upper).any():
-            return False
-        return float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2
 
     def is_possible(self, number: int, belief: InformationState, inputs: Array) -> bool:
         """Return True if a group is inside its limits at a state and its model is finite there."""
@@ -315,34 +286,24 @@ class UpdateStep:
         except KineverseError:
             return False
         group = self.layout.groups[number]
-        parts = [
-            out[where]
-            for i in group.observation_indices
-            for where in (self.layout.value_slices[i], self.layout.jacobian_slices[i])
-        ]
-        if not all(np.isfinite(each).all() for each in parts):
-            return False
-        return self.solver.rows(number, belief.x[group.x], out).violation < _OUTSIDE
+        for i in group.observation_indices:
+            for where in (self.layout.value_slices[i], self.layout.jacobian_slices[i]):
+                if not np.isfinite(out[where]).all():
+                    return False
+        return self.solver.group_bounds[number].rows(belief.x[group.x], out).violation < _OUTSIDE
 
     def _measured_groups(self, reading: Measurements) -> list[int]:
-        return [
-            n
-            for n, group in enumerate(self.layout.groups)
-            if reading.mask[list(group.observation_indices)].any()
-        ]
+        groups = enumerate(self.layout.groups)
+        return [n for n, group in groups if reading.mask[list(group.observation_indices)].any()]
 
     def _keep_turns(self, mixture: GaussianSum, predicted: Array) -> None:
-        """Take periodic coordinates to the turn nearest to their prediction (n,); in place.
-
-        Integrators, controllers and gears count turns, though nothing that is observed tells them.
-        """
+        """Take periodic coordinates to the turn nearest to their prediction (n,), in place."""
         for x, period in self.periods.items():
             i = self.layout.tangent_space.coordinates.index(x)
             for belief in mixture.beliefs:
                 belief.x[i] -= period * round((belief.x[i] - predicted[i]) / period)
 
     def _update_mixture(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
-        """Update all components and keep the best candidates."""
         measured = self._measured_groups(reading)
         candidates, rounds = self._solve_inliers(mixture, reading, inputs, measured)
         solved = {number for candidate in candidates for number in candidate.groups}
@@ -365,11 +326,9 @@ class UpdateStep:
         )
         nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
         dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
-        rejected = [
-            i
-            for i, number in enumerate(self.layout.group_of)
-            if reading.mask[i] and (c := best[number]) and c.weights is not None and c.weights[i] < 0.5
-        ]
+        weights = [None if c is None else c.weights for c in best]
+        of_group = [(i, weights[n]) for i, n in enumerate(self.layout.group_of) if reading.mask[i]]
+        rejected = [i for i, w in of_group if w is not None and w[i] < 0.5]
         if rejected:
             out = self.residuals.evaluate(after.best.x, inputs)
             for i, (error, _) in self.residuals.errors(out, reading, rejected).items():
@@ -378,16 +337,11 @@ class UpdateStep:
         return StepResult(after, nis, dof, tuple(rejected), rounds)
 
     def restart(
-        self,
-        before: GaussianSum,
-        initial: GaussianSum,
-        groups: Sequence[int],
-        reading: Measurements,
-        inputs: Array,
+        self, old: GaussianSum, initial: GaussianSum, groups: list[int], reading: Measurements, inputs: Array
     ) -> StepResult:
-        """Return the result of a reading of some groups that start anew; they keep their evidence."""
+        """Return the result of a reading of some groups that restart; they keep their evidence."""
         mask = reading.mask & np.isin(self.layout.group_of, groups)
-        evidence = {n: float(np.logaddexp.reduce(before.evidence(n))) for n in groups}
+        evidence = {n: float(np.logaddexp.reduce(old.evidence(n))) for n in groups}
 
         def with_evidence(belief: InformationState) -> InformationState:
             result = belief.copy()
@@ -395,18 +349,15 @@ class UpdateStep:
                 result.evidence[number] = log
             return result
 
-        start = before.replace_groups(initial.map(with_evidence), groups)
+        start = old.replace_groups(initial.map(with_evidence), groups)
         result = self.update(start, reading._replace(mask=mask), inputs)
-        self._keep_turns(result.mixture, before.best.x)
+        self._keep_turns(result.mixture, old.best.x)
         return result
 
     def find_accepted(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array
     ) -> npt.NDArray[np.bool_]:
-        """Return True for each group of which a component accepts a measurement as an inlier (groups,).
-
-        About a broad prior that need not be the best component: all outliers are as probable at first.
-        """
+        """Return True for each group of which a component, best or not, accepts a measurement (groups,)."""
         result = np.zeros(len(self.layout.groups), dtype=bool)
         assert self.outliers is not None
         for component, belief in enumerate(mixture.beliefs):
@@ -423,7 +374,6 @@ class UpdateStep:
     def _solve_inliers(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]
     ) -> tuple[list[Candidate], int]:
-        """Return the candidates that C finds for unambiguous groups."""
         if self.inlier_solver is None or not self.is_native:
             return [], 0
         result, rounds = self.inlier_solver.solve(mixture, reading, inputs, groups)
@@ -437,71 +387,51 @@ class UpdateStep:
         self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int], is_best: bool
     ) -> tuple[list[Candidate], int]:
         """Return candidates for one component: without outliers, with outliers, and all outliers."""
-        if self.outliers is None:
-            result = self._map_update(belief, reading, inputs, groups)
-            candidates = [self._relinearised(belief, result, reading, inputs, groups)]
-            if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
-                candidates += self._restart(belief, result, reading, inputs, unexplained)
-            if is_best and self.counted:
-                turned = find_unexplained(result)
-                candidates += self._try_other_turns(belief, result, reading, inputs, turned)
-            return candidates, result.rounds
-        robust_start = self.solver.find_robust_start(belief, reading, inputs, groups)
         candidates, rounds = [], 0
-        for start in (belief, robust_start):
-            result = self.solver.update(start, reading, inputs, groups, self.outliers)
+        if self.outliers is None:
+            starts = [belief]
+        else:
+            starts = [belief, self.solver.find_robust_start(belief, reading, inputs, groups)]
+        for start in starts:
+            if self.outliers is None:
+                result = self._map_update(start, reading, inputs, groups)
+            else:
+                result = self.solver.update(start, reading, inputs, groups, self.outliers)
             candidates.append(self._relinearised(start, result, reading, inputs, groups))
             rounds = max(rounds, result.rounds)
-        if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
-            candidates += self._restart(belief, result, reading, inputs, unexplained)
-        if is_best and self.counted:
-            turned = self._with_rejected(result, reading, groups)
-            candidates += self._try_other_turns(belief, result, reading, inputs, turned)
+        if is_best:
+            rejected = self._with_rejected(result, reading, groups)
+            unexplained = {*self.stationary_points.unexplained(belief, result), *rejected}
+            if again := [n for n in groups if n in unexplained]:
+                candidates += self._restart(belief, result, reading, inputs, again)
+            if self.counted:
+                turned = find_unexplained(result) if self.outliers is None else rejected
+                candidates += self._try_other_turns(belief, result, reading, inputs, turned)
+        if self.outliers is None:
+            return candidates, rounds
         all_outliers = belief.copy()
         none = np.zeros(len(self.layout.groups))
-        for number in groups:
-            measured = [i for i in self.layout.groups[number].observation_indices if reading.mask[i]]
-            log_outliers = sum(
-                self.outliers.log_density(self.layout.observations[i], float(reading.log_scale[i]))
-                for i in measured
-            )
-            all_outliers.evidence[number] += log_outliers
+        for i in np.flatnonzero(reading.mask).tolist():
+            if self.layout.group_of[i] in groups:
+                log = self.outliers.log_density(self.layout.observations[i], float(reading.log_scale[i]))
+                all_outliers.evidence[self.layout.group_of[i]] += log
         weights = np.zeros(len(self.layout.observations))
-        candidates.append(self._candidate(all_outliers, weights, none, none, groups, inputs))
+        candidates.append(self._candidate(MapResult(all_outliers, none, none, 0, weights), groups, inputs))
         return candidates, rounds
 
-    def _unexplained(
-        self, belief: InformationState, result: MapResult, reading: Measurements, groups: list[int]
-    ) -> list[int]:
-        """Return the groups with unexplained residuals or outliers."""
-        unexplained = {
-            *self.stationary_points.unexplained(belief, result),
-            *self._with_rejected(result, reading, groups),
-        }
-        return [n for n in groups if n in unexplained]
-
     def _with_rejected(self, result: MapResult, reading: Measurements, groups: list[int]) -> list[int]:
-        """Return the groups of which an observation is rejected as an outlier."""
         if result.weights is None:
             return []
         rejected = reading.mask & (result.weights < 0.5)
         return [n for n in groups if rejected[list(self.layout.groups[n].observation_indices)].any()]
 
-    def _candidate(
-        self,
-        belief: InformationState,
-        weights: Array | None,
-        nis: Array,
-        dof: Array,
-        groups: list[int],
-        inputs: Array,
-    ) -> Candidate:
-        return Candidate(belief, self.residuals.evaluate(belief.x, inputs), weights, nis, dof, groups)
+    def _candidate(self, result: MapResult, groups: list[int], inputs: Array) -> Candidate:
+        predicted = self.residuals.evaluate(result.belief.x, inputs)
+        return Candidate(result.belief, predicted, result.weights, result.nis, result.dof, groups)
 
 
 def _require_finite(*arrays: Array) -> None:
     if not all(np.isfinite(one).all() for one in arrays):
         raise InvalidValueError(
-            "The step leads to numbers that are not finite, as what was seen or the covariances are too "
-            "large or too small for floating point. The belief stays as it was."
+            "The step leads beyond floating point: measurements or covariances are too large or too small."
         )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from kineverse._checks import as_tolerance
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
 from .estimate import Estimate
@@ -58,9 +59,7 @@ class HypothesisBank:
             raise UnknownNameError(f"The prior does not fit. {suggest(strange, trackers, 'hypothesis')}")
         if not all(math.isfinite(w) and w > 0 for w in weights.values()):
             raise InvalidValueError(f"Probabilities are positive, not {weights!r}.")
-        if not (math.isfinite(forgetting) and forgetting >= 0):
-            raise InvalidValueError(f"Forgetting is a rate that is not negative, not {forgetting!r}.")
-        self._forgetting = forgetting
+        self._forgetting = as_tolerance(forgetting, "The rate of forgetting")
         self._logs = {name: math.log(w) for name, w in weights.items()}
         self._estimates = {name: tracker.estimate for name, tracker in self._trackers.items()}
 
@@ -93,7 +92,7 @@ class HypothesisBank:
         self._trackers, self._estimates = moved, estimates
         self._forget(dt)
 
-    def update(self, seen: Mapping[str, Any], **options: Any) -> dict[str, float]:
+    def update(self, measurements: Mapping[str, Any], **options: Any) -> dict[str, float]:
         """Update all trackers with the same measurements and return the probabilities.
 
         See :meth:`.Tracker.update`. If one of them refuses the measurements, none changes.
@@ -101,7 +100,7 @@ class HypothesisBank:
         # Copies share compiled code. After an error the originals are unchanged.
         after = {name: tracker.copy() for name, tracker in self._trackers.items()}
         stamps = {name: tracker.estimate.stamp for name, tracker in after.items()}
-        estimates = {name: tracker.update(seen, **options) for name, tracker in after.items()}
+        estimates = {name: tracker.update(measurements, **options) for name, tracker in after.items()}
         first = next(iter(after))
         began, now = stamps[first], estimates[first].stamp
         if began is not None and now is not None:

@@ -14,8 +14,8 @@ from kineverse.estimation.linear_algebra import inverse_spd, symmetric
 from kineverse.lie import Array
 
 if TYPE_CHECKING:
+    from .observability import StaticRecord
     from .process_model import ConditionalSpeeds
-    from .static_batch import StaticRecord
 
 TangentIndices = npt.NDArray[np.int64]
 

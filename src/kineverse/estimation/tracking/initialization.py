@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Largest distance between initial values of an angle [rad].
 _SPACING = math.pi / 2
 _MOST_STARTS = 32
-# Initial points are at most this many deviations from the given one.
+# Initial points are at most this many deviations from the first.
 _FARTHEST = 5.5
 _SAME = 1e-9
 # Turns after which gears may stand as before: a gear of ratio p/q does so after q turns.
@@ -42,11 +42,7 @@ _SAMPLES = (0.125, 0.375, 0.625, 0.875)
 def find_turning_coordinates(
     update_step: UpdateStep, x: Array, inputs: Array
 ) -> tuple[dict[Symbol, float], frozenset[Symbol]]:
-    """Return coordinates without limits of which full turns change no predicted observation, or only some.
-
-    The former have the angle after which nothing changes [rad]: several turns where gears are observed. The
-    latter are angles whose turn is observed elsewhere, such as that of a pinion by the place of its rack.
-    """
+    """Return coordinates with periods of all predictions [rad], and those whose turn some observe."""
     layout, limits = update_step.layout, update_step.limits
     periods: dict[Symbol, float] = {}
     counted = []
@@ -102,15 +98,19 @@ def _turns_some(layout: Layout, i: int, predicted: Array, is_same: npt.NDArray[n
 
 
 def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Array) -> GaussianSum:
-    """Return beliefs about several initial points, all with the same Gaussian, the given one first."""
+    """Return beliefs about several initial points with the same Gaussian, the initial state first."""
     layout = update_step.layout
     beliefs, alive = [first], [np.ones(len(layout.groups), dtype=bool)]
     ambiguous = _find_ambiguous(update_step, first, inputs)
     for number, group in enumerate(layout.groups):
         steps = [_offsets(update_step, first, i, i in ambiguous) for i in group.x]
-        offsets = [_to_tangent(layout, number, np.array(x)) for x in _subsample(itertools.product(*steps))]
+        changes = list(itertools.islice(itertools.product(*steps), 4096))
+        changes = changes[:: math.ceil(len(changes) / _MOST_STARTS)]
+        offsets = [_to_tangent(layout, number, change) for change in changes[1:]]
+        # Half turns about rate directions, such as those of quaternions.
+        offsets += [math.pi * np.eye(len(group.tangent))[k] for k in group.rate_directions]
         component = 0
-        for offset in offsets[1:] + _half_turns(layout, number):
+        for offset in offsets:
             if np.abs(offset / update_step.unobservable.deviations[group.t]).max() > _FARTHEST:
                 continue
             x, transport = update_step.process_model.retract(number, first.x[group.x], offset, inputs)
@@ -130,28 +130,14 @@ def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Arra
     return GaussianSum(layout, beliefs, np.array(alive))
 
 
-def _subsample(places: Iterable[tuple[float, ...]]) -> list[tuple[float, ...]]:
-    """Return at most ``_MOST_STARTS`` points, evenly spaced, the first one first."""
-    every = list(itertools.islice(places, 4096))
-    step = math.ceil(len(every) / _MOST_STARTS)
-    return every[::step]
-
-
 def _find_ambiguous(update_step: UpdateStep, first: InformationState, inputs: Array) -> set[int]:
-    """Return the coordinates on which some prediction is not monotonic between their limits.
-
-    An example is the distance from a point, which is equal on both of its sides. All groups are evaluated at
-    once.
-    """
+    """Return coordinates on which a prediction, such as a distance, is not monotonic between their limits."""
     layout, limits = update_step.layout, update_step.limits
     width = limits.upper - limits.lower
     result: set[int] = set()
     for k in range(max(len(group.x) for group in layout.groups)):
-        groups = [
-            g
-            for g in layout.groups
-            if k < len(g.x) and g.tangent_index(k) >= 0 and np.isfinite(width[g.x[k]])
-        ]
+        groups = [g for g in layout.groups if k < len(g.x) and g.tangent_index(k) >= 0]
+        groups = [g for g in groups if np.isfinite(width[g.x[k]])]
         predicted: list[Array] = []
         for share in _SAMPLES if groups else ():
             x = first.x.copy()
@@ -161,12 +147,9 @@ def _find_ambiguous(update_step: UpdateStep, first: InformationState, inputs: Ar
                 predicted.append(update_step.residuals.evaluate(x, inputs))
             except KineverseError:  # infeasible
                 continue
-        if predicted:
-            result.update(
-                int(g.x[k])
-                for g in groups
-                if _is_ambiguous(layout, g, g.tangent_index(k), np.array(predicted))
-            )
+        for group in groups if predicted else ():
+            if _is_ambiguous(layout, group, group.tangent_index(k), np.array(predicted)):
+                result.add(int(group.x[k]))
     return result
 
 
@@ -181,10 +164,8 @@ def _is_ambiguous(layout: Layout, group: CoordinateGroup, column: int, predicted
             if (slopes @ slopes.T < 0.0).any():
                 return True
             if not one.is_pose:
-                changes = (
-                    wrap_difference(np.diff(predicted[:, layout.value_slices[i]], axis=0), one.period)
-                    @ white.T
-                )
+                steps = np.diff(predicted[:, layout.value_slices[i]], axis=0)
+                changes = wrap_difference(steps, one.period) @ white.T
                 if (np.einsum("ij,ij->i", changes, slopes[1:] + slopes[:-1]) < 0.0).any():
                     return True
     return False
@@ -208,25 +189,13 @@ def _offsets(update_step: UpdateStep, first: InformationState, i: int, is_ambigu
     return [0.0, *middles.tolist()]
 
 
-def _to_tangent(layout: Layout, number: int, change: Array) -> Array:
-    """Return the tangent step that changes coordinates by given amounts."""
+def _to_tangent(layout: Layout, number: int, change: Iterable[float]) -> Array:
     group = layout.groups[number]
     step = np.zeros(len(group.tangent))
-    for x, by in zip(group.coordinates, change.tolist(), strict=True):
+    for x, by in zip(group.coordinates, change, strict=True):
         if x not in layout.tangent_space.by_speeds:
             step[group.tangent.index(x.derivative())] = by
     return step
-
-
-def _half_turns(layout: Layout, number: int) -> list[Array]:
-    """Return half turns about each rate direction, such as those of quaternions."""
-    group = layout.groups[number]
-    result = []
-    for k in group.rate_directions:
-        step = np.zeros(len(group.tangent))
-        step[k] = math.pi
-        result.append(step)
-    return result
 
 
 # Distance beyond limits that may be rounding.
@@ -243,7 +212,7 @@ class InitialBelief:
     speed_variances: Mapping[Symbol, float] = field(default_factory=dict)
 
     def spread(self, update_step: UpdateStep, inputs: Array) -> GaussianSum:
-        """Return the belief about several initial points, see :mod:`.multi_start`."""
+        """Return the belief about several initial points."""
         groups = len(update_step.layout.groups)
         belief = InformationState((len(self.x), len(self.deviations), groups))
         belief.x[:] = self.x
@@ -256,7 +225,7 @@ class InitialBelief:
             update_step.velocity.initialise(belief, self.speeds, self.speed_variances)
         return spread_starts(update_step, belief, inputs)
 
-    def with_values(self, update_step: UpdateStep, values: GivenValues) -> InitialBelief:
+    def with_values(self, update_step: UpdateStep, values: InitialValues) -> InitialBelief:
         """Return the belief with other values of some coordinates and speeds, and other deviations."""
         x, deviations = self.x.copy(), self.deviations.copy()
         for symbol, value in values.coordinates.items():
@@ -270,34 +239,42 @@ class InitialBelief:
 
 
 @dataclass(frozen=True, eq=False)
-class GivenValues:
+class InitialValues:
     """Checked initial values and standard deviations."""
 
-    coordinates: Mapping[Symbol, float]  # values by symbol
+    coordinates: Mapping[Symbol, float]
     speeds: Mapping[Symbol, float]
     deviations: Mapping[int, float]  # standard deviations by number of the tangent direction
-    speed_deviations: Mapping[Symbol, float]  # standard deviations of speeds
+    speed_deviations: Mapping[Symbol, float]
 
     @staticmethod
-    def read(update_step: UpdateStep, start: StateLike, uncertainty: StateLike) -> GivenValues:
+    def read(
+        update_step: UpdateStep, start: StateLike | None, uncertainty: StateLike | None
+    ) -> InitialValues:
         """Check initial values and standard deviations."""
-        tangent_space = update_step.layout.tangent_space
+        tangent_space, limits = update_step.layout.tangent_space, update_step.limits
         speeds = () if update_step.velocity is None else tuple(update_step.process_model.speeds.values())
-        state = start if isinstance(start, State) else State(start)
-        given = {s: state[s] for s in (*tangent_space.coordinates, *speeds) if s in state}
+        state = start if isinstance(start, State) else State({} if start is None else start)
+        values = {s: state[s] for s in (*tangent_space.coordinates, *speeds) if s in state}
         for name in () if isinstance(start, State) else state:
-            if name not in given:
+            if name not in values:
                 raise _unknown_name(name, (*tangent_space.coordinates, *speeds))
-        for symbol, value in given.items():
+        for symbol, value in values.items():
             if not math.isfinite(value):
                 raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
             if not isinstance(start, State) and symbol in tangent_space.coordinates:
-                _check_limits(update_step, symbol, value)
+                k = tangent_space.coordinates.index(symbol)
+                low, high = float(limits.lower[k]), float(limits.upper[k])
+                if not low - _BEYOND <= value <= high + _BEYOND:
+                    raise InvalidValueError(
+                        f"start= of '{symbol}' is {value:g}, beyond its limits {low:g} to {high:g}."
+                    )
         names: dict[str, int] = {}
         for k, v in enumerate(tangent_space.tangent):
             names[str(v.position) if v.position in tangent_space.coordinates else str(v)] = k
         speed_names = {str(v): v for v in speeds if str(v) not in names}
         deviations, speed_deviations = {}, {}
+        uncertainty = {} if uncertainty is None else uncertainty
         for key, value in require_mapping(uncertainty, "uncertainty=").items():
             if str(key) in speed_names:
                 speed_deviations[speed_names[str(key)]] = require_positive(key, value)
@@ -305,22 +282,9 @@ class GivenValues:
                 deviations[names[str(key)]] = require_positive(key, value)
             else:
                 raise _unknown_name(key, (*names, *speed_names))
-        return GivenValues(
-            {s: value for s, value in given.items() if s not in speeds},
-            {s: value for s, value in given.items() if s in speeds},
-            deviations,
-            speed_deviations,
-        )
-
-
-def _check_limits(update_step: UpdateStep, symbol: Symbol, value: float) -> None:
-    """Check that a given value is within the limits of its coordinate."""
-    k = update_step.layout.tangent_space.coordinates.index(symbol)
-    low, high = float(update_step.limits.lower[k]), float(update_step.limits.upper[k])
-    if not low - _BEYOND <= value <= high + _BEYOND:
-        raise InvalidValueError(
-            f"start= of '{symbol}' is {value:g}, beyond its limits {low:g} to {high:g} [m], [rad]."
-        )
+        coordinates = {s: value for s, value in values.items() if s not in speeds}
+        values_of_speeds = {s: value for s, value in values.items() if s in speeds}
+        return InitialValues(coordinates, values_of_speeds, deviations, speed_deviations)
 
 
 def _unknown_name(key: object, names: Iterable[object]) -> UnknownNameError:
@@ -329,7 +293,7 @@ def _unknown_name(key: object, names: Iterable[object]) -> UnknownNameError:
 
 
 def make_initial_belief(
-    model: ModelView, update_step: UpdateStep, values: GivenValues, inputs: Array
+    model: ModelView, update_step: UpdateStep, values: InitialValues, inputs: Array
 ) -> InitialBelief:
     """Return the initial belief, and set the periodic coordinates and initial deviations of a tracker."""
     tangent_space, limits = update_step.layout.tangent_space, update_step.limits

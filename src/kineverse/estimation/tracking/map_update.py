@@ -2,8 +2,8 @@
 
 The update minimises ½ξᵀΛξ - ηᵀξ + ½ Σ |W r|² over the state. Every group takes its own steps, but the model
 is evaluated once for all of them. A step that increases the cost is rejected and damped (Levenberg,
-Marquardt). With outliers, each residual is weighted anew at each iterate, and the cost is the negative log
-density of the outlier mixture.
+Marquardt). With outliers, residuals are reweighted at each iterate, and the cost is the negative log density
+of the outlier mixture.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Loss: TypeAlias = Outliers | Literal["gaussian", "cauchy"]
 class MapResult:
     """Result of a MAP update."""
 
-    belief: InformationState  # belief after the update
+    belief: InformationState
     nis: Array  # normalised innovation squared of each group
     dof: Array  # its degrees of freedom
     rounds: int  # number of model evaluations
@@ -52,8 +52,8 @@ class MapResult:
 class _GroupIterate:
     """State of the iteration of one group."""
 
-    x: Array  # best iterate so far: coordinates
-    prior: QuadraticCost  # quadratic costs without
+    x: Array  # coordinates of the best iterate so far
+    prior: QuadraticCost  # there, without measurements
     posterior: QuadraticCost  # with measurements
     trial: Array  # next iterate to evaluate
     trial_prior: QuadraticCost
@@ -74,18 +74,6 @@ class MapSolver:
         self._layout, self._residuals, self._process_model = layout, residuals, process_model
         self.group_bounds = [GroupBounds(number, layout, limits) for number in range(len(layout.groups))]
 
-    def update(
-        self,
-        belief: InformationState,
-        reading: Measurements,
-        inputs: Array,
-        groups: Sequence[int],
-        loss: Loss = "gaussian",
-    ) -> MapResult:
-        """Return the posterior after a reading; arguments are not changed."""
-        iterates, weights, rounds = self._run(belief, reading, inputs, groups, loss)
-        return self._build_result(belief, iterates, reading, rounds, loss, weights)
-
     def constrain(self, belief: InformationState, empty: Measurements, inputs: Array) -> InformationState:
         """Return the same belief about the most probable point inside the limits."""
         return self.update(belief, empty, inputs, range(len(self._layout.groups))).belief
@@ -102,10 +90,6 @@ class MapSolver:
             moved.set_group_cost(group.t, iterate.prior)
         return moved
 
-    def rows(self, number: int, x: Array, out: Array) -> BoundRows:
-        """Return the bounds on steps of a group at a point where the model was evaluated."""
-        return self.group_bounds[number].rows(x, out)
-
     def _run(
         self,
         belief: InformationState,
@@ -115,7 +99,11 @@ class MapSolver:
         loss: Loss,
     ) -> tuple[dict[int, _GroupIterate], Array, int]:
         """Iterate until all groups converge; return iterates, weights and the number of evaluations."""
-        iterates = {number: self._initial_iterate(belief, number) for number in groups}
+        iterates = {}
+        for number in groups:
+            group = self._layout.groups[number]
+            prior, start = belief.group_cost(group.t), belief.x[group.x]
+            iterates[number] = _GroupIterate(start, prior, prior, start, prior)
         weights = np.ones(len(self._layout.observations))
         x, rounds = belief.x.copy(), 0
         while rounds < _MOST_ROUNDS and any(iterate.settled is None for iterate in iterates.values()):
@@ -128,11 +116,6 @@ class MapSolver:
                     self._evaluate_trial(number, iterate, out, reading, loss, weights)
                     self._propose_trial(number, iterate, inputs)
         return iterates, weights, rounds
-
-    def _initial_iterate(self, belief: InformationState, number: int) -> _GroupIterate:
-        group = self._layout.groups[number]
-        prior, x = belief.group_cost(group.t), belief.x[group.x]
-        return _GroupIterate(x, prior, prior, x, prior)
 
     def _evaluate_trial(
         self,
@@ -156,14 +139,16 @@ class MapSolver:
             self._residuals.check(out, group.observation_indices)
             names = ", ".join(map(str, group.coordinates))
             raise InvalidValueError(
-                f"What was seen of {names} is too far away, or its covariance too small, for floating point."
+                f"A measurement of {names} is too far away, or its covariance too small, for floating point."
             )
         rows = self.group_bounds[number].rows(iterate.trial, out)
         if not is_finite or not _is_better(iterate, cost, rows):
             iterate.damping = max(10 * iterate.damping, 1e-3)
             return
         if iterate.rows is None:
-            iterate.constrained_minimum = _constrained_minimum(iterate.prior, rows)
+            # 0 if the limits contradict each other.
+            step = solve_bounded_qp(inverse_spd(iterate.prior.matrix), -iterate.prior.vector, *rows)
+            iterate.constrained_minimum = 0.0 if step is None else iterate.prior.transported(step, None).cost
         iterate.x, iterate.prior, iterate.cost, iterate.rows = iterate.trial, iterate.trial_prior, cost, rows
         weights[list(weighed)] = [weight for weight, _ in weighed.values()]
         iterate.posterior = iterate.prior.with_measurements(
@@ -173,7 +158,6 @@ class MapSolver:
         iterate.damping = iterate.damping / 10 if iterate.damping > 1e-6 else 0.0
 
     def _robust_cost(self, i: int, square: float, reading: Measurements, loss: Loss) -> tuple[float, float]:
-        """Return weight and cost of a squared residual."""
         if loss == "gaussian" or not np.isfinite(square):
             return 1.0, square / 2
         if loss == "cauchy":
@@ -203,15 +187,16 @@ class MapSolver:
         else:
             iterate.trial, iterate.trial_prior = x, iterate.prior.transported(step, transport)
 
-    def _build_result(
+    def update(
         self,
         belief: InformationState,
-        iterates: dict[int, _GroupIterate],
         reading: Measurements,
-        rounds: int,
-        loss: Loss,
-        weights: Array,
+        inputs: Array,
+        groups: Sequence[int],
+        loss: Loss = "gaussian",
     ) -> MapResult:
+        """Return the posterior after a reading; arguments are not changed."""
+        iterates, weights, rounds = self._run(belief, reading, inputs, groups, loss)
         after = belief.copy()
         count = len(self._layout.groups)
         nis, dof = np.zeros(count), np.zeros(count)
@@ -224,24 +209,14 @@ class MapSolver:
             # Least cost without limits. In the linear case this is the innovation squared in S⁻¹.
             nis[number] = max(2 * posterior.minimum, 0.0)
             dof[number] = sum(self._layout.observations[i].size for i in measured if weights[i] >= 0.5)
-            after.evidence[number] += (
-                (iterate.prior.log_determinant - posterior.log_determinant) / 2
-                - (posterior.cost - iterate.constrained_minimum)
-                - iterate.excess
-                - float(reading.log_scale[measured].sum())
-            )
+            gained = (iterate.prior.log_determinant - posterior.log_determinant) / 2
+            gained -= posterior.cost - iterate.constrained_minimum + iterate.excess
+            after.evidence[number] += gained - float(reading.log_scale[measured].sum())
         priors = {number: iterate.prior for number, iterate in iterates.items()}
         return MapResult(after, nis, dof, rounds, None if loss == "gaussian" else weights, priors=priors)
 
 
-def _constrained_minimum(belief: QuadraticCost, rows: BoundRows) -> float:
-    """Return the least cost of a belief inside the limits; 0 if they contradict each other."""
-    step = solve_bounded_qp(inverse_spd(belief.matrix), -belief.vector, *rows)
-    return 0.0 if step is None else belief.transported(step, None).cost
-
-
 def _is_better(iterate: _GroupIterate, cost: float, rows: BoundRows) -> bool:
-    """Return True if a trial is better than the best iterate: less infeasible, or of lower cost."""
     if iterate.rows is not None and iterate.rows.violation > _OUTSIDE:
         if rows.violation < iterate.rows.violation / 2:
             return True

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, ShapeError
 from kineverse.estimation.noise import pose_covariance
 from kineverse.expressions.expression import Expression, array
@@ -44,7 +45,7 @@ class ObservedPose(_Observed):
         Observing frame: the world, or a camera, which may move.
     covariance
         6×6, of the errors in the axes of ``relative_to``, linear part first [m²], [rad²]; by default 1 cm and
-        1°. See :mod:`kineverse.estimation.noise`.
+        1°. See :func:`.pose_covariance`.
     name
         Key of its measurements; the name of the frame if empty.
     """
@@ -59,7 +60,7 @@ class ObservedPosition(_Observed):
     Attributes
     ----------
     frame, point
-        The point (3,) [m] in coordinates of the frame; its origin if not given.
+        The point (3,) [m] in coordinates of the frame; its origin if None.
     relative_to
         Observing frame: the world, or a camera, which may move.
     covariance
@@ -105,9 +106,9 @@ class MeasurementModel:
     label: str  # name in error messages
     is_pose: bool  # True if the value is on SE(3); otherwise it is a vector
     value: Expression  # predicted measurement, 4×4 or (d,)
-    covariance: Array  # default covariance of one measurement
-    period: float = math.inf  # period of the values; inf if they are not periodic
-    frame: str = ""  # [m]
+    covariance: Array  # of one measurement
+    period: float = math.inf  # of the values; inf if they are not periodic
+    frame: str = ""  # observed frame of a pose or position; empty for an expression
     relative_to: str = ""
     is_stated: bool = True  # False if the covariance is a default
 
@@ -118,7 +119,7 @@ class MeasurementModel:
 
 
 def list_observed(observed: Iterable[ObservedLike] | ObservedLike) -> list[ObservedLike]:
-    """Return observations as a list; a single one may be given alone."""
+    """Return observations as a list; a single one needs no list."""
     if isinstance(observed, (str, ObservedPose, ObservedPosition, ObservedExpression)):
         return [observed]
     return list(observed)
@@ -144,36 +145,37 @@ def build_measurement_models(
 def _observation(model: ModelView, item: ObservedLike) -> MeasurementModel:
     if isinstance(item, str):
         item = ObservedPose(item)
+    if isinstance(item, ObservedExpression):
+        value = array(item.expression)
+        if len(value.shape) > 1:
+            raise ShapeError(f"'{item.name}' is a scalar or a vector, not of shape {value.shape}.")
+        value = value.reshape(-1)
+        covariance = require_covariance(item.covariance, len(value), item.name)
+        period = math.inf if item.period is None else item.period
+        if not period > 0:
+            raise InvalidValueError(f"The period of '{item.name}' is positive, not {period!r}.")
+        return MeasurementModel(item.name, item.name, False, value, covariance, float(period))
     if isinstance(item, ObservedPose):
         value = model.fk(item.frame, item.relative_to)
-        usual = pose_covariance(USUAL_POSITION, USUAL_ORIENTATION)
+        covariance = pose_covariance(USUAL_POSITION, USUAL_ORIENTATION)
     elif isinstance(item, ObservedPosition):
         homogeneous = np.append(np.asarray(item.point, dtype=float), 1.0)
         if homogeneous.shape != (4,) or not np.isfinite(homogeneous).all():
             raise InvalidValueError(f"The point of '{item.frame}' is three numbers [m], not {item.point!r}.")
         value = (model.fk(item.frame, item.relative_to) @ homogeneous)[:3]
-        usual = np.eye(3) * USUAL_POSITION**2
-    elif isinstance(item, ObservedExpression):
-        value, usual = _vector(item), np.empty((0, 0))
+        covariance = np.eye(3) * USUAL_POSITION**2
     else:
         raise InvalidValueError(
-            "What is observed is the name of a frame, ObservedPose, ObservedPosition or ObservedExpression, "
+            "observed= has names of frames, ObservedPose, ObservedPosition or ObservedExpression, "
             f"not {item!r}."
         )
-    if isinstance(item, ObservedExpression):
-        name = label = item.name
-    else:
-        name = item.name or item.frame
-        label = item.frame if item.relative_to == WORLD else f"{item.frame} in {item.relative_to}"
-    is_pose = isinstance(item, ObservedPose)
-    size = 6 if is_pose else value.shape[0]
-    covariance = usual if item.covariance is None else require_covariance(item.covariance, size, label)
-    period = item.period if isinstance(item, ObservedExpression) and item.period is not None else math.inf
-    if not period > 0:
-        raise InvalidValueError(f"The period of '{label}' is positive, not {period!r}.")
-    frames = ("", "") if isinstance(item, ObservedExpression) else (item.frame, item.relative_to)
+    label = item.frame if item.relative_to == WORLD else f"{item.frame} in {item.relative_to}"
+    is_pose, is_stated = isinstance(item, ObservedPose), item.covariance is not None
+    if item.covariance is not None:
+        covariance = require_covariance(item.covariance, len(covariance), label)
+    frames = (item.frame, item.relative_to)
     return MeasurementModel(
-        name, label, is_pose, value, covariance, float(period), *frames, item.covariance is not None
+        item.name or item.frame, label, is_pose, value, covariance, math.inf, *frames, is_stated
     )
 
 
@@ -181,25 +183,15 @@ def wrap_difference(difference: Array, period: float) -> Array:
     """Wrap differences of periodic numbers to at most half a period."""
     if math.isinf(period):
         return difference
-    result: Array = difference - period * np.round(difference / period)
-    return result
+    return np.asarray(difference - period * np.round(difference / period))
 
 
-def _vector(item: ObservedExpression) -> Expression:
-    value = array(item.expression)
-    if value.shape == ():
-        return array([value])
-    if len(value.shape) != 1:
-        raise ShapeError(f"'{item.name}' is a scalar or a vector, not of shape {value.shape}.")
-    return value
-
-
-def require_covariance(given: npt.ArrayLike, size: int, label: str) -> Array:
+def require_covariance(covariance: npt.ArrayLike, size: int, label: str) -> Array:
     """Check a covariance, size × size."""
     try:
-        matrix = np.array(given, dtype=np.float64)
+        matrix = np.array(covariance, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InvalidValueError(f"The covariance of '{label}' is not a matrix: {given!r:.80}.") from None
+        raise InvalidValueError(f"The covariance of '{label}' is not a matrix: {covariance!r:.80}.") from None
     if matrix.shape == () and size == 1:
         matrix = matrix.reshape(1, 1)
     if matrix.shape != (size, size):
@@ -213,30 +205,22 @@ def require_covariance(given: npt.ArrayLike, size: int, label: str) -> Array:
     least = float(np.linalg.eigvalsh(matrix)[0])
     if least <= 0:
         raise InvalidValueError(
-            f"The covariance of '{label}' is not positive: its least eigenvalue is {least:.3g}. What is "
-            "known exactly is given as inputs=, and what is not measured is left out."
+            f"The covariance of '{label}' is not positive: its least eigenvalue is {least:.3g}. Known "
+            "values are inputs=; leave out what is not measured."
         )
     return matrix
 
 
-def require_number(given: Any, what: str) -> float:
-    """Convert to float."""
-    try:
-        return float(given)
-    except (TypeError, ValueError):
-        raise InvalidValueError(f"{what} is a number, not {given!r:.80}.") from None
-
-
-def require_mapping(given: Any, what: str) -> Mapping[Any, Any]:
+def require_mapping(values: Any, label: str) -> Mapping[Any, Any]:
     """Check values by name."""
-    if not isinstance(given, Mapping):
-        raise InvalidValueError(f"{what} is a mapping {{name: number}}, not {given!r:.80}.")
-    return given
+    if not isinstance(values, Mapping):
+        raise InvalidValueError(f"{label} is a mapping {{name: number}}, not {values!r:.80}.")
+    return values
 
 
-def require_positive(key: object, given: Any) -> float:
+def require_positive(key: object, value: Any) -> float:
     """Check the standard deviation or variance of ``key``."""
-    number = require_number(given, f"The uncertainty of '{key}'")
-    if not (math.isfinite(number) and number > 0):
-        raise InvalidValueError(f"The uncertainty of '{key}' is positive and finite, not {given!r}.")
+    number = finite_number(value)
+    if number is None or number <= 0:
+        raise InvalidValueError(f"The uncertainty of '{key}' is positive and finite, not {value!r}.")
     return number

@@ -28,7 +28,7 @@ from kineverse.lie import Array
 
 from .bounds import StateBounds
 from .gaussian_sum import PRUNING_LOG_RATIO, Candidate, GaussianSum
-from .information_state import InformationState, TangentIndices
+from .information_state import InformationState
 from .map_update import MapResult
 from .process_model import ProcessModel
 from .residuals import RIGID, Measurements
@@ -69,32 +69,18 @@ native_library = SourceLibrary(
 
 
 class NativeMapSolver:
-    """Compiled counterpart of :class:`.map_update.MapSolver` for one tracker.
-
-    It owns its memory; a lock serialises threads.
-    """
+    """Compiled counterpart of :class:`.MapSolver` for one tracker, with its own memory and a lock."""
 
     def __init__(
         self, layout: Layout, limits: StateBounds, function: CompiledFunction, process_model: ProcessModel
     ) -> None:
-        self._layout, self._limits, self._function, self._process_model = (
-            layout,
-            limits,
-            function,
-            process_model,
-        )
-        count, size, directions = (
-            len(layout.groups),
-            len(layout.tangent_space.coordinates),
-            len(layout.tangent_space.tangent),
-        )
+        self._layout, self._limits = layout, limits
+        self._function, self._process_model = function, process_model
+        count, size = len(layout.groups), len(layout.tangent_space.coordinates)
+        directions = len(layout.tangent_space.tangent)
         self._motions = [process_model.flow(number) for number in range(count)]
-        is_varying = [
-            np.empty(0) if motion is None else motion.is_varying.reshape(-1) for motion in self._motions
-        ]
-        self._input = np.zeros(len(layout.arguments))
-        self._size = size
-        widths = [len(group.tangent) for group in layout.groups]
+        is_varying = [np.empty(0) if m is None else m.is_varying.reshape(-1) for m in self._motions]
+        self._input, self._size = np.zeros(len(layout.arguments)), size
         indices = {
             "is_pose": [one.is_pose for one in layout.observations],
             "size": [one.size for one in layout.observations],
@@ -102,7 +88,7 @@ class NativeMapSolver:
             "slope": [where.start for where in layout.jacobian_slices],
             "seen": [where.start for where in layout.measurement_slices],
             "white": [where.start for where in layout.whitening_slices],
-            "first": np.cumsum([0, *widths]),
+            "first": np.cumsum([0, *(len(group.tangent) for group in layout.groups)]),
             "place": np.concatenate([group.t for group in layout.groups]),
             "own": np.concatenate([group.coordinate_indices for group in layout.groups]),
             "first_x": np.cumsum([0, *(len(group.x) for group in layout.groups)]),
@@ -113,9 +99,7 @@ class NativeMapSolver:
             "step": np.zeros(count),
             "first_bend": np.cumsum([0, *map(len, is_varying)]),
         }
-        self._indices: dict[str, TangentIndices] = {
-            name: np.array(v, dtype=np.int64) for name, v in indices.items()
-        }
+        self._indices = {name: np.array(v, dtype=np.int64) for name, v in indices.items()}
         self._squares = np.zeros(len(layout.observations))
         self._numbers = {
             "bend": np.concatenate(is_varying).astype(np.float64),
@@ -127,13 +111,8 @@ class NativeMapSolver:
             "work": np.zeros(sum(3 * len(g.t) + 3 * len(g.t) ** 2 + 2 * len(g.x) for g in layout.groups)),
             "squares": self._squares,
         }
-        self._problem = _Problem(
-            observations=len(layout.observations),
-            groups=count,
-            coordinates=size,
-            directions=directions,
-            known=len(layout.inputs),
-        )
+        counts = (len(layout.observations), count, size, directions, len(layout.inputs))
+        self._problem = _Problem(**dict(zip(_COUNTS, counts, strict=True)))
         for name, array in (*self._indices.items(), *self._numbers.items()):
             setattr(self._problem, name, array.ctypes.data)
         self._results = np.zeros((2, count))
@@ -151,11 +130,8 @@ class NativeMapSolver:
         self._problem_address = ctypes.addressof(self._problem)
         self._motion_addresses = [row.ctypes.data for row in self._motion]
         self._reading_addresses = [array.ctypes.data for array in self._reading]
-        self._addresses = [
-            self._belief.ctypes.data,
-            *self._reading_addresses,
-            *(row.ctypes.data for row in self._results),
-        ]
+        results = (row.ctypes.data for row in self._results)
+        self._addresses = [self._belief.ctypes.data, *self._reading_addresses, *results]
 
     def __reduce__(self) -> Any:
         # Addresses are valid in this process only.
@@ -185,10 +161,7 @@ class NativeMapSolver:
         return True
 
     def update(self, belief: InformationState, reading: Measurements, inputs: Array) -> MapResult | None:
-        """Update measured groups as :meth:`.map_update.MapSolver.update` does; return None on any difficulty.
-
-        The numpy solver then reports the reason.
-        """
+        """Update measured groups as :meth:`.MapSolver.update`; None on any difficulty, numpy reports it."""
         with self._lock:
             self._load(reading)
             self._belief[:] = belief.numbers
@@ -203,21 +176,13 @@ class NativeMapSolver:
     def predict(
         self, belief: InformationState, displacement: Array, added_variance: Array
     ) -> InformationState | None:
-        """Predict a belief by displacements and added variances per coordinate, inside the limits.
-
-        None on any difficulty.
-        """
+        """Predict a belief by displacements and variances, inside the limits; None on any difficulty."""
+        addresses = self._problem_address, self._addresses[0], *self._motion_addresses
         with self._lock:
             self._belief[:] = belief.numbers
             self._motion[0], self._motion[1] = displacement, added_variance
-            if (
-                native_library.code.predict(
-                    self._problem_address, self._addresses[0], *self._motion_addresses
-                )
-                < 0
-            ):
-                return None
-            return belief.with_numbers(self._belief.copy())
+            is_done = native_library.code.predict(*addresses) >= 0
+            return belief.with_numbers(self._belief.copy()) if is_done else None
 
     def are_rigid(self, reading: Measurements) -> bool:
         """Return True if all measured poses are rigid; False if that is unknown."""
@@ -257,7 +222,8 @@ class NativeInlierSolver:
         result = self._native.update(mixture.best, reading, inputs)
         if result is None:
             return [], 0
-        log_outlier = self._log_outlier(reading)
+        pairs = zip(self._layout.observations, reading.log_scale.tolist(), strict=True)
+        log_outlier = np.array([self._outliers.log_density(one, scale) for one, scale in pairs])  # log(ε u)
         inliers = self._inlier_probabilities(result, reading, log_outlier) > 0.5
         all_right = [n for n in unambiguous if inliers[self._measured(n, reading)].all()]
         candidates = [self._candidate(mixture, result, reading, log_outlier, inliers, all_right)]
@@ -281,11 +247,7 @@ class NativeInlierSolver:
         log_outlier: Array,
         groups: Sequence[int],
     ) -> tuple[MapResult, npt.NDArray[np.bool_]] | None:
-        """Reject the worst measurement of each group until none is an outlier; return the result and a mask.
-
-        One gross error drags the estimate away from the others, so that all seem to be outliers. None if the
-        solver fails.
-        """
+        """Reject the worst measurement of each group, which drags the estimate, until none is an outlier."""
         mask, left = reading.mask.copy(), list(groups)
         for _ in range(_MOST_TRIMMED):
             probable = self._inlier_probabilities(result, reading._replace(mask=mask), log_outlier) > 0.5
@@ -305,13 +267,7 @@ class NativeInlierSolver:
     def _measured(self, number: int, reading: Measurements) -> list[int]:
         return [i for i in self._layout.groups[number].observation_indices if reading.mask[i]]
 
-    def _log_outlier(self, reading: Measurements) -> Array:
-        """Return log(ε u) of each observation."""
-        pairs = zip(self._layout.observations, reading.log_scale.tolist(), strict=True)
-        return np.array([self._outliers.log_density(one, scale) for one, scale in pairs])
-
     def _inlier_probabilities(self, result: MapResult, reading: Measurements, log_outlier: Array) -> Array:
-        """Return the inlier probability of each observation."""
         weights = np.zeros(len(reading.mask))
         assert result.squares is not None
         for i in np.flatnonzero(reading.mask).tolist():
@@ -353,7 +309,7 @@ class NativeInlierSolver:
         groups: Sequence[int],
         rivals: dict[int, float] | None = None,
     ) -> Candidate:
-        """Return the result as a candidate for those groups of which it is the only one."""
+        """Return the result as a candidate for the groups of which it is the only one."""
         weights = self._inlier_probabilities(result, reading, log_outlier)
         certain = []
         for number in groups:
@@ -371,5 +327,4 @@ class NativeInlierSolver:
 
 
 def _evidence_gain(result: MapResult, mixture: GaussianSum, number: int) -> float:
-    """Return the log evidence that a group gained."""
     return float(result.belief.evidence[number] - mixture.best.evidence[number])

@@ -1,24 +1,30 @@
-"""Unobservable directions, and states where the measurement Jacobian vanishes.
+"""Batch relinearisation of measurements while the state is static.
 
-The cosine of an angle has zero slope at 0: a Gauss-Newton step does not move the angle, whatever is measured.
-An arm that is stretched out has the same property at its elbow. Where a residual remains unexplained and some
-direction is unobservable, the update therefore restarts on both sides.
+A filter sums information that was linearised at different estimates. An arm with seven joints can move while
+its end effector rests. The direction of this null motion differs a little between estimates, so the sum holds
+false information about an unobservable direction. While the state is static, measurements are instead
+averaged on SE(3), and the posterior follows from the prior and these means, linearised at one point. This is
+needed only while the group has unobservable directions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from kineverse.errors import KineverseError
-from kineverse.lie import Array
+from kineverse.estimation.linear_algebra import inverse_spd
+from kineverse.lie import Array, pose_difference, retract
 
 from .bounds import GroupBounds
-from .information_state import InformationState
-from .map_update import MapResult
+from .information_state import InformationState, QuadraticCost
+from .map_update import MapResult, MapSolver
+from .measurements import MeasurementModel, wrap_difference
 from .process_model import ProcessModel
+from .residuals import MeasurementReader, Measurements, Residuals, whitening
 from .state_space import CoordinateGroup, Layout
 
 # A direction is unobservable while its deviation exceeds this part of the initial one.
@@ -35,22 +41,31 @@ class UnobservableDirections:
         self.deviations: Array = np.ones(len(layout.tangent_space.tangent))
 
     def directions(self, number: int, information: Array) -> tuple[Array, Array]:
-        """Return steps of one deviation in the tangent of a group: unobservable (k, t), others (t - k, t).
-
-        They are orthogonal in the metric of the information (t, t).
-        """
+        """Return orthogonal steps of one deviation: unobservable (k, t), others (t - k, t)."""
         scale = self.deviations[self._groups[number].t]
         values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
         steps = (vectors * np.maximum(values, _LEAST) ** -0.5).T * scale
         is_unobservable = values < _UNOBSERVABLE**-2
         return steps[is_unobservable], steps[~is_unobservable]
 
-    def is_unobservable(self, number: int, information: Array) -> bool:
-        """Return True if a group has unobservable directions."""
-        scale = self.deviations[self._groups[number].t]
+    def is_in(self, number: int, belief: InformationState) -> bool:
+        """Return True if a group has unobservable directions in a belief."""
+        group = self._groups[number]
+        information, scale = belief.information[group.block], self.deviations[group.t]
         if len(scale) == 1:
             return float(information[0, 0]) * float(scale[0]) ** 2 < _UNOBSERVABLE**-2
         return bool(np.linalg.eigvalsh(information * np.outer(scale, scale))[0] < _UNOBSERVABLE**-2)
+
+
+class Components(NamedTuple):
+    """Components of a tracker that its computations share."""
+
+    layout: Layout
+    residuals: Residuals
+    process_model: ProcessModel
+    reader: MeasurementReader
+    group_bounds: Sequence[GroupBounds]
+    unobservable: UnobservableDirections
 
 
 # Residuals are explained if their χ² is fewer deviations than this above its mean.
@@ -62,7 +77,7 @@ _MOST_DIRECTIONS = 2
 def find_unexplained(result: MapResult) -> list[int]:
     """Return the groups whose residuals exceed the noise."""
     beyond = result.nis > result.dof + _EXPLAINED * np.sqrt(2 * result.dof)
-    return [int(n) for n in np.flatnonzero(beyond)] if beyond.any() else []
+    return np.flatnonzero(beyond).tolist()
 
 
 def move_origin(
@@ -82,43 +97,32 @@ def move_origin(
 
 
 class StationaryPoints:
-    """Detection of states where the measurement Jacobian vanishes, and restarts beside them."""
+    """Detection of states where the measurement Jacobian vanishes, and restarts near them."""
 
-    def __init__(
-        self,
-        layout: Layout,
-        process_model: ProcessModel,
-        unobservable: UnobservableDirections,
-        group_bounds: Sequence[GroupBounds],
-    ) -> None:
-        self._layout, self._process_model, self._unobservable, self._group_bounds = (
-            layout,
-            process_model,
-            unobservable,
-            group_bounds,
-        )
+    def __init__(self, components: Components) -> None:
+        self._layout, _, self._process_model, _, self._group_bounds, self._unobservable = components
         # The cost of such a group is convex: a restart ends where the update did.
-        self._is_affine = [layout.is_affine(number) for number in range(len(layout.groups))]
+        self._is_affine = [self._layout.is_affine(number) for number in range(len(self._layout.groups))]
 
     def unexplained(self, before: InformationState, result: MapResult) -> list[int]:
         """Return the groups whose residuals exceed the noise and that have unobservable directions."""
-        return [n for n in find_unexplained(result) if self._may_have_moved(n, before, result.belief)]
-
-    def _may_have_moved(self, number: int, before: InformationState, after: InformationState) -> bool:
-        if self._is_affine[number]:
-            return False
-        t = self._layout.groups[number].t
-        is_kept = before.records[number] is not None
-        return is_kept or self._unobservable.is_unobservable(number, after.information[np.ix_(t, t)])
+        curved = [n for n in find_unexplained(result) if not self._is_affine[n]]
+        records, is_in = before.records, self._unobservable.is_in
+        return [n for n in curved if records[n] is not None or is_in(n, result.belief)]
 
     def restart_states(
         self, before: InformationState, after: InformationState, groups: Sequence[int], inputs: Array
     ) -> list[InformationState]:
-        """Return prior belief about points on both sides of the estimate, along unobservable directions."""
+        """Return prior beliefs about points on both sides of the estimate, in unobservable directions."""
         beliefs: list[InformationState] = []
         for number in groups:
-            group, x = self._layout.groups[number], before.x[self._layout.groups[number].x]
-            directions, index = self._unobservable_directions(number, before, after), 0
+            group, record, index = self._layout.groups[number], before.records[number], 0
+            x = before.x[group.x]
+            # Unobservable now, or before the stored measurements.
+            directions, _ = self._unobservable.directions(number, after.information[group.block])
+            if not len(directions) and record is not None:
+                directions, _ = self._unobservable.directions(number, record.prior.matrix)
+            directions = directions[:_MOST_DIRECTIONS]
             for direction in (*directions, *-directions):
                 try:
                     there, _ = self._process_model.retract(number, x, direction, inputs)
@@ -134,13 +138,159 @@ class StationaryPoints:
                 index += 1
         return beliefs
 
-    def _unobservable_directions(
-        self, number: int, before: InformationState, after: InformationState
-    ) -> Array:
-        """Return the directions that are unobservable now, or were before the stored measurements."""
-        t = self._layout.groups[number].t
-        directions, _ = self._unobservable.directions(number, after.information[np.ix_(t, t)])
-        record = before.records[number]
-        if not len(directions) and record is not None:
-            directions, _ = self._unobservable.directions(number, record.prior.matrix)
-        return directions[:_MOST_DIRECTIONS]
+
+UpdateFunction: TypeAlias = Callable[[InformationState, Measurements, Array, list[int]], MapResult]
+
+# Measurements with a smaller weight are ignored.
+_LEAST_WEIGHT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class MeanMeasurement:
+    """Information-weighted mean of measurements of one observation."""
+
+    value: Array  # pose 4×4 row by row, or vector
+    information: Array  # inverse covariance of the mean (d, d), in the axes of the observing frame
+    peak: float  # log density of all averaged measurements at their mean
+
+    def combine(self, other: MeanMeasurement, one: MeasurementModel) -> MeanMeasurement:
+        """Return the mean of both, weighted by information."""
+        information = self.information + other.information
+        if one.is_pose:
+            apart = pose_difference(other.value.reshape(4, 4), self.value.reshape(4, 4))
+        else:
+            apart = wrap_difference(other.value - self.value, one.period)
+        step = np.linalg.solve(information, other.information) @ apart
+        peak = self.peak + other.peak - float(apart @ self.information @ step) / 2
+        value = retract(self.value.reshape(4, 4), step).reshape(-1) if one.is_pose else self.value + step
+        return MeanMeasurement(value, information, peak)
+
+
+@dataclass(frozen=True, eq=False)
+class StaticRecord:
+    """Prior and averaged measurements of a group since it last moved."""
+
+    prior: QuadraticCost  # prior before the measurements, in the tangent space at the present estimate
+    means: Mapping[int, MeanMeasurement]  # averaged measurements, by number of the observation
+    inputs: Array  # values of the inputs during these measurements
+    evidence: float  # log evidence of the group before these measurements
+    count: int = 0  # number of updates
+    branch: object = field(default_factory=object)  # identity of the first update
+
+    def with_measurements(
+        self, new: Mapping[int, MeanMeasurement], observations: Sequence[MeasurementModel]
+    ) -> StaticRecord:
+        """Return the record with further measurements averaged in."""
+        means = dict(self.means)
+        for i, one in new.items():
+            means[i] = means[i].combine(one, observations[i]) if i in means else one
+        return replace(self, means=means, count=self.count + 1)
+
+    def as_measurements(self, layout: Layout, reader: MeasurementReader) -> Measurements:
+        """Return the averaged measurements as one reading."""
+        empty = reader.empty()
+        white, scale = empty.whitening.copy(), empty.log_scale.copy()
+        for i, mean in self.means.items():
+            empty.values[layout.measurement_slices[i]] = mean.value
+            empty.mask[i], scale[i] = True, -mean.peak
+            white[layout.whitening_slices[i]] = whitening(inverse_spd(mean.information)).reshape(-1)
+        return empty._replace(whitening=white, log_scale=scale)
+
+
+class StaticBatch:
+    """Batch relinearisation for the groups of a tracker."""
+
+    def __init__(self, components: Components, solver: MapSolver, update: UpdateFunction) -> None:
+        self._layout, self._residuals, _, self._reader, _, self._unobservable = components
+        self._solver, self._update = solver, update
+        # In a group with one direction, linearisation at several estimates adds no false information.
+        self._groups = {number for number, group in enumerate(self._layout.groups) if len(group.t) > 1}
+
+    def relinearise(
+        self,
+        before: InformationState,
+        result: MapResult,
+        reading: Measurements,
+        inputs: Array,
+        groups: Sequence[int] | None = None,
+    ) -> None:
+        """Recompute an update from all stored measurements where a group has unobservable directions."""
+        after, weights = result.belief, result.weights
+        for number in self._groups if groups is None else self._groups.intersection(groups):
+            group, old = self._layout.groups[number], before.records[number]
+            new = {
+                i: self._mean_measurement(i, reading, 1.0 if weights is None else float(weights[i]))
+                for i in group.observation_indices
+                if reading.mask[i] and (weights is None or weights[i] > _LEAST_WEIGHT)
+            }
+            if not new or (old is None and not self._unobservable.is_in(number, after)):
+                continue
+            is_first = old is None
+            old = old or StaticRecord(before.group_cost(group.t), {}, inputs, float(before.evidence[number]))
+            record = old.with_measurements(new, self._layout.observations)
+            if is_first and (result.priors is not None or not group.by_speeds):
+                prior = self._transport_prior(number, before, old.prior, result)
+                after.records[number] = replace(record, prior=prior)
+                continue
+            batch = self._solve_batch(number, before, record)
+            after.x[group.x] = batch.belief.x[group.x]
+            after.set_group_cost(group.t, batch.belief.group_cost(group.t))
+            if weights is None:
+                after.evidence[number] = batch.belief.evidence[number]
+            # Observations still to come may show that the estimate is a mirror image: keep the record.
+            is_complete = len(record.means) == len(group.observation_indices)
+            if is_complete and not self._unobservable.is_in(number, after):
+                after.records[number] = None
+            else:
+                prior = self._transport_prior(number, before, record.prior, batch)
+                after.records[number] = replace(record, prior=prior)
+
+    def add_noise(
+        self, number: int, before: InformationState, after: InformationState, added_variance: Array
+    ) -> None:
+        """Add process noise to the record of a group that moves by noise alone."""
+        record, group = before.records[number], self._layout.groups[number]
+        assert record is not None
+        out = self._residuals.evaluate(after.x, record.inputs)
+        means = {}
+        for i, one in record.means.items():
+            size = self._layout.observations[i].size
+            slope = out[self._layout.jacobian_slices[i]].reshape(size, len(group.t))
+            # Errors from motion are fully correlated; scaled by their number they may count as independent.
+            noise = len(record.means) * (slope * added_variance) @ slope.T
+            information = inverse_spd(inverse_spd(one.information) + noise)
+            lost = np.linalg.slogdet(one.information)[1] - np.linalg.slogdet(information)[1]
+            means[i] = replace(one, information=information, peak=one.peak - float(lost) / 2)
+        covariance = inverse_spd(record.prior.matrix)
+        matrix = inverse_spd(covariance + np.diag(added_variance))
+        prior = QuadraticCost.from_density(matrix, matrix @ (covariance @ record.prior.vector))
+        step = after.x[group.x] - before.x[group.x]
+        reduced = replace(record, prior=prior.transported(step, None), means=means, evidence=0.0)
+        # The evidence of past measurements stays; the reduced information applies to future ones only.
+        from_record = self._solve_batch(number, after, reduced).belief.evidence[number]
+        after.records[number] = replace(reduced, evidence=float(before.evidence[number] - from_record))
+
+    def _mean_measurement(self, i: int, reading: Measurements, weight: float) -> MeanMeasurement:
+        size = self._layout.observations[i].size
+        white = reading.whitening[self._layout.whitening_slices[i]].reshape(size, size)
+        value = reading.values[self._layout.measurement_slices[i]].copy()
+        return MeanMeasurement(value, weight * (white.T @ white), -float(reading.log_scale[i]))
+
+    def _solve_batch(self, number: int, before: InformationState, record: StaticRecord) -> MapResult:
+        group = self._layout.groups[number]
+        first = before.copy()
+        first.set_group_cost(group.t, record.prior)
+        first.evidence[number] = record.evidence
+        reading = record.as_measurements(self._layout, self._reader)
+        # The C code does not return the transport of the tangent space.
+        update = self._solver.update if group.by_speeds else self._update
+        return update(first, reading, record.inputs, [number])
+
+    def _transport_prior(
+        self, number: int, before: InformationState, prior: QuadraticCost, result: MapResult
+    ) -> QuadraticCost:
+        if result.priors is not None:
+            return result.priors[number]
+        group = self._layout.groups[number]
+        step = result.belief.x[group.x] - before.x[group.x]
+        return prior.transported(step, None)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -24,12 +25,13 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .information_state import InformationState
-from .measurements import require_number
-from .state_space import CoordinateGroup, Layout
+from .state_space import Layout
 
 if TYPE_CHECKING:
     from .gaussian_sum_filter import UpdateStep
 
+
+Speeds: TypeAlias = Mapping[Symbol, float]
 
 # Largest displacement in one Runge-Kutta step; the error is below 1e-8.
 _LONGEST = 0.1
@@ -78,23 +80,19 @@ class RateFlow:
 
     def rates(self, q: Array, inputs: Array) -> Array:
         """Return R(q) (n, m)."""
-        result: Array = self._rates(np.concatenate([q, inputs]))
-        return result
+        return np.asarray(self._rates(np.concatenate([q, inputs])))
 
     def integrate(self, q: Array, speeds: Array, inputs: Array) -> tuple[Array, Array, Array]:
-        """Return q after one unit of time, and its derivatives by the initial q (n, n) and the speeds (n, m).
-
-        Classical Runge-Kutta steps of fourth order.
-        """
+        """Return q after one unit of time by Runge-Kutta steps, and its derivatives (n, n), (n, m)."""
         largest = float((self.is_varying * np.abs(self.rates(q, inputs))).sum(axis=0) @ np.abs(speeds))
         if not math.isfinite(largest) or largest > _MOST_STEPS * _LONGEST:
             names = ", ".join(map(str, self.coordinates))
             raise InvalidValueError(
-                f"{names} cannot be followed so far in one step: after a long time without measurements, "
+                f"The step of {names} is too long to be integrated: after a long time without measurements, "
                 "reset the tracker."
             )
-        count = max(1, math.ceil(largest / _LONGEST))
         by_start, by_speeds = np.eye(len(q)), np.zeros((len(q), len(speeds)))
+        count = max(1, math.ceil(largest / _LONGEST))
         for _ in range(count):
             q, slope, gain = self._step(np.concatenate([q, speeds / count, inputs]))
             by_start, by_speeds = slope @ by_start, slope @ by_speeds + gain / count
@@ -125,13 +123,10 @@ class ProcessModel:
 
     def speed(self, key: Symbol | str) -> Symbol:
         """Return the speed of a name, or that of the coordinate of this name."""
-        result = self.speeds.get(str(key))
+        result = self.speeds.get(str(key), self.speeds.get(f"{key}:velocity"))
         if result is None:
-            result = self.speeds.get(f"{key}:velocity")
-        if result is None:
-            raise UnknownNameError(
-                f"Nothing that is estimated moves with '{key}'. {suggest(str(key), self.speeds, 'speed')}"
-            )
+            hint = suggest(str(key), self.speeds, "speed")
+            raise UnknownNameError(f"No estimated coordinate moves with '{key}'. {hint}")
         return result
 
     def speeds_of(self, number: int) -> tuple[Symbol, ...]:
@@ -139,7 +134,7 @@ class ProcessModel:
         flow = self._flows.get(number)
         return self._layout.groups[number].tangent if flow is None else flow.speeds
 
-    def is_noise_only(self, number: int, speeds: Mapping[Symbol, float]) -> bool:
+    def is_noise_only(self, number: int, speeds: Speeds) -> bool:
         """Return True if a group moves by noise alone, in directions that are its coordinates."""
         group = self._layout.groups[number]
         return number not in self._flows and not any(speeds.get(v, 0.0) for v in group.tangent)
@@ -158,17 +153,14 @@ class ProcessModel:
         """True if some coordinates move by rates other than their own speeds."""
         return bool(self._flows)
 
-    def find_moving_groups(self, speeds: Mapping[Symbol, float], noise: Mapping[Symbol, float]) -> list[int]:
-        """Return the numbers of the groups that move at given speeds or with noise."""
+    def find_moving_groups(self, speeds: Speeds, noise: Speeds) -> list[int]:
+        """Return the numbers of the groups that move at these speeds or with noise."""
         active = {v for by in (speeds, noise) for v, value in by.items() if value}
         numbers = range(len(self._layout.groups))
         return [number for number in numbers if not active.isdisjoint(self.speeds_of(number))]
 
     def retract(self, number: int, x: Array, step: Array, inputs: Array) -> tuple[Array, Array | None]:
-        """Return a group's coordinates after a tangent step, and the transport J of the tangent space.
-
-        A further step dξ at the start is J dξ in the tangent space at the end. None stands for the identity.
-        """
+        """Return coordinates after a tangent step, and its transport Jacobian; None for the identity."""
         motion = self._steps.get(number)
         if motion is None:
             return x + step, None
@@ -181,28 +173,28 @@ class ProcessModel:
         return np.eye(len(x)) if motion is None else motion.rates(x, inputs)
 
     def predict(
-        self,
-        belief: InformationState,
-        inputs: Array,
-        dt: float,
-        speeds: Mapping[Symbol, float],
-        noise: Mapping[Symbol, float],
+        self, belief: InformationState, inputs: Array, dt: float, speeds: Speeds, noise: Speeds
     ) -> None:
         """Predict a belief by ``dt`` seconds, with speeds and variances per second; in place."""
         for number, group in enumerate(self._layout.groups):
             order = self.speeds_of(number)
             displacement = np.array([speeds.get(v, 0.0) for v in order]) * dt
             added_variance = np.array([noise.get(v, 0.0) for v in order]) * dt
-            if displacement.any() or added_variance.any():
-                self._predict(number, group, belief, inputs, displacement, added_variance)
+            if not (displacement.any() or added_variance.any()):
+                continue
+            covariance = inverse_spd(belief.information[group.block])
+            after, slope, gain = self.transition(number, belief.x[group.x], displacement, inputs)
+            mean = slope @ (covariance @ belief.vector[group.t])
+            covariance = slope @ covariance @ slope.T + (gain * added_variance) @ gain.T
+            information = inverse_spd(covariance)
+            belief.x[group.x] = after
+            belief.information[group.block] = information
+            belief.vector[group.t] = information @ mean
 
     def transition(
         self, number: int, x: Array, displacement: Array, inputs: Array
     ) -> tuple[Array, Array, Array]:
-        """Return a group's coordinates after a displacement by its speeds, and its derivatives.
-
-        The derivatives by the start (t, t) and by the displacement (t, k) are in the tangent space.
-        """
+        """Return coordinates after a displacement, and its tangent Jacobians (t, t), (t, k)."""
         flow = self._flows.get(number)
         if flow is None:
             identity = self._identities[number]
@@ -210,25 +202,6 @@ class ProcessModel:
         after, slope, gain = flow.integrate(x, displacement, inputs)
         back = np.linalg.pinv(self.basis(number, after, inputs))
         return after, back @ slope @ self.basis(number, x, inputs), back @ gain
-
-    def _predict(
-        self,
-        number: int,
-        group: CoordinateGroup,
-        belief: InformationState,
-        inputs: Array,
-        displacement: Array,
-        added_variance: Array,
-    ) -> None:
-        block = group.block
-        covariance = inverse_spd(belief.information[block])
-        after, slope, gain = self.transition(number, belief.x[group.x], displacement, inputs)
-        mean = slope @ (covariance @ belief.vector[group.t])
-        covariance = slope @ covariance @ slope.T + (gain * added_variance) @ gain.T
-        information = inverse_spd(covariance)
-        belief.x[group.x] = after
-        belief.information[block] = information
-        belief.vector[group.t] = information @ mean
 
 
 Process: TypeAlias = Literal["position", "velocity", "static"]
@@ -241,7 +214,7 @@ They suit a kitchen door that a hand opens within 3.5 s (``kineverse reproduce s
 INITIAL_SPEED_TIME = 3.0
 """The initial variance of a speed is its process noise during this time [s]."""
 
-# Relative positions between limits at which frames are sampled beside the start.
+# Relative positions between limits at which frames are sampled, in addition to the start.
 _SAMPLES = (0.2, 0.5, 0.8)
 _LEAST = 1e-6
 
@@ -253,36 +226,14 @@ def check_process(process: str) -> None:
         raise InvalidValueError(f"There is no process {process!r}. {suggest(str(process), known, 'process')}")
 
 
-def require_noise(key: object, given: Any) -> float:
-    """Check the process noise of ``key``."""
-    number = require_number(given, f"The process noise of '{key}'")
-    if not (math.isfinite(number) and number >= 0):
-        raise InvalidValueError(
-            f"The process noise of '{key}' is positive and finite, or 0 for a part that never moves, not "
-            f"{given!r}."
-        )
-    return number
-
-
 def default_process_noise(
     update_step: UpdateStep, process: Process, start: Array, inputs: Array
 ) -> dict[Symbol, float]:
-    """Return process noise of each speed: variances per second, or spectral densities of accelerations."""
+    """Return the process noise of each speed: a variance per second, or a density of accelerations."""
     if process == "static":
         return {}
-    linear, angular = PROCESSES[process]
+    angular = PROCESSES[process][1]
     largest = dict.fromkeys(update_step.process_model.speeds.values(), 0.0)
-    for x in _sample_states(update_step, start):
-        try:
-            out = update_step.residuals.evaluate(x, inputs)
-            _raise_to(largest, update_step, x, inputs, out, linear, angular)
-        except KineverseError:  # infeasible
-            continue
-    return {v: 1.0 / shown if shown > _LEAST else angular for v, shown in largest.items()}
-
-
-def _sample_states(update_step: UpdateStep, start: Array) -> list[Array]:
-    """Return the start, and states between the limits."""
     limits = update_step.limits
     bounded = np.isfinite(limits.upper - limits.lower)
     lower, upper = limits.lower[bounded], limits.upper[bounded]
@@ -290,35 +241,30 @@ def _sample_states(update_step: UpdateStep, start: Array) -> list[Array]:
     for share in _SAMPLES:
         states.append(start.copy())
         states[-1][bounded] = lower + share * (upper - lower)
-    return states
+    for x in states:
+        with suppress(KineverseError):  # infeasible
+            for v, square in _frame_motions(update_step, x, inputs, *PROCESSES[process]):
+                largest[v] = max(largest[v], square)
+    return {v: 1.0 / square if square > _LEAST else angular for v, square in largest.items()}
 
 
-def _raise_to(
-    largest: dict[Symbol, float],
-    update_step: UpdateStep,
-    x: Array,
-    inputs: Array,
-    out: Array,
-    linear: float,
-    angular: float,
-) -> None:
-    """Raise the largest square of the motion of a frame by each speed, in units of the noise of frames."""
+def _frame_motions(
+    update_step: UpdateStep, x: Array, inputs: Array, linear: float, angular: float
+) -> Iterator[tuple[Symbol, float]]:
+    """Yield the square of the motion of each frame by each speed, in units of the noise of frames."""
     layout, process_model = update_step.layout, update_step.process_model
+    out = update_step.residuals.evaluate(x, inputs)
     for number, group in enumerate(layout.groups):
-        _, _, gain = process_model.transition(
-            number, x[group.x], np.zeros(len(process_model.speeds_of(number))), inputs
-        )
+        speeds = process_model.speeds_of(number)
+        _, _, gain = process_model.transition(number, x[group.x], np.zeros(len(speeds)), inputs)
         for i in group.observation_indices:
             one = layout.observations[i]
-            if not one.frame:
-                continue
-            slope = out[layout.jacobian_slices[i]].reshape(one.size, len(group.t)) @ gain
-            squares = np.square(slope[:3]).sum(axis=0) / linear
-            if one.is_pose:
-                squares = np.maximum(squares, np.square(slope[3:]).sum(axis=0) / angular)
-            for v, square in zip(process_model.speeds_of(number), squares.tolist(), strict=True):
-                if np.isfinite(square):
-                    largest[v] = max(largest[v], square)
+            if one.frame:
+                slope = out[layout.jacobian_slices[i]].reshape(one.size, len(group.t)) @ gain
+                squares = np.square(slope[:3]).sum(axis=0) / linear
+                if one.is_pose:
+                    squares = np.maximum(squares, np.square(slope[3:]).sum(axis=0) / angular)
+                yield from ((v, s) for v, s in zip(speeds, squares.tolist(), strict=True) if math.isfinite(s))
 
 
 _SETTLED = 1e-12
@@ -347,18 +293,13 @@ class ConstantVelocity:
             by_size.setdefault(size, []).append(number)
         self._batches = list(by_size.values())
 
-    def initialise(
-        self, belief: InformationState, means: Mapping[Symbol, float], variances: Mapping[Symbol, float]
-    ) -> None:
+    def initialise(self, belief: InformationState, means: Speeds, variances: Speeds) -> None:
         """Set the speeds of all groups, those without a mean to 0, independent of the state; in place."""
         for number, group in enumerate(self._layout.groups):
             speeds = self._process_model.speeds_of(number)
-            belief.speeds[number] = ConditionalSpeeds(
-                belief.x[group.x].copy(),
-                np.array([means.get(v, 0.0) for v in speeds]),
-                np.zeros((len(speeds), len(group.t))),
-                np.diag([variances[v] for v in speeds]),
-            )
+            mean, gain = np.array([means.get(v, 0.0) for v in speeds]), np.zeros((len(speeds), len(group.t)))
+            covariance = np.diag([variances[v] for v in speeds])
+            belief.speeds[number] = ConditionalSpeeds(belief.x[group.x].copy(), mean, gain, covariance)
 
     def at_state(self, number: int, belief: InformationState, inputs: Array) -> ConditionalSpeeds:
         """Return the speeds of a group given a step in the tangent space at its present state."""
@@ -377,12 +318,7 @@ class ConstantVelocity:
         return symmetric(speeds.covariance + speeds.gain @ state @ speeds.gain.T)
 
     def predict(
-        self,
-        belief: InformationState,
-        inputs: Array,
-        dt: float,
-        commands: Mapping[Symbol, float],
-        noise: Mapping[Symbol, float],
+        self, belief: InformationState, inputs: Array, dt: float, commands: Speeds, noise: Speeds
     ) -> None:
         """Predict states and speeds by ``dt`` seconds; in place."""
         # Too long a step leads to numbers that are not finite, which the caller refuses.
@@ -396,20 +332,19 @@ class ConstantVelocity:
         belief: InformationState,
         inputs: Array,
         dt: float,
-        commands: Mapping[Symbol, float],
-        noise: Mapping[Symbol, float],
+        commands: Speeds,
+        noise: Speeds,
     ) -> None:
-        """Predict groups of equal sizes (g,), all at once."""
         groups = [self._layout.groups[n] for n in numbers]
-        given = [self.at_state(n, belief, inputs) for n in numbers]
+        speeds = [self.at_state(n, belief, inputs) for n in numbers]
         t = np.array([group.t for group in groups])
         rows, columns = t[:, :, None], t[:, None, :]
         covariance = invert_matrices(belief.information[rows, columns])
         mean = multiply_vectors(covariance, belief.vector[t])
-        gain = np.array([one.gain for one in given])
-        speed = np.array([one.mean for one in given]) + multiply_vectors(gain, mean)
+        gain = np.array([one.gain for one in speeds])
+        speed = np.array([one.mean for one in speeds]) + multiply_vectors(gain, mean)
         cross = gain @ covariance
-        spread = np.array([one.covariance for one in given]) + cross @ transposed(gain)
+        spread = np.array([one.covariance for one in speeds]) + cross @ transposed(gain)
         orders = [self._process_model.speeds_of(n) for n in numbers]
         density = np.array([[noise.get(v, 0.0) for v in order] for order in orders])
         for g, order in enumerate(orders):

@@ -3,75 +3,51 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
-from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
 from kineverse.state import State, StateLike
-from kineverse.symbols import Symbol
 
 from .bounds import SpeedLocks
 from .estimate import TrackerState, TrackLoss, find_measured, find_refuted
 from .gaussian_sum_filter import StepResult, UpdateStep
 from .information_state import InformationState
 from .initialization import InitialBelief
+from .process_model import Speeds
 from .residuals import Measurements
 
 
-class Stamped(Protocol):
-    """State with the time [s] it belongs to; None if it has none."""
-
-    @property
-    def stamp(self) -> float | None:
-        """Time [s]."""
-
-
-StampedState = TypeVar("StampedState", bound=Stamped)
-
-
 @dataclass(frozen=True, eq=False)
-class Step(Generic[StampedState]):
-    """Step of a filter."""
+class Step:
+    """Step of a tracker."""
 
     stamp: float  # time at its end [s]
-    before: StampedState  # state before it
-    apply: Callable[
-        [StampedState], StampedState
-    ]  # function of the state before it that returns the state at its end
-    predict: Callable[[StampedState, float], StampedState]
+    before: TrackerState
+    apply: Callable[[TrackerState], TrackerState]
+    predict: Callable[[TrackerState, float], TrackerState]
 
 
-class FixedLag(Generic[StampedState]):
-    """Steps of the last seconds, which are repeated after a late measurement."""
+@dataclass(eq=False)
+class FixedLag:
+    """Steps of the last ``lag`` seconds, which are repeated after a late measurement."""
 
-    def __init__(self, lag: float) -> None:
-        self.lag = lag
-        self._steps: tuple[Step[StampedState], ...] = ()
+    lag: float
+    steps: tuple[Step, ...] = ()
 
-    def copy(self) -> FixedLag[StampedState]:
-        """Return an independent buffer with the same steps."""
-        other = FixedLag[StampedState](self.lag)
-        other._steps = self._steps
-        return other
-
-    def clear(self) -> None:
-        """Forget all steps."""
-        self._steps = ()
-
-    def append(self, step: Step[StampedState]) -> None:
+    def append(self, step: Step) -> None:
         """Add a step, and drop those too old for any late measurement."""
         oldest = step.stamp - self.lag
-        self._steps = (*(one for one in self._steps if one.stamp >= oldest), step)
+        self.steps = (*(one for one in self.steps if one.stamp >= oldest), step)
 
-    def insert(self, stamp: float, apply: Callable[[StampedState], StampedState]) -> StampedState:
+    def insert(self, stamp: float, apply: Callable[[TrackerState], TrackerState]) -> TrackerState:
         """Apply a late measurement at its time, repeat all later steps, and return the state at their end."""
-        later = [one for one in self._steps if one.stamp > stamp]
+        later = [one for one in self.steps if one.stamp > stamp]
         if later and later[-1].stamp - stamp > self.lag:
             raise InvalidValueError(
                 f"A measurement at {stamp:g} s is later than the lag of {self.lag:g} s: leave it out, or "
@@ -84,25 +60,25 @@ class FixedLag(Generic[StampedState]):
                 f"A measurement at {stamp:g} s is from before the start or a reset: leave it out."
             )
         predict, state = later[0].predict, later[0].before
-        steps = [one for one in self._steps if one.stamp <= stamp]
+        steps = [one for one in self.steps if one.stamp <= stamp]
         late = Step(stamp, state, partial(_apply_late, predict, stamp, apply), predict)
         for one in (late, *later):
-            steps.append(Step(one.stamp, state, one.apply, one.predict))
+            steps.append(replace(one, before=state))
             state = one.apply(state)
-        self._steps = tuple(steps)
+        self.steps = tuple(steps)
         return state
 
 
 def _apply_late(
-    predict: Callable[[StampedState, float], StampedState],
+    predict: Callable[[TrackerState, float], TrackerState],
     stamp: float,
-    apply: Callable[[StampedState], StampedState],
-    before: StampedState,
-) -> StampedState:
+    apply: Callable[[TrackerState], TrackerState],
+    before: TrackerState,
+) -> TrackerState:
     return apply(predict(before, stamp))
 
 
-NO_NOISE: Mapping[Symbol, float] = MappingProxyType({})
+NO_NOISE: Speeds = MappingProxyType({})
 """Process noise of no speed."""
 
 
@@ -110,31 +86,25 @@ NO_NOISE: Mapping[Symbol, float] = MappingProxyType({})
 class Recursion:
     """Prediction and update of states, which it never changes in place."""
 
-    update_step: UpdateStep  # prediction and update of beliefs
-    first: InitialBelief  # initial belief
-    noise: Mapping[Symbol, float]  # process noise by speed
-    locks: SpeedLocks | None  # locks that hold speeds; None if they are ignored
+    update_step: UpdateStep
+    first: InitialBelief
+    noise: Speeds  # process noise by speed
+    locks: SpeedLocks | None  # None if locks are ignored
     lost_after: int  # number of refuted updates in a row after which a group is lost
-    restarts: bool  # True if lost groups start anew
+    restarts: bool  # True if lost groups restart
 
     def start(self, inputs: Array, stamp: float | None) -> TrackerState:
         """Return the initial state."""
         mixture = self.first.spread(self.update_step, np.nan_to_num(inputs))
         count = len(self.update_step.layout.groups)
         result = StepResult(mixture, np.zeros(count), np.zeros(count), (), 0)
-        return TrackerState(mixture, result, TrackLoss.none(count), inputs, stamp)
+        loss = TrackLoss(np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
+        return TrackerState(mixture, result, loss, inputs, stamp)
 
     def predict(
-        self,
-        state: TrackerState,
-        dt: float,
-        speeds: Mapping[Symbol, float],
-        noise_now: Mapping[Symbol, float] = NO_NOISE,
+        self, state: TrackerState, dt: float, speeds: Speeds, noise_now: Speeds = NO_NOISE
     ) -> TrackerState:
-        """Return the state after a time step [s] with commanded speeds.
-
-        Speeds that ``noise_now`` has get its process noise, and others the usual one.
-        """
+        """Return the state after a time step [s]; ``noise_now`` overrides the process noise."""
         if dt == 0.0:
             return state
         state = replace(state, stamp=None if state.stamp is None else state.stamp + dt, reading=None)
@@ -157,14 +127,11 @@ class Recursion:
         self,
         state: TrackerState,
         stamp: float,
-        speeds: Mapping[Symbol, float],
+        speeds: Speeds,
         inputs: StateLike | None = None,
-        noise_now: Mapping[Symbol, float] = NO_NOISE,
+        noise_now: Speeds = NO_NOISE,
     ) -> TrackerState:
-        """Return the state predicted to a time, with other values of inputs if these are given.
-
-        A state without a time begins there.
-        """
+        """Return the state predicted to a time; a state without a time begins there."""
         if inputs is not None:
             state = replace(state, inputs=self.read_inputs(state.inputs, inputs))
         if state.stamp is None:
@@ -176,53 +143,53 @@ class Recursion:
         state: TrackerState,
         reading: Measurements,
         stamp: float | None,
-        speeds: Mapping[Symbol, float],
+        speeds: Speeds,
         inputs: StateLike | None,
-        noise_now: Mapping[Symbol, float] = NO_NOISE,
+        noise_now: Speeds = NO_NOISE,
     ) -> TrackerState:
         """Return the state after a reading at a time, or at the present one."""
-        values = self.read_inputs(state.inputs, inputs)
+        step, values = self.update_step, self.read_inputs(state.inputs, inputs)
         # The prediction uses the previous values of the inputs, if there are any.
         if not np.isfinite(state.inputs).all():
             state = replace(state, inputs=values)
-        seen = None
+        latest = state.reading
         if stamp is not None:
-            state, seen = self.advance(state, stamp, speeds, noise_now=noise_now), reading
+            state, latest = self.advance(state, stamp, speeds, noise_now=noise_now), reading
             if state.reading is not None:
-                seen = self.update_step.reader.combine(state.reading, reading, stamp)
-        step = self.update_step
+                latest = step.reader.combine(state.reading, reading, stamp)
         result = step.update(state.mixture, reading, values)
         has_outliers = step.outliers is not None
-        refuted = find_refuted(self.update_step.layout, reading, result, has_outliers)
+        refuted = find_refuted(step.layout, reading, result, has_outliers)
         loss, mixture = state.loss, result.mixture
         if not loss.is_clear or refuted.any():
             loss = loss.after(find_measured(step.layout, reading), refuted, self.lost_after)
             due = loss.is_lost & (loss.refuted % self.lost_after == 0) & refuted
             if self.restarts and due.any():
                 groups = np.flatnonzero(due).tolist()
-                anew = step.restart(state.mixture, self.first.spread(step, values), groups, reading, values)
-                explained = due & (
-                    step.find_accepted(anew.mixture, reading, values)
-                    if has_outliers
-                    else ~find_refuted(step.layout, reading, anew, has_outliers)
+                restarted = step.restart(
+                    state.mixture, self.first.spread(step, values), groups, reading, values
                 )
-                mixture = mixture.replace_groups(anew.mixture, np.flatnonzero(explained).tolist())
-                loss = loss.with_restarted(explained)
-        return TrackerState(mixture, result, loss, values, state.stamp, seen or state.reading)
+                if has_outliers:
+                    explained = due & step.find_accepted(restarted.mixture, reading, values)
+                else:
+                    explained = due & ~find_refuted(step.layout, reading, restarted, has_outliers)
+                mixture = mixture.replace_groups(restarted.mixture, np.flatnonzero(explained).tolist())
+                # They stay lost until measurements agree with them.
+                loss = replace(loss, refuted=np.where(explained, 0, loss.refuted))
+        return TrackerState(mixture, result, loss, values, state.stamp, latest)
 
-    def read_inputs(self, last: Array, given: StateLike | None) -> Array:
-        """Return the values of the inputs, those not given as they were last."""
-        symbols = self.update_step.layout.inputs
-        values = last.copy()
-        if given is not None:
-            state = given if isinstance(given, State) else State(given)
+    def read_inputs(self, last: Array, inputs: StateLike | None) -> Array:
+        """Return the values of the inputs, with the last ones for those that are absent."""
+        symbols, values = self.update_step.layout.inputs, last.copy()
+        if inputs is not None:
+            state = inputs if isinstance(inputs, State) else State(inputs)
             names = {str(s): i for i, s in enumerate(symbols)}
             for key in state:
                 if str(key) in names:
                     values[names[str(key)]] = state[key]
-                elif not isinstance(given, State):
+                elif not isinstance(inputs, State):
                     raise UnknownNameError(f"'{key}' is not in inputs=. {suggest(str(key), names, 'symbol')}")
-        missing = [str(s) for s, v in zip(symbols, values.tolist(), strict=True) if not math.isfinite(v)]
-        if missing and (given is not None or symbols):
-            raise InvalidValueError(f"There is no finite value of '{missing[0]}'; give it in inputs=.")
+        for symbol, value in zip(symbols, values.tolist(), strict=True):
+            if not math.isfinite(value):
+                raise InvalidValueError(f"There is no finite value of '{symbol}'; give it in inputs=.")
         return values

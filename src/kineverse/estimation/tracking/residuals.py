@@ -21,7 +21,7 @@ RIGID = 1e-4
 
 
 class Measurements(NamedTuple):
-    """One reading of all observations, as arrays laid out by :class:`.layout.Layout`."""
+    """One reading of all observations, as arrays laid out by :class:`.state_space.Layout`."""
 
     values: Array  # poses 4×4 row by row, and vectors; arbitrary where missing
     mask: npt.NDArray[np.bool_]  # True for each observation that was measured (m,)
@@ -56,15 +56,12 @@ class MeasurementReader:
             values[self._layout.measurement_slices[i]] = value
         return values
 
-    def read(self, given: Mapping[str, Any]) -> Measurements:
-        """Convert a mapping from names to measurements; absent names are missing.
-
-        Rigidity of poses is checked separately, see :meth:`check_poses`.
-        """
-        if not isinstance(given, Mapping):
-            raise InvalidValueError(f"What was seen is a mapping {{frame: pose}}, not {given!r:.80}.")
+    def read(self, measurements: Mapping[str, Any]) -> Measurements:
+        """Convert measurements by name, without :meth:`check_poses`; absent names are missing."""
+        if not isinstance(measurements, Mapping):
+            raise InvalidValueError(f"Measurements are a mapping {{frame: pose}}, not {measurements!r:.80}.")
         values, observed, whitenings, scales = self.empty()
-        for name, value in given.items():
+        for name, value in measurements.items():
             i = self._index.get(name)
             if i is None:
                 hint = suggest(str(name), self._index, "observation")
@@ -77,52 +74,43 @@ class MeasurementReader:
                     whitenings, scales = whitenings.copy(), scales.copy()
                 whitenings[self._layout.whitening_slices[i]] = whitening(checked).reshape(-1)
                 scales[i] = log_scale(checked)
-            values[self._layout.measurement_slices[i]] = (
-                _pose_like(value, one.label).reshape(-1) if one.is_pose else _checked_vector(value, one)
-            )
+            values[self._layout.measurement_slices[i]] = _checked_value(value, one)
             observed[i] = True
         return Measurements(values, observed, whitenings, scales)
 
     def read_poses(
-        self,
-        poses: npt.ArrayLike,
-        mask: npt.ArrayLike | None,
-        covariances: npt.ArrayLike | None = None,
+        self, poses: npt.ArrayLike, mask: npt.ArrayLike | None, covariances: npt.ArrayLike | None = None
     ) -> Measurements:
-        """Convert an array of poses in the order of the observations, and their covariances (m, 6, 6).
-
-        Rigidity is checked separately, see :meth:`check_poses`.
-        """
+        """Convert poses (m, 4, 4) and their covariances (m, 6, 6), without :meth:`check_poses`."""
         if self._vectors:
             raise InvalidValueError(
                 f"update_poses is for poses alone, which {', '.join(self._vectors)} is not. Use update."
             )
-        given = _numbers(poses, "The poses")
+        checked = _numbers(poses, "The poses")
         count = len(self._all)
-        if given.shape != (count, 4, 4):
-            raise ShapeError(f"The poses are an array of shape {(count, 4, 4)}, not {given.shape}.")
+        if checked.shape != (count, 4, 4):
+            raise ShapeError(f"The poses are an array of shape {(count, 4, 4)}, not {checked.shape}.")
         observed = self._all if mask is None else np.ascontiguousarray(mask)
         if observed.dtype != bool or observed.shape != (count,):
-            raise ShapeError(f"seen= is a mask of {count} booleans, not {mask!r:.80}.")
-        values = np.ascontiguousarray(given).reshape(-1)
+            raise ShapeError(f"mask= is an array of {count} booleans, not {mask!r:.80}.")
+        values = np.ascontiguousarray(checked).reshape(-1)
         if covariances is None:
             return Measurements(values, observed, self._whitening, self._log_scale)
         return Measurements(values, observed, *self._whiten_all(covariances, observed))
 
     def _whiten_all(self, covariances: npt.ArrayLike, observed: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return whitening matrices and scales for covariances (m, 6, 6) of all poses."""
-        given = _numbers(covariances, "The covariances")
-        count = len(observed)
-        if given.shape != (count, 6, 6):
-            raise ShapeError(f"The covariances are an array of shape {(count, 6, 6)}, not {given.shape}.")
-        R = np.where(observed[:, None, None], given, np.eye(6))
+        checked = _numbers(covariances, "The covariances")
+        if checked.shape != (len(observed), 6, 6):
+            shape = (len(observed), 6, 6)
+            raise ShapeError(f"The covariances are an array of shape {shape}, not {checked.shape}.")
+        R = np.where(observed[:, None, None], checked, np.eye(6))
         try:
             if not np.isfinite(R).all() or np.abs(R - np.swapaxes(R, 1, 2)).max() > 1e-9 * np.abs(R).max():
                 raise np.linalg.LinAlgError
             roots = np.linalg.cholesky(R)
         except np.linalg.LinAlgError:
             for i in np.flatnonzero(observed).tolist():
-                require_covariance(given[i], 6, self._layout.observations[i].label)
+                require_covariance(checked[i], 6, self._layout.observations[i].label)
             raise InvalidValueError(
                 "The covariances are too small or too large for floating point."
             ) from None
@@ -183,13 +171,6 @@ def _is_pair(value: Any, one: MeasurementModel) -> bool:
     return isinstance(value, tuple) and (one.size != 2 or np.ndim(value[0]) > 0)
 
 
-def _pose_like(given: npt.ArrayLike, label: str) -> Array:
-    pose = _numbers(given, f"The pose of '{label}'")
-    if pose.shape != (4, 4):
-        raise ShapeError(f"The pose of '{label}' is a 4×4 transform, not of shape {pose.shape}.")
-    return pose
-
-
 def whitening(covariance: Array) -> Array:
     """Return the lower triangular W with Wᵀ W = R⁻¹."""
     result: Array = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -202,8 +183,13 @@ def log_scale(covariance: Array) -> float:
     return float(logarithms.sum() + len(covariance) * np.log(2 * np.pi) / 2)
 
 
-def _checked_vector(given: Any, one: MeasurementModel) -> Array:
-    vector = _numbers(given, f"The value of '{one.label}'")
+def _checked_value(value: Any, one: MeasurementModel) -> Array:
+    if one.is_pose:
+        pose = _numbers(value, f"The pose of '{one.label}'")
+        if pose.shape != (4, 4):
+            raise ShapeError(f"The pose of '{one.label}' is a 4×4 transform, not of shape {pose.shape}.")
+        return pose.reshape(-1)
+    vector = _numbers(value, f"The value of '{one.label}'")
     if vector.shape == () and one.size == 1:
         vector = vector.reshape(1)
     if vector.shape != (one.size,):
@@ -213,15 +199,15 @@ def _checked_vector(given: Any, one: MeasurementModel) -> Array:
     return vector
 
 
-def _numbers(given: npt.ArrayLike, what: str) -> Array:
+def _numbers(values: npt.ArrayLike, label: str) -> Array:
     try:
-        if np.iscomplexobj(given):
+        if np.iscomplexobj(values):
             raise TypeError
-        return np.asarray(given, dtype=np.float64)
+        return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        is_expression = isinstance(given, Expression)
+        is_expression = isinstance(values, Expression)
         hint = " expression({symbol: value}) has those of an expression." if is_expression else ""
-        raise InvalidValueError(f"{what}: these are no numbers: {given!r:.80}.{hint}") from None
+        raise InvalidValueError(f"{label}: these are no numbers: {values!r:.80}.{hint}") from None
 
 
 class Residuals:
@@ -234,8 +220,7 @@ class Residuals:
 
     def evaluate(self, x: Array, inputs: Array) -> Array:
         """Evaluate predicted values and Jacobians of all observations and limits at a state, not whitened."""
-        result: Array = self._function(np.concatenate([x, inputs]))
-        return result
+        return np.asarray(self._function(np.concatenate([x, inputs])))
 
     def errors(
         self, out: Array, reading: Measurements, indices: Sequence[int]
@@ -244,32 +229,24 @@ class Residuals:
         layout = self._layout
         measured = [i for i in indices if reading.mask[i]]
         values = {i: reading.values[layout.measurement_slices[i]] for i in measured}
+        slopes = {i: out[layout.jacobian_slices[i]].reshape(-1, self._widths[i]) for i in measured}
         errors: dict[int, Array] = {}
-        slopes: dict[int, Array] = {}
-        for i in measured:
-            size = layout.observations[i].size
-            slopes[i] = out[layout.jacobian_slices[i]].reshape(size, self._widths[i])
         poses = [i for i in measured if layout.observations[i].is_pose]
         if poses:
             predicted = np.stack([out[layout.value_slices[i]] for i in poses])
             observed = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
-            differences = pose_difference(
-                observed, transform(predicted[:, :9].reshape(-1, 3, 3), predicted[:, 9:])
-            )
+            transforms = transform(predicted[:, :9].reshape(-1, 3, 3), predicted[:, 9:])
+            differences = pose_difference(observed, transforms)
             back = inverse_right_jacobian(differences[:, 3:])
             errors.update(zip(poses, differences, strict=True))
             for i, turn in zip(poses, back, strict=True):
-                slope = slopes[i]
-                slopes[i] = np.concatenate([slope[:3], turn @ slope[3:]])
-        for i in measured:
-            if i not in errors:
-                errors[i] = wrap_difference(
-                    values[i] - out[layout.value_slices[i]], layout.observations[i].period
-                )
+                slopes[i] = np.concatenate([slopes[i][:3], turn @ slopes[i][3:]])
         pairs = {}
         for i in measured:
-            size = layout.observations[i].size
-            white = reading.whitening[layout.whitening_slices[i]].reshape(size, size)
+            one = layout.observations[i]
+            if not one.is_pose:
+                errors[i] = wrap_difference(values[i] - out[layout.value_slices[i]], one.period)
+            white = reading.whitening[layout.whitening_slices[i]].reshape(one.size, one.size)
             pairs[i] = white @ errors[i], white @ slopes[i]
         return pairs
 
@@ -280,6 +257,6 @@ class Residuals:
             for where in (self._layout.value_slices[i], self._layout.jacobian_slices[i]):
                 if not np.isfinite(out[where]).all():
                     raise InvalidValueError(
-                        f"The model says nothing finite about '{one.label}' or its derivative at the present "
-                        "estimate. Give start= a state where it does, or the model limits."
+                        f"'{one.label}' or its derivative is not finite at the present estimate. Give start= "
+                        "a state where it is, or the model limits."
                     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
 
@@ -28,9 +28,9 @@ SpeedRow = Mapping[Symbol, Expression]
 class TangentSpace:
     """Estimated coordinates and their tangent directions."""
 
-    coordinates: tuple[Symbol, ...]  # estimated coordinates, sorted
+    coordinates: tuple[Symbol, ...]  # sorted
     tangent: tuple[Symbol, ...]  # tangent directions, as speeds, sorted
-    rates: Rates  # rate table of the model
+    rates: Rates  # of the model
     by_speeds: frozenset[Symbol]  # coordinates whose tangent directions are speeds other than their own
 
     def resolve(self, expression: Expression) -> Expression:
@@ -71,7 +71,9 @@ def build_tangent_space(
         wanted += [s for s in dependencies if _is_coordinate(s, inputs)]
     coordinates = tuple(sorted(result, key=lambda s: s.sort_key))
     by_speeds: set[Symbol] = set()
-    for block in _blocks(coordinates, rates):
+    rows = {x: frozenset(rates[x] if x in rates else (x.derivative(),)) for x in coordinates}
+    for union in connected_components(list(rows.values())):
+        block = [x for x in coordinates if rows[x] & union]
         if all(x in rates for x in block) and _are_redundant(block, rates, values, default):
             by_speeds.update(block)
     tangent = {v for x in coordinates for v in (rates[x] if x in by_speeds else [x.derivative()])}
@@ -95,14 +97,6 @@ def connected_components(items: Sequence[frozenset[Symbol]]) -> list[set[Symbol]
     return unions
 
 
-def _blocks(coordinates: tuple[Symbol, ...], rates: Rates) -> list[list[Symbol]]:
-    """Return the coordinates that are connected by common speeds."""
-    rows = {x: frozenset(rates[x] if x in rates else (x.derivative(),)) for x in coordinates}
-    return [
-        [x for x in coordinates if rows[x] & union] for union in connected_components(list(rows.values()))
-    ]
-
-
 def _are_redundant(
     block: list[Symbol], rates: Rates, values: Sequence[Expression], default: Mapping[Symbol, float]
 ) -> bool:
@@ -120,15 +114,12 @@ def _are_redundant(
         if rank < len(speeds) or rank == len(block):
             return False
         for direction in left[:, rank:].T:
-            ahead, behind = (
-                {x: point[x] + h * d for x, d in zip(block, direction.tolist(), strict=True)}
-                for h in (_STEP, -_STEP)
-            )
+            change = dict(zip(block, (_STEP * direction).tolist(), strict=True))
+            ahead = {x: point[x] + by for x, by in change.items()}
+            behind = {x: point[x] - by for x, by in change.items()}
             for value in dependent:
-                change = np.abs(
-                    _evaluate_at(value, ahead, default) - _evaluate_at(value, behind, default)
-                ).max()
-                if not change < _CONSTANT * _STEP:
+                off = _evaluate_at(value, ahead, default) - _evaluate_at(value, behind, default)
+                if not np.abs(off).max() < _CONSTANT * _STEP:
                     return False
     return True
 
@@ -141,21 +132,20 @@ def _evaluate_at(
     expression: Expression, point: Mapping[Symbol, float], default: Mapping[Symbol, float]
 ) -> Array:
     values = {s: point.get(s, default.get(s, s.value or 0.0)) for s in expression.symbols}
-    result: Array = expression(values)
-    return result
+    return np.asarray(expression(values))
 
 
 @dataclass(frozen=True, eq=False)
 class CoordinateGroup:
     """Coordinates that share observations or limits; groups are independent of each other."""
 
-    coordinates: tuple[Symbol, ...]  # symbols of the group
+    coordinates: tuple[Symbol, ...]
     tangent: tuple[Symbol, ...]
     x: TangentIndices  # indices into all coordinates
     t: TangentIndices  # into the whole tangent space
-    observation_indices: tuple[int, ...]  # numbers of its observations
+    observation_indices: tuple[int, ...]
     limits: tuple[int, ...]  # numbers of its curved limits
-    rate_directions: TangentIndices
+    rate_directions: TangentIndices  # tangent directions that are not speeds of its coordinates
 
     @property
     def coordinate_indices(self) -> TangentIndices:
@@ -184,69 +174,51 @@ class CoordinateGroup:
 class Layout:
     """Arrangement of state, observations and inputs in vectors."""
 
-    tangent_space: TangentSpace  # coordinates and tangent directions
-    observations: tuple[MeasurementModel, ...]  # measurement models
+    tangent_space: TangentSpace
+    observations: tuple[MeasurementModel, ...]
     limits: tuple[Constraint, ...]  # curved limits: all but bounds on a single free coordinate
-    inputs: tuple[Symbol, ...]  # symbols with given values
-    groups: tuple[CoordinateGroup, ...]  # independent groups, in the order of their first observation
+    inputs: tuple[Symbol, ...]
+    groups: tuple[CoordinateGroup, ...]  # in the order of their first observation
+    group_of: tuple[int, ...] = field(init=False)  # number of each observation's group
+    # Positions in the output: predicted values (rotation row by row, then position, or a vector), Jacobians
+    # (rows by columns of the group's tangent), and of curved limits the value, bounds and gradient.
+    value_slices: tuple[slice, ...] = field(init=False)
+    jacobian_slices: tuple[slice, ...] = field(init=False)
+    limit_slices: tuple[slice, ...] = field(init=False)
+    # Positions in a reading: of observations (4×4 row by row, or a vector), and of their whitening matrices.
+    measurement_slices: tuple[slice, ...] = field(init=False)
+    whitening_slices: tuple[slice, ...] = field(init=False)
 
-    @cached_property
-    def group_of(self) -> tuple[int, ...]:
-        """Number of each observation's group."""
-        result = {i: number for number, group in enumerate(self.groups) for i in group.observation_indices}
-        return tuple(result[i] for i in range(len(self.observations)))
+    def __post_init__(self) -> None:
+        number_of = {i: number for number, group in enumerate(self.groups) for i in group.observation_indices}
+        group_of = tuple(number_of[i] for i in range(len(self.observations)))
+        sizes = []
+        for one, number in zip(self.observations, group_of, strict=True):
+            sizes += [12 if one.is_pose else one.size, one.size * len(self.groups[number].tangent)]
+        count = len(sizes)
+        sizes += [3 + len(self._group_of_limit(number).tangent) for number in range(len(self.limits))]
+        slices = _consecutive_slices(sizes)
+        derived = {
+            "group_of": group_of,
+            "value_slices": slices[0:count:2],
+            "jacobian_slices": slices[1:count:2],
+            "limit_slices": slices[count:],
+            "measurement_slices": _consecutive_slices(16 if o.is_pose else o.size for o in self.observations),
+            "whitening_slices": _consecutive_slices(o.size**2 for o in self.observations),
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
 
     @cached_property
     def arguments(self) -> tuple[Symbol, ...]:
         """Arguments of the compiled function: coordinates, then inputs."""
         return (*self.tangent_space.coordinates, *self.inputs)
 
-    @cached_property
-    def value_slices(self) -> tuple[slice, ...]:
-        """Position of each predicted value in the output: rotation row by row, then position, or a vector."""
-        return self._slices[0]
-
-    @cached_property
-    def jacobian_slices(self) -> tuple[slice, ...]:
-        """Position of each observation's Jacobian in the output, rows by columns of its group's tangent."""
-        return self._slices[1]
-
-    @cached_property
-    def limit_slices(self) -> tuple[slice, ...]:
-        """Position of each curved limit's value, bounds and gradient in the output."""
-        return self._slices[2]
-
-    @cached_property
-    def measurement_slices(self) -> tuple[slice, ...]:
-        """Position of each observation in a reading: 4×4 row by row, or a vector."""
-        return _consecutive_slices(16 if one.is_pose else one.size for one in self.observations)
-
-    @cached_property
-    def whitening_slices(self) -> tuple[slice, ...]:
-        """Position of each observation's whitening matrix in a reading."""
-        return _consecutive_slices(one.size**2 for one in self.observations)
-
-    @cached_property
-    def _slices(self) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
-        at = 0
-        result: tuple[list[slice], list[slice], list[slice]] = [], [], []
-        sizes = []
-        for one, number in zip(self.observations, self.group_of, strict=True):
-            width = len(self.groups[number].tangent)
-            sizes += [(0, 12 if one.is_pose else one.size), (1, one.size * width)]
-        for number in range(len(self.limits)):
-            group = next(g for g in self.groups if number in g.limits)
-            sizes.append((2, 3 + len(group.tangent)))
-        for kind, size in sizes:
-            result[kind].append(slice(at, at + size))
-            at += size
-        return tuple(result[0]), tuple(result[1]), tuple(result[2])
+    def _group_of_limit(self, number: int) -> CoordinateGroup:
+        return next(group for group in self.groups if number in group.limits)
 
     def is_affine(self, number: int) -> bool:
-        """Return True if all measurements of a group are affine functions of its coordinates.
-
-        Frames that are shifted only, by amounts that are affine, and vectors without a period.
-        """
+        """Return True if all measurements of a group are affine functions of its coordinates."""
         group = self.groups[number]
         if group.by_speeds or group.limits:
             return False
@@ -268,22 +240,17 @@ class Layout:
         parts: list[Expression] = []
         for one, number in zip(self.observations, self.group_of, strict=True):
             value = self.tangent_space.resolve(one.value)
-            parts += [
-                _flatten_pose(value) if one.is_pose else value,
-                self._jacobian(one, value, self.groups[number]),
-            ]
+            parts.append(array([*value[:3, :3].reshape(9), *value[:3, 3]]) if one.is_pose else value)
+            parts.append(self._jacobian(one, value, self.groups[number]))
         for number, limit in enumerate(self.limits):
-            group = next(g for g in self.groups if number in g.limits)
             slopes = self.tangent_space.gradient(limit.expression)
-            columns = [slopes.get(v, as_expression(0.0)) for v in group.tangent]
+            tangent = self._group_of_limit(number).tangent
+            columns = [slopes.get(v, as_expression(0.0)) for v in tangent]
             parts.append(array([limit.expression, limit.lower, limit.upper, *columns]))
         return compile(np.concatenate(parts), self.arguments)
 
     def _jacobian(self, one: MeasurementModel, value: Expression, group: CoordinateGroup) -> Expression:
-        """Return the Jacobian of a value in the group's tangent directions, flattened row by row.
-
-        For a pose this is the geometric Jacobian: linear velocity of the origin, then angular velocity.
-        """
+        """Return the Jacobian (geometric for a pose) by the group's tangent, flattened row by row."""
         gradient = self.tangent_space.gradient(value)
         columns = []
         for speed in group.tangent:
@@ -303,10 +270,6 @@ def _consecutive_slices(sizes: Iterable[int]) -> tuple[slice, ...]:
     return tuple(slice(a, b) for a, b in pairwise(ends))
 
 
-def _flatten_pose(pose: Expression) -> Expression:
-    return array([*pose[:3, :3].reshape(9), *pose[:3, 3]])
-
-
 def build_layout(
     tangent_space: TangentSpace,
     observations: tuple[MeasurementModel, ...],
@@ -319,25 +282,20 @@ def build_layout(
     for one in observations:
         symbols = [s for s in tangent_space.resolve(one.value).symbols if s in speeds]
         if not symbols:
-            raise InvalidValueError(
-                f"'{one.label}' does not move with any coordinate that is estimated: nothing can be learnt "
-                "from observing it."
-            )
+            raise InvalidValueError(f"'{one.label}' does not move with any estimated coordinate.")
         observed.append(frozenset().union(*(speeds[s] for s in symbols)))
     limited = [frozenset[Symbol]().union(*(speeds[s] for s in c.symbols if s in speeds)) for c in limits]
     # A rate couples the coordinates it depends on with those it moves.
-    rated = [
-        frozenset().union(
-            speeds[x], *(speeds[s] for e in tangent_space.rates[x].values() for s in e.symbols if s in speeds)
-        )
-        for x in tangent_space.coordinates
-        if x in tangent_space.rates
-    ]
+    rated = []
+    for x in tangent_space.coordinates:
+        if x in tangent_space.rates:
+            symbols = [s for e in tangent_space.rates[x].values() for s in e.symbols if s in speeds]
+            rated.append(speeds[x].union(*(speeds[s] for s in symbols)))
     groups = []
     for union in connected_components([*observed, *limited, *rated]):
         tangent = tuple(v for v in tangent_space.tangent if v in union)
         coordinates = tuple(x for x in tangent_space.coordinates if speeds[x] & union)
-        own = {x.derivative() for x in coordinates if x not in tangent_space.by_speeds}
+        free = {x.derivative() for x in coordinates if x not in tangent_space.by_speeds}
         groups.append(
             CoordinateGroup(
                 coordinates,
@@ -346,7 +304,7 @@ def build_layout(
                 np.array([tangent_space.tangent.index(v) for v in tangent]),
                 tuple(i for i, w in enumerate(observed) if w & union),
                 tuple(i for i, w in enumerate(limited) if w & union),
-                np.array([k for k, v in enumerate(tangent) if v not in own], dtype=np.int64),
+                np.array([k for k, v in enumerate(tangent) if v not in free], dtype=np.int64),
             )
         )
     return Layout(tangent_space, observations, limits, tuple(inputs), tuple(groups))

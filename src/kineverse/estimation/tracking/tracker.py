@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_count, as_tolerance, finite_number
 from kineverse._runtime import CallLock, one_at_a_time
 from kineverse.errors import InvalidValueError
 from kineverse.estimation.noise import Outliers, as_outliers
@@ -25,22 +24,10 @@ from .bounds import SpeedLocks, arrange_state
 from .estimate import Estimate, RecentPoses, TrackerState, TrackLoss, collect_recent_poses
 from .gaussian_sum_filter import UpdateStep
 from .information_state import InformationState
-from .initialization import GivenValues, make_initial_belief
-from .measurements import (
-    ObservedLike,
-    build_measurement_models,
-    list_observed,
-    require_mapping,
-    require_number,
-)
+from .initialization import InitialValues, make_initial_belief
+from .measurements import ObservedLike, build_measurement_models, list_observed, require_mapping
 from .native import native_library
-from .process_model import (
-    INITIAL_SPEED_TIME,
-    Process,
-    check_process,
-    default_process_noise,
-    require_noise,
-)
+from .process_model import INITIAL_SPEED_TIME, Process, check_process, default_process_noise
 from .recursion import FixedLag, Recursion, Step
 from .residuals import Measurements
 
@@ -63,7 +50,7 @@ class Tracker:
         :class:`.ObservedExpression`.
     start
         Initial values of some coordinates; others start in the middle of the limits, or at the default state.
-        Speeds, if these are estimated, start at 0 unless they are given.
+        Speeds, if these are estimated, start at 0 by default.
     uncertainty
         Initial standard deviations [m], [rad], by coordinate, or by speed for directions that are no
         coordinate's; by default half the width of the limits, π for angles, 10 m. Those of estimated speeds
@@ -73,8 +60,8 @@ class Tracker:
         at random and are estimated, ``"static"`` for a state that is constant unless it is commanded.
     process_noise
         Process noise by speed or coordinate: the variance per second, or for ``process="velocity"`` the
-        spectral density of the acceleration [m²/s³], [rad²/s³]. Others have that of furniture that a hand
-        moves, see :mod:`.process_noise`, and none for ``process="static"``. 0 for a part that never moves.
+        spectral density of the acceleration [m²/s³], [rad²/s³]. By default that of furniture that a hand
+        moves, see :mod:`.process_model`, and none for ``process="static"``. 0 for a part that never moves.
     outliers
         Outlier model: :class:`Outliers`, or True for the default one. None without outliers.
     locks
@@ -87,7 +74,7 @@ class Tracker:
         measurements are rejected, or without an outlier model, their normalised innovation squared is one in
         a million.
     restart
-        True if lost groups start anew from the initial uncertainty where that explains the measurements.
+        True if lost groups restart from the initial uncertainty where that explains the measurements.
     lag
         Time by which measurements may come late [s]; they are applied in the order of their times.
     keep
@@ -126,39 +113,29 @@ class Tracker:
             "keep": keep,
         }
         check_process(process)
-        _check_counts(lost_after, keep, lag)
+        lost_after, keep = as_count("lost_after", lost_after, 1), as_count("keep", keep, 1)
+        lag = as_tolerance(lag, "lag= [s]")
         keys = (inputs,) if isinstance(inputs, str | Symbol) else inputs
         if not isinstance(keys, Iterable):
             raise InvalidValueError(f"inputs= has names of coordinates, not {inputs!r:.80}.")
-        given = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in keys)
-        layout, limits = arrange_state(model, build_measurement_models(model, self._observed), given)
-        self.model = model
-        self._layout = layout
+        symbols = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in keys)
+        layout, limits = arrange_state(model, build_measurement_models(model, self._observed), symbols)
+        self.model, self._layout = model, layout
         self._update_step = UpdateStep(
             layout, limits, as_outliers(outliers, has_gate=True), process == "velocity"
         )
         noise = self._read_noise(process_noise)
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
-        given_values = GivenValues.read(
-            self._update_step,
-            {} if start is None else start,
-            {} if uncertainty is None else uncertainty,
-        )
-        first = make_initial_belief(model, self._update_step, given_values, known)
+        initial = InitialValues.read(self._update_step, start, uncertainty)
+        first = make_initial_belief(model, self._update_step, initial, known)
         noise = {**default_process_noise(self._update_step, process, first.x, known), **noise}
         variances = {v: INITIAL_SPEED_TIME * q for v, q in noise.items()}
         first = replace(first, speed_variances={**variances, **first.speed_variances})
-        self._recursion = Recursion(
-            self._update_step,
-            first,
-            noise,
-            SpeedLocks(model, layout, self._update_step.process_model) if locks else None,
-            lost_after,
-            restart,
-        )
+        held = SpeedLocks(model, layout, self._update_step.process_model) if locks else None
+        self._recursion = Recursion(self._update_step, first, noise, held, lost_after, restart)
         self._now = self._recursion.start(values, getattr(start, "stamp", None))
-        self._buffer = FixedLag[TrackerState](lag)
+        self._buffer = FixedLag(lag)
         self._lock = CallLock()
         self._recent: deque[tuple[float | None, Measurements, Array]] = deque(maxlen=keep)
 
@@ -175,7 +152,10 @@ class Tracker:
     @property
     def limits(self) -> dict[Symbol, tuple[float, float]]:
         """Bounds of single coordinates; ±inf without constant bounds."""
-        return self._update_step.limits.by_symbol(self._layout.tangent_space)
+        limits = self._update_step.limits
+        return dict(
+            zip(self.symbols, zip(limits.lower.tolist(), limits.upper.tolist(), strict=True), strict=True)
+        )
 
     @property
     def periodic(self) -> frozenset[Symbol]:
@@ -217,14 +197,14 @@ class Tracker:
         with self._lock:
             other = copy.copy(self)
             other._lock = CallLock()
-            other._recent, other._buffer = self._recent.copy(), self._buffer.copy()
+            other._recent, other._buffer = self._recent.copy(), copy.copy(self._buffer)
         return other
 
     @one_at_a_time
     def rebuild(self, model: ModelView | None = None) -> Tracker:
         """Return a tracker of an edited model with the same observations and options.
 
-        It starts anew, and repeats the recent updates in the order of their times, without commands. Turns
+        It starts again, and repeats the recent updates in the order of their times, without commands. Turns
         are those of this tracker.
 
         Parameters
@@ -249,13 +229,12 @@ class Tracker:
                 return result
 
             other._now = replace(start, mixture=start.mixture.map(turned))
-            other._buffer.clear()
+            other._buffer.steps = ()
             other._recent.clear()
             other._repeat(self)
         return other
 
     def _repeat(self, other: Tracker) -> None:
-        """Update with what another tracker has seen."""
         inputs = {str(s): k for k, s in enumerate(other._layout.inputs)}
         recent = list(other._recent)
         if all(stamp is not None for stamp, _, _ in recent):
@@ -276,21 +255,17 @@ class Tracker:
 
     @one_at_a_time
     def reset(
-        self,
-        start: StateLike | None = None,
-        *,
-        uncertainty: StateLike | None = None,
-        at: float | None = None,
+        self, start: StateLike | None = None, *, uncertainty: StateLike | None = None, at: float | None = None
     ) -> Estimate:
-        """Start anew, or set the estimate of some coordinates.
+        """Start again, or set the estimate of some coordinates.
 
         Parameters
         ----------
         start
             Values of some coordinates, and of speeds if these are estimated. Other coordinates keep their
-            estimate. If neither values nor uncertainties are given, all start as the tracker did.
+            estimate. Without values and uncertainties, all start as the tracker did.
         uncertainty
-            Standard deviations, as at construction; those of other given values are the initial ones.
+            Standard deviations, as at construction; by default the initial ones.
         at
             Time from now on [s]; the time stays if None. If it is earlier, :attr:`recent` is emptied.
 
@@ -301,16 +276,15 @@ class Tracker:
         """
         tangent_space, now = self._layout.tangent_space, self._now
         stamp = now.stamp if at is None else _require_time(at)
-        start, uncertainty = ({} if given is None else given for given in (start, uncertainty))
-        values = GivenValues.read(self._update_step, start, uncertainty)
+        values = InitialValues.read(self._update_step, start, uncertainty)
         first, groups = self._recursion.first, list(range(len(self._layout.groups)))
-        if len(start) or len(uncertainty):
-            own = {v for x in values.coordinates for v in tangent_space.rate_row(x)}
-            own &= {*tangent_space.tangent}
-            anew = [tangent_space.tangent.index(v) for v in own] + list(values.deviations)
+        if (start is not None and len(start)) or (uncertainty is not None and len(uncertainty)):
+            speeds = {v for x in values.coordinates for v in tangent_space.rate_row(x)}
+            speeds &= {*tangent_space.tangent}
+            set_now = [tangent_space.tangent.index(v) for v in speeds] + list(values.deviations)
             spread = np.sqrt(np.diag(self.estimate.covariance))
-            spread[anew] = first.deviations[anew]
-            kept = {v: u for v, u in self.estimate.speeds.items() if v not in own}
+            spread[set_now] = first.deviations[set_now]
+            kept = {v: u for v, u in self.estimate.speeds.items() if v not in speeds}
             variances = {v: self.estimate.deviation[v] ** 2 for v in kept}
             first = replace(
                 first,
@@ -322,20 +296,16 @@ class Tracker:
             first = first.with_values(self._update_step, values)
             changed = {*values.coordinates, *values.speeds, *values.speed_deviations}
             changed |= {tangent_space.tangent[k] for k in values.deviations}
-            groups = [
-                n
-                for n, group in enumerate(self._layout.groups)
-                if not changed.isdisjoint(
-                    (*group.coordinates, *group.tangent, *self._update_step.process_model.speeds_of(n))
-                )
-            ]
+            speeds_of = self._update_step.process_model.speeds_of
+            moving = [{*g.coordinates, *g.tangent, *speeds_of(n)} for n, g in enumerate(self._layout.groups)]
+            groups = [n for n, symbols in enumerate(moving) if changed & symbols]
         mixture = now.mixture.replace_groups(
             first.spread(self._update_step, np.nan_to_num(now.inputs)), groups
         )
         chosen = np.isin(np.arange(len(self._layout.groups)), groups)
         loss = TrackLoss(np.where(chosen, 0, now.loss.refuted), now.loss.is_lost & ~chosen)
         self._now = replace(now, mixture=mixture, loss=loss, stamp=stamp, reading=None)
-        self._buffer.clear()
+        self._buffer.steps = ()
         if stamp is not None and now.stamp is not None and stamp < now.stamp:
             self._recent.clear()
         return self.estimate
@@ -359,8 +329,8 @@ class Tracker:
         inputs
             Values of the inputs; the last ones if None.
         process_noise
-            Process noise of this step by speed or coordinate, where it is another one than that of the
-            tracker: that of what rests, or is pushed just now.
+            Overrides the tracker's process noise for this step, by speed or coordinate, e.g. for a part at
+            rest.
 
         Raises
         ------
@@ -369,39 +339,36 @@ class Tracker:
         UnknownNameError
             For a speed with which no estimated coordinate moves.
         """
-        dt = require_number(dt, "The length of a step")
-        if not (math.isfinite(dt) and dt >= 0):
-            raise InvalidValueError(
-                f"Time goes on: a step of {dt!r} s is none. Steps are finite and not negative."
-            )
+        dt = as_tolerance(dt, "The length of a step [s]")
         speeds, noise = self._read_commands(commands), self._read_noise(process_noise)
         before = self._now
         known = self._recursion.read_inputs(before.inputs, inputs)
         self._now = self._recursion.predict(replace(before, inputs=known), dt, speeds, noise)
         if self._now.stamp is not None:
-            advance = partial(
-                self._recursion.advance, speeds=speeds, inputs=copy.copy(inputs), noise_now=noise
-            )
+            fixed = copy.copy(inputs)
+            advance = partial(self._recursion.advance, speeds=speeds, inputs=fixed, noise_now=noise)
             self._remember(before, self._now.stamp, partial(advance, stamp=self._now.stamp), advance)
         return self.estimate
 
     def _read_commands(self, commands: StateLike | None) -> dict[Symbol, float]:
         speeds = {}
         for key, value in require_mapping({} if commands is None else commands, "commands=").items():
-            speed = require_number(value, f"The commanded speed '{key}'")
-            if not math.isfinite(speed):
-                raise InvalidValueError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
+            if (speed := finite_number(value)) is None:
+                raise InvalidValueError(f"The commanded speed '{key}' is a finite number, not {value!r:.80}.")
             speeds[self._update_step.process_model.speed(key)] = speed
         return speeds
 
     def _read_noise(self, process_noise: StateLike | None) -> dict[Symbol, float]:
-        given = require_mapping({} if process_noise is None else process_noise, "process_noise=")
-        return {self._update_step.process_model.speed(k): require_noise(k, v) for k, v in given.items()}
+        result, noise = {}, {} if process_noise is None else process_noise
+        for key, value in require_mapping(noise, "process_noise=").items():
+            subject = f"The process noise of '{key}' (0 for a part that never moves)"
+            result[self._update_step.process_model.speed(key)] = as_tolerance(value, subject)
+        return result
 
     @one_at_a_time
     def update(
         self,
-        seen: Mapping[str, Any],
+        measurements: Mapping[str, Any],
         *,
         at: float | None = None,
         commands: StateLike | None = None,
@@ -412,9 +379,9 @@ class Tracker:
 
         Parameters
         ----------
-        seen
-            Measurements by name of the observation: poses 4×4, vectors or numbers, or pairs of these and a
-            covariance of their own. Absent names are missing.
+        measurements
+            By name of the observation: poses 4×4, vectors or numbers, or pairs of these and
+            their covariance. Absent names are missing.
         at
             Time of the measurements [s]; the state is predicted to it first. Late ones are applied at their
             time, up to the lag.
@@ -431,13 +398,13 @@ class Tracker:
             For an invalid measurement, naming it, or if time goes backwards by more than the lag. The belief
             does not change then.
         """
-        return self._update(self._update_step.reader.read(seen), at, commands, inputs, process_noise)
+        return self._update(self._update_step.reader.read(measurements), at, commands, inputs, process_noise)
 
     @one_at_a_time
     def update_poses(
         self,
         poses: npt.ArrayLike,
-        seen: npt.ArrayLike | None = None,
+        mask: npt.ArrayLike | None = None,
         *,
         covariances: npt.ArrayLike | None = None,
         at: float | None = None,
@@ -451,7 +418,7 @@ class Tracker:
         ----------
         poses
             Poses of all frames; entries of missing ones are ignored.
-        seen
+        mask
             True for each measured pose (m,); all if None.
         covariances
             Covariances (m, 6, 6) of these poses; entries of missing ones are ignored. Those of the
@@ -459,7 +426,7 @@ class Tracker:
         at, commands, inputs, process_noise
             As in :meth:`update`.
         """
-        reading = self._update_step.reader.read_poses(poses, seen, covariances)
+        reading = self._update_step.reader.read_poses(poses, mask, covariances)
         return self._update(reading, at, commands, inputs, process_noise)
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -491,14 +458,11 @@ class Tracker:
         if native is None or not native.are_rigid(reading):
             self._update_step.reader.check_poses(reading)
         if at is None and (commands or process_noise):
-            what = "Commands" if commands else "process_noise="
-            raise InvalidValueError(f"{what} need the time they lasted: give at=, or call predict.")
+            subject = "Commands" if commands else "process_noise="
+            raise InvalidValueError(f"{subject} need the time they lasted: give at=, or call predict.")
         noise = self._read_noise(process_noise)
-        stamp, speeds, before = (
-            None if at is None else _require_time(at),
-            self._read_commands(commands),
-            self._now,
-        )
+        stamp = None if at is None else _require_time(at)
+        speeds, before = self._read_commands(commands), self._now
         apply = partial(
             self._recursion.update,
             reading=reading,
@@ -538,15 +502,6 @@ class Tracker:
 
 
 def _require_time(at: Any) -> float:
-    time = require_number(at, "The time of an observation")
-    if not math.isfinite(time):
+    if (time := finite_number(at)) is None:
         raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
     return time
-
-
-def _check_counts(lost_after: int, keep: int, lag: float) -> None:
-    for name, count in (("lost_after", lost_after), ("keep", keep)):
-        if not isinstance(count, Integral) or count < 1:
-            raise InvalidValueError(f"{name}= is a number of updates, at least 1, not {count!r}.")
-    if not (math.isfinite(require_number(lag, "The lag")) and lag >= 0):
-        raise InvalidValueError(f"lag= is a finite number of seconds, not negative, not {lag!r}.")

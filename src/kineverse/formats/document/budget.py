@@ -18,43 +18,29 @@ from kineverse.symbols import Symbol
 from .json_values import InvalidDocumentError
 
 MAX_NODES = 1 << 22
-MAX_LISTS = 10_000_000
-"""Most lists and objects in a document."""
-MAX_VALUES = 1 << 26
-"""Most values in a document."""
+MAX_LISTS = 10_000_000  # most lists and objects in a document
+MAX_VALUES = 1 << 26  # most values in a document
 MAX_WORK = 30_000_000
-MAX_DEPTH = 100
-"""Deepest nesting of lists and objects in data and parameters."""
-MAX_NESTING = 400
-"""Deepest nesting of nodes with a gradient of their own; algorithms on them are recursive."""
-MAX_COMPOSITIONS = 12
-"""Deepest nesting of compositions; each doubles the size of the gradient."""
+MAX_DEPTH = 100  # deepest nesting of lists and objects in data and parameters
+MAX_NESTING = 400  # deepest nesting of nodes with a gradient of their own; algorithms on them are recursive
+MAX_COMPOSITIONS = 12  # deepest nesting of compositions; each doubles the size of the gradient
 MAX_ORDER = 1000
 MAX_DIMENSIONS = 16
 MAX_LENGTH = 1 << 24
-MAX_STEPS = 100
-"""Most Newton steps of an implicit function."""
-MAX_PATH = 16
-"""Longest path of nested gradient entries in a ``read`` node."""
+MAX_STEPS = 100  # most Newton steps of an implicit function
+MAX_PATH = 16  # longest path of nested gradient entries in a read node
 MAX_QUESTIONS = 10_000
-MAX_ELEMENTS = 10_000
-"""Most elements in all arguments of a node with a gradient of its own."""
+MAX_ELEMENTS = 10_000  # most elements in all arguments of a node with a gradient of its own
 MAX_NORM = 1000
 """Most elements of the argument of a norm, each of which may have a gradient by as many symbols."""
-MAX_PIECES = 100_000
-"""Most coefficients of a piecewise polynomial, times the elements of its argument."""
+MAX_PIECES = 100_000  # most coefficients of a piecewise polynomial, times the elements of its argument
 COST_OF_SCALAR, COST_OF_ELEMENT = 5, 200
 """Cost of a node with a gradient of its own: of a scalar, and of each element of an array."""
-COST_OF_NODE_BELOW = 20
-"""Cost of a node for each traversal of an expression that contains it."""
-COST_OF_RATE = 20
-"""Cost of a rate for each coordinate whose rate depends on it."""
-COST_OF_NAME = 10
-"""Cost of a name for each operation that listed it."""
-COST_OF_FRAME = 5
-"""Cost of a frame for each pose in a trace whose kinematic chain contains it."""
-COST_OF_STEP = 1000
-"""Cost of a Newton step in addition to that of its residual."""
+COST_OF_NODE_BELOW = 20  # cost of a node for each traversal of an expression that contains it
+COST_OF_RATE = 20  # cost of a rate for each coordinate whose rate depends on it
+COST_OF_NAME = 10  # cost of a name for each operation that listed it
+COST_OF_FRAME = 5  # cost of a frame for each pose in a trace whose kinematic chain contains it
+COST_OF_STEP = 1000  # cost of a Newton step in addition to that of its residual
 
 
 class Budget:

@@ -64,9 +64,9 @@ def check_hash(claim: Any, content: bytes, given: dict[str, Any]) -> None:
         raise InvalidDocumentError("it contains what JSON has no place for") from None
     if not same:
         raise InvalidDocumentError(
-            f"its content is not what {HASH!r} says; it was changed or damaged since it was written. Get it "
-            f"anew, or, if the change is meant, delete the member {HASH!r}: it comes again when the model "
-            "is saved, for instance by 'kineverse convert'"
+            f"its content is not what {HASH!r} says; it was changed or damaged since it was written. Get "
+            f"another copy, or, if the change is intended, delete the member {HASH!r}: it is written again "
+            "when the model is saved, for instance by 'kineverse convert'"
         )
 
 

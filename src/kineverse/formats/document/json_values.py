@@ -125,7 +125,7 @@ def _describe_type(value: Any) -> str:
 
 
 def schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of documents, the content of ``schema.json`` beside this file.
+    """Return the JSON Schema (draft 2020-12) of documents, the content of ``schema.json``.
 
     It defines the parts of a document. Only the reader checks that references are to earlier nodes, shapes,
     limits on size and work, and the hash.

@@ -250,22 +250,6 @@ def _less(graph: NodeGraph, node: list[Any]) -> None:
     graph.add_alike(Less, [a, b], (float(contrast),))
 
 
-def _not(graph: NodeGraph, node: list[Any]) -> None:
-    graph.add_alike(Not, check_length(node, 2)[1:])
-
-
-def _and(graph: NodeGraph, node: list[Any]) -> None:
-    graph.add_alike(And, node[1:])
-
-
-def _or(graph: NodeGraph, node: list[Any]) -> None:
-    graph.add_alike(Or, node[1:])
-
-
-def _select(graph: NodeGraph, node: list[Any]) -> None:
-    graph.add_alike(Select, check_length(node, 4)[1:])
-
-
 def _extremum(graph: NodeGraph, node: list[Any]) -> None:
     if len(node) < 4:
         raise InvalidDocumentError("an extremum is one of at least two expressions")
@@ -354,10 +338,10 @@ NODE_TYPES: Mapping[str, Callable[[NodeGraph, list[Any]], None]] = MappingProxyT
         "matrix": _matrix,
         "augment": _augment,
         "less": _less,
-        "not": _not,
-        "and": _and,
-        "or": _or,
-        "select": _select,
+        "not": lambda graph, node: graph.add_alike(Not, check_length(node, 2)[1:]),
+        "and": lambda graph, node: graph.add_alike(And, node[1:]),
+        "or": lambda graph, node: graph.add_alike(Or, node[1:]),
+        "select": lambda graph, node: graph.add_alike(Select, check_length(node, 4)[1:]),
         "extremum": _extremum,
         "norm": _norm,
         "piecewise": _piecewise,

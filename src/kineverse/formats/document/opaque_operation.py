@@ -90,8 +90,8 @@ class OpaqueOperation(Operation):
         kind = UnknownNameError if isinstance(error, UnknownNameError) else ModelError
         raise kind(
             f"{changed[0]} has changed, and this {self.kind} was made from it: {error} It comes from a "
-            "document, without its code; in the same edit, remove it, or replace it by a "
-            f"{self.kind}(...) made anew.{self._hint}"
+            "document, without its code; in the same edit, remove it, or replace it by "
+            f"a new {self.kind}(...).{self._hint}"
         ) from None
 
     @property

@@ -222,7 +222,7 @@ def decode_parameter(
     if tag == "written":
         named = path(check_text(check_keys(value, (tag,))[tag]))
         if named not in written:
-            raise InvalidDocumentError(f"{named[:60]!r} is said to be written, and is not")
+            raise InvalidDocumentError(f"{named[:60]!r} is not among the values that it writes")
         return WrittenReference(named)
     if tag == "unwritten":
         return UnsupportedParameter(check_text(check_keys(value, (tag,))[tag]))

@@ -99,8 +99,7 @@ def _decode_arguments(
     return (cell(FRAMES if kind in ("body", "factors") else _KIND_OF[kind], given[0])[1],)
 
 
-_COST_OF_POSE = 1000
-"""Cost of a frame in a composed pose, about its number of products and sums."""
+_COST_OF_POSE = 1000  # cost of a frame in a composed pose, about its number of products and sums
 
 
 class TraceConsistency:

@@ -50,8 +50,7 @@ from .node_graph import NodeGraph
 Ref: TypeAlias = Callable[[Expression], int]
 Rename: TypeAlias = Callable[[str], str]
 
-MAX_BITS = 10_000
-"""Length of the longest integer: Python reads no more than 4300 digits."""
+MAX_BITS = 10_000  # length of the longest integer: Python reads no more than 4300 digits
 PLAIN_BITS = 63
 """Length of the longest integer that is written as a number; other languages and msgpack end there."""
 DATUM_TAGS = ("expression", "float", "integer")
@@ -230,7 +229,7 @@ POSE_NUMBERS = 12
 _POSE = Struct(f"{POSE_NUMBERS}d")
 
 
-# -- writing -------------------------------------------------------------------------------------------------
+# -- writing of bodies, numbers and texts --------------------------------------------------------------------
 
 
 def encode_body(body: Body) -> dict[str, Any]:
@@ -274,11 +273,7 @@ def _encode_geometry(geometry: Geometry) -> dict[str, Any]:
     if type(geometry) is Mesh:
         scale = encode_numbers(geometry.scale)
         return {
-            "mesh": {
-                "uri": encode_text(geometry.uri),
-                "scale": scale,
-                "folder": encode_text(geometry.folder),
-            }
+            "mesh": {"uri": encode_text(geometry.uri), "scale": scale, "folder": encode_text(geometry.folder)}
         }
     raise FormatError(f"a {type(geometry).__name__} is no geometry that a document knows")
 
@@ -315,7 +310,7 @@ def encode_text(value: Any) -> str:
     return value
 
 
-# -- reading -------------------------------------------------------------------------------------------------
+# -- reading of bodies ---------------------------------------------------------------------------------------
 
 
 def decode_body(value: Any) -> Body:

@@ -189,7 +189,6 @@ def _lines(items: list[str]) -> Iterator[str]:
 
 
 def _encode_operation(what: _Parts, table: NodeTable) -> str:
-    """Encode an operation as JSON text."""
     entry = what.entry
     cells = sorted(entry.reads.cells.items())
     reads = {

@@ -34,8 +34,7 @@ from kineverse.symbols import Symbol
 from .joint_axes import JointMotion, MotionChain, QuaternionMotion
 
 _ROUNDING = 1e-12
-_UP = 1 + 1e-12
-"""Factor by which sums of a few errors are rounded up."""
+_UP = 1 + 1e-12  # factor by which sums of a few errors are rounded up
 
 
 class CurveApproximation:
@@ -100,7 +99,6 @@ class CurveApproximation:
         return taylor_polynomial(motion.coefficients, inner)
 
     def _sample(self, motion: JointMotion, symbol: Symbol, lower: float, upper: float) -> np.ndarray:
-        """Return a motion's positions at the Chebyshev points of an interval."""
         x = chebyshev_points(lower, upper)
         if motion.curve is not None:
             function = ca.Function("curve", [symbol.sx], [expand_nodes(motion.curve)])
@@ -196,10 +194,8 @@ SeriesCurve = Callable[[RealInterval], TaylorSeries]
 """Function that returns the Taylor series of a curve over an interval."""
 
 SAMPLE_COUNT = 257
-_CLOSE = 1.05
-"""Ratio of the error bound to the largest sampled error at which the bound is close enough."""
-_NEGLIGIBLE = 1e-3
-"""Part of the tolerance within which the bound is close enough."""
+_CLOSE = 1.05  # ratio of the error bound to the largest sampled error at which the bound is close enough
+_NEGLIGIBLE = 1e-3  # part of the tolerance within which the bound is close enough
 _MAX_INTERVALS = 1000
 _MAX_HALVINGS = 4
 _MAX_EXCHANGES = 40
@@ -249,7 +245,7 @@ def bound_error(
     sampled: float,
     negligible: float,
 ) -> float:
-    """Return an upper bound of |curve - polynomial| over an interval, close to the least one."""
+    """Return an upper bound of ``|curve - polynomial|`` over an interval, close to the least one."""
 
     def difference(where: RealInterval) -> TaylorSeries:
         return taylor_subtract(curve(where), taylor_polynomial(polynomial, taylor_variable(where)))
@@ -304,8 +300,7 @@ def _evaluate_series(here: TaylorSeries, around: TaylorSeries, low: float, high:
     for k in range(count):
         coefficient = around[k] if k == count - 1 else here[k]
         total = interval_add(
-            total,
-            interval_multiply(coefficient, interval_power(away, (k, k)) if k else (1.0, 1.0)),
+            total, interval_multiply(coefficient, interval_power(away, (k, k)) if k else (1.0, 1.0))
         )
     return max(total[0], value[0]), min(total[1], value[1])
 

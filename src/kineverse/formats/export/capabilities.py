@@ -18,8 +18,7 @@ class FormatCapabilities:
     polynomial_degree: int = 1  # highest degree of the polynomials by which a joint may follow another
 
 
-_SHOWN = 6
-"""Number of unsupported features that an error message lists."""
+_SHOWN = 6  # number of unsupported features that an error message lists
 
 
 class UnsupportedError(FormatError):
@@ -33,7 +32,7 @@ class UnsupportedError(FormatError):
         options: tuple[str, str, str] = ("tolerance=0.001", "leave_out=(name, ...)", "without strict=True"),
     ) -> None:
         tolerance, leave_out, leave_out_all = options
-        remedies = ["Write a document (.kv.json), which says all of it"]
+        remedies = ["Write a document (.kv.json), which holds all of it"]
         if curved:
             remedies.append(f"have curves approximated with {tolerance}")
         if strict:
@@ -86,9 +85,9 @@ class UnsupportedFeatures:
     def remarks(self) -> list[str]:
         """Sentences about the parts of the model that are left out."""
         return [
-            f"that '{name}' {reason} is left out: {self.target} cannot say it, and its coordinates are free"
+            f"that '{name}' {reason} is left out: {self.target} cannot express it; its coordinates are free"
             if name in self._speeds
-            else f"'{name}' is left out, which {self.target} cannot say: it {reason}"
+            else f"'{name}' is left out, which {self.target} cannot express: it {reason}"
             for name, reason in self.left_out.items()
         ]
 
@@ -103,7 +102,7 @@ class UnsupportedFeatures:
         more = f"; and {count - _SHOWN} more" if count > _SHOWN else ""
         things = "one thing" if count == 1 else f"{count} things"
         raise UnsupportedError(
-            f"{file} is not written: {self.target} cannot say {things} of this model. "
+            f"{file} is not written: {self.target} cannot express {things} of this model. "
             f"{'; '.join(shown)}{more}.",
             self.curved,
             self.strict,

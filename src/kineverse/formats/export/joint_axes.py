@@ -93,8 +93,7 @@ def as_vector3(numbers: Matrix) -> Vector3:
     return x, y, z
 
 
-_SKEW_TOLERANCE = 1e-12
-"""Tolerance for the skew symmetry of an angular velocity matrix Ṙ Rᵀ."""
+_SKEW_TOLERANCE = 1e-12  # tolerance for the skew symmetry of an angular velocity matrix Ṙ Rᵀ
 
 
 def decompose_transform(
@@ -130,7 +129,6 @@ def decompose_transform(
 
 
 def _decompose_factor(factor: Expression, terms: TermGraph, offsets: bool) -> list[Matrix | AnyJointMotion]:
-    """Decompose one factor into constants and motions."""
     converter = TrigPolynomialConverter()
     try:
         if isinstance(factor, OneAxisTransform):
@@ -281,7 +279,6 @@ def _twist(matrix: list[list[TrigPolynomial]], index: int) -> Matrix | None:
 
 
 def _add_up(parts: Iterable[TrigPolynomial]) -> TrigPolynomial:
-    """Return the sum of trigonometric polynomials."""
     total = TrigPolynomial.constant(0.0)
     for part in parts:
         total = total + part
@@ -365,5 +362,4 @@ def _ellipse_motions(
 
 
 def _clean_pose(pose: Matrix) -> Matrix:
-    """Return a pose without the rounding errors of products."""
     return transform(round_exact(pose[:3, :3]), round_position(pose[:3, 3]))

@@ -86,7 +86,6 @@ def intersect_limits(found: Iterable[CoordinateLimit]) -> dict[Symbol, tuple[flo
 def _classify_constraint(
     name: str, expression: Expression, lower: float, upper: float
 ) -> CoordinateLimit | SumLimit | NonlinearLimit:
-    """Return a constraint as the simplest limit that it is."""
     line = Constraint(as_expression(lower), expression, as_expression(upper)).line
     if line is not None:
         return CoordinateLimit(name, expression.symbols[0], *line, lower, upper)

@@ -92,8 +92,7 @@ def check_rotation(link: LinkDescription, unsupported: UnsupportedFeatures) -> N
         )
 
 
-_STILL_TOLERANCE = 1e-9
-"""Largest distance [m] of a point from a plane in which it stays."""
+_STILL_TOLERANCE = 1e-9  # largest distance [m] of a point from a plane in which it stays
 
 
 def find_loop_joints(model: ModelView) -> Iterator[LoopJoint]:
@@ -399,10 +398,7 @@ class LinkTreeBuilder:
         return {k.removeprefix(start): v for k, v in record.dynamics if k.startswith(start)}
 
     def _carrier_links(
-        self,
-        chains: Mapping[str, MotionChain],
-        independent: set[Symbol],
-        links: list[LinkDescription],
+        self, chains: Mapping[str, MotionChain], independent: set[Symbol], links: list[LinkDescription]
     ) -> Iterator[LinkDescription]:
         """Yield links without body, for coordinates that are the position of no joint yet."""
         frames = TakenNames([*self.model.frames, WORLD])
@@ -445,7 +441,6 @@ class LinkTreeBuilder:
             )
 
     def _add_remarks(self) -> None:
-        """Add remarks on data and on names that are left out on request."""
         if self.model.data:
             names = list(self.model.data)
             more = f" and {len(names) - 4} more" if len(names) > 4 else ""
@@ -455,14 +450,12 @@ class LinkTreeBuilder:
 
 
 def _non_loop_articulations(model: ModelView) -> Iterator[tuple[str, Articulation]]:
-    """Yield the names and records of all articulations but loops."""
     for name, record in model.articulations.items():
         if record.kind not in LOOP_KINDS:
             yield name, record
 
 
 def _quaternion_coordinates(found: MotionChain) -> Iterator[Symbol]:
-    """Yield the coordinates of all quaternions in a motion chain."""
     for motion in found.motions:
         if isinstance(motion, QuaternionMotion):
             yield from motion.factor.symbols

@@ -12,8 +12,7 @@ from kineverse.formats.root_folder import find_root, is_common
 from kineverse.model.body import Mesh
 
 RemarkCallback = Callable[[str], None]
-_COMMON_PARTS = 2
-"""Parts of a common folder, such as ``/home``, above which a path is written as an absolute one."""
+_COMMON_PARTS = 2  # parts of a common folder, such as /home, above which a path is written as an absolute one
 
 
 def mesh_reference(mesh: Mesh, folder: Path, remark: RemarkCallback) -> str:

@@ -19,8 +19,7 @@ from kineverse.intervals.graph import Term
 Exponents: TypeAlias = tuple[tuple[int, float], ...]
 """Pairs of a variable and its exponent: a power n, or a frequency w; sorted."""
 
-NOISE = 1e-14
-"""Largest rounding error of a coefficient, in motions in [m] and [rad]."""
+NOISE = 1e-14  # largest rounding error of a coefficient, in motions in [m] and [rad]
 _MAX_TERMS = 300
 
 
@@ -169,7 +168,6 @@ class TrigPolynomialConverter:
         return self._converted[term.index]
 
     def _variable(self, term: Term) -> TrigPolynomial:
-        """Return the polynomial of a term that becomes a variable."""
         self.variables[term.index] = term
         return TrigPolynomial.variable(term.index)
 
@@ -225,7 +223,6 @@ def _multiply_exponents(a: Exponents, b: Exponents) -> Exponents:
 
 
 def _drop_noise(terms: Mapping[tuple[Exponents, Exponents], complex]) -> TrigPolynomial:
-    """Return a polynomial without the coefficients that are rounding errors."""
     if len(terms) > _MAX_TERMS:
         raise TooManyTermsError
     return TrigPolynomial({key: c for key, c in terms.items() if abs(c) > NOISE})

@@ -42,8 +42,7 @@ from .elements import ElementRemark, MjcfElement
 from .meshes import place_mesh
 from .mujoco_api import mujoco
 
-_VISIBLE_GROUPS = range(3)
-"""Geom groups that MuJoCo's viewers show by default."""
+_VISIBLE_GROUPS = range(3)  # geom groups that MuJoCo's viewers show by default
 
 _DEFAULT_COLOR = [0.5, 0.5, 0.5, 1.0]
 """Colour of a geom without one, which has the colour of its material instead."""
@@ -151,8 +150,7 @@ def mujoco_pose(position: Any, wxyz: Any) -> Pose:
     return poses.pose_from_quaternion((x, y, z), (a, b, c, w))
 
 
-FREE_JOINT = "free"
-"""Last part of the name of a mocap body's free joint, after the name of the body."""
+FREE_JOINT = "free"  # last part of the name of a mocap body's free joint, after the name of the body
 
 
 class MjcfBodies:
@@ -164,7 +162,7 @@ class MjcfBodies:
         shapes: MjcfShapes,
         source: str,
         remark: ElementRemark,
-        mend: NameFaultHandler,
+        on_recoverable_error: NameFaultHandler,
     ) -> None:
         self._model, self._source, self._shapes = compiled.model, source, shapes
         self._efforts, self._home = compiled.efforts, compiled.home
@@ -180,8 +178,8 @@ class MjcfBodies:
             for number, node in compiled.nodes(spec.joints).items()
         }
         self._site_nodes = compiled.nodes(spec.sites)
-        self._unique_frames = UniqueNames(mend, WORLD)
-        self._unique_joints = UniqueNames(mend)
+        self._unique_frames = UniqueNames(on_recoverable_error, WORLD)
+        self._unique_joints = UniqueNames(on_recoverable_error)
         self.body_names = self._name_bodies()
         self.joint_names = self._name_joints()
         joints: dict[int, list[MjcfJoint]] = {}
@@ -201,7 +199,6 @@ class MjcfBodies:
         return drop_empty_parts(m.site(site).name) in self._custom.ends and is_identity(pose)
 
     def _where(self, node: MjcfElement | None) -> str:
-        """Return the place of an element for messages."""
         return self._source if node is None else node.where
 
     def _name_bodies(self) -> list[str]:
@@ -328,7 +325,6 @@ class MjcfBodies:
         )
 
     def _home_position(self, number: int, kind: MjcfJointType, address: int) -> tuple[float, ...]:
-        """Return the coordinates of a joint at its home position."""
         m, engine = self._model, mujoco()
         qpos = m.qpos0 if self._home is None else self._home
         if kind in ("hinge", "slide"):
@@ -373,6 +369,5 @@ class MjcfBodies:
 
 
 def _vector(numbers: Any) -> Vector3:
-    """Return three numbers as a tuple."""
     x, y, z = map(float, numbers)
     return x, y, z

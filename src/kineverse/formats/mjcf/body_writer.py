@@ -32,8 +32,7 @@ from kineverse.model.body import (
 from kineverse.model.registry import find_service
 
 _HEADER, _TRIANGLE = 84, 50
-MAX_STL_FACES = 200_000
-"""Largest number of faces of an STL file in MuJoCo."""
+MAX_STL_FACES = 200_000  # largest number of faces of an STL file in MuJoCo
 
 
 class MeshFiles:
@@ -123,7 +122,6 @@ def _is_binary_stl(path: Path) -> bool:
 
 
 def _to_obj(vertices: np.ndarray, faces: np.ndarray) -> bytes:
-    """Return triangles as OBJ text with exact coordinates."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
     return ("\n".join(lines) + "\n").encode()
@@ -307,7 +305,6 @@ class MjcfBodyWriter:
         return self._materials[key]
 
     def _remark(self, text: str) -> None:
-        """Add a remark once."""
         if text not in self._remarks:
             self._remarks.append(text)
 

@@ -40,9 +40,9 @@ _CHECKED_ARRAYS = (
 class CompiledMjcf:
     """Document compiled by MuJoCo."""
 
-    spec: Any  # MjSpec
-    model: Any  # MjModel of the document; elements have the same numbers in both
-    prepared: PreprocessedMjcf  # preprocessed document
+    spec: Any  # MjSpec of the document
+    model: Any  # its MjModel, with the same numbers of elements
+    prepared: PreprocessedMjcf
     assets: dict[str, MeshAsset]  # meshes of files, by name
     left_out: dict[int, str]  # reasons why geoms are left out, by the number of the geom
     unknown_inertia: frozenset[int]  # numbers of the bodies whose inertia depends on missing files
@@ -165,5 +165,4 @@ def _limited(flag: Any, limits: Any) -> bool:
 
 
 def _largest(limits: Any) -> float:
-    """Return the largest magnitude in a range."""
     return max(abs(float(limits[0])), abs(float(limits[1])))

@@ -30,16 +30,20 @@ class MjcfConstraints:
     """Constraints of a compiled model: couplings, loop closures and tendons."""
 
     def __init__(
-        self, compiled: CompiledMjcf, bodies: MjcfBodies, remark: ElementRemark, mend: NameFaultHandler
+        self,
+        compiled: CompiledMjcf,
+        bodies: MjcfBodies,
+        remark: ElementRemark,
+        on_recoverable_error: NameFaultHandler,
     ) -> None:
         self._model, self._bodies, self._remark = compiled.model, bodies, remark
         model = compiled.model
         self._nodes = compiled.nodes(compiled.spec.equalities)
         self._tendon_nodes = compiled.nodes(compiled.spec.tendons)
         self._rest = compute_rest_poses(bodies.links)
-        names = UniqueNames(mend)
+        names = UniqueNames(on_recoverable_error)
         self._tendon_names = self._named(names, "tendon", model.ntendon, self._tendon_nodes)
-        self._names = self._named(UniqueNames(mend), "equality", model.neq, self._nodes)
+        self._names = self._named(UniqueNames(on_recoverable_error), "equality", model.neq, self._nodes)
         found = [self._tendon(number) for number in range(model.ntendon)]
         self.tendons = tuple(tendon for tendon in found if tendon is not None)
         self._known = {tendon.name for tendon in self.tendons}
@@ -60,7 +64,7 @@ class MjcfConstraints:
             elif kind == kinds.mjEQ_WELD:
                 closures += self._closure(number, "weld")
             else:
-                remark(self._nodes.get(number), "is left out: no constraint here says it.")
+                remark(self._nodes.get(number), "is left out: no constraint here expresses it.")
         self.couplings = tuple(couplings)
         loops = compiled.prepared.custom.loops
         self.closures = merge_loop_closures(tuple(closures), bodies.links, loops, remark)
@@ -85,7 +89,6 @@ class MjcfConstraints:
         return result
 
     def _where(self, node: MjcfElement | None) -> str:
-        """Return the place of an element for messages."""
         return "" if node is None else node.where
 
     def _joint_coupling(self, number: int) -> MjcfCoupling:
@@ -115,7 +118,6 @@ class MjcfConstraints:
         )
 
     def _quartic(self, number: int) -> Quartic:
-        """Return the coefficients of the polynomial of an equality."""
         a, b, c, d, e = self._model.eq_data[number][:5].tolist()
         return a, b, c, d, e
 

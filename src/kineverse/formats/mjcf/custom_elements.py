@@ -29,8 +29,7 @@ from .elements import ElementRemark, MjcfElement
 
 SPEED_PREFIX, LOOP_PREFIX = "kineverse:speed:", "kineverse:loop:"
 MASSLESS, ENDS = "kineverse:massless", "kineverse:ends"
-TUPLE_ATTRIBUTES = ("objtype", "objname", "prm")
-"""Attributes of an element of a tuple."""
+TUPLE_ATTRIBUTES = ("objtype", "objname", "prm")  # attributes of an element of a tuple
 
 
 @dataclass(frozen=True, slots=True)

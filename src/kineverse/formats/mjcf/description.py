@@ -18,8 +18,7 @@ Quartic: TypeAlias = tuple[float, float, float, float, float]
 
 _EMPTY_BODY = Body()
 
-WORLD = "world"
-"""Name of the root body."""
+WORLD = "world"  # name of the root body
 
 COORDINATE_SUFFIXES: dict[MjcfJointType, tuple[str, ...]] = {
     "hinge": (),

@@ -65,13 +65,18 @@ def read_tree(
     source: str,
     folder: str,
     root: str,
-    mend: Callable[[str, int, str], None] | None = None,
+    on_recoverable_error: Callable[[str, int, str], None] | None = None,
 ) -> MjcfElement:
     """Return the root element of a document, with includes replaced by the content of their files."""
 
     def parsed(data: str | bytes, source: str) -> Element:
         return parse_xml(
-            data, source, depth=MAX_ELEMENT_DEPTH, mend=None if mend is None else partial(mend, source)
+            data,
+            source,
+            depth=MAX_ELEMENT_DEPTH,
+            on_recoverable_error=None
+            if on_recoverable_error is None
+            else partial(on_recoverable_error, source),
         )
 
     top = parsed(data, source)
@@ -118,7 +123,6 @@ def find_below_root(node: MjcfElement, name: str, root: str, *places: str) -> Pa
 
 
 def _check_root(root: Element, source: str) -> None:
-    """Check that the root element is that of an MJCF."""
     tag, _, _, line = root
     if tag == "mujoco":
         return

@@ -19,8 +19,7 @@ from kineverse.symbols import position
 
 from .description import MjcfCoupling, MjcfJoint, Quartic
 
-_FIXED = "\0"
-"""Leader of joints that an equality fixes; not a valid name."""
+_FIXED = "\0"  # leader of joints that an equality fixes; not a valid name
 
 _HOME_TOLERANCE = 1e-6
 
@@ -114,15 +113,15 @@ LENGTH_KEY = "length"
 class Tendon(Operation, document_kind="Tendon"):
     """Tendon with a length over joints or along a path through frames.
 
-    L = Σ coef · q [m], where q are positions of articulations; or L = Σ |pₖ₊₁ - pₖ| / divisor [m] over the
-    origins p of frames, summed over the branches of pulleys. The length is the datum ``name/length``, and its
-    range the constraint of the same name.
+    L = Σ coef · q [m], where q are positions of articulations; or ``L = Σ |pₖ₊₁ - pₖ| / divisor`` [m] over
+    the origins p of frames, summed over the branches of pulleys. The length is the datum ``name/length``, and
+    its range the constraint of the same name.
     """
 
     name: str
     terms: tuple[tuple[str, float], ...] = ()  # pairs of articulation and factor
     paths: tuple[tuple[float, tuple[str, ...]], ...] = ()
-    lower: float | None = None  # limits of the length [m]; None for no limit
+    lower: float | None = None  # limit of the length [m]; None for none
     upper: float | None = None
     dynamics: tuple[tuple[str, float], ...] = ()
 
@@ -152,11 +151,11 @@ class TendonCoupling(Operation, document_kind="TendonCoupling"):
     """Equality between the lengths of two tendons: L - L0 = Σ aₖ (M - M0)ᵏ."""
 
     name: str  # name of the constraint
-    tendon: str  # tendons of the lengths L
-    leader: str | None  # M; L - L0 = a0 without leader
-    coefficients: Quartic  # coefficients a0 to a4
-    rest: float = 0.0  # L0 and M0 [m]
-    leader_rest: float = 0.0
+    tendon: str  # tendon of the length L
+    leader: str | None  # tendon of the length M; L - L0 = a0 without one
+    coefficients: Quartic  # a0 to a4
+    rest: float = 0.0  # L0 [m]
+    leader_rest: float = 0.0  # M0 [m]
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the constraint."""

@@ -244,9 +244,7 @@ def compile_plugin_meshes(jobs: list[tuple[str, list[tuple[str, str]]]]) -> list
         # MuJoCo takes the principal axes of such a mesh for its own, other than those of all other meshes.
         spec = engine.MjSpec()
         spec.add_mesh(
-            name="m",
-            uservert=model.mesh_vert.ravel().tolist(),
-            userface=model.mesh_face.ravel().tolist(),
+            name="m", uservert=model.mesh_vert.ravel().tolist(), userface=model.mesh_face.ravel().tolist()
         )
         spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_MESH, meshname="m")
         principal = spec.compile()

@@ -120,7 +120,6 @@ def find_blamed_mesh(error: str, root: Tag) -> str | None:
 
 
 def _assets(root: Tag) -> list[Tag]:
-    """Return the asset elements of a document."""
     return [tag for part in root.inside if part.name == "asset" for tag in part.inside]
 
 

@@ -157,7 +157,6 @@ def mjcf_operations(scene: MjcfScene, prefix: str | None = None) -> Iterator[Ope
 
 
 def _link(link: MjcfLink, model_name: NameMap, followers: FollowerJoints) -> Iterator[Operation]:
-    """Yield the operations of the joints of a body in series."""
     child, parent, parent_T_body = model_name(link.name), model_name(link.parent), link.pose
     for joint in link.joints:
         last = joint is link.joints[-1] and not any(joint.anchor)
@@ -246,7 +245,6 @@ def _motion_from_reference(joint: MjcfJoint) -> Pose:
 
 
 def _tendon_coupling(coupling: MjcfCoupling, model_name: NameMap) -> TendonCoupling:
-    """Return the operation of a tendon equality."""
     leader = None if coupling.leader is None else model_name(coupling.leader)
     return TendonCoupling(
         name=model_name(coupling.name),

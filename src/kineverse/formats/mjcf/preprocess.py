@@ -21,8 +21,7 @@ from kineverse.formats.xml_values import LARGEST
 from .custom_elements import CustomElements, read_custom_elements
 from .elements import MjcfElement, find_below_root, read_tree, serialize_elements
 
-MAX_ELEMENTS = 30_000
-"""Largest number of elements of a document after <replicate> and <attach>."""
+MAX_ELEMENTS = 30_000  # largest number of elements of a document after <replicate> and <attach>
 
 BOX_MESH = {
     "vertex": "-1 -2 -3  1 -2 -3  -1 2 -3  1 2 -3  -1 -2 3  1 -2 3  -1 2 3  1 2 3",
@@ -179,7 +178,6 @@ def _plugin_instances(root: MjcfElement) -> dict[str, MeshReference]:
 
 
 def _plugin_reference(plugin: str, owner: MjcfElement) -> MeshReference:
-    """Return a plugin with the settings in an element."""
     settings = [(c.attributes.get("key", ""), c.attributes.get("value", "")) for c in owner.children]
     return MeshReference("", plugin, tuple(settings))
 
@@ -253,15 +251,14 @@ def _count(node: MjcfElement) -> int:
     return product
 
 
-MAX_ATTACH_DEPTH = 20
-"""Deepest nesting of attached models."""
+MAX_ATTACH_DEPTH = 20  # deepest nesting of attached models
 
 
 @dataclass(slots=True)
 class PreprocessedMjcf:
     """Input of MuJoCo's parser."""
 
-    text: str = ""  # text of the document
+    text: str = ""
     models: dict[str, bytes] = field(default_factory=dict)
     passive_text: str = ""  # same without actuators and keys, with all elements on the same lines
     passive_models: dict[str, bytes] = field(default_factory=dict)
@@ -292,10 +289,10 @@ class MjcfPreprocessor:
         top: str,
         root: str,
         remark: Callable[[MjcfElement | None, str], None],
-        mend: Callable[[str, int, str], None] | None,
+        on_recoverable_error: Callable[[str, int, str], None] | None,
     ) -> None:
         self._top, self._root = top, root
-        self._remark, self._mend = remark, mend
+        self._remark, self._on_recoverable_error = remark, on_recoverable_error
         self._models: dict[Path, _AttachedModel] = {}
         self._open_files: list[Path] = []
         self.prepared = PreprocessedMjcf()
@@ -328,8 +325,7 @@ class MjcfPreprocessor:
         return text, passive_text, _AttachedModel("", root.attributes.get("model", ""), size)
 
     def _read(self, data: str | bytes, source: str, folder: str) -> MjcfElement:
-        """Return the element tree of a document."""
-        return read_tree(data, source, folder, self._root, self._mend)
+        return read_tree(data, source, folder, self._root, self._on_recoverable_error)
 
     def _attached_model(self, node: MjcfElement, folder: str) -> _AttachedModel:
         """Return the model that an element attaches, preprocessed once."""

@@ -67,13 +67,13 @@ def parse_mjcf(
         If MuJoCo is not installed.
     """
     mjcf_warnings = _MjcfWarnings(source, strict)
-    add, mend = mjcf_warnings.add, mjcf_warnings.mend
+    add, repair = mjcf_warnings.add, mjcf_warnings.repair
     root_folder = find_text_root(folder, root)
     preprocessor = MjcfPreprocessor(folder, root_folder, add, None if strict else mjcf_warnings.xml_fault)
     compiled = compile_document(preprocessor.run(text, source), source, folder, root_folder, add)
     shapes = MjcfShapes(compiled, folder, root_folder, add)
-    bodies = MjcfBodies(compiled, shapes, source, add, mend)
-    constraints = MjcfConstraints(compiled, bodies, add, mend)
+    bodies = MjcfBodies(compiled, shapes, source, add, repair)
+    constraints = MjcfConstraints(compiled, bodies, add, repair)
     return MjcfScene(
         bodies.links,
         bodies.sites,
@@ -102,7 +102,7 @@ class _MjcfWarnings:
             self.texts[text] = None
             warn([f"{self._source}, {text}"])
 
-    def mend(self, where: str, problem: str, replacement: str) -> None:
+    def repair(self, where: str, problem: str, replacement: str) -> None:
         """Add a warning about a mistake, and its replacement."""
         if self._strict:
             raise FormatError(f"{where}: {problem}.")

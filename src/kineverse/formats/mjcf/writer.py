@@ -34,14 +34,7 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 
 from .body_writer import MjcfBodyWriter, add_pose
-from .custom_elements import (
-    ENDS,
-    MASSLESS,
-    add_loop,
-    add_names,
-    add_speeds,
-    format_range,
-)
+from .custom_elements import ENDS, MASSLESS, add_loop, add_names, add_speeds, format_range
 from .mujoco_api import find_blamed_mesh, find_load_error
 
 MJCF_CAPABILITIES = FormatCapabilities(
@@ -277,7 +270,6 @@ class MjcfWriter:
         return float(np.polynomial.polynomial.polyval(x, joint.coefficients))
 
     def _equalities(self) -> Tag:
-        """Return the equalities of dependent joints and of loops."""
         equality, names = Tag("equality"), TakenNames()
         for joint in self._description.joints:
             if not joint.is_independent:
@@ -304,7 +296,6 @@ class MjcfWriter:
         return equality
 
     def _tendons(self) -> Tag:
-        """Return the limits of sums as fixed tendons."""
         tendon = Tag("tendon")
         for item in self._description.sum_limits:
             fixed = tendon.add("fixed", name=item.name)

@@ -61,7 +61,7 @@ def read_sdf_body(link: PoseNode) -> Body:
                 elif part[0] == "inertial" and inertia is None:
                     inertia = _inertia(part, link)
             except ElementError as mistake:
-                document.remarks.mend(mistake, f"the {label(part)} is left out", link.element)
+                document.remarks.repair(mistake, f"the {label(part)} is left out", link.element)
     return Body(tuple(visuals), tuple(collisions), inertia)
 
 
@@ -114,7 +114,7 @@ def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | N
     try:
         scale = read_child_vector(form, "scale", _UNSCALED)
     except ElementError as mistake:
-        remarks.mend(mistake, "it is not scaled", link.element)
+        remarks.repair(mistake, "it is not scaled", link.element)
         scale = _UNSCALED
     return Mesh(uri, scale, folder, root)
 
@@ -150,7 +150,7 @@ def _color(visual: Element, link: PoseNode) -> Rgba | None:
         opaque = 1.0 - read_child_number(visual, "transparency", 0.0)
     except (ValueError, ElementError) as error:
         mistake = error if isinstance(error, ElementError) else ElementError(part, f"{error}.")
-        link.document.remarks.mend(mistake, "it is no colour", link.element)
+        link.document.remarks.repair(mistake, "it is no colour", link.element)
         return None
     return red, green, blue, alpha * min(max(opaque, 0.0), 1.0)
 

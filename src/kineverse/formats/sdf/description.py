@@ -13,15 +13,7 @@ from kineverse.formats.mimic import MimicRelation
 from kineverse.model.body import Body, Pose, Vector3
 
 SdfJointType: TypeAlias = Literal[
-    "fixed",
-    "revolute",
-    "continuous",
-    "prismatic",
-    "screw",
-    "universal",
-    "revolute2",
-    "ball",
-    "gearbox",
+    "fixed", "revolute", "continuous", "prismatic", "screw", "universal", "revolute2", "ball", "gearbox"
 ]
 
 AXIS_COUNT: dict[SdfJointType, int] = {
@@ -37,8 +29,7 @@ AXIS_COUNT: dict[SdfJointType, int] = {
 }
 """Number of axes of a joint of each type."""
 
-WORLD = "world"
-"""Name of the world in place of a link; reserved in SDF."""
+WORLD = "world"  # name of the world in place of a link; reserved in SDF
 
 _IDENTITY = Pose()
 _EMPTY_BODY = Body()

@@ -95,7 +95,6 @@ def find_included(uri: str, folder: str, root: str) -> Path:
 
 
 def _is_model(path: Path) -> bool:
-    """Return True for the folder of a model and for a description file."""
     if os.path.isdir(path):  # False rather than an error for a name that is too long
         return (path / "model.config").is_file() or (path / "model.sdf").is_file()
     return path.suffix in _FILES and os.path.isfile(path)
@@ -120,7 +119,6 @@ def _model_file(folder: Path) -> Path:
 
 
 def _listed_files(root: Element) -> Iterator[tuple[SdfVersion, str]]:
-    """Yield version and file name of all descriptions that a manifest lists."""
     for element in root[2]:
         if element[0] == "sdf" and read_text(element):
             match = re.fullmatch(r"1\.(\d{1,3})", element[1].get("version", "1.0").strip())

@@ -96,7 +96,7 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
             mistake = ElementError(
                 element, f"is {kind} but has no <{tag}>; by default both axes are z, which is no such joint."
             )
-            remarks.mend(mistake, "it is z")
+            remarks.repair(mistake, "it is z")
             return SdfAxis(suffix=suffix)
         remarks.add(element, f"has no <{tag}>; it is z, the specification's default.")
         return SdfAxis(suffix=suffix)
@@ -112,7 +112,7 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         mistake = ElementError(
             limit, f"has lower {lower!r} above upper {upper!r}: no position would be valid."
         )
-        remarks.mend(mistake, "the joint is not limited", element)
+        remarks.repair(mistake, "the joint is not limited", element)
         lower = upper = None
     values = [] if effort is None or effort < 0.0 else [("effort", effort)]
     if dynamics is not None:
@@ -137,7 +137,7 @@ def _magnitude(limit: Element, key: str, node: PoseNode) -> float | None:
     try:
         return read_child_limit(limit, key)
     except ElementError as mistake:
-        node.document.remarks.mend(mistake, "it bounds nothing", node.element)
+        node.document.remarks.repair(mistake, "it bounds nothing", node.element)
         return None
 
 
@@ -146,12 +146,11 @@ def _dynamics_value(dynamics: Element, key: str, node: PoseNode) -> float:
     try:
         return read_child_number(dynamics, key, 0.0)
     except ElementError as mistake:
-        node.document.remarks.mend(mistake, "0 is taken", node.element)
+        node.document.remarks.repair(mistake, "0 is taken", node.element)
         return 0.0
 
 
 def _direction(node: PoseNode, axis: Element) -> Vector3:
-    """Return the direction of an axis in the joint's frame."""
     xyz, document = read_axis_direction(axis), node.document
     part = find_child(axis, "xyz")
     reference = None
@@ -178,9 +177,9 @@ def _mimic(node: PoseNode, axis: Element) -> MimicRelation[str] | None:
         return None
     name, which = mimic[1].get("joint", ""), mimic[1].get("axis", "axis")
     if not name:
-        raise ElementError(mimic, "does not say which joint.")
+        raise ElementError(mimic, "does not name a joint.")
     if which not in ("axis", "axis2"):
-        raise ElementError(mimic, f"says axis={quote(which)}; axis and axis2 are the ones there are.")
+        raise ElementError(mimic, f"says axis={quote(which)}; it has to be axis or axis2.")
     leader = node.scope.find(name, mimic, node.element)
     if leader.kind != "joint":
         raise ElementError(mimic, f"names {quote(name)}, which is a {leader.kind} and no joint.")
@@ -238,9 +237,9 @@ def resolve_gearboxes(
         if not read_child_text(node.element, "gearbox_reference_body"):
             with node.document.locate_errors(node.element):
                 mistake = ElementError(
-                    node.element, "has no <gearbox_reference_body>: nothing says what it turns against."
+                    node.element, "has no <gearbox_reference_body>: it is undefined what it turns against."
                 )
-                node.document.remarks.mend(mistake, "it is left out")
+                node.document.remarks.repair(mistake, "it is left out")
             result[index] = None
             continue
         body = find_reference_body(node, attachments)
@@ -376,6 +375,5 @@ def reverse_joint(joint: SdfJoint) -> SdfJoint:
 
 
 def _negate_axis(axis: SdfAxis) -> SdfAxis:
-    """Return an axis of the opposite direction."""
     x, y, z = axis.xyz
     return replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z))

@@ -14,18 +14,8 @@ from kineverse.errors import FormatError, suggest
 from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import NOWHERE
-from kineverse.formats.xml_reader import (
-    TEXT,
-    Element,
-    ElementError,
-    find_child,
-    label,
-    quote,
-)
-from kineverse.formats.xml_values import (
-    read_element_pose,
-    read_text,
-)
+from kineverse.formats.xml_reader import TEXT, Element, ElementError, find_child, label, quote
+from kineverse.formats.xml_values import read_element_pose, read_text
 from kineverse.model.body import Pose
 
 NodeKind: TypeAlias = Literal["world", "model", "link", "joint", "frame"]
@@ -214,7 +204,7 @@ def find_early(name: str, element: Element, scope: SdfScope, owner: Element) -> 
     if document.version < (1, 7) and not scope.has(name):
         with document.locate_errors(owner):
             mistake = ElementError(element, f"refers to {quote(name)}, which does not exist in this scope.")
-            document.remarks.mend(mistake, "it is passed over", owner)
+            document.remarks.repair(mistake, "it is passed over", owner)
         return None
     return scope.find(name, element, owner)
 
@@ -271,7 +261,6 @@ def find_joint_end(joint: PoseNode, role: str) -> PoseNode:
 
 
 def _attach(node: PoseNode) -> None:
-    """Set the node to which a joint or a frame is attached."""
     if node.kind == "joint":
         node.attached_to = find_joint_end(node, "child")
     elif node.kind == "frame" and node.is_named_frame:
@@ -363,8 +352,7 @@ def pose_in_model(model: PoseNode, frame: PoseNode) -> Pose:
     return pose
 
 
-_MAX_PATH = 64
-"""Steps of the path between two nodes up to which their relative pose is composed along it."""
+_MAX_PATH = 64  # steps of the path between two nodes up to which their relative pose is composed along it
 
 
 def pose_between(a: PoseNode, b: PoseNode) -> Pose:

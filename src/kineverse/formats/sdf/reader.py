@@ -38,8 +38,7 @@ from .pose_graph import (
 )
 
 _MAX_DEPTH = 100
-MAX_INCLUDED = 100_000
-"""Largest number of links, joints, frames and models with those of included files."""
+MAX_INCLUDED = 100_000  # largest number of links, joints, frames and models with those of included files
 
 _OLDEST, _LATEST = (1, 2), (1, 12)
 _IGNORED = ("actor", "population", "road", "plugin")
@@ -75,7 +74,9 @@ def open_document(
     """Return a document and its root element."""
     reader_warnings = ReaderWarnings(source, remarks, strict)
     try:
-        root = parse_xml(data, source, texts=True, mend=None if strict else reader_warnings.fault)
+        root = parse_xml(
+            data, source, texts=True, on_recoverable_error=None if strict else reader_warnings.fault
+        )
     except FormatError as error:
         raise FormatError(f"{error}{_template_hint(data)}") from None
     document = SdfDocument(source, folder, _LATEST, reader_warnings, root_folder)
@@ -87,7 +88,7 @@ def open_document(
     version = root[1].get("version", "")
     match = re.fullmatch(r"(\d{1,3})\.(\d{1,3})(\.\d{1,3})?", version.strip())
     if match is None:
-        document.refuse(root, 'does not say its version, as <sdf version="1.10"> does.')
+        document.refuse(root, 'has no version, such as <sdf version="1.10"> does.')
     document.version = int(match[1]), int(match[2])
     if not _OLDEST <= document.version <= _LATEST:
         document.refuse(root, f"version={quote(version)} is not one that is read; 1.2 to 1.12 are.")
@@ -277,7 +278,7 @@ class SdfModelReader:
         if merge and scope.model.kind == "world" and any(part[0] == "link" for part in models[0][2]):
             with document.locate_errors(include):
                 mistake = ElementError(include, "has merge, and a world has no links as that model has.")
-                document.remarks.mend(mistake, "it is a model of its own")
+                document.remarks.repair(mistake, "it is a model of its own")
             merge = False
         if merge:
             proxy = self._add("frame", models[0], scope, f"_merged__{name}__model__")
@@ -390,7 +391,6 @@ def _scene(
     document: SdfDocument,
     remarks: list[str],
 ) -> SdfScene:
-    """Return the description of a resolved pose graph."""
     links = tuple(_link(node) for node in graph.by_kind("link"))
     resolved = [read_sdf_joint(node, attachments) for node in graph.by_kind("joint")]
     resolved = resolve_gearboxes(resolved, attachments)

@@ -1,4 +1,4 @@
-"""SRDF, the Semantic Robot Description Format of MoveIt, which stands beside a URDF."""
+"""SRDF, the Semantic Robot Description Format of MoveIt, which accompanies a URDF."""
 
 from typing import TYPE_CHECKING
 

@@ -72,7 +72,7 @@ def parse_srdf(
     """
     check_prefix(prefix)
     remarks = ReaderWarnings(source, strict=strict)
-    root = parse_xml(text, source, mend=None if strict else remarks.fault)
+    root = parse_xml(text, source, on_recoverable_error=None if strict else remarks.fault)
     try:
         _check_root(root)
         document = _SemanticDocument(root, ModelNames(model, prefix or ""), remarks)
@@ -87,9 +87,7 @@ def _check_root(root: Element) -> None:
         raise ElementError(root, "is not <robot>, the root element of an SRDF.")
     tags = {part[0] for part in root[2]}
     if _URDF_ONLY & tags and not {"group", "disable_collisions"} & tags:
-        raise ElementError(
-            root, "is a URDF: it has links and joints. Load it as a model, and read the SRDF beside it."
-        )
+        raise ElementError(root, "is a URDF: it has links and joints. Load it as a model, and read its SRDF.")
 
 
 class _SemanticDocument:
@@ -137,7 +135,7 @@ class _SemanticDocument:
                 child = self._names.link(element, "child_link")
                 found[name] = VirtualJoint(name, kind, required(element, "parent_frame"), child)
             except ElementError as mistake:
-                self._remarks.mend(mistake, PASSED_OVER)
+                self._remarks.repair(mistake, PASSED_OVER)
         return found
 
     def _passive_joints(self) -> tuple[str, ...]:
@@ -146,7 +144,7 @@ class _SemanticDocument:
             try:
                 found[self._names.joint(element)] = None
             except ElementError as mistake:
-                self._remarks.mend(mistake, PASSED_OVER)
+                self._remarks.repair(mistake, PASSED_OVER)
         return tuple(found)
 
     def _groups(self, virtual: dict[str, VirtualJoint], passive: tuple[str, ...]) -> dict[str, SrdfGroup]:
@@ -155,7 +153,7 @@ class _SemanticDocument:
             try:
                 add_unique(elements, element, self._remarks)
             except ElementError as mistake:
-                self._remarks.mend(mistake, PASSED_OVER)
+                self._remarks.repair(mistake, PASSED_OVER)
         return GroupResolver(elements, self._names, virtual, self._remarks).resolve(passive)
 
     def _rules(self) -> tuple[CollisionRule, ...]:
@@ -167,7 +165,7 @@ class _SemanticDocument:
                 link = self._names.link(element, "link")
                 rules.append((link, self._names.links_pattern(), False, "off by default"))
             except ElementError as mistake:
-                self._remarks.mend(mistake, PASSED_OVER)
+                self._remarks.repair(mistake, PASSED_OVER)
         for tag, check in (("enable_collisions", True), ("disable_collisions", False)):
             for element in self._elements(tag):
                 try:
@@ -178,7 +176,7 @@ class _SemanticDocument:
                 except ElementError as mistake:
                     # A link that this variant of the robot lacks may have a rule with each of the others.
                     if mistake.message not in warned:
-                        self._remarks.mend(mistake, "all rules like this are passed over")
+                        self._remarks.repair(mistake, "all rules like this are passed over")
                     warned.add(mistake.message)
         return tuple(rules)
 
@@ -202,7 +200,7 @@ class _SemanticDocument:
                     )
                 found[name] = EndEffector(name, group, parent, above)
             except ElementError as mistake:
-                self._remarks.mend(mistake, PASSED_OVER)
+                self._remarks.repair(mistake, PASSED_OVER)
         return found
 
     def _states(self, groups: dict[str, SrdfGroup]) -> dict[str, dict[str, float]]:
@@ -218,7 +216,7 @@ class _SemanticDocument:
                 if name in own:
                     raise ElementError(element, f"is a state of the group {quote(group)} already.")
             except ElementError as mistake:
-                self._remarks.mend(mistake, PASSED_OVER)
+                self._remarks.repair(mistake, PASSED_OVER)
                 continue
             own[name] = values = self._values(element)
             together = states.setdefault(name, {})
@@ -244,7 +242,7 @@ class _SemanticDocument:
                 joint = self._names.joint(part)
                 values.update(self._joint_values(part, joint))
             except ElementError as mistake:
-                self._remarks.mend(mistake, PASSED_OVER, state)
+                self._remarks.repair(mistake, PASSED_OVER, state)
         return values
 
     def _joint_values(self, part: Element, joint: str) -> dict[str, float]:
@@ -337,7 +335,7 @@ class GroupResolver:
                 inner = optional(part, "name") if part[0] == "group" else ""
                 if inner in open_names:
                     mistake = ElementError(part, "contains itself.")
-                    self._remarks.mend(mistake, PASSED_OVER, self._elements[name])
+                    self._remarks.repair(mistake, PASSED_OVER, self._elements[name])
                 elif inner in self._elements and inner not in done:
                     stack.append((inner, iter(self._elements[inner][2])))
                     open_names.add(inner)
@@ -349,7 +347,7 @@ class GroupResolver:
             try:
                 self._add(members, part, group)
             except ElementError as mistake:
-                self._remarks.mend(mistake, PASSED_OVER, group)
+                self._remarks.repair(mistake, PASSED_OVER, group)
         return members
 
     def _add(self, members: _Members, part: Element, group: Element) -> None:
@@ -404,5 +402,5 @@ def add_unique(elements: dict[str, Element], element: Element, remarks: ReaderWa
     if first is element:
         return True
     mistake = ElementError(element, f"has the name of {label(first)} of line {first[3]} again.")
-    remarks.mend(mistake, "the first one counts")
+    remarks.repair(mistake, "the first one counts")
     return False

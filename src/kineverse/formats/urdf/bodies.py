@@ -58,7 +58,7 @@ class UrdfMaterials:
                 f"is {_format_appearance(appearance)} here and {_format_appearance(earlier)} before; "
                 "give the two different names.",
             )
-            self._remarks.mend(mistake, "the first is taken")
+            self._remarks.repair(mistake, "the first is taken")
 
     def appearance(self, material: Element, link: Element) -> Appearance | None:
         """Return the appearance of a visual's ``<material>``; None if it is not defined yet."""
@@ -98,14 +98,13 @@ class UrdfMaterials:
         try:
             red, green, blue, alpha = parse_numbers(" ".join(text.split()[:4]), 4)
         except ValueError:
-            self._remarks.mend(mistake, "it is no colour", owner)
+            self._remarks.repair(mistake, "it is no colour", owner)
             return (None, file)
-        self._remarks.mend(mistake, "the first four are taken", owner)
+        self._remarks.repair(mistake, "the first four are taken", owner)
         return ((red, green, blue, alpha), file)
 
 
 def _format_appearance(appearance: Appearance) -> str:
-    """Return an appearance as text for messages."""
     color, texture = appearance
     words = [] if color is None else ["rgba " + " ".join(f"{part:g}" for part in color)]
     return " with ".join([*words, f"texture {quote(texture)}"] if texture else words)
@@ -194,7 +193,7 @@ class UrdfLinkReader:
     def _geometry(self, geometry: Element | None, shape: Element, link: Element) -> Geometry | None:
         """Return the geometry of a shape; None, with a remark, if it is missing or unknown."""
         if geometry is None or not geometry[2]:
-            self._remarks.add(geometry or shape, "says no shape and is left out.", link)
+            self._remarks.add(geometry or shape, "has no shape and is left out.", link)
             return None
         form = geometry[2][0]
         tag = form[0]

@@ -71,7 +71,7 @@ def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderW
     limit, safety, mimic, dynamics = map(parts.get, ("limit", "safety_controller", "mimic", "dynamics"))
     if mimic is not None and not has_one_dof:
         mistake = ElementError(mimic, f"cannot drive a {kind} joint: only a joint of one DoF can mimic.")
-        remarks.mend(mistake, "it moves by itself", element)
+        remarks.repair(mistake, "it moves by itself", element)
         mimic = None
     limits = _limits(limit, kind, element, version, remarks)
     controller = read_or_default(lambda: _safety(safety, limits), None, "it is left out", remarks, element)
@@ -119,7 +119,7 @@ def _kind(element: Element, remarks: ReaderWarnings) -> UrdfJointType:
         )
         if kind not in DOF_BY_TYPE:
             raise mistake
-        remarks.mend(mistake, "MuJoCo knows it as a ball joint, which it is here")
+        remarks.repair(mistake, "MuJoCo knows it as a ball joint, which it is here")
     return kind
 
 
@@ -141,7 +141,7 @@ def _link(element: Element, parts: dict[str, Element], role: str) -> str:
         raise ElementError(element, f'has no <{role} link="..."/>; the specification requires it.')
     link = part[1].get("link")
     if not link:
-        raise ElementError(part, "does not say which link.")
+        raise ElementError(part, "does not name a link.")
     return link
 
 
@@ -157,7 +157,7 @@ def _axis(axis: Element | None, joint: Element, remarks: ReaderWarnings, taken: 
         mistake = ElementError(
             axis, f'xyz="{abbreviate(axis[1]["xyz"])}" has length zero: nothing to move along or about.'
         )
-        remarks.mend(mistake, taken, joint)
+        remarks.repair(mistake, taken, joint)
         return None
     if abs(length - 1.0) > 1e-3:
         remarks.add(axis, f"has length {length:g}; only its direction is used.", joint)
@@ -180,7 +180,7 @@ def _limits(
                 '<limit lower="..." upper="..." effort="..." velocity="..."/>'
                 + (', or type="continuous" for a joint without bounds.' if kind == "revolute" else "."),
             )
-            remarks.mend(mistake, "it has no limits")
+            remarks.repair(mistake, "it has no limits")
         return UNLIMITED
     newer = version >= (1, 2)
     lower = upper = None
@@ -218,7 +218,7 @@ def _magnitude(
         return None
     if newer and value < 0.0:
         mistake = ElementError(limit, f"has {key}={value!r}; URDF 1.2 refuses negative magnitudes.")
-        remarks.mend(mistake, "it bounds nothing", joint)
+        remarks.repair(mistake, "it bounds nothing", joint)
         return None
     if key == "velocity" and not newer and value <= 0.0:
         remarks.add(limit, f"has velocity {value:g}, which is taken as no bound at all.", joint)
@@ -243,7 +243,7 @@ def _range(
         for key in ("lower", "upper"):
             if key not in attributes:
                 mistake = ElementError(limit, f"has no {key}; the specification requires it.")
-                remarks.mend(mistake, "the joint is not limited", joint)
+                remarks.repair(mistake, "the joint is not limited", joint)
                 return None, None
     elif "lower" not in attributes and "upper" not in attributes:
         remarks.add(
@@ -262,7 +262,7 @@ def _range(
             limit, f"has lower={lower!r} and upper={upper!r}: all positions would be beyond {LARGEST:g}."
         )
     if invalid is not None:
-        remarks.mend(invalid, "the joint is not limited", joint)
+        remarks.repair(invalid, "the joint is not limited", joint)
         return None, None
     return (lower if lower > -math.inf else None), (upper if upper < math.inf else None)
 
@@ -314,7 +314,7 @@ def _mimic(mimic: Element) -> UrdfMimic:
     """Return the joint that is followed, by its name in the file, and the factors."""
     joint = mimic[1].get("joint")
     if not joint:
-        raise ElementError(mimic, "does not say which joint.")
+        raise ElementError(mimic, "does not name a joint.")
     return UrdfMimic(
         joint, read_attribute_number(mimic, "multiplier", 1.0), read_attribute_number(mimic, "offset", 0.0)
     )

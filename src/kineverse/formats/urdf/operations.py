@@ -105,7 +105,6 @@ def urdf_operations(
 def _joint_operations(
     joint: UrdfJoint, frame_name: Callable[[str], str], joint_name: Callable[[str], str]
 ) -> Iterator[Operation]:
-    """Yield the operations of a joint and of its soft limits."""
     name = joint_name(joint.name)
     common: dict[str, Any] = {
         "name": name,

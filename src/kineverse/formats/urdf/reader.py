@@ -81,7 +81,9 @@ def parse_urdf(
     """
     remarks = ReaderWarnings(source, strict=strict)
     document = _Document(folder, find_text_root(folder, root), remarks)
-    top = parse_xml(text, source, _EXTENSIONS, document.begin, mend=None if strict else remarks.fault)
+    top = parse_xml(
+        text, source, _EXTENSIONS, document.begin, on_recoverable_error=None if strict else remarks.fault
+    )
     hint = document.finish(top)
     joints = keep_one_parent(list(document.joints.values()), remarks)
     links = tuple(document.links.values())
@@ -133,7 +135,6 @@ class _Document:
         return hint
 
     def _read_element(self, element: Element) -> None:
-        """Read a child of the root element."""
         tag = element[0]
         try:
             if tag in ("link", "joint"):
@@ -160,13 +161,12 @@ class _Document:
         mistake = ElementError(
             element, f"has the name of the joint on line {other.line} again; names are unique."
         )
-        self.remarks.mend(mistake, f'the fixed one is called "{fixed}"')
+        self.remarks.repair(mistake, f'the fixed one is called "{fixed}"')
         if other.kind == "fixed" and joint.kind != "fixed":
             self.joints[name], joint = joint, other
         self.joints[fixed] = replace(joint, name=fixed)
 
     def _error(self, mistake: ElementError, owner: Element) -> FormatError:
-        """Return a mistake as an error that names the enclosing link or joint."""
         part = "" if mistake.element is owner else f"{label(mistake.element)} "
         where = f"{self.remarks.source}, line {mistake.element[3]}, {label(owner)}"
         return FormatError(f"{where}: {part}{mistake.message}")
@@ -188,10 +188,10 @@ def _version(root: Element, remarks: ReaderWarnings) -> tuple[int, int]:
         mistake = ElementError(root, f"is not <robot>, the root element of a URDF.{guess}")
         if root[0].lower() != "robot":
             raise mistake
-        remarks.mend(mistake, "it is taken for that")
+        remarks.repair(mistake, "it is taken for that")
     if "name" not in root[1]:
         mistake = ElementError(root, 'has no name; the specification requires <robot name="...">.')
-        remarks.mend(mistake, "it is called nothing")
+        remarks.repair(mistake, "it is called nothing")
     text = root[1].get("version", "1.0")
     if text in _VERSIONS:
         return _VERSIONS[text]
@@ -203,7 +203,7 @@ def _version(root: Element, remarks: ReaderWarnings) -> tuple[int, int]:
     except ValueError:
         latest = False
     assumed = "1.2" if latest else "1.0"
-    remarks.mend(mistake, f"{assumed} is taken")
+    remarks.repair(mistake, f"{assumed} is taken")
     return _VERSIONS[assumed]
 
 
@@ -221,7 +221,7 @@ def _warn_unknown_elements(
             mistake = ElementError(element, f"is xacro that was not expanded. {XACRO_HINT}")
             if not has_joints:
                 raise mistake
-            remarks.mend(mistake, "it is passed over, and what it would add is missing")
+            remarks.repair(mistake, "it is passed over, and what it would add is missing")
     suspects = [e for e in unknown if e[0].lower().endswith(("link", "joint")) and not e[0].startswith(xacro)]
     for element in suspects:
         remarks.add(element, "is ignored: URDF does not know it.")
@@ -232,14 +232,13 @@ def _warn_unknown_elements(
 
 
 def _check_expanded(element: Element, xacro: str, remarks: ReaderWarnings) -> None:
-    """Warn of xacro inside of an element."""
     if "${" in element[1].get("name", ""):
         mistake = ElementError(element, f"has a name that xacro was to expand. {XACRO_HINT}")
-        remarks.mend(mistake, "it is taken as it is")
+        remarks.repair(mistake, "it is taken as it is")
     for part in element[2]:
         if part[0].startswith(xacro):
             mistake = ElementError(part, f"is xacro that was not expanded. {XACRO_HINT}")
-            remarks.mend(mistake, "it is passed over, and what it would add is missing", element)
+            remarks.repair(mistake, "it is passed over, and what it would add is missing", element)
 
 
 def _xacro_prefix(root: Element) -> str:

@@ -133,7 +133,6 @@ class UrdfBodyWriter:
         return shape.texture
 
     def _remark(self, text: str) -> None:
-        """Add a remark once."""
         if text not in self._remarks:
             self._remarks.append(text)
 
@@ -156,8 +155,7 @@ def _add_inertia(link: Tag, inertia: Inertia) -> None:
 
 
 URDF_CAPABILITIES = FormatCapabilities("URDF")
-LARGEST_FLOAT = sys.float_info.max
-"""Number written in place of no limit, where URDF requires a number."""
+LARGEST_FLOAT = sys.float_info.max  # number written in place of no limit, where URDF requires a number
 
 _NEWER = ("acceleration", "deceleration", "jerk")
 _KNOWN = frozenset(("effort", "damping", "friction", "k_position", "k_velocity", *_NEWER))
@@ -245,7 +243,6 @@ class UrdfWriter:
         return roots[0]
 
     def _link(self, link: LinkDescription, is_root: bool) -> None:
-        """Add a link with its joints and the intermediate links between them."""
         check_rotation(link, self._unsupported)
         if is_root:
             self._bodies.write(self._root.add("link", name=link.name), link.body)
@@ -340,11 +337,7 @@ class UrdfWriter:
         self._dynamics(element, joint.name, joint.dynamics, soft)
 
     def _dynamics(
-        self,
-        element: Tag,
-        name: str,
-        known: Mapping[str, Any],
-        soft: tuple[float, float] | None = None,
+        self, element: Tag, name: str, known: Mapping[str, Any], soft: tuple[float, float] | None = None
     ) -> None:
         """Add the ``<dynamics>`` and the ``<safety_controller>`` of a joint."""
         if known.get("damping") or known.get("friction"):
@@ -383,15 +376,8 @@ class UrdfWriter:
             limit.give(key, value)
 
     def _joint(
-        self,
-        name: str,
-        kind: str,
-        parent: str,
-        child: str,
-        pose: Matrix,
-        axis: Iterable[float] | None = None,
+        self, name: str, kind: str, parent: str, child: str, pose: Matrix, axis: Iterable[float] | None = None
     ) -> Tag:
-        """Add a joint and return its element."""
         element = self._root.add("joint", name=name, type=kind)
         xyz, rpy = pose[:3, 3].tolist(), rpy_angles(pose)
         if any(xyz) or any(rpy):

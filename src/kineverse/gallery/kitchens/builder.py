@@ -17,8 +17,7 @@ from kineverse.model.body import Body, Box, Cylinder, Inertia, Pose, Rgba, Shape
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import Operation
 
-Span: TypeAlias = tuple[float, float]
-"""Ends of a range along an axis [m]."""
+Span: TypeAlias = tuple[float, float]  # ends of a range along an axis [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +91,7 @@ def furniture_body(solids: Iterable[MaterialShape], decoration: Iterable[Materia
 
 
 def compute_inertia(solids: Iterable[MaterialShape]) -> Inertia:
-    """Return mass and inertia of boxes and cylinders: the parallel axis theorem, Σ I + m (|d|² E - d dᵀ)."""
+    """Return mass and inertia of solids by the parallel axis theorem, ``Σ I + m (|d|² E - d dᵀ)``."""
     parts = [(*_mass_and_tensor(s), s.shape.origin.matrix) for s in solids]
     mass = sum(m for m, _, _ in parts)
     center: npt.NDArray[np.float64] = np.sum([m * pose[:3, 3] for m, _, pose in parts], axis=0) / mass
@@ -129,11 +128,11 @@ class Style:
     counter_material: Material
     bar: Material  # material of the handles
     round_bar: bool  # True for round bars, False for square ones
-    thickness: float  # thickness of a bar, and the free space between bar and front [m]
-    clearance: float
+    thickness: float  # of a bar [m]
+    clearance: float  # between bar and front [m]
     length: float  # largest length of a bar [m]; fronts that are narrower have shorter ones
     travel: float  # travel of the drawers [m]
-    plinth: float  # [m]
+    plinth: float  # height [m]
     counter: float
     worktop: float
     top: float

@@ -28,26 +28,22 @@ from .builder import (
     slab,
 )
 
-GAP = 0.003
-"""Gap between fronts, and between a front and its carcass [m]."""
-FRONT: Span = (GAP, GAP + 0.018)
-"""Ends of a front along x [m]."""
-WALL = 0.016
-"""Thickness of the panels of a carcass [m]."""
+GAP = 0.003  # gap between fronts, and between a front and its carcass [m]
+FRONT: Span = (GAP, GAP + 0.018)  # ends of a front along x [m]
+WALL = 0.016  # thickness of the panels of a carcass [m]
 GRAVITY = 9.81
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0)
 _LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _RUNNER = 0.013
-_BEHIND = 0.03
-"""Length of a drawer that stays in its carcass [m]."""
+_BEHIND = 0.03  # length of a drawer that stays in its carcass [m]
 
 
 @dataclass(frozen=True, slots=True)
 class Area:
     """Part of a unit's face that one front covers, up to half a gap on each side."""
 
-    y: Span  # ends across and in height [m]
+    y: Span  # ends across [m]
     z: Span
 
     @property

@@ -12,12 +12,9 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-OBJECTS = (8, 14)
-"""Least and largest number of doors, drawers and flaps of a kitchen."""
-AISLES = (1.0, 1.6)
-"""Least and largest width of the aisle, from fronts to fronts [m]."""
-SIDE_MARGIN = 0.12
-"""Distance of wall cupboards from a tall unit, whose side is before their fronts [m]."""
+OBJECTS = (8, 14)  # least and largest number of doors, drawers and flaps of a kitchen
+AISLES = (1.0, 1.6)  # least and largest width of the aisle, from fronts to fronts [m]
+SIDE_MARGIN = 0.12  # distance of wall cupboards from a tall unit, whose side is before their fronts [m]
 
 Opposite: TypeAlias = Literal["row", "island", "wall"]
 

@@ -26,16 +26,13 @@ from .builder import (
 from .layout import KitchenLayout, Opposite, Row, Unit
 from .units import BACK, DEPTH
 
-ROOM = "room"
-"""Frame on the floor, in the middle of the aisle; y along the rows."""
-
-_OVERHANG = 0.035
-"""End of a countertop before the fronts' plane [m]."""
+ROOM = "room"  # frame on the floor, in the middle of the aisle; y along the rows
+_OVERHANG = 0.035  # end of a countertop before the fronts' plane [m]
 _ISLAND_BACK = 0.75
 _BASIN_X, _BASIN_DEPTH = (-0.47, -0.11), 0.17
 _WHEEL_ROOM = 0.01
 """Depth of what the floor collides with below what is seen [m]: wheels at height 0 do not touch it."""
-_CEILING, _PARAPET, _BESIDE = 2.45, 1.1, 0.3
+_CEILING, _PARAPET, _SIDE_WALKWAY = 2.45, 1.1, 0.3
 
 
 def add_room(kitchen: KitchenBuilder, layout: KitchenLayout) -> list[str]:
@@ -44,7 +41,7 @@ def add_room(kitchen: KitchenBuilder, layout: KitchenLayout) -> list[str]:
     The frame of a row is on the floor in the plane of its fronts: x into the aisle, z up.
     """
     half = layout.aisle / 2
-    reach = max(max(map(abs, row.length)) for row in layout.rows) + _BESIDE
+    reach = max(max(map(abs, row.length)) for row in layout.rows) + _SIDE_WALKWAY
     y: Span = (-reach, reach)
     far = {"row": half + BACK, "island": half + 1.6, "wall": half}[layout.opposite]
     kitchen.fixed(ROOM, WORLD, shift())
@@ -56,10 +53,7 @@ def add_room(kitchen: KitchenBuilder, layout: KitchenLayout) -> list[str]:
         _add_wall(kitchen, "room_wall_2", (-far - 0.1, -far), y, _PARAPET, PLASTER)
     elif layout.opposite == "wall":
         _add_wall(kitchen, "room_wall_2", (-far - 0.1, -far), y, _CEILING, CLEAR)
-    facing = (
-        Pose((-1.0, 0.0, 0.0, half, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)),
-        shift(-half, 0.0, 0.0),
-    )
+    facing = (Pose((-1.0, 0.0, 0.0, half, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)), shift(-half, 0.0, 0.0))
     names = []
     for number, (row, pose) in enumerate(zip(layout.rows, facing, strict=False), 1):
         low, high = row.length

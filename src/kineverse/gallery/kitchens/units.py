@@ -16,18 +16,14 @@ from .builder import BOARD, ENAMEL, FOAM, GLASS, STEEL, KitchenBuilder, Span, op
 from .fronts import FRONT, GAP, WALL, Area, door, drawer, flap
 from .layout import Unit
 
-DEPTH = 0.56
-"""Depth of the carcasses on the floor [m]."""
-WALL_DEPTH = 0.35
-"""Depth of the wall cupboards [m]."""
-BACK = 0.58
-"""Distance from the fronts' plane of a row to the wall behind it [m]."""
+DEPTH = 0.56  # depth of the carcasses on the floor [m]
+WALL_DEPTH = 0.35  # depth of the wall cupboards [m]
+BACK = 0.58  # distance from the fronts' plane of a row to the wall behind it [m]
 
 _FOLDING_SIZE = (0.336, 0.6, 0.72)
 """Cupboard of the folding door: its panels swing clear of it, as they would not with the depth by default."""
 _WIDE_OPEN, _OPEN = 1.9, 1.57
-_HANDLE_HEIGHT = 1.05
-"""Height of the handles of tall doors that reach above and below it [m]."""
+_HANDLE_HEIGHT = 1.05  # height of the handles of tall doors that reach above and below it [m]
 
 _HIGHEST_HANDLE = 1.9
 

@@ -39,8 +39,8 @@ def main(source: str, target: str, error: str, memory: str) -> None:
     hulls = []
     for part in range(int(parts.max()) + 1):
         used, inside = np.unique(faces[parts == part], return_inverse=True)
-        given = coacd.Mesh(vertices[used], inside.reshape(-1, 3))
-        hulls += coacd.run_coacd(given, threshold=float(error), **COACD_OPTIONS)
+        mesh_part = coacd.Mesh(vertices[used], inside.reshape(-1, 3))
+        hulls += coacd.run_coacd(mesh_part, threshold=float(error), **COACD_OPTIONS)
     points = [corners for corners, _ in hulls]
     np.savez(target, points=np.concatenate(points), sizes=np.array([len(some) for some in points]))
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
-from kineverse.geometry.shapes import build_bvh, convex_hull
+from kineverse.geometry.shapes import build_bvh, convex_hull, hull_faces
 
 SAMPLES = 4000
 """Number of sample points on each surface and in each hull, in addition to all corners."""
@@ -62,21 +62,9 @@ class Polytope:
     def from_points(points: Floats) -> Polytope:
         """Return the hull of (n, 3) points [m]; flat hulls are thickened."""
         convex = convex_hull(points)
-        corners = np.array(convex.points())
-        polygons = (convex.polygons(i) for i in range(convex.num_polygons))
-        triangles = np.array([[p[0], p[1], p[2]] for p in polygons], dtype=np.int64)
-        a, b, c = (corners[triangles[:, k]] for k in range(3))
-        across = np.cross(b - a, c - a)
-        lengths = np.linalg.norm(across, axis=1)
-        across, a, triangles = (array[lengths > 0.0] for array in (across, a, triangles))
-        normals = across / lengths[lengths > 0.0, None]
-        offsets = np.einsum("ij,ij->i", normals, a)
-        # The triangles of coal are not all counter-clockwise.
-        inwards = normals @ corners.mean(axis=0) > offsets
-        normals[inwards] *= -1.0
-        offsets[inwards] *= -1.0
-        triangles[inwards] = triangles[inwards, ::-1]
-        return Polytope(convex, corners, triangles, normals, offsets)
+        mesh = hull_faces(convex)
+        offsets = -np.array(convex.offsets()).reshape(-1)
+        return Polytope(convex, mesh.vertices, mesh.faces, np.array(convex.normals()), offsets)
 
     def face_distances(self, points: Floats) -> Floats:
         """Return the largest signed distances of (N, 3) points from the planes of the faces, (N,) [m].
@@ -204,7 +192,7 @@ def _winding_numbers(mesh: Faces, points: Floats) -> Floats:
 
 
 def nearest_surface_points(engine: Any, points: Floats) -> tuple[Floats, Floats]:
-    """Return the distances (N,) of points (N, 3) from a geometry of coal, and its nearest points (N, 3) [m].
+    """Return distances (N,) and nearest points (N, 3) of a geometry of coal, for points (N, 3) [m].
 
     Inside of a hull the distance is 0, and the nearest point is meaningless.
     """

@@ -67,16 +67,13 @@ def run_coacd(
     with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=place, ignore_cleanup_errors=True) as folder:
         source, target, said = (Path(folder) / name for name in ("in.npz", "out.npz", "said.txt"))
         np.savez(source, vertices=surface.faces.vertices, faces=surface.faces.faces, parts=surface.parts)
+        # -P keeps the program from importing its neighbours by accident.
+        command = [sys.executable, "-P", str(PROGRAM), str(source), str(target), repr(error)]
         with said.open("wb") as errors:
-            status = _run_process(_command_line(source, target, error, limits), errors.fileno(), limits, stop)
+            status = _run_process([*command, str(limits.memory)], errors.fileno(), limits, stop)
         if status == 0:
             return _read_hulls(target, surface)
         raise DecompositionError(_explain_failure(status, said.read_bytes()[-20_000:]))
-
-
-def _command_line(source: Path, target: Path, error: float, limits: ResourceLimits) -> list[str]:
-    # -P keeps the program from importing its neighbours by accident.
-    return [sys.executable, "-P", str(PROGRAM), str(source), str(target), repr(error), str(limits.memory)]
 
 
 def _run_process(
@@ -136,5 +133,5 @@ def _explain_failure(status: int, said: bytes) -> str:
     elif "SIGKILL" in how:
         advice = "Systems without free memory do that: decompose fewer at a time, or simplify the mesh."
     else:
-        advice = "Simplify or mend the mesh, or allow more memory."
+        advice = "Simplify or repair the mesh, or allow more memory."
     return f"CoACD {how}{': ' if last else ''}{last.rstrip('.')}. {advice}"

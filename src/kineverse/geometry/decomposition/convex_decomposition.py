@@ -25,20 +25,20 @@ _INSIDE = 1e-9
 
 
 def clean_hulls(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
-    """Return the hulls of sets of points, without degenerate hulls and hulls inside of another one.
+    """Make hulls of sets of points, without degenerate hulls and hulls inside of another one.
 
     Points outside of the hull of the whole mesh are projected onto it, because CoACD's wrapping of an open
     surface is a little larger all around.
     """
-    found = []
+    result = []
     for points in hulls:
         try:
-            found.append(Polytope.from_points(_project_inside(points, whole)))
+            result.append(Polytope.from_points(_project_inside(points, whole)))
         except InvalidValueError:  # A degenerate part: a cut has met a corner or an edge.
             continue
-    found.sort(key=lambda polytope: -polytope.volume)
+    result.sort(key=lambda polytope: -polytope.volume)
     kept: list[Polytope] = []
-    for polytope in found:
+    for polytope in result:
         room = _INSIDE * np.ptp(polytope.points, axis=0).max()
         if not any((larger.face_distances(polytope.points) <= room).all() for larger in kept):
             kept.append(polytope)
@@ -209,8 +209,9 @@ def _decompose_surface(
 ) -> Decomposition:
     start = time.perf_counter()
     error = settings.max_error(surface.size)
-    found = clean_hulls(run_coacd(surface, error, limits, stop), Polytope.from_points(surface.faces.vertices))
-    hulls = reduce_hulls(found, settings.max_hulls)
+    whole = Polytope.from_points(surface.faces.vertices)
+    hulls = clean_hulls(run_coacd(surface, error, limits, stop), whole)
+    hulls = reduce_hulls(hulls, settings.max_hulls)
     if not hulls:
         raise DecompositionError("CoACD found no hull.")
     accuracy = measure_accuracy(surface.faces, hulls)
@@ -218,13 +219,7 @@ def _decompose_surface(
     for array in corners:
         array.flags.writeable = False
     seconds = time.perf_counter() - start
+    now = time.time()
     return Decomposition(
-        tuple(corners),
-        surface.name,
-        error,
-        settings.max_hulls,
-        accuracy,
-        seconds,
-        time.time(),
-        surface.remarks,
+        tuple(corners), surface.name, error, settings.max_hulls, accuracy, seconds, now, surface.remarks
     )

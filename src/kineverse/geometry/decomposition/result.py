@@ -161,16 +161,16 @@ class CacheEntry:
 
 
 def find_entry(mesh: str, settings: str | None = None) -> Decomposition | None:
-    """Return the cached decomposition of a mesh, or None."""
+    """Return the cached decomposition of a mesh, for a key of settings or the latest one, or None."""
     if settings is not None:
         return DECOMPOSITIONS.read(_key(mesh, settings), Decomposition.from_bytes)
     keys = [key for key in DECOMPOSITIONS.list_keys() if key.startswith(_key(mesh, ""))]
-    found = [DECOMPOSITIONS.read(key, Decomposition.from_bytes) for key in keys]
-    return max((some for some in found if some), key=lambda some: some.made, default=None)
+    result = [DECOMPOSITIONS.read(key, Decomposition.from_bytes) for key in keys]
+    return max((some for some in result if some), key=lambda some: some.made, default=None)
 
 
 def add_entry(mesh: str, settings: str, decomposition: Decomposition) -> None:
-    """Write a decomposition atomically; see :func:`find_entry`."""
+    """Write a decomposition atomically, see :func:`find_entry`."""
     DECOMPOSITIONS.write(_key(mesh, settings), decomposition.to_bytes())
 
 

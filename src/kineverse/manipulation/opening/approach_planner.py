@@ -1,39 +1,39 @@
-"""Ways of a robot to where it begins a motion: the drive of a base on wheels, and the path of the rest."""
+"""Approaches: drive of a base on wheels, path of the rest, and what all openings by one gripper share."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from kineverse.control import Controller
+from kineverse.grasping import Grasp, Gripper, Handle, sample_grasps
 from kineverse.lie import Array
 from kineverse.manipulation.base_drive import BaseDrive, DriveSearch, Place
+from kineverse.model.frame import is_of_robot
+from kineverse.model.model_view import ModelView
 from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .base_placement import BasePlacement, PlacementSearch
 
-_PLANNING = 2.0
-"""Largest time to plan the way to the handle [s]."""
-_TUCKED = 300
-"""Number of random arms among which a compact one is chosen."""
-_MOST_TUCKED, _TUCKING = 3, 2.0
-"""Number of compact arms to which a way is planned, and the time for each [s]."""
-_KEPT = 4
-"""Number of searches of drives that are kept."""
-_HERE = 1e-3
-"""Distance of a base from its place at which it stays [m], [rad]."""
+_PLANNING = 2.0  # largest time to plan the path to the handle [s]
+_TUCKED = 300  # number of random arms among which a compact one is chosen
+_MOST_TUCKED, _TUCKING = (3, 2.0)  # number of compact arms that are tried, and the time to plan for each [s]
+_KEPT = 4  # number of searches of drives that are kept
+_HERE = 1e-3  # distance of a base from its place at which it stays [m], [rad]
 
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """Way of a robot to a configuration."""
+    """Path of a robot to a configuration."""
 
     why: str = ""  # why there is none; empty if there is one
     trajectory: Trajectory | None = None
-    tuck: Trajectory | None = None  # way of the arm before the drive; None if it stays
+    tuck: Trajectory | None = None  # path of the arm before the drive; None if it stays
     places: Array | None = None  # places (K, 3) of the drive; None if the base does not drive by itself
     base: Mapping[Symbol, float] | None = None  # values of the coordinates of a base on wheels at the end
 
@@ -42,12 +42,12 @@ class Approach:
 
     @property
     def barrier(self) -> str:
-        """Sentence that there is no way, to be added to another one; empty if there is a way."""
-        return f" There is no way to the handle: {self.why}" if self.why else ""
+        """Sentence that there is no path, to be added to another one; empty if there is a path."""
+        return f" There is no path to the handle: {self.why}" if self.why else ""
 
 
 class ApproachPlanner:
-    """Planner of ways to configurations, with the hand empty.
+    """Planner of paths to configurations, with the hand empty.
 
     A base that moves freely is planned with the arm. One on wheels drives first, with the arm as it is or,
     where that leads nowhere, with a compact one. A base on wheels that cannot turn on the spot, or that
@@ -59,7 +59,9 @@ class ApproachPlanner:
         self.planner = Planner(search.model, search.moving, rules=search.scene.rules)
         standing = {*search.standing}
         self.drive = (
-            BaseDrive(search.model, search.base, search.scene, search.own, search.others, search.margin)
+            BaseDrive(
+                search.model, search.base, search.scene, search.robot_bodies, search.others, search.margin
+            )
             if standing and standing == {*search.base}
             else None
         )
@@ -69,14 +71,14 @@ class ApproachPlanner:
     def plan(
         self, state: State, wanted: Mapping[Symbol, float], *, seconds: float, seed: int = 0
     ) -> Approach:
-        """Plan a way from a state to values of the robot's coordinates."""
+        """Plan a path from a state to values of the robot's coordinates."""
         planner, base = self.planner, {s: float(wanted[s]) for s in self.search.standing}
         places, tuck, arms = None, None, state
-        if base and self.can_drive(state):
-            found = self._find_drive(state, base)
-            if found is None:
-                return Approach("no way for the base, with the arm as it is or compact")
-            places, tuck, arms = found
+        if base and self.drive is not None and self.drive.is_possible and self._drives(state).begins_free:
+            result = self._find_drive(state, base)
+            if result is None:
+                return Approach("no path for the base, with the arm as it is or compact")
+            places, tuck, arms = result
         planner.place(state.updated(base))
         here = arms.vector(planner.symbols)
         end = np.array([wanted[s] for s in planner.symbols])
@@ -86,15 +88,9 @@ class ApproachPlanner:
         return Approach("", path.trajectory(), tuck, places, base)
 
     def plan_to(self, state: State, placement: BasePlacement, seed: int) -> Approach:
-        """Plan a way from a state to the pose before the handle of a placement, within 2 s."""
+        """Plan a path from a state to the pose before the handle of a placement, within 2 s."""
         wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
         return self.plan(state, wanted, seconds=_PLANNING, seed=seed)
-
-    def can_drive(self, state: State) -> bool:
-        """Return whether the base rolls to other places by itself from a state."""
-        if self.drive is None or not self.drive.is_possible:
-            return False
-        return self._drives(state).begins_free
 
     def _drives(self, state: State) -> DriveSearch:
         assert self.drive is not None
@@ -107,7 +103,7 @@ class ApproachPlanner:
     def _find_drive(
         self, state: State, base: Mapping[Symbol, float]
     ) -> tuple[Array, Trajectory | None, State] | None:
-        """Return places of a drive, the way of the arm before it, and the state of the arm on the way."""
+        """Return places of a drive, the path of the arm before it, and the state of the arm on the way."""
         x, y, angle = (base[s] for s in self.search.base)
         goal: Place = (x, y, angle)
         if max(abs(state[s] - v) for s, v in base.items()) < _HERE:
@@ -115,19 +111,16 @@ class ApproachPlanner:
         places = self._drives(state).find(goal)
         if places is not None:
             return places, None, state
-        tucked = self._tuck(state)
+        if state not in self._tucked:
+            self._tucked = {state: self._plan_tuck(state)}
+        tucked = self._tucked[state]
         if tucked is None:
             return None
         places = self._drives(tucked[1]).find(goal)
         return None if places is None else (places, *tucked)
 
-    def _tuck(self, state: State) -> tuple[Trajectory, State] | None:
-        """Return a way of the arm to a compact configuration, and the state there; None without one."""
-        if state not in self._tucked:
-            self._tucked = {state: self._plan_tuck(state)}
-        return self._tucked[state]
-
     def _plan_tuck(self, state: State) -> tuple[Trajectory, State] | None:
+        """Return a path of the arm to a compact configuration, and the state there; None without one."""
         planner = self.planner
         planner.place(state)
         here = state.vector(planner.symbols)
@@ -145,13 +138,38 @@ class ApproachPlanner:
         limits = np.array([search.model.limits(s) for s in symbols])
         lower, upper = np.where(np.isfinite(limits), limits, np.array([-np.pi, np.pi])).T
         rows = np.random.default_rng(0).uniform(lower, upper, (_TUCKED, len(lower)))
-        itself = scene.watch(search.own, search.own, 0.0)
-        touching = itself, scene.watch(search.own, search.others, search.margin)
+        itself = scene.watch(search.robot_bodies, search.robot_bodies, 0.0)
+        touching = itself, scene.watch(search.robot_bodies, search.others, search.margin)
         x, y, _ = (state[s] for s in search.base)
-        found: list[tuple[float, int]] = []
+        result: list[tuple[float, int]] = []
         for k, row in enumerate(rows):
             scene.update(state.updated(dict(zip(symbols, row.tolist(), strict=True))))
             if not any(len(watch()) for watch in touching):
-                places = np.array([scene.pose(b)[:2, 3] for b in search.own])
-                found.append((float(np.hypot(*(places - [x, y]).T).max()), k))
-        return rows[[k for _, k in sorted(found)]]
+                places = np.array([scene.pose(b)[:2, 3] for b in search.robot_bodies])
+                result.append((float(np.hypot(*(places - [x, y]).T).max()), k))
+        return rows[[k for _, k in sorted(result)]]
+
+
+_GRASPS = 96
+_KEPT_GRASPS = 15  # number of sets of grasps that are kept
+
+
+class Opener:
+    """Searches, planner and controllers of a gripper in a model, made once."""
+
+    def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
+        self.model, self.gripper = model, gripper
+        self.search = PlacementSearch(model, gripper, state)
+        self.approaches = ApproachPlanner(self.search)
+        self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
+        self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
+
+    def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:
+        """Return the grasps of a handle where everything but the robot is as in a state, up to a slant."""
+        robot = self.gripper.robot
+        others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
+        key = handle.frame, handle.coordinate, seed, slant, others
+        if key not in self._grasps:
+            result = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
+            self._grasps = {**dict([*self._grasps.items()][-_KEPT_GRASPS:]), key: result}
+        return self._grasps[key]

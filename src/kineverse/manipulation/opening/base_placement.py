@@ -1,4 +1,4 @@
-"""Base placement: a base, a grasp and a way of the arm along which a held object can be moved."""
+"""Base placement: a base, a grasp and a path of the arm along which a held object can be moved."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from itertools import count, product
+from itertools import count
 from time import perf_counter
 
 import numpy as np
@@ -17,6 +17,7 @@ from kineverse._checks import as_count
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
 from kineverse.grasping import Grasp, Gripper
+from kineverse.grasping.hand_model import find_box_corners
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.base_sampling import BaseSampler, find_planar_base
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules
@@ -29,15 +30,13 @@ from .cartesian_paths import TOLERANCE, CartesianPaths
 from .grasp_selection import PlacementSampler
 from .path_collisions import OWN_MARGIN, CandidatePath, PathCheck, PathContacts, interpolate_poses
 
-NO_WAY, NO_PLACE = "no way to the handle", "no free place of the base"
-"""Reasons of placements that are refused, and of bases that touch something."""
-_DIFFERENCE = 0.025
-"""Difference of the values at the ends of a way to those of the way back [m], [rad]."""
+NO_PATH, NO_PLACE = "no path to the handle", "no free place of the base"  # reasons of refusals
+_DIFFERENCE = 0.025  # difference of the values at the ends of a path and of its reversal [m], [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BasePlacement:
-    """Base, grasp and way of the arm, true if they were found.
+    """Base, grasp and path of the arm, true if they were found.
 
     Attributes
     ----------
@@ -47,9 +46,9 @@ class BasePlacement:
         Coordinates (n,) of the robot: base and arm.
     approach, line
         Configuration (n,) before the hand is at the handle, and those (L, n) from there to the grasp.
-    values, way
+    values, path
         Values (K,) of the object's coordinate [m], [rad], and configurations (K, n) of the robot there. They
-        end at the target, or where the arm or something in the way ends them.
+        end at the target, or where the arm or an obstacle ends them.
     retreat
         Configurations (L, n) with which the hand goes away from the handle at the end.
     samples
@@ -67,7 +66,7 @@ class BasePlacement:
     approach: Array
     line: Array
     values: Array
-    way: Array
+    path: Array
     retreat: Array
     samples: int
     reasons: Counter[str]
@@ -78,9 +77,9 @@ class BasePlacement:
         return self.grasp is not None
 
     def find_end_backwards(self, value: float, target: float) -> float | None:
-        """Return the value to which the way leads back from a value, towards a target; None if it does not.
+        """Return the value to which the reversed path leads towards a target; None if it leads nowhere.
 
-        It begins where the way ends, and small differences [m], [rad] at both ends are made up for.
+        It begins where the path ends, and small differences [m], [rad] at both ends are made up for.
         """
         ahead = math.copysign(1.0, target - value)
         begin, end = float(self.values[-1]), float(self.values[0])
@@ -90,44 +89,34 @@ class BasePlacement:
 
     @property
     def failure(self) -> str:
-        """Class of the failure: ``"collision"`` if an arm reaches along the way, otherwise ``"reach"``."""
-        return "collision" if any(" at " in r or r in (NO_WAY, NO_PLACE) for r in self.reasons) else "reach"
+        """Class of the failure: ``"collision"`` if an arm reaches along the path, otherwise ``"reach"``."""
+        return "collision" if any(" at " in r or r in (NO_PATH, NO_PLACE) for r in self.reasons) else "reach"
 
     @property
     def why(self) -> str:
         """Text with the number of samples and the reasons of failures."""
         failed = ", ".join(f"{n} {reason}" for reason, n in self.reasons.most_common(6) if n)
         what = "arms of a robot without a mobile base" if self.stands else "bases"
-        found = (
+        result = (
             f"Found after {self.samples} {what}" if self else f"None of {self.samples} {what} goes through"
         )
-        return f"{found}; failed: {failed}." if failed else f"{found}."
+        return f"{result}; failed: {failed}." if failed else f"{result}."
 
 
-_STEP = 0.05
-"""Distance of neighbouring values of the object along its way [m], [rad]."""
-_RANDOM_STATES = 24
-"""Number of random states in which links that are always near to each other are sought."""
-_BESIDE = 0.1
-"""Largest change of each coordinate of the base in these states [m], [rad]."""
+_STEP = 0.05  # distance of neighbouring values of the object along its path [m], [rad]
+_RANDOM_STATES = 24  # number of random states in which links that are always near to each other are sought
+_OFFSET = 0.1  # largest change of each coordinate of the base in these states [m], [rad]
 _START_ITERATIONS = 30
-_CORRECTIONS = 6
-"""Iterations from a configuration to one near it."""
-_STARTS = 4
-"""Arms that are tried for each base."""
-_MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
-"""Shares of the object's way from which the arms of successive batches set out to both ends."""
+_CORRECTIONS = 6  # iterations from a configuration to one near it
+_STARTS = 4  # arms that are tried for each base
+_MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)  # shares of the motion from which arms of successive batches follow it
 _WHOLE = 300
-"""Number of bases after which a way to a part of the motion is taken, and after which the search ends if no
-arm has reached the handle anywhere: at the middle of its way, or at a quarter of it."""
-_NOWHERE = 300
-"""Number of bases after which the search ends if each one touched something wherever it was drawn."""
-_AROUND, _HERE = 0.6, 100
-"""Distance of the hand from the handle up to which the base may stay [m], and the number of arms there."""
-_LEAST_SHARE = 0.2
-"""Least share of the motion that one grasp is for."""
-_MOST_CHECKS, _MOST_REFUSED = 150, 3
-"""Most ways that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
+"""Number of bases after which a path to a part of the motion is taken, and after which the search ends if no
+arm has reached the handle anywhere: at the middle of its motion, or at a quarter of it."""
+_NOWHERE = 300  # number of bases after which the search ends if each one touched something
+_AROUND, _HERE = 0.6, 100  # distance of the hand up to which the base may stay [m], and number of arms there
+_LEAST_SHARE = 0.2  # least share of the motion that one grasp is for
+_MOST_CHECKS, _MOST_REFUSED = 150, 3  # most paths checked after a batch, and most that may be refused
 
 
 class PlacementSearch:
@@ -147,37 +136,42 @@ class PlacementSearch:
     Attributes
     ----------
     moving, standing
-        Coordinates that move along ways, and those of a base that only stands somewhere.
+        Coordinates that move along paths, and those of a base that only stands somewhere.
     scene
         Scene of the checks, with the rules for pairs that overlap always.
     """
 
     def __init__(self, model: ModelView, gripper: Gripper, state: State, margin: float = 0.006) -> None:
         self.model, self.gripper, self.margin = model, gripper, margin
-        own = model.symbols_of(gripper.hand)
-        free = {s for s in own if s in model.degrees_of_freedom and s not in gripper.joints}
-        self.standing = tuple(s for s in own if s in model.rates and s in free)
-        self.moving = tuple(s for s in own if s in free and s not in self.standing)
-        self.base = find_planar_base(model, own)
+        symbols = model.symbols_of(gripper.hand)
+        free = {s for s in symbols if s in model.degrees_of_freedom and s not in gripper.joints}
+        self.standing = tuple(s for s in symbols if s in model.rates and s in free)
+        self.moving = tuple(s for s in symbols if s in free and s not in self.standing)
+        self.base = find_planar_base(model, symbols)
         self.coordinates = (*self.moving, *self.standing)
         self.samples = PlacementSampler(model, self.moving, self.standing, self.base)
         self.paths = CartesianPaths(model, gripper.hand, self.moving, self.standing, self.samples.eases[0])
         self.scene = Scene(model)
         bodies = self.scene.bodies
-        self.own = tuple(b for b in bodies if gripper.robot and is_of_robot(b, gripper.robot))
-        others = tuple(b for b in bodies if b not in self.own)
+        self.robot_bodies = tuple(b for b in bodies if gripper.robot and is_of_robot(b, gripper.robot))
+        others = tuple(b for b in bodies if b not in self.robot_bodies)
         if not others:
             raise InvalidValueError("The model has nothing but the robot, so there is nothing to hold.")
         self.others = others
         add_rules = self.scene.collision_world.add_rules
-        add_rules((*find_overlapping_links(self.scene, self.own, state), *furniture_rules(bodies, self.own)))
+        add_rules(
+            (
+                *find_overlapping_links(self.scene, self.robot_bodies, state),
+                *furniture_rules(bodies, self.robot_bodies),
+            )
+        )
         add_rules(self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN))
-        self.contacts = PathContacts(model, self.scene, gripper, self.own, others, margin)
-        self.bases = BaseSampler(self.scene, self.base, self.own, others, margin)
+        self.contacts = PathContacts(model, self.scene, gripper, self.robot_bodies, others, margin)
+        self.bases = BaseSampler(self.scene, self.base, self.robot_bodies, others, margin)
         self._reach: float | None = None
 
     def _random_states(self, state: State) -> Iterator[State]:
-        """Yield states with random arms, and the base a little beside its place.
+        """Yield states with random arms, and the base a little off its place.
 
         So what is always near is the robot's own or the floor, and not a wall that it stands at.
         """
@@ -186,18 +180,18 @@ class PlacementSearch:
         lower, upper = np.array([self.model.limits(s) for s in bounded]).reshape(-1, 2).T
         for _ in range(_RANDOM_STATES):
             arm = dict(zip(bounded, random.uniform(lower, upper).tolist(), strict=True))
-            beside = random.uniform(-_BESIDE, _BESIDE, len(self.base)).tolist()
-            yield state.updated(arm | {s: state[s] + by for s, by in zip(self.base, beside, strict=True)})
+            off = random.uniform(-_OFFSET, _OFFSET, len(self.base)).tolist()
+            yield state.updated(arm | {s: state[s] + by for s, by in zip(self.base, off, strict=True)})
 
     def find_too_high(self, state: State, coordinate: Symbol, values: Array) -> str:
-        """Return why an object on its way is out of reach above the hand; empty if it is not.
+        """Return why an object is out of reach above the hand along its motion; empty if it is not.
 
         Parameters
         ----------
         state
             State of everything.
         coordinate, values
-            Coordinate of the object, and its values (N,) on the way [m], [rad].
+            Coordinate of the object, and its values (N,) along the motion [m], [rad].
         """
         moved = [b for b in self.scene.bodies_moved_by([coordinate]) if b in self.others]
         value, lowest = find_highest_passage(self.scene, moved, state, coordinate, values)
@@ -226,9 +220,9 @@ class PlacementSearch:
 
         Bases are sampled in front of the handle, arms at random. Where none of the first batch leads to the
         target and the hand is near, so that it has just let go, the base may stay as well. All of them
-        follow the way of the handle at once, and the straight ways to it and from it; those that arrive are
+        follow the path of the handle at once, and the straight paths to it and from it; those that arrive are
         checked for contacts, the quickest first. Where none of many bases arrives, the one with the longest
-        way is returned. The search ends early if no arm reaches the handle on its way, or if the base touches
+        path is returned. The search ends early if no arm reaches the handle anywhere, or if the base touches
         something at all of the first places.
 
         Parameters
@@ -260,18 +254,18 @@ class PlacementSearch:
             samples = batch
         for number in count():
             whole = number * batch < min(_WHOLE, samples)
-            found = search.take(whole)
+            result = search.take(whole)
             ended = number * batch >= samples or (not whole and not search.reached)
             ended = ended or (number * batch >= _NOWHERE and search.nowhere)
-            if number and found is None and not ended:
+            if number and result is None and not ended:
                 report(search.nothing.why)
-            if found is not None or ended or search.refused >= _MOST_REFUSED:
+            if result is not None or ended or search.refused >= _MOST_REFUSED:
                 break
             self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
             search.add(min(batch, samples - number * batch), _MIDDLES[number % len(_MIDDLES)])
             if number == 1:
                 search.add_here()
-        return found or search.nothing
+        return result or search.nothing
 
     def retrace(
         self,
@@ -280,17 +274,17 @@ class PlacementSearch:
         target: float,
         accept: Callable[[BasePlacement], bool] = lambda placement: True,
     ) -> BasePlacement | None:
-        """Return the way of an earlier placement backwards, from the object's value to a target.
+        """Return the path of an earlier placement backwards, from the object's value to a target.
 
-        What was possible once is possible backwards, also where an open door leaves no way to another place.
-        Contacts are looked for anew, and None is returned if there are any.
+        What was possible once is possible backwards, also where an open door leaves no path to another place.
+        Contacts are checked again, and None is returned if there are any.
 
         Parameters
         ----------
         state
             State of everything at the beginning.
         earlier
-            Placement whose way leads back to the target, see :meth:`.BasePlacement.find_end_backwards`.
+            Placement whose path leads back to the target, see :meth:`.BasePlacement.find_end_backwards`.
         target, accept
             As for :meth:`find`.
 
@@ -358,7 +352,7 @@ class _Search:
             self._keep(*samples.stay(self.random, self.state, _HERE), choice, 0)
 
     def add(self, batch: int, middle_share: float) -> None:
-        """Sample bases, arms and grasps, and keep those that reach along the way."""
+        """Sample bases, arms and grasps, and keep those that reach along the path."""
         paths, handles = self.owner.paths, self.handles
         middle = round(middle_share * self.last)
         samples = self.owner.samples
@@ -368,7 +362,7 @@ class _Search:
             return
         hands = handles[middle] @ self.poses[choice]
         outside = handles[middle] @ self.approaches[choice]
-        # A base that stands has to be free on all the way.
+        # A base that stands has to be free along the whole motion.
         stops = (middle, 0, self.last) if samples.stands(paths.ease) else (middle,)
         states = [self.state.updated({self.coordinate: float(self.values[k])}) for k in stops]
         Q, base = samples.draw(self.random, states, hands, outside, _STARTS, self.owner.bases)
@@ -381,7 +375,7 @@ class _Search:
         self._keep(Q, base, choice, middle)
 
     def _keep(self, Q: Array, base: Array, choice: npt.NDArray[np.intp], middle: int) -> None:
-        """Keep those arms (N, n) that reach along the way, from a value with the index ``middle`` on."""
+        """Keep those arms (N, n) that reach along the path, from a value with the index ``middle`` on."""
         paths, handles = self.owner.paths, self.handles
         Q, error = paths.solve(Q, base, handles[middle] @ self.poses[choice], _START_ITERATIONS)
         good = self._count(error < 1e-3, "out of reach")
@@ -398,12 +392,14 @@ class _Search:
         after, passed = paths.follow(Q, base, handles[None, middle:] @ poses[:, None])
         ends = np.minimum(middle + passed - 1, self.free[choice])
         good = self._count(ends >= self.least, "the arm ends on the way")
-        way = np.concatenate([before[:, :0:-1], after], axis=1)
+        path = np.concatenate([before[:, :0:-1], after], axis=1)
         if not good.any():
             return
-        score = self.owner.samples.cost(self.state, way, back[:, -1], ends) + 0.02 * choice
+        score = self.owner.samples.cost(self.state, path, back[:, -1], ends) + 0.02 * choice
         for k in np.flatnonzero(good):
-            self._push(CandidatePath(int(choice[k]), base[k], back[k], way[k], int(ends[k])), float(score[k]))
+            self._push(
+                CandidatePath(int(choice[k]), base[k], back[k], path[k], int(ends[k])), float(score[k])
+            )
 
     def _count(self, good: npt.NDArray[np.bool_], reason: str) -> npt.NDArray[np.bool_]:
         self.reasons[reason] += int((~good).sum()) // _STARTS
@@ -413,28 +409,28 @@ class _Search:
         heappush(self.heap, (-candidate.end, score, next(self.number), candidate))
 
     def retrace(self, earlier: BasePlacement) -> BasePlacement | None:
-        """Return the way of an earlier placement backwards, without contacts; None if there is none."""
+        """Return the path of an earlier placement backwards, without contacts; None if there is none."""
         paths, count = self.owner.paths, len(self.owner.moving)
-        base = earlier.way[0, count:]
+        base = earlier.path[0, count:]
         order = np.argsort(earlier.values)
-        rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.way.T[:count]]
+        rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.path.T[:count]]
         hands = self.handles @ self.poses[0]
-        way = self._correct(np.stack(rows, axis=1), base, hands)
-        # The hand comes on the way on which it left, in the same place beside the handle.
+        path = self._correct(np.stack(rows, axis=1), base, hands)
+        # The hand comes on the path on which it left, at the same place at the handle.
         retreat = earlier.retreat[:, :count]
         poses = paths.find_poses(retreat, base)
         back = self._correct(retreat, base, hands[0] @ np.linalg.inv(poses[0]) @ poses)
-        if way is None or back is None:
+        if path is None or back is None:
             return None
-        found = self._check(CandidatePath(0, base, back, way, self.last))
-        if found is None or len(found.values) <= self.last or not self.accept(found):
+        result = self._check(CandidatePath(0, base, back, path, self.last))
+        if result is None or len(result.values) <= self.last or not self.accept(result):
             return None
-        return found
+        return result
 
     def _correct(self, Q: Array, base: Array, poses: Array) -> Array | None:
         """Return configurations near to some (K, n) at which the hand is at poses; None if one fails."""
-        found, error = self.owner.paths.solve(Q, np.tile(base, (len(Q), 1)), poses, _CORRECTIONS)
-        return found if error.max() < TOLERANCE else None
+        result, error = self.owner.paths.solve(Q, np.tile(base, (len(Q), 1)), poses, _CORRECTIONS)
+        return result if error.max() < TOLERANCE else None
 
     # -- checks --------------------------------------------------------------------------------------------
 
@@ -446,12 +442,12 @@ class _Search:
             _, score, _, candidate = heappop(self.heap)
             free = int(self.free[candidate.choice])
             if candidate.end <= free:
-                found = self._check(candidate)
-                if found is not None and self.accept(found):
-                    return found
-                if found is not None:
+                result = self._check(candidate)
+                if result is not None and self.accept(result):
+                    return result
+                if result is not None:
                     self.refused += 1
-                    self.reasons[NO_WAY] += 1
+                    self.reasons[NO_PATH] += 1
                     continue
             candidate.end = min(candidate.end, int(self.free[candidate.choice]))
             if candidate.end >= self.least:
@@ -459,12 +455,12 @@ class _Search:
         return None
 
     def _check(self, candidate: CandidatePath) -> BasePlacement | None:
-        """Return the placement of a candidate without contacts; otherwise shorten its way."""
+        """Return the placement of a candidate without contacts; otherwise shorten its path."""
         retreat = self.check.find_retreat(candidate)
         if retreat is None:
             return None
         end, base = candidate.end, candidate.base
-        parts = (candidate.back[::-1], candidate.way[: end + 1], retreat)
+        parts = (candidate.back[::-1], candidate.path[: end + 1], retreat)
         full = [np.hstack([a, np.tile(base, (len(a), 1))]) for a in parts]
         return BasePlacement(
             self.grasps[candidate.choice], self.owner.coordinates, full[0][0], full[0],
@@ -472,10 +468,8 @@ class _Search:
         )  # fmt: skip
 
 
-_ARMS = 200
-"""Number of random arms from which the highest one is sought."""
-_STEPS = np.geomspace(0.5, 2e-3, 60)
-"""Largest changes of a coordinate in the steps of the ascent [m], [rad]."""
+_ARMS = 200  # number of random arms from which the highest one is sought
+_STEPS = np.geomspace(0.5, 2e-3, 60)  # largest changes of a coordinate in the steps of the ascent [m], [rad]
 
 
 def find_highest_reach(scene: Scene, paths: CartesianPaths, gripper: Gripper, state: State) -> float:
@@ -485,10 +479,10 @@ def find_highest_reach(scene: Scene, paths: CartesianPaths, gripper: Gripper, st
     great than too small. Contacts are left out.
     """
     hand_T_world = inverse(np.asarray(scene.model.fk(gripper.hand)(state)))
-    corners = [
-        _find_corners(scene, gripper.bodies, state.updated(gripper.values_at(gap)))
-        for gap in (0.0, gripper.width)
-    ]
+    corners = []
+    for gap in (0.0, gripper.width):
+        scene.update(state.updated(gripper.values_at(gap)))
+        corners.append(find_box_corners(scene, gripper.bodies))
     points = np.vstack(corners) @ hand_T_world[:3, :3].T + hand_T_world[:3, 3]
     random = np.random.default_rng(0)
     bounded = np.isfinite(paths.lower) & np.isfinite(paths.upper)
@@ -508,24 +502,10 @@ def find_highest_reach(scene: Scene, paths: CartesianPaths, gripper: Gripper, st
 def find_highest_passage(
     scene: Scene, bodies: Iterable[str], state: State, coordinate: Symbol, values: Array
 ) -> tuple[float, float]:
-    """Return value (of some) at which an object is the highest, and the height of its lowest point [m]."""
-    names = tuple(bodies)
-    lowest = [
-        _find_corners(scene, names, state.updated({coordinate: v}))[:, 2].min() for v in values.tolist()
-    ]
+    """Return the one of some values at which an object is the highest, and the height of its lowest point."""
+    names, lowest = tuple(bodies), []
+    for value in values.tolist():
+        scene.update(state.updated({coordinate: value}))
+        lowest.append(find_box_corners(scene, names)[:, 2].min())
     highest = int(np.argmax(lowest))
     return float(values[highest]), float(lowest[highest])
-
-
-def _find_corners(scene: Scene, bodies: Iterable[str], state: State) -> Array:
-    """Return the corners (N, 3) of the boxes around the shapes of bodies at a state, in the world."""
-    scene.update(state)
-    world = scene.collision_world
-    world.prepare()
-    signs = np.array(list(product((-1.0, 1.0), repeat=3)))
-    found = []
-    for body in bodies:
-        for item in world.members[world.body_index(body)] if body in world.bodies else ():
-            solid, pose = world.solid(item), world.table.poses[item]
-            found.append((solid.centre + signs * solid.half) @ pose[:, :3].T + pose[:, 3])
-    return np.vstack(found)

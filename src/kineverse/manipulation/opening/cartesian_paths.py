@@ -12,14 +12,10 @@ from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
 _DAMPING = 1e-6
-_CENTERING = 0.1
-"""Share of the way to the middle of the limits that a step takes in the null space."""
-_LONGEST = 0.4
-"""Largest step of a coordinate [m], [rad]."""
-_JUMP = 0.6
-"""Largest change of a coordinate between neighbouring poses of a sequence [m], [rad]."""
-TOLERANCE = 1e-4
-"""Error of a pose that counts as reached [m], [rad]."""
+_CENTERING = 0.1  # share of the distance to the middle of the limits that a step takes in the null space
+_LONGEST = 0.4  # largest step of a coordinate [m], [rad]
+_JUMP = 0.6  # largest change of a coordinate between neighbouring poses of a sequence [m], [rad]
+TOLERANCE = 1e-4  # error of a pose that counts as reached [m], [rad]
 
 
 class CartesianPaths:
@@ -99,11 +95,11 @@ class CartesianPaths:
         for k in range(count):
             if not len(going):
                 break
-            found, error = self.solve(paths[going, max(k - 1, 0)], base[going], targets[going, k], 6)
-            jump = np.abs(found - paths[going, max(k - 1, 0)]).max(axis=1, initial=0.0)
+            result, error = self.solve(paths[going, max(k - 1, 0)], base[going], targets[going, k], 6)
+            jump = np.abs(result - paths[going, max(k - 1, 0)]).max(axis=1, initial=0.0)
             good = (error < TOLERANCE) & (jump < _JUMP)
-            going, found = going[good], found[good]
-            paths[going, k] = found
+            going, result = going[good], result[good]
+            paths[going, k] = result
             reached[going] = k + 1
         return paths, reached
 
@@ -115,9 +111,9 @@ def find_least_time(rows: Array, speeds: Array) -> float:
 
 
 def row_at(rows: Array, share: float) -> Array:
-    """Return the configuration (n,) at a share of the way along some (K, n)."""
+    """Return the configuration (n,) at a share of the path along some (K, n)."""
     place = share * (len(rows) - 1)
     k = min(max(int(place), 0), max(len(rows) - 2, 0))
     rest = min(max(place - k, 0.0), 1.0)
-    found = (1.0 - rest) * rows[k] + rest * rows[min(k + 1, len(rows) - 1)]
-    return np.asarray(found)
+    result = (1.0 - rest) * rows[k] + rest * rows[min(k + 1, len(rows) - 1)]
+    return np.asarray(result)

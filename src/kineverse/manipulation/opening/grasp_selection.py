@@ -16,23 +16,17 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 _BASE_EASE, _BASE_SPEED = (0.1, 0.01), 1.0
-"""Weights of a base that can move beside those of joints, so that it moves where they are not enough, or
+"""Weights of a base that can move relative to those of joints, so that it moves where they are not enough, or
 nearly stands where there is little room; and its speed where the model has no limit [m/s]."""
-_WHOLE_ARM, _STANDING_EASE = 6, (0.1, 0.0, 0.0)
-"""Number of joints from which on an arm needs no motion of the base, and the weights of its base."""
-_QUICK, _SOON = 0.5, 4.0
-"""Speed from which on a joint has the full weight [m/s], [rad/s]; time in which most arms are reached [s]."""
+_WHOLE_ARM, _STANDING_EASE = 6, (0.1, 0.0, 0.0)  # joints of an arm that needs no base, weights of its base
+_QUICK, _SOON = 0.5, 4.0  # speed of joints with full weight [m/s], [rad/s]; time to reach most arms [s]
 
 
 class PlacementSampler:
     """Random bases, arms and grasps."""
 
     def __init__(
-        self,
-        model: ModelView,
-        moving: Sequence[Symbol],
-        standing: Sequence[Symbol],
-        base: Sequence[Symbol],
+        self, model: ModelView, moving: Sequence[Symbol], standing: Sequence[Symbol], base: Sequence[Symbol]
     ) -> None:
         self.moving, self.standing, self.base = tuple(moving), tuple(standing), tuple(base)
         limits = np.array([model.limits(s) for s in moving], dtype=float).reshape(-1, 2)
@@ -48,7 +42,7 @@ class PlacementSampler:
         self._on_base = on_base
 
     def stands(self, ease: Array) -> bool:
-        """Return True if the base stands along ways with weights (n,)."""
+        """Return True if the base stands along paths with weights (n,)."""
         return not ease[self._on_base].any()
 
     def choose_grasps(
@@ -67,7 +61,7 @@ class PlacementSampler:
         if upright:
             rank = random.geometric(min(1.0, 4.0 / size), count) - 1
             return usable[np.where(rank < size, rank, random.integers(size, size=count))]
-        # Some ways need a hand that comes from above or from the side, and few grasps are such.
+        # Some paths need a hand that comes from above or from the side, and few grasps are such.
         tilts = np.array([grasp.tilt for grasp in grasps])[usable]
         wanted = random.uniform(tilts.min(), tilts.max(), count)
         order = np.argsort(tilts, kind="stable")
@@ -120,8 +114,8 @@ class PlacementSampler:
         high = np.where(soon, np.maximum(np.minimum(upper, here + span), lower), upper)
         return random.uniform(low, high)
 
-    def cost(self, state: State, ways: Array, approaches: Array, ends: npt.NDArray[np.int_]) -> Array:
-        """Return the costs (N,) of ways (N, K, n) until indices (N,): their times, and nearness to limits.
+    def cost(self, state: State, paths: Array, approaches: Array, ends: npt.NDArray[np.int_]) -> Array:
+        """Return the costs (N,) of paths (N, K, n) until indices (N,): their times, and nearness to limits.
 
         ``approaches`` (N, n) are the configurations before the hand is at the handle; the time [s] to get
         there from a state counts as well.
@@ -133,12 +127,12 @@ class PlacementSampler:
                 k = self.moving.index(s)
                 away[:, k] = approaches[:, k] - state[s]
         there = (np.abs(away) / self.speeds).max(axis=1, initial=0.0)
-        steps = (np.abs(np.diff(ways, axis=1)) / self.speeds).max(axis=2, initial=0.0)
+        steps = (np.abs(np.diff(paths, axis=1)) / self.speeds).max(axis=2, initial=0.0)
         used = np.arange(steps.shape[1]) < ends[:, None]
         along = (steps * used).sum(axis=1)
         # Joints that their limits hold are as near to them everywhere.
         has_range = self._bounded & (self.lower < self.upper)
-        lower, upper, bounded = self.lower[has_range], self.upper[has_range], ways[:, :, has_range]
+        lower, upper, bounded = self.lower[has_range], self.upper[has_range], paths[:, :, has_range]
         room = np.minimum(bounded - lower, upper - bounded) / (upper - lower)
         room = np.where(np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
         least = room.min(axis=(1, 2), initial=1.0)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from kineverse._checks import as_count
-from kineverse.control import Controller
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
-from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
-from kineverse.manipulation.outcome import Outcome, SkillError, SlipError
+from kineverse.grasping import Handle, find_gripper, find_handle
+from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
     check_positive,
@@ -23,64 +22,25 @@ from kineverse.manipulation.skill_arguments import (
     explain_fixed,
     find_object_coordinate,
 )
+from kineverse.manipulation.slip_detection import SlipError
 from kineverse.manipulation.swept_volume import BlockedError, find_obstacle
-from kineverse.model.frame import is_of_robot
-from kineverse.model.model_view import ModelView
 from kineverse.model.symbolic_view import cached_for_version
-from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 from kineverse.worlds.run_metrics import JudgedOverlap
 
-from .approach_planner import Approach, ApproachPlanner
-from .base_placement import BasePlacement, PlacementSearch
+from .approach_planner import Approach, Opener
+from .base_placement import BasePlacement
 from .hand_motion import HandMotion, move_held
 from .push_regrasp import PushRegrasp
 
-_GRASPS = 96
-_KEPT = 15
-"""Number of sets of grasps that are kept."""
-
-
-class Opener:
-    """Searches and controllers of a gripper in a model, made once."""
-
-    def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
-        self.model, self.gripper = model, gripper
-        self.search = PlacementSearch(model, gripper, state)
-        self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
-        self._approaches: ApproachPlanner | None = None
-        self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
-
-    @property
-    def approaches(self) -> ApproachPlanner:
-        """Planner of the robot's ways with the hand empty."""
-        if self._approaches is None:
-            self._approaches = ApproachPlanner(self.search)
-        return self._approaches
-
-    def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:
-        """Return the grasps of a handle where everything but the robot is as in a state, up to a slant."""
-        robot = self.gripper.robot
-        others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
-        key = handle.frame, handle.coordinate, seed, slant, others
-        if key not in self._grasps:
-            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
-            self._grasps = {**dict([*self._grasps.items()][-_KEPT:]), key: found}
-        return self._grasps[key]
-
-
-_SLANT = math.radians(50.0)
-"""Largest slant of grasps where those from across the handle lead nowhere [rad]."""
-_PROOF = 200
-"""Largest number of sampled bases that are to prove that an object is too high."""
+_SLANT = math.radians(50.0)  # largest slant of grasps where those from across the handle lead nowhere [rad]
+_PROOF = 200  # largest number of sampled bases that are to prove that an object is too high
 _MOST_GRASPS, _MOST_PUSHES = 4, 3
-_LATE = 1.0
-"""Time before the end at which it counts as up [s]."""
+_LATE = 1.0  # time before the end at which it counts as up [s]
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
-_HEIGHTS = 12
-"""Number of values at which the height of an object is compared with that of the hand."""
+_HEIGHTS = 12  # number of values at which the height of an object is compared with that of the hand
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
 _NAMED = {"limit": "limit_violation", "penetrating": "penetration", "penetration_from": "penetration"}
@@ -101,9 +61,9 @@ def open_object(
 ) -> Outcome:
     """Move an object to a value of its coordinate by its handle.
 
-    A base, a grasp and a way of the arm are found, see :class:`.PlacementSearch`. The robot goes to the
+    A base, a grasp and a path of the arm are found, see :class:`.PlacementSearch`. The robot goes to the
     handle on a planned path, closes its fingers, moves the object, lets go and retracts. Where one grasp does
-    not lead to the target, the object is released on the way and grasped anew. Where no grasp leads on,
+    not lead to the target, the object is released on the way and grasped again. Where no grasp leads on,
     such as at an oven door whose handle faces the floor, it is pushed. A base on two wheels drives to its
     place before the arm moves. One that cannot turn on the spot, or that begins in contact, is put there by a
     reset of the world. Nothing is moved where something is in the way of the object, see
@@ -122,7 +82,7 @@ def open_object(
     seconds
         Largest time in the world [s].
     tolerance
-        Largest distance from the target [m], [rad]; by default 2 % of the way, and 20 mm at a limit, see
+        Largest distance from the target [m], [rad]; by default 2 % of the distance, and 20 mm at a limit, see
         :func:`.choose_tolerance`.
     placements
         Largest number of sampled bases for one grasp.
@@ -135,7 +95,7 @@ def open_object(
         With ``measures``: those of :class:`.Judge`, ``placements``, ``grasps`` and ``slips`` (number of
         grasps, and of those that the handle slipped out of), ``tolerance``, ``peak_force`` [N] in a world
         with forces, and ``failure``: ``"collision"``, ``"reach"``, ``"time"`` or ``"other"`` if it was not
-        done; ``free``, the value up to which the way is free, if something is in it.
+        done; ``free``, the value up to which the path is free, if something is in the way.
 
     Raises
     ------
@@ -152,19 +112,19 @@ def open_object(
         return Outcome(False, here, fixed, world.name, 0.0, 0, {"failure": "other"})
     goal = choose_target(model, coordinate, session.state, check_target(target))
     tolerance = choose_tolerance(model, coordinate, session.state, goal, tolerance)
-    if not session.deviation(coordinate):  # an estimate is looked at before, see _Run
+    if not session.deviation(coordinate):  # with an estimate the robot looks first, see _Run
         obstacle = find_obstacle(
             model, coordinate, session.state, goal, robot=world.robot, start=session.start
         )
         if obstacle is not None:
             return Outcome(False, here, str(obstacle), world.name, 0.0, 0, obstacle.measures)
-    found = find_handle(model, coordinate, handle)
+    result = find_handle(model, coordinate, handle)
     gripper = find_gripper(model, world.robot, hand)
     opener = cached_for_version(
         model, ("opener", gripper.hand), lambda: Opener(model, gripper, session.state)
     )
     session.peak_force = math.nan
-    run = _Run(session, opener, found, goal, seconds, tolerance, placements, seed)
+    run = _Run(session, opener, result, goal, seconds, tolerance, placements, seed)
     reason, kind, measures = "", "", dict[str, Any]()
     try:
         run.perform()
@@ -200,7 +160,7 @@ def open_object(
 
 
 class _Run:
-    """One opening: its phases, and what was measured on the way."""
+    """One opening: its phases, and its measurements."""
 
     def __init__(
         self,
@@ -226,40 +186,42 @@ class _Run:
         self._earlier: list[Mapping[str, Any]] = []
         self._overlaps: list[JudgedOverlap] = []
         self._approach = Approach()
-        self._ways_back = [made for made in session.made if self._is_of_this(made)]
+        held = self.gripper.hand, handle.frame, handle.coordinate
+        self._reversible = [
+            made
+            for made in session.made
+            if (g := made.grasp) and (g.gripper.hand, g.handle.frame, g.handle.coordinate) == held
+        ]
         self.judge = Judge(
             self.model, session.world.robot, self.gripper, handle.frame,
             coordinate=handle.coordinate, start=session.start,
         )  # fmt: skip
         self.judge.update(session.world.state)
-        self.motion = HandMotion(
-            session, self.gripper, handle, opener.search, opener.approaches, self.judge, self.begin + seconds,
-            opener.controllers,
-        )  # fmt: skip
+        self.motion = HandMotion(session, opener, handle, self.judge, self.begin + seconds)
 
     @property
     def measures(self) -> dict[str, Any]:
         """Measures of the judge, also of those parts that ended with a reset of the world."""
-        found = [*self._earlier, self.judge.measures]
-        last = dict(found[-1])
+        result = [*self._earlier, self.judge.measures]
+        last = dict(result[-1])
         for name in _LARGEST:
-            last[name] = max((m[name] for m in found if not math.isnan(m[name])), default=math.nan)
+            last[name] = max((m[name] for m in result if not math.isnan(m[name])), default=math.nan)
         for what, name in _NAMED.items():
-            last[what] = max(found, key=lambda m: float(m[name]))[what]
+            last[what] = max(result, key=lambda m: float(m[name]))[what]
         for name in _SUMS:
-            last[name] = sum(m[name] for m in found)
-        last["excepted"] = tuple(dict.fromkeys(pair for m in found for pair in m["excepted"]))
+            last[name] = sum(m[name] for m in result)
+        last["excepted"] = tuple(dict.fromkeys(pair for m in result for pair in m["excepted"]))
         return last
 
     @property
     def overlap(self) -> JudgedOverlap | None:
         """The deepest overlap that came on the way, also before a reset of the world; None without any."""
-        found = [*self._overlaps, *filter(None, (self.judge.overlap,))]
-        return max(found, key=lambda one: one.depth, default=None)
+        result = [*self._overlaps, *filter(None, (self.judge.overlap,))]
+        return max(result, key=lambda one: one.depth, default=None)
 
     @property
     def how(self) -> str:
-        """Words on what was done beside a grasped motion."""
+        """Words on pushes that helped the grasped motions."""
         if self.pushed_from is None:
             return ""
         return f"; it was pushed from {self.pushed_from:.3f} on, where no grasp led further"
@@ -300,7 +262,6 @@ class _Run:
         return failure or SkillError(kind, f"After {self.grasps} grasps '{what}' is not at the target.")
 
     def _move(self, placement: BasePlacement) -> None:
-        """Move the object with one grasp as far as the way of a placement leads."""
         assert placement.grasp is not None
         self.grasps += 1
         self._come(placement)
@@ -399,7 +360,7 @@ class _Run:
         if search.standing:
             return  # the base is put elsewhere
         search.scene.update(self.session.state)
-        touching = search.scene.watch(search.own, search.others, 0.0)()
+        touching = search.scene.watch(search.robot_bodies, search.others, 0.0)()
         if len(touching):
             pair = touching[0]
             raise SkillError("collision", f"The robot begins in contact: '{pair.a}' at '{pair.b}'.")
@@ -410,22 +371,22 @@ class _Run:
         here = float(state[coordinate])
         last = self.target - math.copysign(min(self.tolerance, self.left), self.target - here)
         why = search.find_too_high(state, coordinate, np.linspace(here, last, _HEIGHTS))
-        found = self._search(min(self.samples, _PROOF)) if why else None
-        if found is not None and not (found and found.values[-1] == self.target):
-            raise SkillError("reach", f"{why} None of {found.samples} bases leads to {self.target:.3f}.")
+        result = self._search(min(self.samples, _PROOF)) if why else None
+        if result is not None and not (result and result.values[-1] == self.target):
+            raise SkillError("reach", f"{why} None of {result.samples} bases leads to {self.target:.3f}.")
 
     # -- phases --------------------------------------------------------------------------------------------
 
     def _place(self) -> BasePlacement:
-        """Return a placement that leads as far as possible, and plan the way to the handle."""
+        """Return a placement that leads as far as possible, and plan the path to the handle."""
         back = self._retrace(whole=True)
         if back is not None:
             return back
         try:
-            found = self._search(self.samples)
-            if found:
-                return found
-            failure = SkillError(found.failure, f"{found.why}{self._approach.barrier}")
+            result = self._search(self.samples)
+            if result:
+                return result
+            failure = SkillError(result.failure, f"{result.why}{self._approach.barrier}")
         except SkillError as error:  # no grasp has room
             failure = error
         back = self._retrace(whole=False)
@@ -433,17 +394,12 @@ class _Run:
             raise failure
         return back
 
-    def _is_of_this(self, made: BasePlacement) -> bool:
-        """Return whether a placement is one of this hand, handle and coordinate."""
-        grasp, own = made.grasp, (self.gripper.hand, self.handle.frame, self.handle.coordinate)
-        return grasp is not None and (grasp.gripper.hand, grasp.handle.frame, grasp.handle.coordinate) == own
-
     def _retrace(self, *, whole: bool) -> BasePlacement | None:
-        """Return the way back of a motion that ended here, to the target or at least on; None without any."""
+        """Return an earlier motion, reversed, that leads on from here or to the target; None without any."""
         session, here = self.session, float(self.session.state[self.handle.coordinate])
         session.phase = "place"
         with session.timed("place"):
-            for earlier in reversed(self._ways_back):
+            for earlier in reversed(self._reversible):
                 end = earlier.find_end_backwards(here, self.target)
                 if (
                     end is None
@@ -451,20 +407,20 @@ class _Run:
                     or abs(end - here) < _LEAST_PROGRESS * self.left
                 ):
                     continue
-                found = self.opener.search.retrace(session.state, earlier, end, self._plan)
-                if found is not None:
-                    self._ways_back.remove(earlier)
-                    return found
+                result = self.opener.search.retrace(session.state, earlier, end, self._plan)
+                if result is not None:
+                    self._reversible.remove(earlier)
+                    return result
         self._approach = Approach()
         return None
 
     def _search(self, samples: int) -> BasePlacement:
         """Search a placement, with hands that come from along the bar where no other one leads to it."""
-        found = self._search_with(samples, 0.0)
-        if not found and not self.handle.is_knob:
+        result = self._search_with(samples, 0.0)
+        if not result and not self.handle.is_knob:
             with contextlib.suppress(SkillError):  # there may be no room for such a hand
-                found = self._search_with(samples, _SLANT) or found
-        return found
+                result = self._search_with(samples, _SLANT) or result
+        return result
 
     def _search_with(self, samples: int, slant: float) -> BasePlacement:
         """Search a placement among the most sampled bases that are allowed, and count them."""
@@ -478,7 +434,7 @@ class _Run:
                 grasps = self.opener.grasps(self.handle, session.state, self.seed, slant)
             except InvalidValueError as error:
                 raise SkillError("collision", str(error)) from error
-            found = search.find(
+            result = search.find(
                 session.state,
                 grasps,
                 self.target,
@@ -487,16 +443,15 @@ class _Run:
                 seed=self.seed + self.grasps,
                 report=session.report_search,
             )
-        self.placements += found.samples
-        return found
+        self.placements += result.samples
+        return result
 
     def _plan(self, placement: BasePlacement) -> bool:
-        """Plan the way to the pose before the handle, and return whether there is one."""
+        """Plan the path to the pose before the handle, and return whether there is one."""
         self._approach = self.opener.approaches.plan_to(self.session.state, placement, self.seed)
         return bool(self._approach)
 
     def _come(self, placement: BasePlacement) -> None:
-        """Bring the base to its place, and the hand to the handle."""
         self._bring_base(self._approach)
         self.session.phase = "approach"
         assert self._approach.trajectory is not None

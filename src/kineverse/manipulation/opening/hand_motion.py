@@ -15,48 +15,39 @@ from kineverse.compilation import compile
 from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
 from kineverse.geometry import Rule, Scene
-from kineverse.grasping import Grasp, Gripper, Handle
+from kineverse.grasping import Grasp, Handle
 from kineverse.lie import Array, inverse
-from kineverse.manipulation.outcome import SkillError, SlipError
+from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import HandReference, Session, Speeds
+from kineverse.manipulation.slip_detection import SlipDetector
 from kineverse.model.frame import is_of_robot
 from kineverse.planning import Trajectory, TrajectoryFollower
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
-from .approach_planner import Approach, ApproachPlanner
-from .base_placement import BasePlacement, PlacementSearch
+from .approach_planner import Approach, Opener
+from .base_placement import BasePlacement
 from .cartesian_paths import find_least_time, row_at
+from .path_collisions import draw_retreats
 
-_CLOSING, _MOST_CLOSING = 1.5, 4.0
-"""Time in which fingers open or close fully, and the largest one [s]."""
-_IDLE = 10
-"""Number of steps in which fingers that stand still have not moved."""
-_LINE_SPEED = 0.1
-"""Speed of the hand on the straight way to the handle and from it [m/s]."""
+_CLOSING, _MOST_CLOSING = 1.5, 4.0  # time in which fingers open or close fully, and the largest one [s]
+_IDLE = 10  # number of steps in which fingers that stand still have not moved
+_LINE_SPEED = 0.1  # speed of the hand on the straight path to the handle and from it [m/s]
 _SETTLED, _MOST_SETTLING = 5e-4, 150
-"""Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
-_REFERENCES = 24
-"""Number of poses that pages show of a way."""
+"""Error of the hand's pose at the end of a straight path [m], [rad], and the most steps until it is met."""
+_REFERENCES = 24  # number of poses that pages show of a path
 _KNOWN, _MOST_LOOKING, _UNKNOWN = 1.5e-3, 1.0, 0.02
 """Deviation of a handle's position that is small [m], longest time to look until it is [s], and the deviation
 from which on nothing is done [m]."""
-_SIGMAS = 2.0
-"""Standard deviations of the believed handle by which the hand may be off instead."""
+_SIGMAS = 2.0  # standard deviations of the believed handle by which the hand may be off instead
 FOLLOWING = 5.0
 """Gain of all goals and holds [1/s]. A larger one follows the noise of estimates, and the delay of servos
 adds to it."""
-_POSTURE = 0.5
-"""Weight of the arm beside the object."""
-_LOST = 0.002
-"""Motion of closed fingers that says that nothing is between them any more [m]."""
-_ARRIVED = 0.05
-"""Distance from the end of a way up to which the retreat there is meant [m], [rad]."""
-_BESIDE = 0.008
-"""Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
-_KEPT = 8
-"""Number of controllers that are kept."""
+_POSTURE = 0.5  # weight of the arm relative to the object
+_ARRIVED = 0.05  # distance from the end of a path up to which the retreat there is meant [m], [rad]
+_BESIDE = 0.008  # difference of the gap to the thickness of the bar if it is not between the fingers [m]
+_KEPT = 8  # number of controllers that are kept
 
 Targets = TypeVar("Targets")
 
@@ -64,27 +55,16 @@ Targets = TypeVar("Targets")
 class HandMotion:
     """Motions of the hand of a robot at a handle."""
 
-    def __init__(
-        self,
-        session: Session,
-        gripper: Gripper,
-        handle: Handle,
-        search: PlacementSearch,
-        approaches: ApproachPlanner,
-        judge: Judge,
-        until: float,
-        controllers: dict[Hashable, tuple[Controller, Any]] | None = None,
-    ) -> None:
-        self.session, self.gripper, self.handle = session, gripper, handle
-        self.search, self.approaches, self.judge, self.until = search, approaches, judge, until
-        self.model = search.model
-        self.turns: Array = np.zeros(len(search.moving))
-        self.controllers = {} if controllers is None else controllers
-        self._hand, self._bar = self.model.fk(gripper.hand), self.model.fk(handle.frame)
+    def __init__(self, session: Session, opener: Opener, handle: Handle, judge: Judge, until: float) -> None:
+        self.session, self.handle, self.judge, self.until = session, handle, judge, until
+        self.gripper, self.search, self.approaches = opener.gripper, opener.search, opener.approaches
+        self.controllers, self.model = opener.controllers, opener.search.model
+        self.turns: Array = np.zeros(len(self.search.moving))
+        self._hand, self._bar = self.model.fk(self.gripper.hand), self.model.fk(handle.frame)
         self._slope = self._bar[:3, 3].partial([handle.coordinate])
-        limits = {s: self.model.limits(s) for s in (*search.moving, handle.coordinate)}
+        limits = {s: self.model.limits(s) for s in (*self.search.moving, handle.coordinate)}
         self._limits = {s: (float(a), float(b)) for s, (a, b) in limits.items()}
-        self._closed_at: dict[Symbol, float] = {}
+        self.fingers: dict[Symbol, float] = {}  # where they stood around the bar
 
     @property
     def deviation(self) -> float:
@@ -157,8 +137,8 @@ class HandMotion:
         session = self.session
 
         def make() -> tuple[Controller, TrajectoryFollower]:
-            found = TrajectoryFollower(trajectory)
-            return self.controller(found.tasks, posture=0.0), found
+            result = TrajectoryFollower(trajectory)
+            return self.controller(result.tasks, posture=0.0), result
 
         controller, follower = self.find_controller(("follow", trajectory.symbols), make)
         follower.trajectory = trajectory
@@ -188,12 +168,12 @@ class HandMotion:
 
         bar = compile(self._bar, tier="interpreter")  # some hundred calls
         controller, (wanted, rate, posture, follow) = self.find_controller(("line", rows is None), make)
-        way = end[:3, 3] - start[:3, 3]
-        seconds = float(np.linalg.norm(way)) / _LINE_SPEED
+        displacement = end[:3, 3] - start[:3, 3]
+        seconds = float(np.linalg.norm(displacement)) / _LINE_SPEED
         if rows is not None:
             seconds = max(seconds, find_least_time(rows, self.search.samples.speeds))
         steps = max(2, math.ceil(seconds / session.dt))
-        speed = np.concatenate([end[:3, :3].T @ way / (steps * session.dt), np.zeros(3)])
+        speed = np.concatenate([end[:3, :3].T @ displacement / (steps * session.dt), np.zeros(3)])
         uncertain = [session.deviation(x) for x in (self._bar @ end)[:3, 3]]
         settled = max(_SETTLED, _SIGMAS * float(np.linalg.norm(uncertain)))
         self.refer(self._bar(session.state) @ np.array([start, end]))
@@ -208,7 +188,7 @@ class HandMotion:
                 controller.set(wanted, bar(state.vector(bar.inputs)) @ pose)
                 controller.set(rate, speed if k < steps else 0.0 * speed)
                 if posture is not None and follow is not None and rows is not None:
-                    # A base that lags would lead the arm along another way than the checked one.
+                    # A base that lags would lead the arm along a path that was not checked.
                     row, next_row = row_at(rows, share), row_at(rows, min(1.0, (k + 1) / steps))
                     controller.set(posture, row)
                     controller.set(follow, (next_row - row) / session.dt)
@@ -248,24 +228,13 @@ class HandMotion:
         self.move_fingers(self.gripper.closed)
         self._await_readings()
         state, gripper = self.session.state, self.gripper
-        self._closed_at = {s: state[s] for s in gripper.joints}
+        self.fingers = {s: state[s] for s in gripper.joints}
         narrow = gripper.values_at(max(0.25 * grasp.thickness, grasp.thickness - _BESIDE))
         wide = gripper.values_at(grasp.thickness + _BESIDE)
         return all(
             min(narrow[s], wide[s]) - 1e-4 <= state[s] <= max(narrow[s], wide[s]) + 1e-4
             for s in gripper.joints
         )
-
-    def is_lost(self) -> bool:
-        """Return True if the fingers have closed further since they stood around the bar."""
-        gripper, state = self.gripper, self.session.state
-        closed = 0.0
-        for s, held in self._closed_at.items():
-            range_ = gripper.closed[s] - gripper.opened[s]
-            noise = math.copysign(4.0 * self.session.deviation(s), range_)
-            further = (state[s] - held - noise) / range_ if range_ else 0.0
-            closed = max(closed, gripper.width * further)
-        return closed > _LOST
 
     def release(self, placement: BasePlacement) -> None:
         """Open the fingers, and take the hand away."""
@@ -277,7 +246,7 @@ class HandMotion:
         pose = inverse(world_T_bar) @ world_T_hand
         self.session.phase = "retract"
         if abs(state[self.handle.coordinate] - placement.values[-1]) > _ARRIVED:
-            # The retreat of the placement was looked at for an object that has arrived.
+            # The retreat of the placement was checked for an object that has arrived.
             retreat = find_retreat(self, grasp, world_T_bar, world_T_hand)
             self.follow_line(pose, inverse(world_T_bar) @ retreat.end, retreat.arms)
             return
@@ -300,19 +269,19 @@ class HandMotion:
             others = (s for s in self.model.degrees_of_freedom if s not in moving)
             still += [s for s in others if not is_of_robot(s.path, robot)]
         with self.session.timed("plan"):  # which lasts less in the interpreter than a compiler would take
-            return Controller(self.model, tasks, dt=self.session.dt, still=still, **options)
+            return Controller(self.model, tasks, dt=self.session.dt, fixed=still, **options)
 
     def find_controller(
         self, key: Hashable, make: Callable[[], tuple[Controller, Targets]]
     ) -> tuple[Controller, Targets]:
-        """Return a controller at rest and targets of its tasks, those of an earlier motion if there are."""
+        """Return a controller at rest and the targets of its tasks, those of an earlier motion if any."""
         key = key, self.session.dt
-        found = self.controllers.pop(key) if key in self.controllers else make()
-        self.controllers[key] = found  # the last one is the one used last
+        result = self.controllers.pop(key) if key in self.controllers else make()
+        self.controllers[key] = result  # the last one is the one used last
         if len(self.controllers) > _KEPT:
             del self.controllers[next(iter(self.controllers))]
-        found[0].reset()
-        return found
+        result[0].reset()
+        return result
 
     def move_fingers(self, values: Mapping[Symbol, float]) -> None:
         """Move the fingers to values, or until they stand still."""
@@ -350,7 +319,7 @@ class HandMotion:
         begin = session.world.time
         while (seen := session.observation) is not None and seen.stamp < begin - 1e-9:
             if session.world.time - begin > _MOST_LOOKING:
-                raise SkillError("other", f"The sensors have said nothing for {_MOST_LOOKING:g} s.")
+                raise SkillError("other", f"The sensors have been silent for {_MOST_LOOKING:g} s.")
             self.act({})
 
     def act(self, speeds: Mapping[Symbol, float], command: Command | None = None) -> None:
@@ -360,11 +329,11 @@ class HandMotion:
         self.judge.update(session.world.state, session.commands, held=session.world.held)
 
     def refer(self, poses: npt.ArrayLike) -> None:
-        """State the world poses (K, 4, 4) of the hand along the way that begins."""
+        """State the world poses (K, 4, 4) of the hand along the path that begins."""
         self.session.reference = HandReference(np.asarray(poses, dtype=float))
 
     def refer_to(self, share: float) -> None:
-        """State the share of the way that lies behind, in [0, 1]."""
+        """State the share of the path that was passed, in [0, 1]."""
         if self.session.reference is not None:
             self.session.reference.share = share
 
@@ -374,39 +343,27 @@ class HandMotion:
             raise SkillError("time", f"The time is up in '{self.session.phase}'.")
 
 
-_SPEED, _RAMP = 0.3, 0.5
-"""Speed of an object along its planned way [m/s], [rad/s], and the time from rest to it [s]."""
-_LATE = 0.1
-"""Distance from the way at which the reference begins to wait [m], [rad]."""
-_MARGIN = 0.002
-"""Least distance of bodies while the object moves [m]; placements keep more."""
-_SLIPPED, _SLIP_SIGMAS = 0.008, 4.0
-"""Distance of the bar from its place in the hand from which on it has slipped [m], and the standard
-deviations of its estimate that are added."""
-_STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
-"""Least progress of the object [m], [rad] in a time [s], and in one at the end of the way."""
+_SPEED, _RAMP = 0.3, 0.5  # speed of an object on its path [m/s], [rad/s], and time from rest to it [s]
+_LATE = 0.1  # distance from the path at which the reference begins to wait [m], [rad]
+_MARGIN = 0.002  # least distance of bodies while the object moves [m]; placements keep more
+_STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5  # least progress [m], [rad] in a time [s], and at the end
 _LOCKED, _STANDING = 1.5, 1e-3
 """Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
 beyond some [m/s], [rad/s] for it either: its own constraints hold it."""
-_STEPS_AT_TARGET = 10
-"""Number of steps for which an estimate is at the target when a motion ends."""
+_STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target when a motion ends
 
 
 def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
-    """Move a held object along the way of a placement."""
+    """Move a held object along the path of a placement."""
     bar, hand = motion.model.fk(motion.handle.frame), motion.model.fk(motion.gripper.hand)
     session, coordinate, grasp = motion.session, motion.handle.coordinate, placement.grasp
     assert grasp is not None
     session.phase = "move"
-    state = session.state
-    held = inverse(bar(state)) @ hand(state)
-    middle = motion.gripper.grasp_pose[:, 3]
-    uncertain = [session.deviation(x) for x in ((bar @ held - hand) @ middle)[:3]]
-    slipped = _SLIPPED + _SLIP_SIGMAS * float(np.linalg.norm(uncertain))
-    poses = compile([bar, hand], tier="interpreter")  # a call a step
+    slip = SlipDetector(session, motion.gripper, bar, hand, motion.fingers)
+    held = slip.bar_T_hand
     target = float(placement.values[-1])
     moving = motion.search.moving
-    rows = motion.rows(placement.way)
+    rows = motion.rows(placement.path)
     values = placement.values
 
     def make() -> tuple[Controller, tuple[Target, Target, Target, Target]]:
@@ -416,15 +373,15 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
         hold = Hold(same_pose(bar @ grasped.expression, hand), gain=FOLLOWING, name="grasp")
         goal = Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")
         scene = Scene(motion.model, rules=motion.holding_rules)
-        found = motion.controller([hold, goal, *goals], scene=scene, margin=_MARGIN)
-        return found, (grasped, wanted, posture, arm_speeds)
+        result = motion.controller([hold, goal, *goals], scene=scene, margin=_MARGIN)
+        return result, (grasped, wanted, posture, arm_speeds)
 
     key = "held", motion.handle.frame, coordinate
     controller, (grasped, wanted, posture, arm_speeds) = motion.find_controller(key, make)
     share, speed, length = 0.0, 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time
     controller.set(grasped, held)
-    controller.set(arm_speeds, np.zeros(len(moving)))  # the way waits for the arm
+    controller.set(arm_speeds, np.zeros(len(moving)))  # the path waits for the arm
     places = np.linspace(values[0], target, len(values)).tolist()
     motion.refer([bar(session.state.updated({coordinate: v})) @ held for v in places])
     within, enough = 0, _STEPS_AT_TARGET if session.deviation(coordinate) else 1
@@ -449,17 +406,10 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             speed = min(speed + _SPEED / _RAMP * session.dt, _SPEED)
             speed *= min(1.0, max(0.0, 1.5 - late / _LATE))
             share = min(1.0, share + speed * session.dt / length)
-            world_T_bar, world_T_hand = poses(state.vector(poses.inputs))
-            apart = float(np.linalg.norm(((world_T_bar @ held - world_T_hand) @ middle)[:3]))
+            apart = slip.measure(state)
         motion.refer_to(share)
         motion.act(command.speeds, command)
-        if motion.is_lost() or apart > slipped:
-            how = (
-                "It is out of the hand."
-                if motion.is_lost()
-                else f"It moved {1e3 * apart:.0f} mm in the hand."
-            )
-            raise SlipError(f"The handle slipped at {session.state[coordinate]:.3f} of '{coordinate}'. {how}")
+        slip.check(apart, coordinate)
         done = abs(session.state[coordinate] - values[0])
         if done > best + _STALLED:
             best, since = done, session.world.time
@@ -476,15 +426,12 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             )
 
 
-_ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))
-"""Angles along the bar by which a retreat deviates from the reversed approach [rad]."""
-_STEPS = 12
-"""Number of arms along a retreat."""
+_STEPS = 12  # number of arms along a retreat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandRetreat:
-    """Straight way of a hand from a handle."""
+    """Straight path of a hand from a handle."""
 
     end: Array  # last pose world_T_hand (4, 4)
     arms: Array | None  # configurations (L, n) of the arm along it; None if the arm does not reach the end
@@ -496,25 +443,17 @@ def find_retreat(motion: HandMotion, grasp: Grasp, world_T_handle: Array, world_
     It is the reversed approach of the grasp, or deviates from it along the bar.
     """
     search, state = motion.search, motion.state
-    out = grasp.approach[:3, 3] - grasp.pose[:3, 3]
-    bar, length = grasp.handle.pose[:3, 2], float(np.linalg.norm(out))
-    ends = np.repeat(world_T_hand[None], len(_ASIDE), axis=0)
-    for k, angle in enumerate(_ASIDE):
-        away = math.cos(angle) * out + math.sin(angle) * length * bar
-        ends[k, :3, 3] += world_T_handle[:3, :3] @ away
-    share = np.linspace(0.0, 1.0, _STEPS)[:, None]
-    lines = np.repeat(ends[:, None], _STEPS, axis=1)
-    lines[:, :, :3, 3] = world_T_hand[:3, 3] + share * (ends[:, None, :3, 3] - world_T_hand[:3, 3])
+    lines = draw_retreats(grasp, world_T_handle, world_T_hand, _STEPS)
     arm, base = state.vector(search.moving), state.vector(search.standing)
-    count = len(_ASIDE)
-    ways, reached = search.paths.follow(np.tile(arm, (count, 1)), np.tile(base, (count, 1)), lines)
+    count, ends = len(lines), lines[:, -1]
+    paths, reached = search.paths.follow(np.tile(arm, (count, 1)), np.tile(base, (count, 1)), lines)
     best, farthest = HandRetreat(ends[0], None), 0
-    for end, way, number in zip(ends, ways, reached.tolist(), strict=True):
+    for end, path, number in zip(ends, paths, reached.tolist(), strict=True):
         if number < 2:
             continue
-        rows = way[:number]
+        rows = path[:number]
         hit = search.contacts.first(state, search.moving, rows, motion.handle.frame, opened=False)
         free = number if hit is None else hit
         if free > farthest:
-            best, farthest = HandRetreat(end, way if number == _STEPS else None), free
+            best, farthest = HandRetreat(end, path if number == _STEPS else None), free
     return best

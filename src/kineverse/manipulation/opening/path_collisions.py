@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -21,28 +20,26 @@ from kineverse.symbols import Symbol
 
 from .cartesian_paths import CartesianPaths
 
-OWN_MARGIN = 0.003
-"""Least distance of the robot's own links [m]; pairs that are always nearer do not count."""
-_BESIDE_BAR = 5e-4
-"""Least distance of the opened fingers from the handle [m]."""
+OWN_MARGIN = 0.003  # least distance of the robot's own links [m]; pairs that are always nearer do not count
+_BESIDE_BAR = 5e-4  # least distance of the opened fingers from the handle [m]
 
 
 class PathContacts:
-    """Queries of the distances of a robot along ways."""
+    """Queries of the distances of a robot along paths."""
 
     def __init__(
         self,
         model: ModelView,
         scene: Scene,
         gripper: Gripper,
-        own: Sequence[str],
+        robot_bodies: Sequence[str],
         others: Sequence[str],
         margin: float,
     ) -> None:
         self.scene, self.gripper, self.margin = scene, gripper, margin
-        self.own, self.others = tuple(own), tuple(others)
-        self._model = model
-        self._hand = {b for b in own if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
+        self.robot_bodies, self.others = tuple(robot_bodies), tuple(others)
+        self._self_watch = scene.watch(self.robot_bodies, self.robot_bodies, OWN_MARGIN)
+        self.hand = {b for b in robot_bodies if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
         self._around: dict[str, PreparedQuery] = {}
         self._beside: dict[str, PreparedQuery] = {}
         self._found: tuple[PreparedQuery, float] | None = None
@@ -55,14 +52,16 @@ class PathContacts:
         The scene is placed there.
         """
         self.scene.update(state.updated(dict(zip(columns, rows[0].tolist(), strict=True))))
-        queries = [(self._watch_around(handle), self.margin), (self._own_watch, OWN_MARGIN)]
+        queries = [(self._watch_around(handle), self.margin), (self._self_watch, OWN_MARGIN)]
         if opened and handle:
-            queries.append((self._watch_beside(handle), _BESIDE_BAR))
+            if handle not in self._beside:
+                self._beside[handle] = self.scene.watch([*self.gripper.bodies], [handle], _BESIDE_BAR)
+            queries.append((self._beside[handle], _BESIDE_BAR))
         first: int | None = None
         for query, radius in queries:
-            found = query.first_within(columns, rows[:first], radius) if first != 0 else None
-            if found is not None:
-                first, self._found = found, (query, radius)
+            result = query.first_within(columns, rows[:first], radius) if first != 0 else None
+            if result is not None:
+                first, self._found = result, (query, radius)
         if first is not None:
             self.scene.update(state.updated(dict(zip(columns, rows[first].tolist(), strict=True))))
         return first
@@ -72,58 +71,40 @@ class PathContacts:
         assert self._found is not None
         query, radius = self._found
         pair = query(radius)[0]
-        return (pair.b, pair.a) if pair.b in self._hand else (pair.a, pair.b)
-
-    def is_of_hand(self, body: str) -> bool:
-        """Return True if a body is rigid with the hand or one of its fingers."""
-        return body in self._hand
+        return (pair.b, pair.a) if pair.b in self.hand else (pair.a, pair.b)
 
     def _watch_around(self, handle: str) -> PreparedQuery:
         """Return the query of the robot's distance from everything else, but of the hand from the handle."""
         if handle not in self._around:
             bodies = self.gripper.bodies if handle else ()
             allowed = [Rule(b, handle, False, "grasped") for b in bodies]
-            self._around[handle] = self.scene.watch(self.own, self.others, self.margin, rules=allowed)
+            self._around[handle] = self.scene.watch(
+                self.robot_bodies, self.others, self.margin, rules=allowed
+            )
         return self._around[handle]
 
-    def _watch_beside(self, handle: str) -> PreparedQuery:
-        """Return the query of the hand's distance from the handle."""
-        if handle not in self._beside:
-            self._beside[handle] = self.scene.watch([*self.gripper.bodies], [handle], _BESIDE_BAR)
-        return self._beside[handle]
 
-    @cached_property
-    def _own_watch(self) -> PreparedQuery:
-        return self.scene.watch(self.own, self.own, OWN_MARGIN)
-
-
-_LINE = 5
-"""Number of configurations on the straight way to the handle."""
-_BETWEEN = 4
-"""Number of samples between neighbouring configurations that are checked."""
-_SHORTER = 0.15
-"""Share of the motion by which a way is shortened where that may help."""
-_ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))
-"""Angles along the bar by which a retreat deviates from the reversed approach [rad]."""
-_LEAST_RETREAT = 3
-"""Least number of configurations of a retreat."""
-_SWEEP = 8
-"""Number of gaps of the fingers that are checked while they close or open."""
+_LINE = 5  # number of configurations on the straight path to the handle
+_BETWEEN = 4  # number of samples between neighbouring configurations that are checked
+_SHORTER = 0.15  # share of the motion by which a path is shortened where that may help
+_ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))  # of retreats, along the bar [rad]
+_LEAST_RETREAT = 3  # least number of configurations of a retreat
+_SWEEP = 8  # number of gaps of the fingers that are checked while they close or open
 
 
 @dataclass(slots=True, eq=False)
 class CandidatePath:
-    """Way of an arm that reaches, until the value with the index ``end``."""
+    """Path of an arm that reaches, until the value with the index ``end``."""
 
     choice: int  # index of the grasp
     base: Array  # values of the coordinates that stand
     back: Array  # configurations (L, n) from the handle to the pose before it
-    way: Array  # configurations (K, n) along the values of the object
+    path: Array  # configurations (K, n) along the values of the object
     end: int  # index of the last value
 
 
 class PathCheck:
-    """Check of ways in one state, of one object."""
+    """Check of paths in one state, of one object."""
 
     def __init__(
         self,
@@ -140,13 +121,12 @@ class PathCheck:
         self.reasons = Counter[str]()
         gripper, handle = grasps[0].gripper, grasps[0].handle
         self._gripper, self._frame = gripper, handle.frame
-        self._bar = handle.pose[:3, 2]
         self._columns: tuple[Symbol, ...] = (
             *paths.moving, *paths.still, *gripper.joints, handle.coordinate,
         )  # fmt: skip
 
     def find_retreat(self, candidate: CandidatePath) -> Array | None:
-        """Return a retreat (L, n) of a candidate without contacts; otherwise shorten its way."""
+        """Return a retreat (L, n) of a candidate without contacts; otherwise shorten its path."""
         if self._is_blocked_before(candidate) or self._is_blocked_along(candidate):
             return None
         retreat = self._retreat(candidate)
@@ -167,21 +147,21 @@ class PathCheck:
         ]
         for rows, frame, fingers_open in parts:
             if self._find(rows, frame, opened=fingers_open) is not None:
-                if self.contacts.is_of_hand(self._note()) and frame:
+                if self._note() in self.contacts.hand and frame:
                     self.free[candidate.choice] = -1
                 candidate.end = -1
                 return True
         return False
 
     def _is_blocked_along(self, candidate: CandidatePath) -> bool:
-        """Return True, and shorten the way of the candidate, if something is in it."""
+        """Return True, and shorten the path of the candidate, if something is in the way."""
         grasp, end, base = self.grasps[candidate.choice], candidate.end, candidate.base
         closed = self._gripper.values_at(grasp.thickness)
-        rows = self._rows(candidate.way[: end + 1], base, closed, self.values[: end + 1])
+        rows = self._rows(candidate.path[: end + 1], base, closed, self.values[: end + 1])
         first = self._find(rows, self._frame, opened=False)
         if first is not None:
             candidate.end = first // _BETWEEN - 1
-            if self.contacts.is_of_hand(self._note()):
+            if self._note() in self.contacts.hand:
                 self.free[candidate.choice] = min(int(self.free[candidate.choice]), candidate.end)
             return True
         return False
@@ -192,32 +172,25 @@ class PathCheck:
         It is the reversed approach, or deviates from it along the bar, between the fingers.
         """
         grasp, end, base = self.grasps[candidate.choice], candidate.end, candidate.base
-        Q = candidate.way[end]
+        Q = candidate.path[end]
         sweep = self._sweep(grasp, Q, base, end)
         if self._find(sweep, self._frame, opened=False) is not None:
             self._note()
             return None
-        out = grasp.approach[:3, 3] - grasp.pose[:3, 3]
-        pose = self.handles[end] @ grasp.pose
-        ends = np.repeat(pose[None], len(_ASIDE), axis=0)
-        length = float(np.linalg.norm(out))
-        for k, angle in enumerate(_ASIDE):
-            away = math.cos(angle) * out + math.sin(angle) * length * self._bar
-            ends[k, :3, 3] += self.handles[end, :3, :3] @ away
-        count = len(_ASIDE)
-        lines = interpolate_poses(np.repeat(pose[None], count, axis=0), ends)
-        ways, reached = self.paths.follow(np.tile(Q, (count, 1)), np.tile(base, (count, 1)), lines)
+        lines = draw_retreats(grasp, self.handles[end], self.handles[end] @ grasp.pose, _LINE)
+        count = len(lines)
+        paths, reached = self.paths.follow(np.tile(Q, (count, 1)), np.tile(base, (count, 1)), lines)
         opened = self._gripper.opened
         blocked = False
         for k in np.argsort(-reached, kind="stable"):
-            way = ways[k, : reached[k]]
-            if len(way) < _LEAST_RETREAT:
+            path = paths[k, : reached[k]]
+            if len(path) < _LEAST_RETREAT:
                 break
-            rows = self._rows(way, base, opened, np.full(len(way), self.values[end]))
+            rows = self._rows(path, base, opened, np.full(len(path), self.values[end]))
             # At its end the hand is free: a path begins there.
             parts = ((rows, self._frame), (rows[-1:], ""))
             if all(self._find(part, frame, opened=True) is None for part, frame in parts):
-                return np.asarray(way)
+                return np.asarray(path)
             blocked = True
             self._note()
         if not blocked:
@@ -252,9 +225,21 @@ class PathCheck:
         return one
 
 
-def interpolate_poses(a: Array, b: Array) -> Array:
-    """Return poses (N, L, 4, 4) on the straight way between poses of one orientation, a first."""
-    share = np.linspace(0.0, 1.0, _LINE)
-    poses = np.repeat(a[:, None], _LINE, axis=1)
+def draw_retreats(grasp: Grasp, world_T_handle: Array, world_T_hand: Array, count: int) -> Array:
+    """Return straight retreats (N, L, 4, 4): the reversed approach of a grasp, and others along the bar."""
+    out, bar = grasp.approach[:3, 3] - grasp.pose[:3, 3], grasp.handle.pose[:3, 2]
+    length = float(np.linalg.norm(out))
+    starts = np.repeat(world_T_hand[None], len(_ASIDE), axis=0)
+    ends = starts.copy()
+    for k, angle in enumerate(_ASIDE):
+        away = math.cos(angle) * out + math.sin(angle) * length * bar
+        ends[k, :3, 3] += world_T_handle[:3, :3] @ away
+    return interpolate_poses(starts, ends, count)
+
+
+def interpolate_poses(a: Array, b: Array, count: int = _LINE) -> Array:
+    """Return poses (N, L, 4, 4) on the straight path between poses of one orientation, a first."""
+    share = np.linspace(0.0, 1.0, count)
+    poses = np.repeat(a[:, None], count, axis=1)
     poses[:, :, :3, 3] += share[:, None] * (b - a)[:, None, :3, 3]
     return poses

@@ -14,16 +14,11 @@ from kineverse.state import State
 from .approach_planner import Approach
 from .hand_motion import HandMotion
 
-_SAMPLES = 960
-"""Largest number of sampled starts. A limit of time would let results depend on other processes."""
-_LEAST_SHARE = 0.2
-"""Least share of the motion that a push is for."""
-_LONGER, _SETTLING = 1.5, 2.0
-"""Share of its time in the roll-out for which a push to a part of the motion lasts, and what is added [s]."""
-_PLANNING = 1.0
-"""Largest time to plan the way to a start [s]."""
-_PUSHING = 10.0
-"""Time in the world that a push is given at least [s]."""
+_SAMPLES = 960  # most sampled starts; a limit of time would let results depend on other processes
+_LEAST_SHARE = 0.2  # least share of the motion that a push is for
+_LONGER, _SETTLING = 1.5, 2.0  # share of the time in the roll-out that a partial push lasts, and rest [s]
+_PLANNING = 1.0  # largest time to plan the path to a start [s]
+_PUSHING = 10.0  # time in the world that a push is given at least [s]
 
 
 class PushRegrasp:
@@ -36,7 +31,7 @@ class PushRegrasp:
         self.approach = Approach()
 
     def find_start(self, seed: int) -> None:
-        """Find a state of the robot from which the push goes through, or far, and to which a way leads."""
+        """Find a state of the robot from which the push goes through, or far, and to which a path leads."""
         motion, session = self.motion, self.motion.session
         session.phase = "place"
         session.report_search("starts of a push, as no grasp leads on")
@@ -51,9 +46,9 @@ class PushRegrasp:
                     target=self.target,
                     robot=session.world.robot,
                     dt=session.dt,
-                    still=motion.gripper.joints,
+                    fixed=motion.gripper.joints,
                 )
-                found = find_push_start(
+                result = find_push_start(
                     self.pushing,
                     state,
                     samples=_SAMPLES,
@@ -65,14 +60,14 @@ class PushRegrasp:
                 )
             except InvalidValueError as error:
                 raise SkillError("reach", f"It cannot be pushed: {error}") from error
-        self.samples += found.samples
-        if found.state is None:
-            raise SkillError(found.failure, f"Nor does a push: {found.why}")
-        if not found.whole:
-            self._seconds = _LONGER * found.steps * session.dt + _SETTLING
+        self.samples += result.samples
+        if result.state is None:
+            raise SkillError(result.failure, f"Nor does a push: {result.why}")
+        if not result.whole:
+            self._seconds = _LONGER * result.steps * session.dt + _SETTLING
 
     def _plan(self, start: State) -> str:
-        """Plan the way to a start, and return why there is none."""
+        """Plan the path to a start, and return why there is none."""
         motion, state = self.motion, self.motion.session.state
         self.approach = motion.approaches.plan(state, start, seconds=_PLANNING)
         if self.approach.trajectory is None:

@@ -25,33 +25,23 @@ from kineverse.symbols import Symbol
 
 from .push_controller import Pushing
 
-_STANDOFF = 0.03
-"""Distance of the tip from the contact point at the start [m]."""
-_TILT = math.radians(50.0)
-"""Largest angle between the pusher's axis and the direction of the push at a start that is exact."""
-_NEARBY = 0.12
-"""Largest entry of the distance of the tip at a start that is not [m]."""
+_STANDOFF = 0.03  # distance of the tip from the contact point at the start [m]
+_TILT = math.radians(50.0)  # largest angle of the pusher's axis to the push at an exact start
+_NEARBY = 0.12  # largest entry of the distance of the tip at a start that is not [m]
 _MARGIN = 0.01
 _LEAST_CLEARANCE = 1.5e-3
 """Least distance in a roll-out of pairs that may not touch [m]: pushes in worlds differ a little."""
-_STARTS = 4
-"""Number of arms from which inverse kinematics decides whether an arm that stands reaches a point."""
-_CANDIDATES = 1.0
-"""Largest difference of the score of contact points to the best one."""
-_SOLVER_STARTS = 2, 1
-"""Numbers of starts of inverse kinematics: to the point, and out of collisions from there."""
-_DRAWS = 40
-"""Number of times that a place is drawn at which the base touches nothing."""
+_STARTS = 4  # number of arms from which inverse kinematics decides whether an arm that stands reaches a point
+_CANDIDATES = 1.0  # largest difference of the score of contact points to the best one
+_SOLVER_STARTS = 2, 1  # starts of inverse kinematics: to the point, and out of collisions from there
+_DRAWS = 40  # number of times that a place is drawn at which the base touches nothing
 _MOST_UNMOVED, _MOST_NO_FURTHER = 60, 120
 """Numbers of roll-outs without motion of the object, and without more of it, after which none is expected."""
-_NOWHERE = 200
-"""Number of samples after which the search ends if none could be rolled out."""
-_REPORTED = 20
-"""Number of samples from one text on the progress to the next."""
+_NOWHERE = 200  # number of samples after which the search ends if none could be rolled out
+_REPORTED = 20  # number of samples from one text on the progress to the next
 _NO_ROOM, _UNREACHED, _LATE = "too little room", "out of reach", "out of time"
 _CLASSES = {_UNREACHED: "reach", _LATE: "time"}
-_MOVED = 0.01
-"""Motion of an object that counts as one [m], [rad]."""
+_MOVED = 0.01  # motion of an object that counts as one [m], [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,8 +69,8 @@ class PushStart:
     def why(self) -> str:
         """Text with the number of samples and the reasons of failures."""
         failed = ", ".join(f"{count} {reason}" for reason, count in self.reasons.most_common(6))
-        found = f"Found after {self.samples} samples" if self else f"None of {self.samples} samples"
-        return f"{found}; failed: {failed}." if failed else f"{found}."
+        result = f"Found after {self.samples} samples" if self else f"None of {self.samples} samples"
+        return f"{result}; failed: {failed}." if failed else f"{result}."
 
 
 def find_push_start(
@@ -130,12 +120,12 @@ def find_push_start(
             reasons[start] += 1
             continue
         end, rolled = roll_out(pushing, start, steps), rolled + 1
-        problem, way = end.problem, abs(end.value - here)
-        # Pushes that go through and are not accepted tell nothing about those to come.
-        since = 0 if not problem or way > furthest + _MOVED else since + 1
-        furthest = max(furthest, way) if way > _MOVED else furthest
-        if problem and problem != _NO_ROOM and way >= least * abs(pushing.target - here):
-            parts.append((-way, count, start, end.steps))
+        problem, distance = end.problem, abs(end.value - here)
+        # A push that goes through and is not accepted says nothing about later ones.
+        since = 0 if not problem or distance > furthest + _MOVED else since + 1
+        furthest = max(furthest, distance) if distance > _MOVED else furthest
+        if problem and problem != _NO_ROOM and distance >= least * abs(pushing.target - here):
+            parts.append((-distance, count, start, end.steps))
         if not problem and accept is not None:
             problem = accept(start)
         if not problem:
@@ -202,30 +192,30 @@ class _Sampler:
         )  # fmt: skip
         clear = [
             InverseKinematics(
-                model, tasks, still=still, scene=pushing.scene, margin=_MARGIN, tolerance=tolerance
+                model, tasks, fixed=still, scene=pushing.scene, margin=_MARGIN, tolerance=tolerance
             )
             for tasks, tolerance in goals
         ]
         self._coordinates = clear[0].coordinates
-        self._ways: list[tuple[InverseKinematics, ...]] = [(last,) for last in clear]
+        self._solvers: list[tuple[InverseKinematics, ...]] = [(last,) for last in clear]
         if self.base:
             # Steps out of collisions take most of the time, and seldom lead a base out of one.
             arm = all({s.position for s in e.gradient()} - {*self.base} for e in (tip, axis))
-            self._ways = [
-                (InverseKinematics(model, tasks, still=[*still, *standing], tolerance=tolerance), last)
+            self._solvers = [
+                (InverseKinematics(model, tasks, fixed=[*still, *standing], tolerance=tolerance), last)
                 for standing in ((self.base, ()) if arm else ((),))
                 for (tasks, tolerance), last in zip(goals, clear, strict=True)
             ]
         self._tried = 0
-        own = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
-        others = [b for b in pushing.scene.bodies if b not in own]
-        self._bases = BaseSampler(pushing.scene, self.base, own, others, _MARGIN)
+        robot_bodies = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
+        others = [b for b in pushing.scene.bodies if b not in robot_bodies]
+        self._bases = BaseSampler(pushing.scene, self.base, robot_bodies, others, _MARGIN)
         self._points = pushing.surface.at(state)
         score = pushing.choice.score(self._points)
         good = np.flatnonzero(score > score.max() - _CANDIDATES)
         self.unreachable = 0
         if not self.base:
-            free = InverseKinematics(model, [nearby], still=still, tolerance=_NEARBY)
+            free = InverseKinematics(model, [nearby], fixed=still, tolerance=_NEARBY)
             near = self._select_reachable(free, good)
             good, self.unreachable = (near, 0) if len(near) else (good, len(good))
         weights = np.exp(2.0 * (score[good] - score.max()))
@@ -236,16 +226,16 @@ class _Sampler:
         random, state = self._generator, self._state
         k = int(random.choice(self._candidates, p=self._weights))
         at = state.updated(self._arm())
-        way = self._ways[self._tried % len(self._ways)]
+        solvers = self._solvers[self._tried % len(self._solvers)]
         self._tried += 1
         if self.base:
             place, free = self._draw_place(k)
             # A base that moves may leave what it touches: below a flap most places are in cupboards.
-            if not free and self.base[0] not in way[0].coordinates:
+            if not free and self.base[0] not in solvers[0].coordinates:
                 return "no free place of the base"
             at = at.updated(dict(zip(self.base, place.tolist(), strict=True)))
         seed = int(random.integers(2**31))
-        for starts, solver in zip(_SOLVER_STARTS, way, strict=False):
+        for starts, solver in zip(_SOLVER_STARTS, solvers, strict=False):
             reached = solver.solve(dict(at) | self._targets(k, solver), starts=starts, seed=seed)
             if not reached.solved:
                 (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or [_UNREACHED]
@@ -270,10 +260,10 @@ class _Sampler:
         near, unknown = np.zeros(len(chosen), dtype=bool), np.ones(len(chosen), dtype=bool)
         while unknown.any():
             i = int(np.argmax(unknown))
-            found = solver.solve(dict(self._state) | self._targets(int(chosen[i]), solver), starts=_STARTS)
-            near[i], unknown[i] = found.solved, False
+            result = solver.solve(dict(self._state) | self._targets(int(chosen[i]), solver), starts=_STARTS)
+            near[i], unknown[i] = result.solved, False
             # What is around a point that is far out of reach is so, too.
-            around = found.residuals["tip"] - math.sqrt(3.0) * _NEARBY
+            around = result.residuals["tip"] - math.sqrt(3.0) * _NEARBY
             unknown &= np.linalg.norm(points - points[i], axis=1) > around
         return chosen[near]
 

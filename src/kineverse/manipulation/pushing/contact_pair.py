@@ -81,7 +81,7 @@ def make_view(pair: PushPair | None, point: PushPoint, tip: Vector) -> PushView:
 
 
 class ContactRates:
-    """Derivatives of a contact over speeds: of the gap, and of the way of a tip on the object.
+    """Derivatives of a contact over speeds: of the gap, and of the motion of a tip on the object.
 
     They follow from the twists of the touching body, of the object and of the hand, by one compiled function.
     """
@@ -99,7 +99,7 @@ class ContactRates:
         self._rows = compile([array([e for row in rows for e in row])], inputs).bind()
 
     def __call__(self, contact: PushPair, tangents: tuple[Vector, Vector], tip: Vector) -> Array:
-        """Return the derivatives (3 n) of the gap, and of the way along both tangents.
+        """Return the derivatives (3 n) of the gap, and of the motion along both tangents.
 
         The array is overwritten by the next call.
         """
@@ -157,7 +157,6 @@ class PairFinder:
         return best, clearance
 
     def _make_pair(self, found: DistanceResults, row: int, gap: float, swapped: bool) -> PushPair:
-        """Return a pair of results as one of robot and object."""
         robot, thing = found.body_indices[row].tolist()
         a, b, c, d, e, f, u, v, w = found.witnesses[row].tolist()
         r, p, n = (a, b, c), (d, e, f), (-u, -v, -w)

@@ -23,6 +23,7 @@ from kineverse.geometry import Scene
 from kineverse.geometry.gjk import smoothed_support
 from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.shapes import Solid
+from kineverse.grasping.finger_branches import path_to_root
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
@@ -30,17 +31,13 @@ from kineverse.symbols import Symbol
 
 from .vectors import Vector, inner_product, length
 
-_SPACING = 0.05
-"""Distance of sampled points [m]."""
-_INSET = 0.04
-"""Distance of sampled points from edges, where the surface is that large [m]."""
+_SPACING = 0.05  # distance of sampled points [m]
+_INSET = 0.04  # distance of sampled points from edges, where the surface is that large [m]
 _MOST = 7
-_ROOM = 0.06
-"""Free space in front of a point that a hand needs [m]."""
+_ROOM = 0.06  # free space in front of a point that a hand needs [m]
 _OUTSIDE = 0.1
 _SAME = 0.01
-_FRONT = 0.004
-"""Depth of the foremost part of a pusher [m]."""
+_FRONT = 0.004  # depth of the foremost part of a pusher [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,16 +87,16 @@ class PushSurface:
         self.sign = 1.0 if values[-1] >= values[0] else -1.0
         scene = Scene(model, leave_out=tuple(ignored))
         states = [state.updated({coordinate: value}) for value in values]
-        found = [point for at in states for point in self._sample(scene, at)]
-        if not found:
+        result = [point for at in states for point in self._sample(scene, at)]
+        if not result:
             raise InvalidValueError(
                 f"No surface of {', '.join(bodies)} opposes the motion of '{coordinate}' towards "
                 f"{values[-1]:g}, so it cannot be pushed there."
             )
-        found = _without_doubles(found)
-        self.owner = np.array([k for k, *_ in found], dtype=np.intp)
-        self._points = np.array([p for _, p, _ in found])
-        self._normals = np.array([n for _, _, n in found])
+        result = _without_doubles(result)
+        self.owner = np.array([k for k, *_ in result], dtype=np.intp)
+        self._points = np.array([p for _, p, _ in result])
+        self._normals = np.array([n for _, _, n in result])
         self._compile_one(poses, twists, tip)
         self.room = np.min([self._find_room(scene, at) for at in states], axis=0)
 
@@ -167,7 +164,7 @@ class PushSurface:
         world.prepare()
         poses, twists = self._place(state)
         twists = self.sign * twists
-        found = []
+        result = []
         for k, body in enumerate(self.bodies):
             R, t = poses[k, :, :3], poses[k, :, 3]
             for item in world.members[world.body_index(body)]:
@@ -182,8 +179,8 @@ class PushSurface:
                     hit = scene.ray(start, u, _OUTSIDE + 4 * solid.radius)
                     if hit is None or hit.body != body or hit.distance <= 0.0 or -hit.normal @ u < 0.5:
                         continue
-                    found.append((k, R.T @ (hit.point - t), R.T @ hit.normal))
-        return found
+                    result.append((k, R.T @ (hit.point - t), R.T @ hit.normal))
+        return result
 
     def _find_room(self, scene: Scene, state: State) -> Array:
         """Return the free space (N,) in front of all points at a state."""
@@ -198,7 +195,6 @@ class PushSurface:
 
 
 def _without_doubles(found: list[tuple[int, Array, Array]]) -> list[tuple[int, Array, Array]]:
-    """Return points without those that are about the same."""
     kept: dict[tuple[float, ...], tuple[int, Array, Array]] = {}
     for body, point, normal in found:
         kept.setdefault(
@@ -245,7 +241,7 @@ def find_push_tool(
     model: ModelView, bodies: Sequence[str], state: State, leave_out: Iterable[Exclusion] = ()
 ) -> PushTool:
     """Return the foremost point of a group of bodies, away from what carries the group."""
-    chains = [_ancestors(model, body) for body in bodies]
+    chains = [path_to_root(model, body) for body in bodies]
     common = [frame for frame in chains[0] if all(frame in chain for chain in chains)]
     frame = common[0]
     scene = Scene(model, leave_out=leave_out)
@@ -283,15 +279,6 @@ def _front(placed: tuple[Solid, Array, Array], axis: Array) -> Array:
         return np.asarray(smoothed_support(placed, axis))
     half = np.abs(R.T @ axis) @ solid.half
     return np.asarray(R @ solid.centre + t + axis * half)
-
-
-def _ancestors(model: ModelView, frame: str) -> list[str]:
-    """Return a frame and all that carry it, nearest first."""
-    frames, found = model.frames, []
-    while frame in frames:
-        found.append(frame)
-        frame = frames[frame].parent
-    return found
 
 
 def find_alignment(normal: Vector, velocity: Vector) -> float:

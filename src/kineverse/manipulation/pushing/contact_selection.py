@@ -1,4 +1,4 @@
-"""Choice of contact points of a push: ranking, progress, and points that were given up."""
+"""Selection of contact points of a push: ranking, progress, and points that were given up."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from kineverse.state import State
 from .contact_points import PushContacts, PushPoint, PushSurface
 from .vectors import Vector, length
 
-CONE, CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
-"""Cosines of the friction cone in which a contact point is chosen, and of the one in which it is kept."""
+CONE, CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))  # to choose, and to keep
 _DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
 """Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
-_SURROUNDINGS = 0.1
-"""Distance within which other points count as given up, too [m]."""
+_SURROUNDINGS = 0.1  # distance within which other points count as given up, too [m]
 _OUT_OF_REACH = 0.02
 """Distance of the tip from a point that is given up from which on points beyond are out of reach, too [m]."""
 _BLOCKED_STEPS = 60
 _BLOCKED_WAY = 0.004
+_MOST_JAMMED = 3  # number of contact points at which the object does not move before it counts as jammed
 
 
 class ContactSelection:
@@ -40,8 +39,13 @@ class ContactSelection:
         self.restart()
 
     def restart(self) -> None:
-        """Count progress anew."""
+        """Start counting progress again."""
         self._best, self._since = math.inf, 0
+
+    @property
+    def is_jammed(self) -> bool:
+        """True if the object did not move at several contact points."""
+        return self.jammed >= _MOST_JAMMED
 
     def score(self, points: PushContacts) -> Array:
         """Return how well the object can be pushed at each point (N,)."""

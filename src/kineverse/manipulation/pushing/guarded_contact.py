@@ -1,4 +1,4 @@
-"""Press of a pusher on an object: touch, lag of the servos, speed, and the object's value at the contact.
+"""Guarded contact of a pusher with an object: touch, lag of the servos, speed, and value at the contact.
 
 A robot that is late presses: its servos are springs between where it should be and where it is. The lag
 
@@ -20,27 +20,18 @@ from collections.abc import Sequence
 from .push_program import PRESS
 from .vectors import ZERO, Vector, add, inner_product, length, rotate_back, scale, subtract, transform_point
 
-RAMP = 0.02
-"""Speed of the contact point beyond the measured one that is tried [m/s]."""
-SPEED = 0.25
-"""Largest speed of the contact point [m/s]."""
-_MOST_LAG = 8e-4
-"""Lag at which the press grows no more [m]."""
-_CREEP = 0.02
-"""Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
-STILL = 5e-3
-"""Speed of a contact point that counts as none [m/s]."""
-_DEEPEN, _DEEPER = 0.5, 3.0
-"""Time in which a press on what does not move becomes deeper [s], and by how many times its depth."""
-_FORGET, _FORGET_WAY = 1.0, 0.01
-"""Time [s] and way [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
-and what moves on gives way."""
-_REMEMBER = 0.1
-"""Time for which a touch counts after the last report [s]."""
-_RETURN = 0.3
-"""Time in which a correction returns to the estimate without a touch [s]."""
-_LEAST_RATE = 0.02
-"""Least rate of a gap over the coordinate for a correction [m/rad]."""
+RAMP = 0.02  # speed of the contact point beyond the measured one that is tried [m/s]
+SPEED = 0.25  # largest speed of the contact point [m/s]
+_MOST_LAG = 8e-4  # lag at which the press grows no more [m]
+_CREEP = 0.02  # speed at which a pusher feels for an object whose distance is uncertain [m/s]
+STILL = 5e-3  # speed of a contact point that counts as none [m/s]
+_DEEPEN, _DEEPER = 0.5, 3.0  # time in which a press on what does not move gets deeper [s], and its factor
+_FORGET, _FORGET_DISTANCE = 1.0, 0.01
+"""Time [s] and distance [m] after which a lag is forgotten: lag of acceleration and delays is no press, and
+what moves on gives way."""
+_REMEMBER = 0.1  # time for which a touch counts after the last report [s]
+_RETURN = 0.3  # time in which a correction returns to the estimate without a touch [s]
+_LEAST_RATE = 0.02  # least rate of a gap over the coordinate for a correction [m/rad]
 
 
 class PushPress:
@@ -54,7 +45,7 @@ class PushPress:
     def reset(self) -> None:
         """Forget everything but the deviation."""
         self.speed = self.lag = self.correction = 0.0
-        self._way = self._crept = self._stuck = 0.0
+        self._travel = self._crept = self._stuck = 0.0
         self._touch, self._estimate, self._value = math.inf, math.nan, math.nan
         self._tip: Vector | None = None
         self._planned, self._velocity = ZERO, ZERO
@@ -83,20 +74,20 @@ class PushPress:
         moved = ZERO if self._tip is None else subtract(tip, self._tip)
         leverage = length(self._velocity)
         along = scale(1.0 / max(leverage, 1e-9), self._velocity)
-        self._way = way = inner_product(along, moved)
+        self._travel = travel = inner_product(along, moved)
         shift = self._sign * (estimate - self._estimate) if math.isfinite(self._estimate) else 0.0
         if touching and self.touched:
-            self.speed = max(way / self._dt, 0.0)
+            self.speed = max(travel / self._dt, 0.0)
         else:
             self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
         if touching:
-            kept = self.lag * math.exp(-self._dt / _FORGET - max(way, 0.0) / _FORGET_WAY)
-            self.lag = max(kept + inner_product(along, self._planned) - way, 0.0)
+            kept = self.lag * math.exp(-self._dt / _FORGET - max(travel, 0.0) / _FORGET_DISTANCE)
+            self.lag = max(kept + inner_product(along, self._planned) - travel, 0.0)
         else:
             self.lag = 0.0
         self._stuck = self._stuck + self._dt if touching and self.speed < STILL else 0.0
         if touching and self.touched and leverage > _LEAST_RATE:
-            self.correction += self._sign * (max(way, 0.0) / leverage - shift)
+            self.correction += self._sign * (max(travel, 0.0) / leverage - shift)
         elif not self.touched:
             self.correction *= 1.0 - self._dt / _RETURN
         self._tip, self._estimate = tip, estimate
@@ -104,7 +95,7 @@ class PushPress:
 
     def correct(self, gap: float, rate: float) -> None:
         """Correct the value by a gap, for the next step."""
-        self._crept = self._crept + max(self._way, 0.0) if gap < self.slack else 0.0
+        self._crept = self._crept + max(self._travel, 0.0) if gap < self.slack else 0.0
         if self.deviation > 0.0 and abs(rate) > _LEAST_RATE and gap < (self.slack if self.touched else 0.0):
             most = self.slack / abs(rate)
             self.correction = min(max(self.correction - gap / rate, -most), most)

@@ -44,22 +44,16 @@ from .guarded_contact import PushPress, TipAnchor
 from .push_program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
 from .vectors import ZERO, Vector, add, inner_product, length, move_point, scale, subtract
 
-_APART = 4e-3
-"""Gap between pusher and object away from the contact [m]."""
-_FUNNEL = 0.08
-"""Largest height of the way to a contact above the surface [m]."""
+_APART = 4e-3  # gap between pusher and object away from the contact [m]
+_FUNNEL = 0.08  # largest height of the path to a contact above the surface [m]
 _STANDOFF = 2e-3
 _FAR = 0.05
-_RETREAT = 0.1
-"""Distance from the object at which a retreat ends [m]."""
-_LOW = 0.03
-"""Height of the tip above a contact point from which on the pusher may touch [m]."""
+_RETREAT = 0.1  # distance from the object at which a retreat ends [m]
+_LOW = 0.03  # height of the tip above a contact point from which on the pusher may touch [m]
 _HOLD_WEIGHT = 10.0
 _LARGEST_DEVIATION = 0.01
-_LEAST_DEVIATION = 1e-5
-"""Deviation below which gaps count as exact [m]."""
-_JAMMED = 2.0
-"""Depth at which the object counts as not giving way, in depths of the press."""
+_LEAST_DEVIATION = 1e-5  # deviation below which gaps count as exact [m]
+_JAMMED = 2.0  # depth at which the object counts as not giving way, in depths of the press
 _DEEPEST = 2e-4
 
 
@@ -84,8 +78,8 @@ class Pushing:
         Bodies of the object that may be pushed, names or patterns; by default all that the coordinate moves.
     dt
         Time of a step [s].
-    still
-        Further coordinates that stay still.
+    fixed
+        Further coordinates that stay fixed.
     rules, leave_out
         Rules of the collision filter, and excluded bodies, as for :class:`.Scene`.
     logic
@@ -133,7 +127,7 @@ class Pushing:
         robot: str | None = None,
         object_frames: str | Iterable[str] | None = None,
         dt: float = 0.02,
-        still: Iterable[Symbol | str] = (),
+        fixed: Iterable[Symbol | str] = (),
         rules: Iterable[Rule] = (),
         leave_out: Iterable[Exclusion] = (),
         logic: str | None = "and",
@@ -151,9 +145,9 @@ class Pushing:
         plain = Scene(model, rules=self.rules, leave_out=self.leave_out)
         self.pusher = match_bodies(plain.bodies, bodies, "bodies=")
         self.robot = self.pusher[0].split("/")[0] if robot is None else robot
-        own = tuple(b for b in plain.bodies if is_of_robot(b, self.robot))
+        robot_bodies = tuple(b for b in plain.bodies if is_of_robot(b, self.robot))
         moved = plain.bodies_moved_by([coordinate])
-        self.object_bodies = tuple(b for b in moved if b not in own)
+        self.object_bodies = tuple(b for b in moved if b not in robot_bodies)
         if not self.object_bodies:
             raise InvalidValueError(f"'{coordinate}' moves no body with a shape, so nothing can be pushed.")
         pushed = self.object_bodies
@@ -165,18 +159,18 @@ class Pushing:
             model,
             coordinate,
             pushed,
-            (*own, *self.leave_out),
+            (*robot_bodies, *self.leave_out),
             at,
             (at[coordinate], (at[coordinate] + target) / 2, target),
             self.tool.locate_tip(model),
         )
-        furniture = furniture_rules(plain.bodies, own)
-        self.overlapping = find_overlapping_links(plain, own, at)
+        furniture = furniture_rules(plain.bodies, robot_bodies)
+        self.overlapping = find_overlapping_links(plain, robot_bodies, at)
         self.scene = Scene(
             model, rules=(*furniture, *self.overlapping, *self.rules), leave_out=self.leave_out
         )
         self._program = PushProgram(
-            model, coordinate, self.target, self.tool, self.scene, dt=dt, still=still, logic=logic
+            model, coordinate, self.target, self.tool, self.scene, dt=dt, fixed=fixed, logic=logic
         )
         self.controller = self._program.controller
         self.speeds = self.controller.speeds
@@ -226,19 +220,19 @@ class Pushing:
     def first_contact(self, state: State) -> str:
         """Return which body of the robot penetrates something at a state; empty if none does."""
         self.scene.update(state)
-        found = self._all()
-        deep = [pair for pair in found if pair.distance < -_DEEPEST]
+        result = self._all()
+        deep = [pair for pair in result if pair.distance < -_DEEPEST]
         return f"contact of {deep[0].a} and {deep[0].b}" if deep else ""
 
     def find_obstacle(self, state: State) -> Obstacle | None:
-        """Return the first thing in the way of the object to its target; None if the way is free."""
+        """Return the first thing in the way of the object to its target; None if the path is free."""
         others = tuple(v for s, v in state.items() if not is_of_robot(s.path, self.robot))
         if others != self._swept[0]:  # roll-outs begin where the object is, with the robot elsewhere
-            found = find_obstacle(
+            result = find_obstacle(
                 self.model, self.coordinate, state, self.target,
                 robot=self.robot, rules=self.rules, leave_out=self.leave_out,
             )  # fmt: skip
-            self._swept = others, found
+            self._swept = others, result
         return self._swept[1]
 
     def find_deviation(self, state: State, deviation: Callable[[Symbol], float]) -> float:

@@ -25,25 +25,16 @@ from kineverse.symbols import Symbol
 from .contact_points import PushTool
 from .vectors import Vector
 
-TOUCHING = 1e-3
-"""Largest gap of a contact [m]."""
-LOST = 3e-3
-"""Gap at which a contact is lost [m]."""
-PRESS = 2e-4
-"""Depth that rows of touching bodies allow, so that contact is kept [m]."""
-NEAR = 0.012
-"""Distance of the tip from the axis of a contact within which it approaches the surface [m]."""
-_REACH_SPEED = 0.5
-"""Largest speed of the tip on its way to a contact [m/s]."""
-_TOUCH_SPEED = 0.15
-"""Rate at which the trend of contact is followed [m/s]."""
-_SPIN_WEIGHT = 0.01
-"""Weight against turns of the pusher about its axis, which change nothing but the nearest points."""
-_MARGIN, _RADIUS = 5e-3, 0.035
-"""Distance that pairs which may not touch keep, and from which they count [m]."""
+TOUCHING = 1e-3  # largest gap of a contact [m]
+LOST = 3e-3  # gap at which a contact is lost [m]
+PRESS = 2e-4  # depth that rows of touching bodies allow, so that contact is kept [m]
+NEAR = 0.012  # distance of the tip from the axis of a contact within which it approaches the surface [m]
+_REACH_SPEED = 0.5  # largest speed of the tip on its way to a contact [m/s]
+_TOUCH_SPEED = 0.15  # rate at which the trend of contact is followed [m/s]
+_SPIN_WEIGHT = 0.01  # against turns of the pusher about its axis, which change nothing but nearest points
+_MARGIN, _RADIUS = 5e-3, 0.035  # distance that pairs which may not touch keep, and from which they count [m]
 _SMOOTH = 0.02
-_ANY = 1e3
-"""Speed that restricts nothing."""
+_ANY = 1e3  # speed that restricts nothing
 _SIZES = {
     "gap": 1, "slip": 2, "pushed": 1, "target": 3, "facing": 3, "normal": 3, "reach": 1, "touch": 1,
     "hold": 1, "engaged": 1, "near": 1, "pace": 1, "free": 1,
@@ -53,17 +44,17 @@ _SIZES = {
 
 @dataclass(slots=True)
 class PushNumbers:
-    """Numbers of the present contact, which a program is set to in each step."""
+    """Parameters of a push program at the present contact."""
 
     gap: float  # distance of pusher and object [m]
     slip: Sequence[float]  # how far the tip has moved along both tangents since it touched [m]
     pushed: float  # derivative of the gap over the object's speed
-    target: Vector  # [m]
+    target: Vector  # contact point [m], direction of the push, and outward normal
     facing: Vector
     normal: Vector
-    reach: float  # weights of the ways to that point
-    touch: float  # to a contact
-    hold: float  # of the goals that keep a contact
+    reach: float  # weight of the goal that moves the tip to the contact point
+    touch: float  # weight of the trend towards a contact
+    hold: float  # weight of the goals that keep a contact
     engaged: float  # 1 while the pusher touches, else 0
     near: float  # gap from which on the pusher touches [m]
     pace: float  # largest speed of the coordinate [m/s], [rad/s]
@@ -90,13 +81,13 @@ class PushProgram:
         scene: Scene,
         *,
         dt: float,
-        still: Iterable[Symbol | str],
+        fixed: Iterable[Symbol | str],
         logic: str | None,
     ) -> None:
-        still = tuple(still)
+        fixed = tuple(fixed)
         speed = coordinate.derivative()
         tip, axis = tool.locate_tip(model), tool.point_axis(model)
-        resting = find_speeds(model, still, "still")
+        resting = find_speeds(model, fixed, "fixed")
         moving = set(model.rates.over_free_speeds(tip.gradient())) - resting - {speed}
         speeds = [*sorted(moving, key=lambda s: s.sort_key), speed]
 
@@ -147,7 +138,7 @@ class PushProgram:
             model,
             tasks,
             dt=dt,
-            still=still,
+            fixed=fixed,
             scene=scene,
             margin=_MARGIN,
             radius=_RADIUS,

@@ -34,8 +34,7 @@ from .guarded_contact import STILL
 from .push_controller import Pushing
 
 _STANDOFF = 0.03
-_TILT = math.radians(60.0)
-"""Largest angle between the pusher's axis and the direction of the push."""
+_TILT = math.radians(60.0)  # largest angle between the pusher's axis and the direction of the push
 _CONFIGURATIONS = 48
 
 
@@ -44,8 +43,8 @@ def plan_push_approach(
 ) -> tuple[Path, int]:
     """Return a path of the robot to a contact point, and the index of the point.
 
-    Coordinates that rates drive, such as those of a base on rolling wheels, stand still. Without a way the
-    path is that of the last point, and says why.
+    Coordinates that rates drive, such as those of a base on rolling wheels, stand still. If no path is found,
+    the returned one says why.
     """
     model, tool = pushing.model, pushing.tool
     moving = [s.position for s in pushing.speeds if s.position != pushing.coordinate]
@@ -59,14 +58,14 @@ def plan_push_approach(
     for chosen in pushing.rank(state)[:points]:
         point, normal = at.points[chosen], at.normals[chosen]
         goal = Goal(tip, point + _STANDOFF * normal, name="tip")
-        found = planner.solutions(goal, _CONFIGURATIONS, seconds=seconds, seed=seed)
-        if not len(found):
+        result = planner.solutions(goal, _CONFIGURATIONS, seconds=seconds, seed=seed)
+        if not len(result):
             continue
-        states = [state.updated(dict(zip(planner.symbols, q, strict=True))) for q in found.tolist()]
+        states = [state.updated(dict(zip(planner.symbols, q, strict=True))) for q in result.tolist()]
         facing = np.array([-normal @ axis(at_goal) for at_goal in states])
-        good = found[facing > math.cos(_TILT)]
+        good = result[facing > math.cos(_TILT)]
         here = state.vector(planner.symbols)
-        ends = [planner.space.nearest_turn(q, here) for q in (good if len(good) else found)]
+        ends = [planner.space.nearest_turn(q, here) for q in (good if len(good) else result)]
         path = planner.plan(None, ends, seconds=seconds, seed=seed)
         if path.found:
             break
@@ -77,20 +76,13 @@ def plan_push_approach(
 
 _SETTLED, _SETTLED_ESTIMATE = 5, 25
 """Number of steps for which the value, or its estimate, is within half of the tolerance when a push ends."""
-_PATIENCE = 25
-"""Number of further steps within the tolerance without progress after which a push ends all the same."""
+_PATIENCE = 25  # further steps within the tolerance without progress that end a push
 _PROGRESS = 5e-4
-_AVERAGED = 0.1
-"""Weight of the latest estimate in the mean that counts at the end."""
-_PRESSED = 5
-"""Number of steps for which an object within the tolerance gives way no more when a push ends."""
-_MOST_BLOCKED = 3
-"""Number of contact points given up before an approach is planned."""
-_MOST_JAMMED = 3
-"""Number of contact points at which the object does not move before it counts as jammed."""
+_AVERAGED = 0.1  # weight of the latest estimate in the mean that counts at the end
+_PRESSED = 5  # number of steps for which an object within the tolerance gives way no more when a push ends
+_MOST_BLOCKED = 3  # number of contact points given up before an approach is planned
 _MOST_APPROACHES = 2
-_UNKNOWN, _LOOK = 0.05, 2.0
-"""Deviation of a coordinate that is not known yet [m], [rad], and the time to wait until it is [s]."""
+_UNKNOWN, _LOOK = 0.05, 2.0  # deviation of an unknown coordinate [m], [rad], and time to look for it [s]
 _RETREAT_STEPS = 100
 
 
@@ -103,7 +95,7 @@ def push(
     object_frames: str | Iterable[str] | None = None,
     seconds: float = 30.0,
     tolerance: float | None = None,
-    still: Iterable[Symbol | str] = (),
+    fixed: Iterable[Symbol | str] = (),
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
     logic: str | None = "and",
@@ -135,12 +127,12 @@ def push(
     seconds
         Largest time in the world [s].
     tolerance
-        Largest distance from the target [m], [rad]; by default 2 % of the way, and 20 mm at a limit, see
+        Largest distance from the target [m], [rad]; by default 2 % of the distance, and 20 mm at a limit, see
         :func:`.choose_tolerance`.
-    still, rules, leave_out, logic
+    fixed, rules, leave_out, logic
         As for :class:`.Pushing`.
     plan
-        Whether approaches are planned where the way of the controller is blocked.
+        Whether approaches are planned where the path of the controller is blocked.
     retreat
         Whether the pusher is taken away from the object at the end.
     pushing
@@ -156,8 +148,8 @@ def push(
         With ``measures``: those of :class:`.Judge`, ``losses``, ``blocked``, ``contacts``, ``jammed``,
         ``planned``, ``jitter`` (largest mean change of a speed from step to step while touching, [m/s],
         [rad/s]), ``tolerance``, ``peak_force`` [N] in a world with forces, and ``failure``: ``"collision"``,
-        ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the way is free, if
-        something is in it.
+        ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the path is free, if
+        something is in the way.
 
     Raises
     ------
@@ -193,8 +185,8 @@ def push(
         if abs(session.state[coordinate] - target) <= tolerance / 2:
             done = abs(world.state[coordinate] - target) <= tolerance
             return skip(done, f"'{coordinate}' is there from the start")
-        if fixed := explain_fixed(model, coordinate, session.state):
-            return skip(False, fixed)
+        if why := explain_fixed(model, coordinate, session.state):
+            return skip(False, why)
         own = tuple(rules), tuple(leave_out)
         obstacle = find_obstacle(
             model, coordinate, session.state, target,
@@ -213,7 +205,7 @@ def push(
             robot=world.robot,
             object_frames=object_frames,
             dt=session.dt,
-            still=still,
+            fixed=fixed,
             rules=own[0],
             leave_out=own[1],
             logic=logic,
@@ -324,7 +316,7 @@ class _Run:
             if end.reached(session.state):
                 self.claimed = True
                 return SkillError("other", "The estimate is at the target, and the world is not.")
-            if pushing.choice.jammed >= _MOST_JAMMED:
+            if pushing.choice.is_jammed:
                 force = session.peak_force
                 strength = "" if math.isnan(force) else f" with up to {force:.0f} N"
                 return SkillError(
@@ -373,13 +365,13 @@ class _Run:
             self._judge.update(session.world.state, session.commands, pushing=self._pushing.touching)
 
     def _approach(self) -> str:
-        """Plan a way to another contact point and follow it; return what prevents it."""
+        """Plan a path to another contact point and follow it; return what prevents it."""
         if self._approaches >= _MOST_APPROACHES:
             tried = self._pushing.choice.contacts
             return f"No contact point was reached, of {tried} and {self._approaches} plans."
         self._approaches += 1
         session, pushing = self._session, self._pushing
-        self.retreat()  # a way that begins with a contact cannot be planned
+        self.retreat()  # a path that begins with a contact cannot be planned
         self.act({})
         path, point = plan_push_approach(pushing, session.state)
         if not path.found:
@@ -390,7 +382,6 @@ class _Run:
         return ""
 
     def _follow(self, path: Path) -> None:
-        """Follow a path at the speeds of its trajectory."""
         session, trajectory = self._session, path.trajectory()
         session.phase = "approach"
         dt = session.dt

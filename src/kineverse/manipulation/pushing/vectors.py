@@ -47,11 +47,7 @@ def rotate(R: Sequence[Sequence[float]], a: Vector) -> Vector:
     """Return R a for the first three columns of a matrix with three rows."""
     x, y, z = a
     r, s, t = R[0], R[1], R[2]
-    return (
-        r[0] * x + r[1] * y + r[2] * z,
-        s[0] * x + s[1] * y + s[2] * z,
-        t[0] * x + t[1] * y + t[2] * z,
-    )
+    return (r[0] * x + r[1] * y + r[2] * z, s[0] * x + s[1] * y + s[2] * z, t[0] * x + t[1] * y + t[2] * z)
 
 
 def rotate_back(R: Sequence[Sequence[float]], a: Vector) -> Vector:

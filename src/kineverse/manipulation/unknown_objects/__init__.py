@@ -1,4 +1,4 @@
-"""Parts whose joint nobody described: they are pulled, the joint is learned, and written into the model."""
+"""Parts with an unknown joint: the hand pulls, the joint is learned, and written into the model."""
 
 from typing import TYPE_CHECKING
 

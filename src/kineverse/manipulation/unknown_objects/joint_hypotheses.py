@@ -20,10 +20,8 @@ from .part_belief import PartBelief, measure_way
 from .pull_controllers import place_beside
 from .unmodelled_joint import UnknownPart, find_joint, write_joint
 
-_LEAST_RADIUS = 0.15
-"""Distance of a bar from an edge of its part from which on a hinge may be there [m]."""
-_STEP = 0.05
-"""Way of the handle between two poses of an arm [m]."""
+_LEAST_RADIUS = 0.15  # distance of a bar from an edge of its part from which on a hinge may be there [m]
+_STEP = 0.05  # distance of the handle between two poses of an arm [m]
 
 
 def guess_hinges(unknown: UnknownPart, search: PlacementSearch, state: State) -> list[Array]:
@@ -56,7 +54,7 @@ def least_share(
     placement: BasePlacement,
     state: State,
     twists: list[Array],
-    way: float,
+    distance: float,
     turn: float,
 ) -> float:
     """Return the least share of possible motions along which the arm of a placement holds the handle."""
@@ -64,8 +62,8 @@ def least_share(
     world_T_part = np.asarray(unknown.model.fk(unknown.frame)(state))
     part_T_hand = unknown.frame_T_handle @ placement.grasp.pose
     count = len(search.moving)
-    arm, base = placement.way[:1, :count], placement.way[:1, count:]
-    shares = [(placement.values[-1] - placement.values[0]) / way]
+    arm, base = placement.path[:1, :count], placement.path[:1, count:]
+    shares = [(placement.values[-1] - placement.values[0]) / distance]
     for twist in twists:
         radius = float(np.linalg.norm(twist[:3] + np.cross(twist[3:], unknown.point)))
         angles = np.linspace(0.0, turn, max(2, round(radius * turn / _STEP) + 1))
@@ -77,8 +75,7 @@ def least_share(
 
 _DISTANCE, _FLOOR_POSITION, _FLOOR_ORIENTATION = 1.0, 1e-3, 2e-3
 """Distance of the camera, and least standard deviations, for the test of a believed joint [m], [rad]."""
-_MOVED, _TURNED = 0.01, math.radians(1.0)
-"""Distance [m] and angle [rad] of furniture from where it was believed that are reported."""
+_MOVED, _TURNED = 0.01, math.radians(1.0)  # motion of furniture that is reported [m], [rad]
 
 
 def watch_joint(model: Model, belief: PartBelief) -> PlausibilityMonitor | None:
@@ -109,7 +106,7 @@ def revise_joint(model: Model, belief: PartBelief, learned: LearnedJoint) -> tup
 
     Furniture that stands elsewhere than the model has it is put where it was seen.
     """
-    words = f"Its joint is {learned.family}, certain after {100 * learned.way:.1f} cm and "
+    words = f"Its joint is {learned.family}, certain after {100 * learned.distance:.1f} cm and "
     words += f"{math.degrees(learned.turn):.1f}°."
     if belief.beside != WORLD:
         before = np.asarray(model.fk(belief.beside)({}))

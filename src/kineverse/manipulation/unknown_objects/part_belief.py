@@ -19,16 +19,12 @@ from kineverse.worlds.sensor_sampler import find_camera
 
 from .unmodelled_joint import JointPath, UnknownPart
 
-_FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4
-"""Least standard deviations of observed poses [m], [rad]: no camera is exact."""
+_FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4  # least noise of poses [m], [rad]: no camera is exact
 _HELD_LOOKS, _STATIC_LOOKS = 16.0, 60.0
 """Number of looks that a mean is worth: of the part in the hand, which slips, and of what stands still."""
-_NEAR, _TURNED = 0.06, 0.35
-"""Distance [m] and angle [rad] from where a part is believed beyond which a look is an outlier."""
-_FIRST = 5
-"""Number of first looks of which the largest cluster is believed."""
-_LOST_LOOKS = 6
-"""Outliers in a row after which a part is not where it was believed."""
+_NEAR, _TURNED = 0.06, 0.35  # distance [m] and angle [rad] from the believed pose that make an outlier
+_FIRST = 5  # number of first looks of which the largest cluster is believed
+_LOST_LOOKS = 6  # outliers in a row after which a part is not where it was believed
 
 
 @dataclass(slots=True, eq=False)
@@ -126,7 +122,7 @@ class PartBelief:
         return next(seen, WORLD) if self._beside is None else self._beside
 
     def slip(self, part_T_hand: Array, point: Array) -> float:
-        """Return distance [m] of a point (3,) of the part from its place in the hand, inf if unseen."""
+        """Return the distance [m] of a point (3,) from its place in the hand; infinite if it is not seen."""
         if self.held is None or self.held.pose is None or self.held.missed >= _LOST_LOOKS:
             return math.inf
         place = np.append(point, 1.0)
@@ -175,7 +171,7 @@ class PartBelief:
         self.held, self.path, self.still = None, None, PoseMean(_STATIC_LOOKS)
 
     def reset(self) -> None:
-        """Forget all looks, as the time of the world begins anew."""
+        """Forget all looks, as the time of the world restarts."""
         self.held, self.path, self.looks = None, None, []
         self._earlier, self._stamp = self._earlier + self._stamp, 0.0
         self.observation: Observation | None = None
@@ -256,6 +252,6 @@ def _fuse(looks: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
 
 
 def measure_way(first: Array, last: Array, point: Array) -> tuple[float, float]:
-    """Return the way [m] of a point (3,) of a part between two poses (4, 4), and the angle [rad]."""
+    """Return the distance [m] of a point (3,) of a part between two poses (4, 4), and the angle [rad]."""
     a, b = (pose @ np.append(point, 1.0) for pose in (first, last))
     return float(np.linalg.norm((b - a)[:3])), float(rotation_angle(first[:3, :3].T @ last[:3, :3]))

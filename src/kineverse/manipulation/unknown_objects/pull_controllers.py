@@ -24,26 +24,16 @@ from kineverse.symbols import Symbol
 from .part_belief import PartBelief
 from .unmodelled_joint import JointPath, write_joint
 
-_FIRST_SPEED, PULL_SPEED, _SPEED_UP = 0.02, 0.05, 0.04
-"""Speeds of the straight pull at first and after a way [m/s], [m]."""
-PATH_SPEED = 0.1
-"""Speed of the handle along a learned joint [m/s]."""
-_BEYOND = 1.2
-"""Place of the goal by the wanted opening: before a goal the motion slows down."""
-_GAIN = 5.0
-"""Rate at which errors of the hand's place on the part decay [1/s]."""
-_STRAIGHT = 0.035
-"""Way of the handle after which the likeliest joint counts as much as the first direction [m]."""
-_RAMP = 0.5
-"""Time in which the pull begins [s]."""
-_STEP = 0.03
-"""Way of the handle between two arms that are found for a learned joint [m]."""
-_QUICK = 0.5
-"""Speed from which on joints take their whole part [m/s], [rad/s]."""
-_UNSURE = 0.01
-"""Depth from which on something is in the way along a learned joint, which is off by millimetres [m]."""
-_MARGIN = 0.002
-"""Least distance of bodies while the part moves [m]."""
+_FIRST_SPEED, PULL_SPEED, _SPEED_UP = 0.02, 0.05, 0.04  # at first, and after a distance [m/s], [m]
+PATH_SPEED = 0.1  # speed of the handle along a learned joint [m/s]
+_BEYOND = 1.2  # place of the goal by the wanted opening: before a goal the motion slows down
+_GAIN = 5.0  # rate at which errors of the hand's place on the part decay [1/s]
+_STRAIGHT = 0.035  # distance after which the likeliest joint counts as much as the first direction [m]
+_RAMP = 0.5  # time in which the pull begins [s]
+_STEP = 0.03  # distance of the handle between two arms that are found for a learned joint [m]
+_QUICK = 0.5  # speed from which on joints take their whole part [m/s], [rad/s]
+_UNSURE = 0.01  # depth of obstacles along a learned joint, which is off by millimetres [m]
+_MARGIN = 0.002  # least distance of bodies while the part moves [m]
 
 
 class StraightPull:
@@ -74,16 +64,16 @@ class StraightPull:
         self._point = motion.handle.pose[:3, 3]
         self.likely: JointPath | None = None
 
-    def step(self, way: float) -> Command:
-        """Return the command of a step, after a way of the handle [m]."""
+    def step(self, distance: float) -> Command:
+        """Return the command of a step, after a distance of the handle [m]."""
         session = self.motion.session
         share = min(1.0, (session.world.time - self._begin) / _RAMP)
-        speed = _FIRST_SPEED + min(1.0, way / _SPEED_UP) * (PULL_SPEED - _FIRST_SPEED)
+        speed = _FIRST_SPEED + min(1.0, distance / _SPEED_UP) * (PULL_SPEED - _FIRST_SPEED)
         lead = share * speed / _GAIN
         twist = np.concatenate([self._direction, np.zeros(3)])
         if self.likely is not None:
             self.likely.project(self.belief.relative_pose)
-            weight = way**2 / (way**2 + _STRAIGHT**2)
+            weight = distance**2 / (distance**2 + _STRAIGHT**2)
             led = adjoint(inverse(self._part_T_bar)) @ self.likely.twist()
             twist = (1.0 - weight) * twist + weight * led / point_speed(led, self._point)
         self._controller.set(self._place, exp_se3(lead * twist) @ self.bar_T_hand)
@@ -136,13 +126,13 @@ class LearnedPull:
         arm, base = state.vector(search.moving), state.vector(search.standing)
         # Slow joints, such as a torso's, would hold up the motion.
         search.paths.ease = search.samples.eases[0] * np.minimum(1.0, search.samples.speeds / _QUICK)
-        ways, reached = search.paths.follow(arm[None], base[None], np.array(hands)[None])
-        self._arms = ways[0, : reached[0]] if reached[0] else arm[None]
+        paths, reached = search.paths.follow(arm[None], base[None], np.array(hands)[None])
+        self._arms = paths[0, : reached[0]] if reached[0] else arm[None]
         self._controller.set(self._speeds, np.zeros(len(arm)))
 
     @property
     def is_blocked(self) -> bool:
-        """Obstacle reached: True if the part is where its way ends before something."""
+        """Obstacle reached: True if the part is where an obstacle ends its motion."""
         value = self.path.value
         return self.obstacle is not None and self.path.direction * (value - self.obstacle.free) >= 0.0
 
@@ -151,8 +141,8 @@ class LearnedPull:
         """End of the arm before the part is open: True if it is expected."""
         return len(self._arms) < len(self._values)
 
-    def step(self, way: float) -> Command:
-        """Return the command of a step, after a way of the handle [m]."""
+    def step(self, distance: float) -> Command:
+        """Return the command of a step, after a distance of the handle [m]."""
         ahead = (self.path.value + self._lead - self._values[0]) / (self._values[-1] - self._values[0])
         share = ahead * (len(self._values) - 1) / max(1, len(self._arms) - 1)
         self._controller.set(self._posture, row_at(self._arms, min(max(share, 0.0), 1.0)))
@@ -194,4 +184,4 @@ def _make_controller(
     """Return a controller with rows for near bodies, in which the hand may touch the handle."""
     with motion.session.timed("plan"):
         scene = Scene(model, rules=motion.holding_rules)
-        return Controller(model, tasks, dt=motion.session.dt, still=still, scene=scene, margin=_MARGIN)
+        return Controller(model, tasks, dt=motion.session.dt, fixed=still, scene=scene, margin=_MARGIN)

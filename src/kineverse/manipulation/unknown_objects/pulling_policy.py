@@ -13,6 +13,7 @@ from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.slip_detection import PULLED_OUT
 from kineverse.manipulation.swept_volume import BlockedError
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
@@ -22,32 +23,24 @@ from .part_belief import PartBelief, measure_way
 from .pull_controllers import LearnedPull, StraightPull, learn_model, point_speed
 from .unmodelled_joint import JointPath
 
-LEAST_OPENING = 0.08, math.radians(10.0)
-"""Opening from which a part at its own stop counts as open [m], [rad]."""
-LOOKING, _HELD_LOOKING = 0.6, 1.0
-"""Times of looks at a part that stands, and with the hand closed [s]."""
+LEAST_OPENING = 0.08, math.radians(10.0)  # from which a part at its own stop is open [m], [rad]
+LOOKING, _HELD_LOOKING = 0.6, 1.0  # times of looks at a part that stands, and with the hand closed [s]
 _MOST_GRASPS = 3
 _DIRECTIONS = (
     (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0),
 )  # fmt: skip
 """Directions in which a part is pulled one after the other until it follows, in the axes of its handle: along
 its outward normal, to both sides across the bar, and to both ends along it."""
-_REFIT = 0.5
-"""Time between two controllers for a learned joint [s]."""
+_REFIT = 0.5  # time between two controllers for a learned joint [s]
 _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
 """Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
-_SLIPPED = 0.012
-"""Distance of the handle from its place in the hand from which on it has slipped [m]."""
-_LED = 0.06
-"""Way of the handle before which the hand does not rely on a joint that was learned [m]."""
-_ENDING = 0.5
-"""Time without progress where the arm is expected to end [s]."""
-_AHEAD, _AHEAD_STEPS = 0.03, 4
-"""Way of the handle that an arm must be able to go on [m], and its number of poses."""
+_LED = 0.06  # distance of the handle before which the hand does not rely on a joint that was learned [m]
+_ENDING = 0.5  # time without progress where the arm is expected to end [s]
+_AHEAD, _AHEAD_STEPS = 0.03, 4  # distance that an arm must be able to go on [m], and number of poses
 
 
 class ArmEndError(SkillError):
-    """End of the arm's way, or something in it, before the part is open."""
+    """End of the arm's reach, or an obstacle, before the part is open."""
 
 
 class PartPulling:
@@ -78,15 +71,15 @@ class PartPulling:
     def perform(self, motion: HandMotion, grasp: Grasp) -> str:
         """Pull until the part is open or at its own stop, and return how far that is.
 
-        A handle that slips is grasped anew.
+        A handle that slips is grasped again.
         """
         self.motion = motion
-        way = self.opening[0] if self.learning.poses else -math.inf
+        distance = self.opening[0] if self.learning.poses else -math.inf
         for _ in range(_MOST_GRASPS):
             self._measures["grasps"] += 1
             barrier = ""
             if not self.motion.close(grasp):
-                why = "The fingers closed beside the handle."
+                why = "The fingers closed next to the handle."
             else:
                 if not self.learning.poses:
                     self.begin = self.session.world.time
@@ -94,11 +87,11 @@ class PartPulling:
             if not why:
                 return self._describe_opening("is open")
             self._let_go()
-            last, way = way, self.opening[0]
-            if barrier and way >= _FOLLOWS:
+            last, distance = distance, self.opening[0]
+            if barrier and distance >= _FOLLOWS:
                 kind = ArmEndError if self.learning.learned is not None else SkillError
                 raise kind(barrier, f"{self._describe_opening('was pulled')} {why}")
-            if way - last < _FOLLOWS:
+            if distance - last < _FOLLOWS:
                 break
             self._measures["opened_seconds"] = self._reached - self.begin
             pose = inverse(self.belief.pose @ self.frame_T_handle) @ self.belief.hand_pose
@@ -122,7 +115,6 @@ class PartPulling:
         self.begin, self._reached = self.begin - gone, self._reached - gone
 
     def _let_go(self) -> None:
-        """Open the fingers, and look where the part is."""
         self.session.phase = "let go"
         self.belief.release()
         self.motion.move_fingers(self.motion.gripper.opened)
@@ -150,12 +142,12 @@ class PartPulling:
             for look in belief.looks:
                 learning.add(look.pose, look.covariance)
             belief.looks.clear()
-            way, turn = self.opening
+            distance, turn = self.opening
             now = self.session.world.time
             with session.timed("learn"):
-                if learning.update(way, turn, now - self.begin):
+                if learning.update(distance, turn, now - self.begin):
                     known = True
-                if known and now - fitted >= _REFIT and way >= _LED and learning.learned is not None:
+                if known and now - fitted >= _REFIT and distance >= _LED and learning.learned is not None:
                     fit, fitted = learning.learned.fit, now
                     pull = LearnedPull(
                         motion, belief, learn_model(self.model, belief, fit), bar_T_hand, self.start,
@@ -167,22 +159,22 @@ class PartPulling:
                 self._let_go()
                 raise BlockedError(pull.obstacle)
             with session.timed("open"):
-                command = pull.step(way)
+                command = pull.step(distance)
             motion.act(command.speeds)
-            way, turn = self.opening
-            if self._is_open(way, turn):
+            distance, turn = self.opening
+            if self._is_open(distance, turn):
                 self._measures["opened_seconds"] = now - self.begin
                 return "", ""
-            if belief.slip(part_T_hand, self.point) > _SLIPPED:
+            if belief.slip(part_T_hand, self.point) > PULLED_OUT:
                 session.stop()
                 ends = isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand)
                 why = "The handle slipped in the hand"
                 return (f"{why} where the arm ends.", "reach") if ends else (f"{why}.", "")
-            if way > best + _STALLED:
-                best, since = way, now
+            if distance > best + _STALLED:
+                best, since = distance, now
                 self._reached = now
             elif now - since > (_ENDING if isinstance(pull, LearnedPull) and pull.ends else _PATIENCE):
-                if isinstance(pull, StraightPull) and way < _FOLLOWS and self._others:
+                if isinstance(pull, StraightPull) and distance < _FOLLOWS and self._others:
                     # It may slide to a side.
                     self._direction, since = self._others.pop(0), now
                     pull = StraightPull(motion, belief, bar_T_hand, self._direction)
@@ -214,15 +206,15 @@ class PartPulling:
 
     @property
     def opening(self) -> tuple[float, float]:
-        """Believed way of the handle [m] and angle of the part [rad] since the first grasp."""
+        """Believed distance of the handle [m] and angle of the part [rad] since the first grasp."""
         return measure_way(self.start, self.belief.relative_pose, self.point)
 
-    def _is_open(self, way: float, turn: float) -> bool:
+    def _is_open(self, distance: float, turn: float) -> bool:
         learned = self.learning.learned
         if learned is not None and learned.fit.motion.kinds[0]:
             return turn >= self.wanted[1]
-        return way >= self.wanted[0] or turn >= self.wanted[1]
+        return distance >= self.wanted[0] or turn >= self.wanted[1]
 
     def _describe_opening(self, verb: str) -> str:
-        way, turn = self.opening
-        return f"'{self.part}' {verb}, by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
+        distance, turn = self.opening
+        return f"'{self.part}' {verb}, by {100 * distance:.0f} cm and {math.degrees(turn):.0f}°."

@@ -1,4 +1,4 @@
-"""Opening of a part whose joint nobody described: its handle is pulled, and the joint is learned."""
+"""Opening of a part with an unknown joint: the hand pulls at its handle, and the joint is learned."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import Any
 from kineverse.compilation import compile
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
+from kineverse.grasping.finger_branches import path_to_root
 from kineverse.lie import Array, inverse
-from kineverse.manipulation.opening import BasePlacement, PlacementSearch
-from kineverse.manipulation.opening.approach_planner import Approach, ApproachPlanner
+from kineverse.manipulation.opening import BasePlacement
+from kineverse.manipulation.opening.approach_planner import Approach, Opener
 from kineverse.manipulation.opening.hand_motion import HandMotion, find_retreat
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import check_positive
-from kineverse.model.frame import WORLD, is_of_robot
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
 from kineverse.worlds import Judge, Sensors
 
@@ -27,21 +28,14 @@ from .pull_controllers import point_speed
 from .pulling_policy import LEAST_OPENING, LOOKING, ArmEndError, PartPulling
 from .unmodelled_joint import JointPath, UnknownPart, find_joint, free_part
 
-OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
-"""Opening that is wanted by default [m], [rad]."""
-_MOST_LOOKING = 3.0
-"""Largest time until a part is seen [s]."""
-_REACH = 0.25
-"""Straight way of the handle that a placement should allow [m]."""
+OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)  # opening that is wanted by default [m], [rad]
+_MOST_LOOKING = 3.0  # largest time until a part is seen [s]
+_REACH = 0.25  # straight distance of the handle that a placement should allow [m]
 _GRASPS = 128
-_SEARCHES, _ENOUGH = 3, 0.99
-"""Number of searches of a first place, and share of possible motions from which on it is taken."""
-_MOST_PLACES = 3
-"""Largest number of places of the robot, or of its hand."""
-_FURTHER = 1.1
-"""Share of the rest of an opening that a further placement should lead along the learned joint."""
-_CLOSED_WAY, _CLOSED_TURN = 0.03, math.radians(6.0)
-"""Motion back [m], [rad] after which a part that was open is not."""
+_SEARCHES, _ENOUGH = 3, 0.99  # searches of a first place, share of possible motions that is enough
+_MOST_PLACES = 3  # largest number of places of the robot, or of its hand
+_FURTHER = 1.1  # share of the rest of an opening that a further placement should lead along the learned joint
+_CLOSED_WAY, _CLOSED_TURN = 0.03, math.radians(6.0)  # motion back after which a part is not open [m], [rad]
 
 
 def open_unknown(
@@ -59,12 +53,12 @@ def open_unknown(
     placements: int = 1000,
     seed: int = 0,
 ) -> Outcome:
-    """Open a part whose joint is unknown, or not as believed, and write the learned joint into a model.
+    """Open a part whose joint is unknown or wrong, and write the learned joint into a model.
 
     The robot sees markers on the part and on what it moves in. It grasps the handle, pulls straight along its
     outward normal and yields to all other motion, while the joint is identified. As soon as its family is
-    certain, it is a joint of a model that a controller holds the hand to, and it is fitted anew on the way.
-    A handle that slips out of the hand is grasped anew.
+    certain, it is a joint of a model that a controller holds the hand to, and it is fitted again on the way.
+    A handle that slips out of the hand is grasped again.
 
     If the model has a joint for the part already, that is tested meanwhile. It stays if it explains what was
     seen. Else the learned joint replaces it.
@@ -86,7 +80,7 @@ def open_unknown(
     sensors
         Stated noise of the observations; exact by default.
     way, turn
-        Wanted opening: way of the handle of a part that slides [m], angle of one that turns [rad].
+        Wanted opening: distance of the handle of a part that slides [m], angle of one that turns [rad].
     hand
         Frame of the hand, found by default.
     seconds
@@ -128,7 +122,7 @@ def open_unknown(
 
 
 class _Run:
-    """One opening: its phases, and what was found on the way."""
+    """One opening: its phases, and its results."""
 
     def __init__(
         self,
@@ -147,7 +141,7 @@ class _Run:
         self.session, self.model, self.world = session, model, session.world
         self.wanted, self.seconds, self.samples, self.seed = wanted, seconds, placements, seed
         self.gripper = find_gripper(model, self.world.robot, hand)
-        above = _ancestors(model, handle)
+        _, *above = path_to_root(model, handle)
         self.part = part or next((f for f in (handle, *above) if find_joint(model, f)), handle)
         if self.part not in (handle, *above):
             raise InvalidValueError(
@@ -156,9 +150,9 @@ class _Run:
         before = model.default_state()
         before = before.updated({s: v for s, v in session.state.items() if s in before})
         self.unknown = unknown = free_part(model, self.part, handle, before)
-        rigid = [f for f in model.frames if f == self.part or self.part in _ancestors(model, f)]
+        rigid = [f for f in model.frames if self.part in path_to_root(model, f)]
         markers = [f for f in rigid if not unknown.model.fk(f, self.part).symbols]
-        still = [f for f in _ancestors(model, self.part) if not model.fk(f).symbols]
+        still = [f for f in path_to_root(model, self.part)[1:] if not model.fk(f).symbols]
         references = still if beside is None else [beside]
         stated = sensors or Sensors()
         self.belief = PartBelief(unknown, self.world, before, self.gripper.hand, markers, references, stated)
@@ -242,27 +236,23 @@ class _Run:
             self.measures |= self.pulling.measures
 
     def _prepare(self, unknown: UnknownPart) -> None:
-        """Prepare motions of the hand at a part."""
         session = self.session
         with session.timed("place"):
-            self.search = PlacementSearch(unknown.model, self.gripper, session.state)
-            self.approaches = ApproachPlanner(self.search)
+            self.opener = Opener(unknown.model, self.gripper, session.state)
         until = self.begin + self.seconds
-        self.motion = HandMotion(
-            session, self.gripper, unknown.handle, self.search, self.approaches, self.judge, until
-        )
+        self.motion = HandMotion(session, self.opener, unknown.handle, self.judge, until)
         self.unknown = unknown
 
     def _place_first(self) -> BasePlacement:
         """Return a placement for a straight pull, from which the arm follows possible hinges, too."""
         session, unknown = self.session, self.unknown
         with session.timed("place"):
-            twists = guess_hinges(unknown, self.search, session.state)
+            twists = guess_hinges(unknown, self.opener.search, session.state)
         found: list[tuple[float, BasePlacement]] = []
 
         def accept(placement: BasePlacement) -> bool:
             share = least_share(
-                unknown, self.search, placement, session.state, twists, _REACH, self.wanted[1]
+                unknown, self.opener.search, placement, session.state, twists, _REACH, self.wanted[1]
             )
             found.append((share, placement))
             return share > _ENOUGH and self._plan(placement)
@@ -290,10 +280,10 @@ class _Run:
         kind = learned.fit.motion.kinds[0]
         scale = point_speed(path.twist(), self.unknown.point)
         rest = self.wanted[kind] - self.pulling.opening[kind]
-        found = self._search(_FURTHER * scale * rest, self._plan, self.seed)
-        if not found:
-            raise SkillError(found.failure, f"{found.why}{self.approach.barrier}")
-        return found
+        result = self._search(_FURTHER * scale * rest, self._plan, self.seed)
+        if not result:
+            raise SkillError(result.failure, f"{result.why}{self.approach.barrier}")
+        return result
 
     def _pull(self, placement: BasePlacement) -> str:
         """Take the handle, pull, let go, and return how far the part is open."""
@@ -324,7 +314,6 @@ class _Run:
         motion.stand(LOOKING)
 
     def _look(self) -> None:
-        """Look at the part while the robot stands."""
         self.session.phase = "look"
         begin = self.world.time
         self.motion.stand(LOOKING)
@@ -336,24 +325,22 @@ class _Run:
                 )
             self.motion.stand(self.session.dt)
 
-    def _search(self, way: float, accept: Callable[[BasePlacement], bool], seed: int) -> BasePlacement:
-        """Search a placement from which the handle can be pulled by a way [m], or as far as possible."""
+    def _search(self, distance: float, accept: Callable[[BasePlacement], bool], seed: int) -> BasePlacement:
+        """Search a placement from which the handle can be pulled by a distance [m], or as far as possible."""
         session, self.approach = self.session, Approach()
         session.phase = "place"
         with session.timed("place"):
             model, handle = self.unknown.model, self.unknown.handle
             grasps = sample_grasps(model, self.gripper, handle, _GRASPS, seed, state=session.state)
-            return self.search.find(
-                session.state, grasps, way, accept=accept, samples=self.samples, seed=seed
+            return self.opener.search.find(
+                session.state, grasps, distance, accept=accept, samples=self.samples, seed=seed
             )
 
     def _plan(self, placement: BasePlacement) -> bool:
-        """Plan the way to the pose before the handle, and return whether there is one."""
-        self.approach = self.approaches.plan_to(self.session.state, placement, self.seed)
+        self.approach = self.opener.approaches.plan_to(self.session.state, placement, self.seed)
         return bool(self.approach)
 
     def _come(self, placement: BasePlacement) -> None:
-        """Bring a base on wheels to its place, and the hand to the handle."""
         session, approach, motion = self.session, self.approach, self.motion
         if approach.places is not None:
             motion.drive(approach)
@@ -375,7 +362,7 @@ class _Run:
         """Write the learned joint into the model if it had another one or none, and say so."""
         self.measures |= {
             "family": learned.family,
-            "decided_way": learned.way,
+            "decided_way": learned.distance,
             "decided_turn": learned.turn,
             "decided_seconds": learned.time,
             "parent": self.belief.beside,
@@ -384,11 +371,3 @@ class _Run:
         self.measures |= {key: parameters[key] for key in ("axis", "point") if key in parameters}
         self.measures["believed"], words = revise_joint(self.model, self.belief, learned)
         return words
-
-
-def _ancestors(model: Model, frame: str) -> list[str]:
-    """Return the frames above a frame, the nearest first, without the world."""
-    found = []
-    while (frame := model.frames[frame].parent) != WORLD:
-        found.append(frame)
-    return found

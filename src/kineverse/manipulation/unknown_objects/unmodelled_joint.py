@@ -1,4 +1,4 @@
-"""Part of unknown motion in a model: where it was seen, and as something that a hand pulls straight."""
+"""Part with an unmodelled joint: floating where it was seen, or pulled straight by its handle."""
 
 from __future__ import annotations
 
@@ -23,11 +23,9 @@ from kineverse.spatial import axis_angle, translation
 from kineverse.state import State
 from kineverse.symbols import Symbol, position
 
-_ROTATION_ARM = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
-"""Lengths that make rotations comparable to distances [m]."""
+_ROTATION_ARM = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])  # make rotations comparable to distances [m]
 _STEPS, _DIFFERENCE = 3, 1e-5
-_STRAIGHT = 1e-3
-"""Turn by way of the handle from which on a motion is a rotation [rad/m]."""
+_STRAIGHT = 1e-3  # turn by motion of the handle from which on a motion is a rotation [rad/m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +34,7 @@ class UnknownPart:
 
     model: Model  # copy of a model in which the part floats, and is pulled
     frame: str
-    handle: Handle  # handle; its coordinate is the way of its middle by the pull [m]
+    handle: Handle  # its coordinate is the distance by which the pull moves its middle [m]
     parent: str  # frame in which the part floats
     origin: Array  # pose (4, 4) of the part in the parent, in the model that was copied
     floating: tuple[Symbol, ...]  # seven coordinates of the floating joint
@@ -89,18 +87,18 @@ def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPar
         edit.apply(floating)
         edit.attach(frame, name, translation(pull, 0, 0), tag)
     try:
-        found = find_handle(copy, pull, handle)
+        result = find_handle(copy, pull, handle)
     except UnknownNameError as error:
         raise UnknownNameError(
             f"'{handle}' has no slim shape that stands out of '{frame}', so no hand closes around it. "
             "Name the body of a handle."
         ) from error
     frame_T_handle = copy.fk(handle, frame)({})
-    outward = frame_T_handle[:3, :3] @ found.pose[:3, 0]
+    outward = frame_T_handle[:3, :3] @ result.pose[:3, 0]
     with copy.edit() as edit:
         edit.remove(tag)
         edit.attach(frame, name, translation(*(float(v) * pull for v in outward)), tag)
-    return UnknownPart(copy, frame, found, parent, parent_T_frame, copy.articulations[name].coordinates)
+    return UnknownPart(copy, frame, result, parent, parent_T_frame, copy.articulations[name].coordinates)
 
 
 def _pull_tag(frame: str) -> str:
@@ -148,7 +146,7 @@ def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
     name = next(iter(records), f"{frame}/joint")
     writer = model.history.writers(f"frames/{frame}")[-1]
     with model.edit() as edit:
-        if f"articulations/{name}" in _written(model, writer):
+        if ("articulations", name) in model.history.entry(writer).writes:
             edit.replace(writer, fit.operation(name, parent, frame, limits=False))
         else:
             child = f"{frame}/learned"
@@ -156,11 +154,6 @@ def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
             edit.attach(frame, child, translation(0, 0, 0))
     (coordinate,) = model.fk(frame, parent).symbols
     return coordinate
-
-
-def _written(model: Model, tag: str) -> set[str]:
-    """Return the paths that an operation writes."""
-    return {f"{kind}/{name}" for kind, name in model.history.entry(tag).writes}
 
 
 class JointPath:

@@ -1,4 +1,4 @@
-"""Mechanisms whose parts lock each other: execution of plans, exploration of locks that nobody described."""
+"""Mechanisms whose parts lock each other: execution of plans, exploration of unknown locks."""
 
 from typing import TYPE_CHECKING
 

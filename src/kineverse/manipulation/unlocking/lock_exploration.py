@@ -25,8 +25,7 @@ from .lock_model import SAME, LockModel
 
 MoveFunction = Callable[[Symbol, float], float]
 
-_MOST_DOUBTS = 12
-"""Number of plans that are made by other hypotheses if one is refuted."""
+_MOST_DOUBTS = 12  # number of plans that are made by other hypotheses if one is refuted
 _MOST_CONFIGURATIONS = 3000
 
 
@@ -179,7 +178,7 @@ class _Explorer:
         return self.known.read(self.state)
 
     @property
-    def still(self) -> set[Symbol]:
+    def erratic(self) -> set[Symbol]:
         """Coordinates that moved at one time, and did not at another one in the same configuration."""
         known = self.known
         return {known.coordinates[move.key] for move, lock in known.locks.items() if lock.is_erratic}
@@ -223,7 +222,7 @@ class _Explorer:
         for _ in range(_MOST_DOUBTS):
             costs = known.expected_tries(here)
             known.write_hypotheses(here, costs)
-            plan = plan_unlocking(known.model, goal, self.near(goal), still=self.still)
+            plan = plan_unlocking(known.model, goal, self.near(goal), fixed=self.erratic)
             blocking = (lock for lock in plan.blocking if isinstance(lock, Interlock))
             if not known.doubt({name for lock in blocking for name in lock.constraints}, here, costs):
                 break
@@ -271,34 +270,34 @@ class _Explorer:
 
     def find_unexplored(self) -> list[KeySide]:
         """Return the fewest known moves to a try of unknown result, and that try; none if there is none."""
-        known, still = self.known, self.still
-        ways: dict[Configuration, list[KeySide]] = {self.here: []}
-        waiting = deque(ways)
-        while waiting and len(ways) < _MOST_CONFIGURATIONS:
+        known, erratic = self.known, self.erratic
+        paths: dict[Configuration, list[KeySide]] = {self.here: []}
+        waiting = deque(paths)
+        while waiting and len(paths) < _MOST_CONFIGURATIONS:
             here = waiting.popleft()
             chances = {
                 move: lock.probability(here)
                 for move, lock in known.locks.items()
-                if here[move.key] != known.end(move) and known.coordinates[move.key] not in still
+                if here[move.key] != known.end(move) and known.coordinates[move.key] not in erratic
             }
             unknown = {move: chance for move, chance in chances.items() if 0.0 < chance < 1.0}
             if unknown:
-                return [*ways[here], max(unknown, key=unknown.__getitem__)]
+                return [*paths[here], max(unknown, key=unknown.__getitem__)]
             for move in (move for move, chance in chances.items() if chance == 1.0):
                 there = (*here[: move.key], known.end(move), *here[move.key + 1 :])
-                if there not in ways:
-                    ways[there] = [*ways[here], move]
+                if there not in paths:
+                    paths[there] = [*paths[here], move]
                     waiting.append(there)
         return []
 
     def list_locks(self) -> tuple[LearnedLock, ...]:
         """Return what is known about each lock that was tried."""
-        names, found = self.known.coordinates, list[LearnedLock]()
+        names, result = self.known.coordinates, list[LearnedLock]()
         for move, lock in self.known.locks.items():
             if lock.is_tried:
                 certain = lock.necessary()
                 further = {s for one in lock.sufficient() for s in one if lock.refused and s not in certain}
-                found.append(
+                result.append(
                     LearnedLock(
                         names[move.key],
                         move.side,
@@ -309,4 +308,4 @@ class _Explorer:
                         lock.is_conjunction,
                     )
                 )
-        return tuple(found)
+        return tuple(result)

@@ -18,8 +18,7 @@ _SIDES: tuple[Side, Side] = (1, -1)
 Configuration: TypeAlias = tuple[float, ...]
 
 
-_HELD = 0.1
-"""Probability of a condition that holds at the start, relative to one that does not: boxes come shut."""
+_HELD = 0.1  # relative probability of a condition that holds at the start: boxes come shut
 
 
 class KeySide(NamedTuple):
@@ -46,7 +45,7 @@ class Enclosure(NamedTuple):
 
 @dataclass
 class LockHypothesis:
-    """Lock of a coordinate in one direction, as far as tries tell."""
+    """Lock of a coordinate in one direction, as far as tries show."""
 
     number: int  # number of the locked coordinate, which is no key of its own
     limits: Enclosure  # limits of all coordinates
@@ -93,13 +92,13 @@ class LockHypothesis:
 
     def suspects(self, q: Configuration, box: Enclosure) -> list[KeySide]:
         """Return the conditions of which one is the reason for a refusal, if the lock is open in a box."""
-        found = list[KeySide]()
+        result = list[KeySide]()
         for k, (x, low, high) in enumerate(zip(q, box.lower, box.upper, strict=True)):
             if x < low:
-                found.append(KeySide(k, 1))
+                result.append(KeySide(k, 1))
             if x > high:
-                found.append(KeySide(k, -1))
-        return found
+                result.append(KeySide(k, -1))
+        return result
 
     def sufficient(self) -> list[dict[KeySide, None]]:
         """Return for each alternative the conditions under which the part was seen to move."""
@@ -115,9 +114,9 @@ class LockHypothesis:
 
     def necessary(self) -> dict[KeySide, tuple[float, float]]:
         """Return the conditions of every conjunction that agrees with the tries, and where thresholds are."""
-        found = dict[KeySide, tuple[float, float]]()
+        result = dict[KeySide, tuple[float, float]]()
         if not self.is_conjunction:
-            return found
+            return result
         (box,) = self.alternatives
         for q in self.refused:
             suspects = self.suspects(q, box)
@@ -126,9 +125,9 @@ class LockHypothesis:
                 low, high = (q[only.key], box.lower[only.key])
                 if only.side < 0:
                     low, high = box.upper[only.key], q[only.key]
-                before = found.get(only, (-math.inf, math.inf))
-                found[only] = max(before[0], low), min(before[1], high)
-        return found
+                before = result.get(only, (-math.inf, math.inf))
+                result[only] = max(before[0], low), min(before[1], high)
+        return result
 
     def weight(self, s: KeySide) -> float:
         """Return the relative probability of a condition: less if it already holds at the start."""

@@ -23,13 +23,10 @@ Costs: TypeAlias = dict[KeySide, float]
 Option: TypeAlias = tuple[float, KeySide, float]
 """Condition that explains a refusal: its rank, the condition, and the tries that it takes to fulfil it."""
 
-SAME = 1e-3
-"""Difference of positions that counts as none, as a share of a coordinate's range."""
-_WAYS: tuple[Side, Side] = (1, -1)
-_SPEED = 1.0
-"""Speed limit of a learned lock where the model has none [m/s] or [rad/s]."""
-_DOUBT = 5.0
-"""Tries by which a condition counts as more costly after a plan was refuted because of it."""
+SAME = 1e-3  # difference of positions that counts as none, as a share of a coordinate's range
+_SIDES: tuple[Side, Side] = (1, -1)
+_SPEED = 1.0  # speed limit of a learned lock where the model has none [m/s] or [rad/s]
+_DOUBT = 5.0  # tries by which a condition counts as more costly after a plan was refuted because of it
 _MOST_CHOICES = 500
 
 
@@ -42,13 +39,15 @@ class LockModel:
         for s, (low, high) in zip(self.coordinates, ends, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise InvalidValueError(
-                    f"'{s}' has no limits, so nobody knows how far to move it when locks are explored. Give "
+                    f"'{s}' has no limits, so it is unknown how far to move it when locks are explored. Give "
                     f"it some: edit.constrain('{s} range', lower, model.symbol('{s}'), upper)."
                 )
         self.limits = Enclosure(tuple(low for low, _ in ends), tuple(high for _, high in ends))
         here = self.read(start)
         self.locks = {
-            KeySide(k, way): LockHypothesis(k, self.limits, here) for k in range(len(ends)) for way in _WAYS
+            KeySide(k, direction): LockHypothesis(k, self.limits, here)
+            for k in range(len(ends))
+            for direction in _SIDES
         }
         self.priority: list[int] = np.random.default_rng(seed).permutation(len(ends)).tolist()
         self._doubts = dict[tuple[KeySide, KeySide], float]()
@@ -56,11 +55,11 @@ class LockModel:
 
     def read(self, state: State) -> Configuration:
         """Return the configuration of a state, with positions near a limit at the limit."""
-        found = []
+        result = []
         for s, low, high in zip(self.coordinates, *self.limits, strict=True):
             step = SAME * (high - low)
-            found.append(min(max(low + step * round((state[s] - low) / step), low), high))
-        return tuple(found)
+            result.append(min(max(low + step * round((state[s] - low) / step), low), high))
+        return tuple(result)
 
     def end(self, move: KeySide) -> float:
         """Return the limit of a coordinate in a direction."""
@@ -88,7 +87,7 @@ class LockModel:
         self, move: KeySide, here: Configuration, costs: Costs
     ) -> tuple[float, list[dict[KeySide, None]]]:
         """Return the expected tries of a move, and the conditions of its lock."""
-        lock, best, found = self.locks[move], math.inf, list[dict[KeySide, None]]()
+        lock, best, result = self.locks[move], math.inf, list[dict[KeySide, None]]()
         for box in lock.alternatives:
             refusals = [(q, lock.suspects(q, box)) for q in reversed(lock.refused)]
             chosen = _explain(
@@ -106,21 +105,21 @@ class LockModel:
             if chance:
                 # Not 1 / chance: a try that fails is not made again, since it teaches something.
                 best = min(best, sum(tries for _, tries in chosen.values()) + 1 / math.sqrt(chance))
-            found.append(dict.fromkeys(s for s, _ in chosen.values()))
-        return best, found
+            result.append(dict.fromkeys(s for s, _ in chosen.values()))
+        return best, result
 
     def _rank(
         self, move: KeySide, here: Configuration, q: Configuration, suspects: list[KeySide], costs: Costs
     ) -> list[Option]:
         """Return the possible reasons of a refusal, the one that is cleared most easily first."""
-        lock, found = self.locks[move], list[Option]()
+        lock, result = self.locks[move], list[Option]()
         total = sum(map(lock.weight, suspects))
         for s in suspects:
             tries = 0.0 if s.side * (here[s.key] - q[s.key]) > 0 else costs[s]
             if math.isfinite(tries):
                 rank = tries + total / lock.weight(s) + self._doubts.get((move, s), 0.0)
-                found.append((rank, s, tries))
-        return sorted(found, key=lambda option: (option[0], self.priority[option[1].key]))
+                result.append((rank, s, tries))
+        return sorted(result, key=lambda option: (option[0], self.priority[option[1].key]))
 
     # -- constraints of the model --------------------------------------------------------------------------
 
@@ -152,7 +151,8 @@ class LockModel:
                     edit.remove(name)
                 if k in wanted:
                     upper, lower = (
-                        self._bound(KeySide(k, way), conditions[KeySide(k, way)]) for way in _WAYS
+                        self._bound(KeySide(k, direction), conditions[KeySide(k, direction)])
+                        for direction in _SIDES
                     )
                     edit.constrain(name, lower, self.coordinates[k].derivative(), upper, tag=name)
         self._written = wanted
@@ -183,14 +183,14 @@ class LockModel:
 
     def doubt(self, names: Collection[str], here: Configuration, costs: Costs) -> bool:
         """Make the uncertain conditions of learned constraints less attractive; return if there are any."""
-        found = False
+        result = False
         for move, lock in self.locks.items():
             if self.constraint_name(move.key) in names:
                 certain = lock.necessary()
                 for s in {s for one in self.conditions(move, here, costs) for s in one if s not in certain}:
                     self._doubts[move, s] = self._doubts.get((move, s), 0.0) + _DOUBT
-                    found = True
-        return found
+                    result = True
+        return result
 
     def forget_doubts(self) -> None:
         """Forget all doubts."""
@@ -206,8 +206,8 @@ def _explain(
             continue
         for _, s, tries in options:
             if s.key not in chosen and next(left) > 0:
-                found = _explain(refusals[n + 1 :], {**chosen, s.key: (s, tries)}, left)
-                if found is not None:
-                    return found
+                result = _explain(refusals[n + 1 :], {**chosen, s.key: (s, tries)}, left)
+                if result is not None:
+                    return result
         return None
     return chosen

@@ -22,8 +22,7 @@ from kineverse.worlds import World
 from kineverse.worlds.furniture_overlaps import FurnitureOverlaps
 from kineverse.worlds.run_metrics import LimitJudge
 
-TOLERANCE = 1e-4
-"""Distance from a target at which it is reached [m] or [rad]."""
+TOLERANCE = 1e-4  # distance from a target at which it is reached [m] or [rad]
 _TARGET = "unlocking/target"
 
 
@@ -89,22 +88,19 @@ class PartMover:
         return session.state[symbol]
 
     def _controller(self, symbol: Symbol) -> Controller:
-        """Return the controller that moves a coordinate."""
         if symbol not in self._controllers:
             goal = Goal(
                 symbol, self._target, name=f"move {symbol}", gain=0.5 / self.session.dt, speed=self._speed
             )
             others = [s for s in self.model.degrees_of_freedom if s != symbol]
             self._controllers[symbol] = Controller(
-                self.model, [goal], dt=self.session.dt, still=others, smooth=1e-3, posture=0.0
+                self.model, [goal], dt=self.session.dt, fixed=others, smooth=1e-3, posture=0.0
             )
         return self._controllers[symbol]
 
 
-_SHARE = 0.1
-"""Largest distance from a target, as a share of its distance beyond the threshold."""
-_VIOLATED = 1e-6
-"""Excess of a constraint from which on it is violated, in its unit."""
+_SHARE = 0.1  # largest distance from a target, as a share of its distance beyond the threshold
+_VIOLATED = 1e-6  # excess of a constraint from which on it is violated, in its unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +226,7 @@ def execute_unlocking(
     goal: Mapping[Symbol, float] | Mapping[str, float],
     *,
     model: ModelView | None = None,
-    still: Collection[Symbol | str] = (),
+    fixed: Collection[Symbol | str] = (),
     budget: float = BUDGET,
     dt: float = 0.05,
     patience: float = 1.0,
@@ -252,7 +248,7 @@ def execute_unlocking(
         Positions to reach, by coordinate or its name [m] or [rad].
     model
         Model by which it is planned and controlled; None for the model of the world.
-    still
+    fixed
         Coordinates that are known not to move.
     budget
         Time for each plan [s].
@@ -287,7 +283,7 @@ def execute_unlocking(
     moves, stuck, plans = list[ExecutedMove](), list[Symbol](), 0
     obstacles: list[Obstacle] = []
     while True:
-        plan = plan_unlocking(known, goal, session.state, still=[*still, *stuck], budget=budget)
+        plan = plan_unlocking(known, goal, session.state, fixed=[*fixed, *stuck], budget=budget)
         plans += 1
         made: list[ExecutedMove] = []
         for step in plan.steps:

@@ -190,8 +190,7 @@ def _below(node: Node) -> tuple[Expression, ...]:
     return () if isinstance(node, ReadNode) else node.arguments
 
 
-MAX_ANSWER = 200_000
-"""Largest number of nodes in a query result."""
+MAX_ANSWER = 200_000  # largest number of nodes in a query result
 
 
 class UntraceableError(ModelError):

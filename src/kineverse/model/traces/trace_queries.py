@@ -41,8 +41,7 @@ class ResultPart(NamedTuple):
     place: int
 
 
-FAILED = "there is none"
-"""Result of a query that raises an error."""
+FAILED = "there is none"  # result of a query that raises an error
 
 
 class QueryResult(NamedTuple):

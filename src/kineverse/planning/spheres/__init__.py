@@ -10,7 +10,6 @@ from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
     from .object_covers import cover_objects as cover_objects
-    from .quality import CoverQuality as CoverQuality, measure_cover as measure_cover
     from .sphere_cover import (
         SphereCover as SphereCover,
         cover_solid as cover_solid,
@@ -27,7 +26,6 @@ lazy_face(
     __name__,
     {
         ".object_covers": "cover_objects",
-        ".quality": "CoverQuality measure_cover",
         ".sphere_cover": "SphereCover cover_solid cover_solids default_protrusion",
         ".sphere_tree": "SphereTree enclosing_ball make_sphere_tree",
     },

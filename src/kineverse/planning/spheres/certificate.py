@@ -26,12 +26,12 @@ _NEAR, _SMALL = 10, 0.7
 class Uncovered:
     """Cells that lie in none of the spheres after subdivision."""
 
-    growth: Floats  # (N,) by how much the radii have to grow, so that the spheres cover everything [m]
-    points: Floats  # (n, 3) points outside of all spheres, one of a cell that has one [m]
+    growth: Floats  # (N,) growth of the radii with which the spheres cover everything [m]
+    points: Floats  # (n, 3) points outside of all spheres, one for each cell that has one [m]
 
 
 def find_uncovered(region: CoverRegion, centres: Floats, radii: Floats, tolerance: float) -> Uncovered:
-    """Return the part of a region that spheres do not cover."""
+    """Find the part of a region that spheres do not cover."""
     growth = np.zeros(len(radii))
     points: list[Floats] = []
     cells = np.concatenate([region.middles[region.owners][:, None], region.corners[region.faces]], axis=1)
@@ -78,9 +78,9 @@ def _nearest_spheres(cells: Floats, centres: Floats, radii: Floats) -> Integers:
 def _measure_gaps(
     cells: Floats, near: Integers, centres: Floats, radii: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Return how far each cell is from lying in one of some spheres, and in which one.
+    """Measure how far each cell is from lying in a sphere, and in which one.
 
-    Further, how far its worst corner is from all of them, negative inside; and that corner.
+    Further, how far its worst corner is from all spheres, negative inside; and that corner.
     """
     beyond = np.empty((len(cells), 4, near.shape[1]))
     around, sizes = centres[near], radii[near]

@@ -81,7 +81,7 @@ class _Problem:
 
 
 def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSpheres:
-    """Return few spheres that cover a region."""
+    """Cover a region by few spheres."""
     protrusion = max(protrusion, _least_protrusion(region, most))
     problem = _Problem(region, protrusion)
     aim = protrusion / _ALLOWANCE
@@ -92,8 +92,8 @@ def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSphe
             # The proof found points between those of the mesh.
             problem.gaps = gaps[:: len(gaps) // _SAMPLES + 1]
             fitted = descend(problem, fitted.centres, aim)
-            mended, _ = prove(region, fitted)
-            proved = min(proved, mended, key=lambda cover: cover.protrusion)
+            again, _ = prove(region, fitted)
+            proved = min(proved, again, key=lambda cover: cover.protrusion)
         if proved.protrusion <= protrusion or fitted.protrusion > aim:
             break
         aim *= 0.99 * protrusion / proved.protrusion
@@ -101,7 +101,7 @@ def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSphe
 
 
 def _least_protrusion(region: CoverRegion, most: int) -> float:
-    """Return a protrusion that no cover by so many spheres is below.
+    """Return a lower bound of the protrusion of covers by a number of spheres.
 
     The part of a convex surface in a sphere is no larger than the sphere, which sticks out by its radius less
     a depth.
@@ -113,7 +113,6 @@ def _least_protrusion(region: CoverRegion, most: int) -> float:
 
 
 def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
-    """Return few spheres that cover the points of a problem."""
     corners = problem.region.corners
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     best = descend(problem, middle[None], aim, _FEW_ROUNDS)
@@ -136,7 +135,7 @@ def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
 def _search_start(
     problem: _Problem, start: CoverStarts, aim: float, most: int, best: FittedSpheres
 ) -> FittedSpheres:
-    """Return the best of several short descents, each from a start for another protrusion."""
+    """Run short descents, each from a start for another protrusion, and return the best result."""
     least = start.least_greedy(most)
     wanted = max(1.2 * aim, least)
     tried: set[int] = set()
@@ -148,23 +147,23 @@ def _search_start(
         if not len(centres) or len(centres) in tried:
             break
         tried.add(len(centres))
-        found = descend(problem, centres, aim, _FEW_ROUNDS)
-        best = found if found.is_better(best, aim) else best
+        result = descend(problem, centres, aim, _FEW_ROUNDS)
+        best = result if result.is_better(best, aim) else best
         # The protrusion after the descent is about proportional to that of the start.
-        wanted = max(wanted * aim / found.protrusion, least)
+        wanted = max(wanted * aim / result.protrusion, least)
     for factor in (1.3, 1.1):
         centres = start.lattice(factor * aim, most)
         reached = best.protrusion <= aim
         if not len(centres) or len(centres) in tried or len(centres) > (len(best.radii) if reached else most):
             continue
         tried.add(len(centres))
-        found = descend(problem, centres, aim, _FEW_ROUNDS)
-        best = found if found.is_better(best, aim) else best
+        result = descend(problem, centres, aim, _FEW_ROUNDS)
+        best = result if result.is_better(best, aim) else best
     return best
 
 
 def _split_worst(problem: _Problem, cover: FittedSpheres, most: int) -> Floats:
-    """Return the centres with one more beside each of those that protrude most, at most so many."""
+    """Add a centre next to each sphere that protrudes most, up to a number of spheres."""
     depths = problem.region.depths(cover.centres)
     points, owners = problem.find_critical(cover.centres, depths + cover.protrusion)
     needs = np.linalg.norm(points - cover.centres[owners], axis=1) - depths[owners]
@@ -175,7 +174,7 @@ def _split_worst(problem: _Problem, cover: FittedSpheres, most: int) -> Floats:
 
 
 def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUNDS) -> FittedSpheres:
-    """Return the cover with the least protrusion on the way down from some centres (N, 3)."""
+    """Descend from centres (N, 3), and return the cover with the least protrusion on the way."""
     region = problem.region
     best = FittedSpheres(centres, np.zeros(0), math.inf)
     estimate = aim
@@ -202,9 +201,9 @@ def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUND
 
 
 def _pull_inside(region: CoverRegion, centres: Floats) -> tuple[Floats, Integers, Floats]:
-    """Return the centres, those outside of all solids moved towards the middle of one up to its surface.
+    """Move centres outside of all solids towards the middle of one, up to its surface.
 
-    Further, the solid in which each is deepest, and its depth there. Depths are concave along the way.
+    Also return the solid in which each is deepest, and its depth there. Depths are concave along the line.
     """
     depths = region.part_depths(centres)
     solids = depths.argmax(axis=1)
@@ -221,7 +220,7 @@ def _pull_inside(region: CoverRegion, centres: Floats) -> tuple[Floats, Integers
 
 
 def _relocate(centres: Floats, radii: Floats, protrusions: Floats, corners: Floats) -> Floats:
-    """Return the centres with those without a cell beside the worst ones, towards their furthest corner."""
+    """Move centres without a cell to the worst spheres, towards their furthest corner."""
     moved = centres.copy()
     unused = np.flatnonzero(radii <= 0.0)
     worst = np.argsort(np.where(radii > 0.0, -protrusions, np.inf), kind="stable")[: len(unused)]
@@ -239,14 +238,14 @@ def _relax(
     owners: Integers,
     temperature: float,
 ) -> Floats:
-    """Return centres in solids (n,) after gradient steps on the smoothed largest need of their points."""
+    """Descend the smoothed largest need of points over their centres in solids (n,)."""
     order = np.argsort(owners, kind="stable")
     points, owners = points[order], owners[order]
     first = np.flatnonzero(np.diff(owners, prepend=-1))
     moving = owners[first]
     solids = solids[moving]
     group = np.cumsum(np.diff(owners, prepend=-1) > 0) - 1
-    found = centres.copy()
+    result = centres.copy()
     centres, speed = centres[moving], np.zeros((len(moving), 3))
     slack, normals = region.nearest_sides(centres, solids, _SIDES)
     offsets = slack + np.einsum("nfj,nj->nf", normals, centres)
@@ -261,12 +260,12 @@ def _relax(
         gradient += np.einsum("nf,nfj->nj", near, normals) / near.sum(axis=1, keepdims=True)
         speed = _MOMENTUM * speed - temperature * gradient
         centres = centres + speed
-    found[moving] = centres
-    return found
+    result[moving] = centres
+    return result
 
 
 def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSpheres:
-    """Return the cover without spheres that the others can replace within the aim."""
+    """Remove spheres that the others can replace within the aim."""
     failures = 0
     while cover.protrusion <= aim and len(cover.radii) > 1 and failures < _REMOVALS:
         # Protrusions shrink about as the number of spheres to the power -0.7.
@@ -275,9 +274,9 @@ def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSphere
             break
         count = max(count >> failures, 1)
         dropped = np.argsort(_removal_losses(problem, cover), kind="stable")[:count]
-        found = descend(problem, np.delete(cover.centres, dropped, axis=0), aim)
-        if found.protrusion <= aim:
-            cover = found
+        result = descend(problem, np.delete(cover.centres, dropped, axis=0), aim)
+        if result.protrusion <= aim:
+            cover = result
         elif count == 1:
             break
         else:
@@ -286,7 +285,7 @@ def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSphere
 
 
 def _removal_losses(problem: _Problem, cover: FittedSpheres) -> Floats:
-    """Return for each sphere the protrusion (N,) that the others would need for what it covers."""
+    """Return for each sphere the protrusion (N,) that the others would need for its points."""
     depths = problem.region.depths(cover.centres)
     points = problem.find_critical(cover.centres, depths + cover.protrusion)[0]
     needs = distances(points, cover.centres) - depths
@@ -298,10 +297,7 @@ def _removal_losses(problem: _Problem, cover: FittedSpheres) -> Floats:
 
 
 def prove(region: CoverRegion, cover: FittedSpheres) -> tuple[FittedSpheres, Floats]:
-    """Return a cover whose radii have grown as far as the proof by subdivision needs.
-
-    Further, points (n, 3) that the given spheres do not cover.
-    """
+    """Grow radii as far as the proof by subdivision needs; also return points (n, 3) uncovered before."""
     tolerance = _PROOF * cover.protrusion
     radii = cover.radii + tolerance
     uncovered = find_uncovered(region, cover.centres, radii, tolerance)

@@ -1,4 +1,11 @@
-"""First centres for sphere covers: a greedy set cover, and lattices."""
+"""Points of a region that are hardest to cover by spheres, and first centres for covers.
+
+The power of a point x for a sphere is |x - c|² - r². Spheres cover a solid if and only if each one covers the
+part where its own power is least. These parts are convex, so that their corners are hardest to cover: on the
+surface, points of equal power for three spheres; on an edge, for two. A triangle whose corners belong to
+different spheres is likely to have one (F. Aurenhammer, Power diagrams: properties, algorithms and
+applications, SIAM J. Comput. 16, 1987). First centres come from a greedy set cover, and from lattices.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +23,7 @@ from .polytope import CoverRegion, scalar_products
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
 _LAYERS, _INNER_TRIANGLES = (0.75, 0.5, 0.25), 60
-"""Sizes of the inner surfaces beside the outer one, and the number of their triangles."""
+"""Sizes of the inner surfaces relative to the outer one, and the number of their triangles."""
 
 
 class CoverMesh:
@@ -63,10 +70,12 @@ class CoverMesh:
         after = powers[b, owners[a]] - powers[b, owners[b]]
         part = before / np.maximum(before + after, 1e-30)
         on_edges = self.points[a] + part[:, None] * (self.points[b] - self.points[a])
-        own = owners[self._triangles]
-        mixed = (own[:, 0] != own[:, 1]) & (own[:, 1] != own[:, 2]) & (own[:, 2] != own[:, 0])
-        corners, own = self._triangles[mixed], own[mixed]
-        u, v = (powers[corners, own[:, :1]] - powers[corners, own[:, k : k + 1]] for k in (1, 2))
+        labels = owners[self._triangles]
+        mixed = (
+            (labels[:, 0] != labels[:, 1]) & (labels[:, 1] != labels[:, 2]) & (labels[:, 2] != labels[:, 0])
+        )
+        corners, labels = self._triangles[mixed], labels[mixed]
+        u, v = (powers[corners, labels[:, :1]] - powers[corners, labels[:, k : k + 1]] for k in (1, 2))
         weights = np.cross(u, v)
         weights = np.maximum(weights * np.sign(weights.sum(axis=1, keepdims=True)), 0.0) + 1e-30
         weights /= weights.sum(axis=1, keepdims=True)
@@ -88,9 +97,9 @@ def is_deep_in_others(region: CoverRegion, triangles: Floats, owners: Integers, 
 
 
 def split_triangles(triangles: Floats, owners: Integers, longest: float) -> tuple[Floats, Integers]:
-    """Return triangles (n, 3, 3) cut at the middle of their longest edges, until none is too long.
+    """Cut triangles (n, 3, 3) at the middle of their longest edges, until none is too long.
 
-    Further, of each the owner (n,) of the triangle that it is a part of.
+    Also return the owner (n,) of each part.
     """
     done: list[tuple[Floats, Integers]] = []
     while len(triangles):
@@ -150,7 +159,7 @@ class CoverStarts:
         self._protrusion = protrusion
 
     def least_greedy(self, most: int) -> float:
-        """Return a protrusion, close to the least one, for which :meth:`greedy` chooses at most so many.
+        """Return nearly the least protrusion for which :meth:`greedy` chooses at most so many centres.
 
         The search begins at half the protrusion of the starts.
         """
@@ -184,17 +193,17 @@ class CoverStarts:
         """
         region = self._region
         centres = [_box_centres(part.corners, protrusion, most) for part in region.parts]
-        owners = np.repeat(np.arange(len(centres)), [len(found) for found in centres])
+        owners = np.repeat(np.arange(len(centres)), [len(result) for result in centres])
         points = np.concatenate(centres)
         depths = region.part_depths(points)
         # What lies deeper in another solid is left to that one.
         kept = (depths.max(axis=1) > -protrusion) & (depths.argmax(axis=1) == owners)
-        found: Floats = points[kept]
-        return found if len(found) else region.middles[:1]
+        result: Floats = points[kept]
+        return result if len(result) else region.middles[:1]
 
 
 def _box_centres(corners: Floats, protrusion: float, most: int) -> Floats:
-    """Return the centres (n, 3) of equal boxes that a box around some corners consists of."""
+    """Return the centres (n, 3) of equal boxes that make up a box around corners."""
     axes = _principal_axes(corners)
     low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
     numbers = range(1, most + 1)
@@ -210,7 +219,7 @@ def _box_centres(corners: Floats, protrusion: float, most: int) -> Floats:
 
 
 def _principal_axes(corners: Floats) -> Floats:
-    """Return axes (3, 3) as rows: the given ones, or those of the corners where their box is smaller."""
+    """Return axes (3, 3) as rows: the coordinate axes, or those of the corners if their box is smaller."""
     principal = np.linalg.svd(corners - corners.mean(axis=0), full_matrices=False)[2]
     boxes = [float(np.ptp(corners @ axes.T, axis=0).prod()) for axes in (np.eye(3), principal)]
     return principal if boxes[1] < 0.99 * boxes[0] else np.eye(3)

@@ -26,7 +26,7 @@ from .sphere_cover import MOST, SphereCover, check_cover_settings, cover_solids
 from .sphere_tree import SphereTree
 
 _DIGITS = 12
-"""Digits to which poses in a body are told apart."""
+"""Digits in which poses in a body differ."""
 
 
 def cover_objects(
@@ -47,21 +47,21 @@ def cover_objects(
         If a shape cannot be used, or is a triangle mesh; the message names the body.
     """
     solids, key = _request(items, protrusion, most)
-    found = None if force else find_cover(key)
-    if found is None:
+    result = None if force else find_cover(key)
+    if result is None:
         try:
-            found = cover_solids(solids, protrusion, most)
+            result = cover_solids(solids, protrusion, most)
         except InvalidValueError as error:
             raise InvalidValueError(
                 f"No spheres cover the shapes of body '{items[0].body}' ({_name(items)}): {error} Make them "
                 "thicker, or leave the body out: Planner(model, leave_out=[...])."
             ) from None
-        keep_cover(key, _name(items), found)
-    return found
+        keep_cover(key, _name(items), result)
+    return result
 
 
 def are_covered(items: Sequence[CollisionObject], protrusion: float | None = None, most: int = MOST) -> bool:
-    """Return True if the cover of collision objects is kept; for errors see :func:`cover_objects`."""
+    """Return True if the cover of collision objects is cached; for errors see :func:`cover_objects`."""
     return find_cover(_request(items, protrusion, most)[1]) is not None
 
 
@@ -144,7 +144,7 @@ def find_cover(key: str) -> SphereCover | None:
 def keep_cover(key: str, name: str, cover: SphereCover) -> None:
     """Keep a cover in memory, and atomically on the disk, with the name of what it covers."""
     _remember(key, cover)
-    head = {"name": name, "protrusion": cover.protrusion, "excess": cover.excess, "sizes": [len(cover)]}
+    head = {"name": name, "protrusion": cover.protrusion, "sizes": [len(cover)]}
     COVERS.write(key, _pack(head, cover.centres, cover.radii))
 
 
@@ -189,10 +189,10 @@ def _find(cache: ContentCache, key: str, parse: Callable[[bytes], Kept]) -> Kept
         if key in _in_memory:
             _in_memory.move_to_end(key)
             return _in_memory[key]  # type: ignore[return-value]
-    found = cache.read(key, parse)
-    if found is not None:
-        _remember(key, found)
-    return found
+    result = cache.read(key, parse)
+    if result is not None:
+        _remember(key, result)
+    return result
 
 
 def _remember(key: str, content: SphereCover | SphereTree) -> None:
@@ -204,12 +204,12 @@ def _remember(key: str, content: SphereCover | SphereTree) -> None:
 
 
 def _pack(head: dict[str, Any], *arrays: Floats) -> bytes:
-    """Return a line of JSON and the numbers of some arrays; an archive of numpy takes longer to read."""
+    """Write a line of JSON and the numbers of arrays; an archive of numpy takes longer to read."""
     return json.dumps(head).encode() + b"\n" + b"".join(array.astype("<f8").tobytes() for array in arrays)
 
 
 def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]]:
-    """Return the head that :func:`_pack` was given, and centres (N, 3) and radii (N,) for each size in it."""
+    """Read the head that :func:`_pack` wrote, and centres (N, 3) and radii (N,) for each size in it."""
     try:
         line, _, numbers = content.partition(b"\n")
         head = json.loads(line)
@@ -225,7 +225,7 @@ def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]
 
 def _parse_cover(content: bytes) -> tuple[str, SphereCover]:
     head, ((centres, radii),) = _unpack(content)
-    return head["name"], SphereCover(centres, radii, head["protrusion"], head["excess"])
+    return head["name"], SphereCover(centres, radii, head["protrusion"])
 
 
 def _parse_tree(content: bytes) -> SphereTree:

@@ -46,11 +46,11 @@ class RoundSide:
     the origin. A sphere has the reach 0; cylinders and cones have an infinite one, and a cone has a slope.
     """
 
-    origin: Floats  # (3,) origin of the axis [m], and its direction
-    axis: Floats
-    reach: float  # lengths of the formula [m]
-    offset: float
-    slope: float = 0.0  # its factors
+    origin: Floats  # (3,), of the axis [m]
+    axis: Floats  # (3,), its direction
+    reach: float  # [m]
+    offset: float  # [m]
+    slope: float = 0.0
     width: float = 1.0
 
 
@@ -62,18 +62,18 @@ _NO_SIDE = RoundSide(np.zeros(3), _Z, 0.0, _FAR, width=0.0)
 class CoverPolytope:
     """Convex solid, with a polytope that contains it."""
 
-    corners: Floats  # (V, 3), [m], (T, 3)
-    faces: Integers
-    normals: Floats  # (F, 3), (F,), [m]
+    corners: Floats  # (V, 3), of the polytope [m]
+    faces: Integers  # (T, 3), its triangles
+    normals: Floats  # (F, 3) and (F,), flat sides of the solid: normals @ x <= offsets [m]
     offsets: Floats
-    volume: float  # volume of the solid itself [m³]
-    side: RoundSide = _NO_SIDE  # its round side
+    volume: float  # of the solid [m³]
+    side: RoundSide = _NO_SIDE
     is_hull: bool = False  # True if the polytope is the solid
 
     def simplify(self) -> CoverPolytope:
-        """Return the hull of the corners that are extreme along some directions, if there are many corners.
+        """Return the hull of the corners of a hull that are extreme along some directions, if there are many.
 
-        It lies inside of the solid, and is returned for hulls only.
+        It lies inside of the solid.
         """
         if not self.is_hull or len(self.corners) <= _MANY_CORNERS:
             return self
@@ -205,11 +205,11 @@ def scalar_products(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> npt.N
 
     It is computed in blocks: libraries share a large product among threads, which may have other work.
     """
-    found = np.empty((len(points), len(others)), dtype=points.dtype)
+    result = np.empty((len(points), len(others)), dtype=points.dtype)
     rows = max(_BLOCK // max(len(others), 1), 1)
     for k in range(0, len(points), rows):
-        np.matmul(points[k : k + rows], others.T, out=found[k : k + rows])
-    return found
+        np.matmul(points[k : k + rows], others.T, out=result[k : k + rows])
+    return result
 
 
 def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
@@ -225,7 +225,7 @@ def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
 
 
 def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
-    """Return a convex solid with a polytope, close enough for covers with a protrusion [m]."""
+    """Bound a convex solid by a polytope that is close enough for covers with a protrusion [m]."""
     surface = solid.surface
     if isinstance(surface, Faces):
         raise InvalidValueError(
@@ -295,7 +295,7 @@ def _bound_hull(solid: Solid) -> CoverPolytope:
 def _bound_round(
     corners: Floats, volume: float, side: RoundSide, below: float | None = None, above: float | None = None
 ) -> CoverPolytope:
-    """Return a solid with a round side, which may be cut flat below and above the origin [m]."""
+    """Bound a solid with a round side, which may be cut flat below and above the origin [m]."""
     around = _bound_hull(solid_from_points(corners))
     cuts = [(-_Z, below), (_Z, above)]
     normals = np.array([normal for normal, height in cuts if height is not None]).reshape(-1, 3)
@@ -304,7 +304,7 @@ def _bound_round(
 
 
 def _count_sides(radius: float, protrusion: float) -> int:
-    """Return the sides of a regular polygon whose sagitta is small beside a protrusion [m]."""
+    """Return the sides of a regular polygon whose sagitta is small compared with a protrusion [m]."""
     cosine = 1.0 - min(_ROUNDNESS * protrusion / radius, 0.5)
     return min(max(4 * math.ceil(math.pi / math.acos(cosine) / 4), _FEWEST_SIDES), _MOST_SIDES)
 

@@ -15,7 +15,6 @@ from kineverse.model.body import Capsule, Sphere
 
 from .cover_fit import FittedSpheres, fit_spheres
 from .polytope import CoverPolytope, CoverRegion, bound_solid, solid_volume
-from .union_volume import union_volume
 
 MOST = 48
 """Default largest number of spheres of a cover."""
@@ -26,7 +25,7 @@ PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
 _MOST_OF_ALL = 1024
 
 _NEEDLE, _LEAST_RATIO = 1e-3, 1e-4
-"""Thickness of a needle beside its length, and the least one beside the largest size of what is fitted."""
+"""Thickness of a needle relative to its length, and least thickness relative to the largest size."""
 _SMALL, _LARGE = 1e-4, 1e4
 """Radii between which a solid is bounded as it is [m]."""
 
@@ -41,14 +40,11 @@ class SphereCover:
         (N, 3) and (N,) in the frame of the solids' poses [m]; read-only.
     protrusion
         Upper bound of the distance of any point of a sphere from the solids [m].
-    excess
-        Volume of the union of the spheres over that of the union of the solids, minus 1.
     """
 
     centres: Floats
     radii: Floats
     protrusion: float
-    excess: float
 
     def __len__(self) -> int:
         """Return the number of spheres."""
@@ -97,7 +93,7 @@ def cover_solids(
     if len(spheres) == len(solids) <= most:
         places = np.array([pose[:3, 3] for pose, _ in spheres])
         sizes = np.array([sphere.radius for _, sphere in spheres], dtype=float)
-        return _make_cover(places, sizes, 0.0, _volume(solids))
+        return _make_cover(places, sizes, 0.0)
     if protrusion is None:
         protrusion = default_protrusion(solids)
     # Solids may be longer than any sensible protrusion, and one ball is then enough.
@@ -105,10 +101,10 @@ def cover_solids(
     (first, pose), *others = solids
     if isinstance(first.surface, Capsule) and not others:
         centres, radii, reached = _capsule_chain(first.surface, protrusion, most)
-        return _make_cover(centres, radii, reached, _volume(solids)).move(pose)
+        return _make_cover(centres, radii, reached).move(pose)
     if _is_needle(first) and not others:
         centres, reached = _needle_chain(first, protrusion, most)
-        return _make_cover(centres, np.full(len(centres), reached), reached, _volume(solids)).move(pose)
+        return _make_cover(centres, np.full(len(centres), reached), reached).move(pose)
     parts, growth = _bound_solids(solids, protrusion)
     corners = np.concatenate([part.corners for part in parts])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -117,13 +113,12 @@ def cover_solids(
     shift[:3, 3] = -origin
     region = CoverRegion([part.move(shift, 1.0 / unit) for part in parts])
     fitted: FittedSpheres = fit_spheres(region, protrusion / unit, most)
-    volume = solid_volume(first) if not others else region.measure_volume() * unit**3
     reached = fitted.protrusion * unit + growth
-    return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, reached, volume)
+    return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, reached)
 
 
 def default_protrusion(solids: Sequence[tuple[Solid, Floats]]) -> float:
-    """Return the protrusion of covers where none is asked for: a tenth of the size, from 5 mm to 25 mm [m].
+    """Return the default protrusion of covers: a tenth of the size, from 5 mm to 25 mm [m].
 
     The size is the edge of a cube with the volume of the union.
     """
@@ -149,7 +144,7 @@ def _volume(solids: Sequence[tuple[Solid, Floats]]) -> float:
 def _bound_solids(
     solids: Sequence[tuple[Solid, Floats]], protrusion: float
 ) -> tuple[list[CoverPolytope], float]:
-    """Return polytopes around solids at poses, and by how much solids have grown at most [m].
+    """Bound solids at poses by polytopes; return these and the largest growth of a solid [m].
 
     Plates and needles are thickened, and what is very large or small is bounded at a size of 1 m, since hulls
     need a volume and a size.
@@ -168,13 +163,12 @@ def _bound_solids(
 
 
 def _is_needle(solid: Solid) -> bool:
-    """Return True for a primitive that is a thousand times as long as it is thick."""
     _, width, length = np.sort(solid.half).tolist()
     return not isinstance(solid.surface, Hull | Faces) and width <= _NEEDLE * length
 
 
 def _needle_chain(solid: Solid, protrusion: float, most: int) -> tuple[Floats, float]:
-    """Return the centres of equal spheres along the axis of a needle, and their radius [m].
+    """Cover a needle by equal spheres along its axis; return their centres and radius [m].
 
     The axis lies inside, so that none sticks out by more than its radius.
     """
@@ -189,14 +183,13 @@ def _needle_chain(solid: Solid, protrusion: float, most: int) -> tuple[Floats, f
     return solid.centre + centres, math.hypot(half / count, aside) * (1.0 + 1e-9)
 
 
-def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float) -> SphereCover:
+def _make_cover(centres: Floats, radii: Floats, protrusion: float) -> SphereCover:
     centres.flags.writeable = radii.flags.writeable = False
-    excess = max(union_volume(centres, radii) / volume - 1.0, 0.0)
-    return SphereCover(centres, radii, protrusion, excess)
+    return SphereCover(centres, radii, protrusion)
 
 
 def _capsule_chain(capsule: Capsule, protrusion: float, most: int) -> tuple[Floats, Floats, float]:
-    """Return equal spheres along the axis of a capsule, and their protrusion [m].
+    """Cover a capsule by equal spheres along its axis; return them and their protrusion [m].
 
     With radius r + e they reach beyond both ends by e if the outermost are e inside of the ends of the axis,
     and cover the side as long as neighbours are no further than 2 √((r + e)² - r²) apart.

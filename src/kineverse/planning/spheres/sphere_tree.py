@@ -81,7 +81,7 @@ def make_sphere_tree(centres: npt.ArrayLike, radii: npt.ArrayLike) -> SphereTree
 
 
 def enclosing_ball(centres: Floats, radii: Floats, steps: int = _BALL_STEPS) -> tuple[Floats, float]:
-    """Return centre (3,) and radius [m] of a ball that contains spheres, close to the smallest one.
+    """Return centre (3,) and radius [m] of a ball around spheres, close to the smallest one.
 
     The centre approaches the sphere that reaches furthest by ever smaller steps (Bădoiu and Clarkson, Smaller
     core-sets for balls, 2003); the best centre on the way is taken.

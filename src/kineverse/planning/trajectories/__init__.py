@@ -6,18 +6,16 @@ from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
     from .blends import BlendedPath as BlendedPath, round_corners as round_corners
-    from .follower import TrajectoryFollower as TrajectoryFollower
     from .kinematic_limits import MotionLimits as MotionLimits, motion_limits as motion_limits
     from .time_parameterization import time_parameterize as time_parameterize
-    from .trajectory import Trajectory as Trajectory
+    from .trajectory import Trajectory as Trajectory, TrajectoryFollower as TrajectoryFollower
 
 lazy_face(
     __name__,
     {
         ".blends": "BlendedPath round_corners",
-        ".follower": "TrajectoryFollower",
         ".kinematic_limits": "MotionLimits motion_limits",
         ".time_parameterization": "time_parameterize",
-        ".trajectory": "Trajectory",
+        ".trajectory": "Trajectory TrajectoryFollower",
     },
 )

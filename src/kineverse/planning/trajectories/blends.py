@@ -67,16 +67,16 @@ class BlendedPath:
     @property
     def deviation(self) -> Array:
         """Distances between the inner corners and their blends (N-2,)."""
-        found: Array = self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4
-        return found
+        result: Array = self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4
+        return result
 
     @property
     def curvature(self) -> Array:
         """Second derivatives q'' of the blends (N-2, n); 0 where there is none."""
         change: Array = np.diff(self.directions, axis=0)
         reach = self.reach[:, None]
-        found: Array = np.where(reach > 0, change / np.where(reach > 0, 2 * reach, 1.0), 0.0)
-        return found
+        result: Array = np.where(reach > 0, change / np.where(reach > 0, 2 * reach, 1.0), 0.0)
+        return result
 
     def blend(self, corner: int, count: int) -> Array:
         """Return ``count`` configurations on the blend of an inner corner, both ends included."""
@@ -159,12 +159,11 @@ def _segments(points: Array) -> tuple[Array, Array]:
 
 
 def _rounding(points: Array) -> float:
-    """Return the error of the coordinates of points (N, n)."""
     return _ROUNDING * (1.0 + float(np.abs(points).max()))
 
 
 def _find_turns(points: Array, directions: Array, lengths: Array) -> npt.NDArray[np.bool_]:
-    """Return flags of the inner corners (N-2,) where the direction changes by more than rounding explains."""
+    """Return flags of the inner corners (N-2,) where the direction changes by more than rounding."""
     turn = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     shorter = np.minimum(lengths[:-1], lengths[1:])
     turns: npt.NDArray[np.bool_] = turn > _STRAIGHT + _rounding(points) / shorter
@@ -172,7 +171,7 @@ def _find_turns(points: Array, directions: Array, lengths: Array) -> npt.NDArray
 
 
 def _find_distinct(points: Array) -> npt.NDArray[np.intp]:
-    """Return the indices of points (N, n) without those that are as good as equal to the one before."""
+    """Return the indices of points (N, n) that differ from the one before by more than rounding."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     apart = max(_rounding(points), _STRAIGHT * float(steps.sum()))
     if (steps > apart).all():
@@ -185,11 +184,11 @@ def _find_distinct(points: Array) -> npt.NDArray[np.intp]:
 
 
 def _find_corners(points: Array, allowed: Array) -> npt.NDArray[np.intp]:
-    """Return the indices of points (N, n), no two equal in a row, without those on a line with others.
+    """Return the indices of points (N, n), no two equal in a row, that are not on a line with others.
 
-    A curve of many points turns at none of them, so that the line between the ends of a straight part
-    decides. On a path that never turns all count. So do points to which the path has to come nearer than to
-    an end of their line, by the deviations that are allowed (N,).
+    A curve of many points turns at none of them, so the line between the ends of a straight part decides. On
+    a path that never turns all count. So do points to which the path has to come nearer than to an end of
+    their line, by the allowed deviations (N,).
     """
     turns = _find_turns(points, *_segments(points))
     if not turns.any():
@@ -209,7 +208,7 @@ def _find_corners(points: Array, allowed: Array) -> npt.NDArray[np.intp]:
 
 
 def _shrink(path: BlendedPath, valid: Validity, resolution: float) -> BlendedPath:
-    """Return a path whose blends have been halved until they are valid."""
+    """Halve blends until they are valid."""
     reach = path.reach.copy()
     open_corners = np.flatnonzero(reach > 0)
     for _ in range(_HALVINGS + 1):
@@ -231,7 +230,6 @@ def _shrink(path: BlendedPath, valid: Validity, resolution: float) -> BlendedPat
 
 
 def _blend_points(path: BlendedPath, corners: npt.NDArray[np.intp], count: int) -> Array:
-    """Return configurations on the blends of inner corners (len(corners), count, n)."""
     u = np.linspace(0.0, 1.0, count)[:, None]
     reach = path.reach[corners, None, None]
     before, after = path.directions[corners, None], path.directions[corners + 1, None]

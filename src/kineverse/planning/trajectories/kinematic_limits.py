@@ -14,7 +14,7 @@ from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
-from kineverse.model.speed_limits import SpeedLimits
+from kineverse.model.velocity_constraints.speed_limits import SpeedLimits
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
@@ -83,13 +83,13 @@ def motion_limits(
     velocity = np.array([bounds.get(s, math.inf) for s in speeds])
     velocity[np.isinf(velocity)] = speed
     stated, _ = acceleration_limits(model, None)
-    found = [_evaluate(stated[s], values) if s in stated else math.inf for s in speeds]
-    acceleration = np.array(found, dtype=float)
+    result = [_evaluate(stated[s], values) if s in stated else math.inf for s in speeds]
+    acceleration = np.array(result, dtype=float)
     return MotionLimits(velocity, np.where(np.isfinite(acceleration), acceleration, velocity / ramp))
 
 
 def _speed_bounds(model: ModelView, speeds: Sequence[Symbol], values: State) -> dict[Symbol, float]:
-    """Return the largest magnitudes of speeds that may all be used at once."""
+    """Return largest magnitudes of speeds that may all be used at once."""
     moving = {s for s in speeds if s in model.speeds}
     limits = SpeedLimits(model.rates)
     for name, constraint in model.constraints_for(moving).items():

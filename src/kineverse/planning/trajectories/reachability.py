@@ -1,4 +1,7 @@
-"""Fastest speeds along a rounded path by reachability analysis, cell by cell (TOPP-RA)."""
+"""Reachability analysis of a rounded path: the largest squared path speeds within the limits.
+
+The two passes of TOPP-RA (Pham & Pham 2018, IEEE T-RO 34(3), algorithm 1), with x = ṡ² and u = s̈.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +20,17 @@ from .blends import BlendedPath
 class PathGrid:
     """Cells of a path: straight segments, and parts of blends."""
 
-    lengths: Array  # lengths in s (K,)
-    first: Array  # derivatives q' at the ends (K, n)
-    last: Array
-    curvature: Array  # derivatives q'' (K, n)
-    start: Array  # configurations at the beginning (K, n)
-    straight: npt.NDArray[np.bool_]  # flags of the cells that are straight segments (K,)
-    stops: npt.NDArray[np.bool_]  # flags of the nodes where the motion is at rest (K+1,)
+    lengths: Array  # (K,), in the path parameter s
+    first: Array  # (K, n), q' at the beginning
+    last: Array  # (K, n), q' at the end
+    curvature: Array  # (K, n), q''
+    start: Array  # (K, n), q at the beginning
+    straight: npt.NDArray[np.bool_]  # (K,), True for straight segments
+    stops: npt.NDArray[np.bool_]  # (K+1,), True for nodes where the motion is at rest
 
 
 def divide_path(path: BlendedPath, cells: int) -> PathGrid:
-    """Divide a path into cells."""
+    """Divide a path into its straight segments and some cells for each blend."""
     segments = len(path.lengths)
     reach = np.concatenate(([0.0], path.reach, [0.0]))
     straight = path.lengths - reach[:-1] - reach[1:]
@@ -60,15 +63,8 @@ def divide_path(path: BlendedPath, cells: int) -> PathGrid:
     keep = ~kind | (lengths > 8 * np.finfo(float).eps * path.lengths.max())
     ends[-1] = True
     # A segment that its blends use up ends at no stop.
-    return PathGrid(
-        lengths[keep],
-        first[keep],
-        last[keep],
-        bend[keep],
-        start[keep],
-        kind[keep],
-        np.concatenate(([True], ends[keep][:-1], [True])),
-    )
+    stops = np.concatenate(([True], ends[keep][:-1], [True]))
+    return PathGrid(lengths[keep], first[keep], last[keep], bend[keep], start[keep], kind[keep], stops)
 
 
 _ITERATIONS = 12
@@ -85,7 +81,7 @@ _TINY = 1e-9
 
 
 def maximal_squared_speeds(grid: PathGrid, speeds: Array, accelerations: Array) -> Array:
-    """Return the largest squared path speeds at the nodes (K+1,): the backward and the forward pass."""
+    """Compute the largest squared path speeds at the nodes (K+1,) by a backward and a forward pass."""
     before, after = _speed_caps(grid, speeds)
     with np.errstate(divide="ignore", over="ignore"):
         path_accelerations = (accelerations / np.abs(grid.first)).min(axis=1)
@@ -107,7 +103,7 @@ def maximal_squared_speeds(grid: PathGrid, speeds: Array, accelerations: Array) 
 
 
 def _speed_caps(grid: PathGrid, speeds: Array) -> tuple[Array, Array]:
-    """Return bounds of x at both ends of each cell (K,) with which q'·√x keeps the speed limits between.
+    """Bound x at both ends of each cell (K,) so that q'·√x keeps the speed limits between them.
 
     In a cell x and q' are linear. x has to stay below (v/q')², which is convex, and below its tangent in the
     middle of the cell it does. Where q' changes much, it stays below the smallest value instead.
@@ -160,7 +156,7 @@ class CellPrograms:
         return float(np.minimum.reduce(self._row))
 
     def _find_best(self, lower: tuple[Array, Array], most: Array) -> Array:
-        """Return for each cell the x₁ of the largest x₀, or a little less, at most ``most``.
+        """Find for each cell the x₁ of the largest x₀, or a little less, at most ``most``.
 
         The upper bound of x₀ is concave in x₁, and the lower bound convex. Newton's method from the right
         finds where they meet, and secants of the upper bound find its maximum before that.
@@ -183,12 +179,12 @@ class CellPrograms:
         for _ in range(_ITERATIONS):
             meet = np.divide(c - a, slope - other, out=left.copy(), where=rising)
             up, e, between = _extreme(self._x0, meet, np.argmin)
-            found = up >= (a + slope * meet) * (1 - _ROUNDING)
-            ahead = rising & (found | (between > 0))
+            result = up >= (a + slope * meet) * (1 - _ROUNDING)
+            ahead = rising & (result | (between > 0))
             left, a, slope = (
                 np.where(ahead, new, old) for new, old in ((meet, left), (e, a), (between, slope))
             )
-            rising &= ~found
+            rising &= ~result
             if not rising.any():
                 break
             c, other = np.where(ahead, c, e), np.where(ahead, other, between)

@@ -106,12 +106,12 @@ def time_parameterize(
 def _limits(
     path: BlendedPath, velocity: npt.ArrayLike, acceleration: npt.ArrayLike, symbols: Sequence[Symbol]
 ) -> tuple[Array, Array]:
-    """Return the limits of the coordinates (n,), checked; infinite speeds become those that none reaches."""
+    """Check the limits of the coordinates (n,); infinite speeds become those that none reaches."""
     n = path.points.shape[1]
     travel = np.abs(np.diff(path.points, axis=0)).sum(axis=0)
-    found = []
-    for noun, given in (("speed", velocity), ("acceleration", acceleration)):
-        limits = np.array(given, dtype=float)
+    result = []
+    for noun, values in (("speed", velocity), ("acceleration", acceleration)):
+        limits = np.array(values, dtype=float)
         if limits.shape not in ((), (n,)):
             raise ShapeError(f"The {noun} limits are a number or {n} numbers, not of shape {limits.shape}.")
         limits = np.broadcast_to(limits, (n,)).copy()
@@ -122,8 +122,8 @@ def _limits(
                 f"The {noun} limit of '{symbols[int(k)]}', which moves, is {wanted}, not {limits[k]:g}."
             )
         limits[~good] = 1.0
-        found.append(limits)
-    speeds, accelerations = found
+        result.append(limits)
+    speeds, accelerations = result
     # With the acceleration a over the travel S the speed stays below √(2·a·S).
     return np.minimum(speeds, 2 * np.sqrt(accelerations * travel) + np.finfo(float).tiny), accelerations
 
@@ -131,16 +131,16 @@ def _limits(
 class _Phases(NamedTuple):
     """Parts of cells in which the path speed is linear in time, (P,) each."""
 
-    cells: npt.NDArray[np.intp]  # indices of the cells
-    durations: Array  # durations [s]
-    begins: Array  # beginning in the cell and length, in s
+    cells: npt.NDArray[np.intp]
+    durations: Array  # [s]
+    begins: Array  # beginning within the cell, in the path parameter
     lengths: Array
     before: Array  # path speeds ṡ at both ends
     after: Array
 
 
 def _straight_phases(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> _Phases:
-    """Return three phases of each straight segment: up to its largest speed, along at that, down from it."""
+    """Divide each straight segment into three phases: faster, at its largest speed, slower."""
     cells = np.flatnonzero(grid.straight)
     first, last, length = x[cells], x[cells + 1], grid.lengths[cells]
     with np.errstate(divide="ignore", over="ignore"):
@@ -162,7 +162,7 @@ def _straight_phases(grid: PathGrid, x: Array, speeds: Array, accelerations: Arr
 
 
 def _blend_phases(grid: PathGrid, x: Array, accelerations: Array) -> _Phases:
-    """Return phases of the cells of blends, so short that cubics are near to the motion.
+    """Divide the cells of blends into phases so short that cubics are near to the motion.
 
     The motion has the fourth derivative 3·q''·u² in time. At the ends of a phase of duration T, the second
     derivative of the cubic with the same ends differs by that times T²/12.
@@ -184,7 +184,7 @@ def _blend_phases(grid: PathGrid, x: Array, accelerations: Array) -> _Phases:
 
 
 def _motion(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> tuple[Array, Array, Array]:
-    """Return times (T,), positions and velocities (T, n) of the motion with the squared path speeds x."""
+    """Compute times (T,), positions and velocities (T, n) of the motion with the squared path speeds x."""
     blends = _blend_phases(grid, x, accelerations)
     slower = _excess(grid, blends, speeds, accelerations)
     straight = _straight_phases(grid, x, speeds, accelerations)
@@ -205,7 +205,7 @@ def _motion(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> tu
 
 
 def _excess(grid: PathGrid, phases: _Phases, speeds: Array, accelerations: Array) -> float:
-    """Return the factor on all times with which the cubics of phases of blends keep the limits, at least 1.
+    """Return the factor on all times, at least 1, with which the cubics of blends keep the limits.
 
     On straight segments the cubics are the motion.
     """

@@ -1,4 +1,4 @@
-"""Trajectory: a timed motion of coordinates as a value."""
+"""Trajectories: timed motions of coordinates as values, and goals that let a controller follow them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import finite_number
 from kineverse.errors import FormatError, InvalidValueError, ShapeError
+from kineverse.expressions.expression import ExpressionLike
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
@@ -21,8 +23,13 @@ from kineverse.symbols import Symbol
 
 from .trajectory_file import TrajectoryData, parse_coordinates, read_trajectory_file, write_trajectory_file
 
+if TYPE_CHECKING:
+    from kineverse.control import Controller
+
 _JUMP = 1e-6
 """Largest difference of positions and velocities at which two trajectories are joined [rad], [m], per s."""
+_GAIN, _WEIGHT = 5.0, 100.0
+"""Gain [1/s] and weight of the goals of a follower."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,7 +133,7 @@ class Trajectory:
         return np.array([np.stack(rows, axis=1) for rows in (begins, ends)])
 
     def _position_at(self, time: float) -> Array:
-        """Return the position (n,) at one time, for loops: as :meth:`positions_at`, ten times as fast."""
+        """Return the position (n,) at one time: as :meth:`positions_at`, ten times as fast."""
         last = len(self.times) - 1
         k = int(self.times.searchsorted(time, side="right")) - 1
         if k < 0 or k >= last:
@@ -217,10 +224,7 @@ class Trajectory:
     def reversed(self) -> Trajectory:
         """Return the motion backwards in time."""
         return Trajectory(
-            self.symbols,
-            self.duration - self.times[::-1],
-            self.positions[::-1],
-            -self.velocities[::-1],
+            self.symbols, self.duration - self.times[::-1], self.positions[::-1], -self.velocities[::-1]
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -293,7 +297,6 @@ class Trajectory:
 
     @property
     def _single(self) -> int:
-        """1 if there is a single knot, else 0."""
         return int(len(self.times) == 1)
 
     def _locate(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], Array, Array]:
@@ -310,8 +313,84 @@ class Trajectory:
         return Trajectory(self.symbols, times - times[0], self.positions_at(times), self.velocities_at(times))
 
 
-def _time(given: float) -> float:
-    number = finite_number(given)
+class TrajectoryFollower:
+    """Goals for the coordinates of a trajectory, whose targets and feed-forward rates are parameters.
+
+    ::
+
+        follower = kv.planning.TrajectoryFollower(trajectory)
+        controller = kv.control.Controller(model, follower.tasks, dt=0.02)
+        follower.set(controller, time)
+        command = controller.step(state)
+
+    A trajectory of the same coordinates can take the place of another one at any time, without another
+    compilation: ``follower.trajectory = other``.
+
+    Parameters
+    ----------
+    trajectory
+        The trajectory.
+    gain
+        Rate at which errors decay [1/s], at most 1/dt of the controller.
+    weight
+        Weight of the goals; with a large one, other goals give way.
+    name
+        Path of the parameters.
+
+    Attributes
+    ----------
+    tasks
+        One goal for each coordinate.
+    """
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        *,
+        gain: ExpressionLike = _GAIN,
+        weight: ExpressionLike = _WEIGHT,
+        name: str = "trajectory",
+    ) -> None:
+        # For start-up time: a trajectory alone imports no controllers.
+        from kineverse.control.tasks import Goal, Target
+
+        self._trajectory = trajectory
+        self._position = Target(f"{name}/position", trajectory.positions[0])
+        self._speed = Target(f"{name}/speed", 0 * trajectory.positions[0])
+        targets, rates = self._position.expression, self._speed.expression
+        self.tasks = tuple(
+            Goal(s, targets[k], rate=rates[k], gain=gain, weight=weight, name=f"{name}/{s}")
+            for k, s in enumerate(trajectory.symbols)
+        )
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The trajectory that is followed; another one has the same coordinates."""
+        return self._trajectory
+
+    @trajectory.setter
+    def trajectory(self, other: Trajectory) -> None:
+        if other.symbols != self._trajectory.symbols:
+            raise InvalidValueError(
+                "The goals are about the coordinates of the first trajectory, and another one has the same, "
+                "in the same order. For others make another follower and controller."
+            )
+        self._trajectory = other
+
+    def set(self, controller: Controller, time: float) -> None:
+        """Set the targets of a controller for its step at a time of the trajectory [s].
+
+        The rate is the mean one of the coming control period, so that a motion without disturbances stays
+        on the trajectory. After the end, the goals hold the last position.
+        """
+        dt, trajectory = controller.dt, self._trajectory
+        now, later = trajectory.positions_at(float(time)), trajectory.positions_at(float(time) + dt)
+        controller.set(self._position, now)
+        controller.set(self._speed, (later - now) / dt)
+
+
+def _time(value: float) -> float:
+    number = finite_number(value)
     if number is None:
-        raise InvalidValueError(f"A time is a finite number of seconds, not {given!r}.")
+        raise InvalidValueError(f"A time is a finite number of seconds, not {value!r}.")
     return number

@@ -36,7 +36,7 @@ class TrajectoryData(NamedTuple):
 
 
 def check_trajectory_name(path: str | os.PathLike[str]) -> None:
-    """Check that the name of a file ends in .json, or has no suffix."""
+    """Check that a file name ends in .json, or has no suffix."""
     suffix = Path(path).suffix
     if suffix.lower() not in ("", ".json"):
         raise FormatError(
@@ -45,7 +45,7 @@ def check_trajectory_name(path: str | os.PathLike[str]) -> None:
 
 
 def write_trajectory_file(path: str | os.PathLike[str], data: TrajectoryData) -> None:
-    """Write the data of a trajectory to a file."""
+    """Write a trajectory to a file."""
     check_trajectory_name(path)
     document = {"format": FORMAT, "version": VERSION, "coordinates": data.names}
     document |= {key: getattr(data, key).tolist() for key in data._fields[1:]}
@@ -53,7 +53,7 @@ def write_trajectory_file(path: str | os.PathLike[str], data: TrajectoryData) ->
 
 
 def read_trajectory_file(path: str | os.PathLike[str]) -> TrajectoryData:
-    """Read the data of a trajectory from a file, and check their types and shapes."""
+    """Read a trajectory from a file, and check types and shapes."""
     path = Path(path)
     source = path.name
 
@@ -80,17 +80,13 @@ def read_trajectory_file(path: str | os.PathLike[str]) -> TrajectoryData:
         raise FormatError(f"{source}: 'coordinates' is a list of names.")
     times = _numbers(document["times"], "times", source)
     shape = (times.size, len(names))
-    return TrajectoryData(
-        names,
-        times,
-        _table(document["positions"], "positions", shape, source),
-        _table(document["velocities"], "velocities", shape, source),
-    )
+    tables = (_table(document[key], key, shape, source) for key in ("positions", "velocities"))
+    return TrajectoryData(names, times, *tables)
 
 
 def parse_coordinates(names: list[str], source: str) -> tuple[Symbol, ...]:
-    """Return the symbols of names in a file."""
-    found = []
+    """Parse names of coordinates."""
+    result = []
     for name in names:
         try:
             path, order = parse_symbol_name(name)
@@ -99,12 +95,12 @@ def parse_coordinates(names: list[str], source: str) -> tuple[Symbol, ...]:
             raise FormatError(f"{source}: {name!r:.80} is no name of a coordinate: {error}") from None
         if order:
             raise FormatError(f"{source}: {name!r:.80} is a derivative; the columns are positions.")
-        found.append(symbol)
-    return tuple(found)
+        result.append(symbol)
+    return tuple(result)
 
 
 def _numbers(values: Any, key: str, source: str) -> Array:
-    """Return a list of numbers as an array; texts, truth values and nested lists are none."""
+    """Read a list of numbers as an array; texts, truth values and nested lists are refused."""
     if not isinstance(values, list):
         raise FormatError(f"{source}: '{key}' is a list of numbers, not {values!r:.40}.")
     for value in values:

@@ -122,7 +122,7 @@ class OpeningSetup:
         values = self.robot.start_state(self.model).updated(opened)
         if seed:
             values = values.updated(self._draw_configuration(np.random.default_rng(seed)))
-        solver = InverseKinematics(self.model, [held], still=[self.what], scene=scene, margin=_MARGIN)
+        solver = InverseKinematics(self.model, [held], fixed=[self.what], scene=scene, margin=_MARGIN)
         for more in range(_SEEDS):
             found = solver.solve(values, starts=_STARTS, seed=_SEEDS * seed + more)
             if found.solved:

@@ -86,7 +86,7 @@ class LeaderFollower:
                 Goal(turned, gain=1.0 / DT, weight=ROTATION_WEIGHT, name="rotation"),
             ],
             dt=DT,
-            still=[setup.what],
+            fixed=[setup.what],
             smooth=1e-4,
             posture=0.0,
         )

@@ -31,11 +31,7 @@ NodeT = TypeVar("NodeT", bound=Hashable)
 def spanning_tree(
     nodes: Iterable[NodeT], gains: Mapping[frozenset[NodeT], float], leaves: Collection[NodeT] = ()
 ) -> list[frozenset[NodeT]]:
-    """Return the connections of the spanning tree, or forest, with the largest sum of gains.
-
-    It is the structure of largest likelihood if the density is a product over connections (Chow and Liu
-    1968). Leaves have one connection at most.
-    """
+    """Return the spanning forest of largest gain (Chow and Liu 1968); leaves have one connection."""
     group = {node: {node} for node in nodes}
     chosen = []
     for connection in sorted(gains, key=lambda c: -gains[c]):
@@ -86,7 +82,7 @@ def edge_probabilities(
         if connection <= order.keys():
             i, j = (order[node] for node in connection)
             logs[i, j] = logs[j, i] = gain
-    found = {}
+    result = {}
     for connection, gain in gains.items():
         if connection <= order.keys():
             i, j = (order[node] for node in connection)
@@ -94,8 +90,8 @@ def edge_probabilities(
         else:
             (leaf,) = connection & {*leaves}
             total = of_leaf[leaf]
-        found[connection] = math.exp(min(0.0, gain - total))
-    return found
+        result[connection] = math.exp(min(0.0, gain - total))
+    return result
 
 
 def replacement_probabilities(
@@ -104,23 +100,18 @@ def replacement_probabilities(
     gains: Mapping[frozenset[NodeT], float],
     leaves: Collection[NodeT] = (),
 ) -> dict[frozenset[NodeT], float]:
-    """Return the probabilities of the connections that replace one, in trees without it.
-
-    They connect the two sides of the removed one and are sorted by probability. Their sum is at least the
-    probability that the one is absent.
-    """
+    """Return the probabilities of the connections that replace one, the largest first."""
     one, other = split_tree(connection, tree)
     around = {c: gain for c, gain in gains.items() if c <= one | other}
     missing = 1.0 - edge_probabilities(one | other, around, leaves)[connection]
     del around[connection]
-    found = edge_probabilities(one | other, around, leaves)
+    likely = edge_probabilities(one | other, around, leaves)
     apart = {*leaves} - connection
-    across = {c: missing * p for c, p in found.items() if c & one and c & other and not c & apart}
+    across = {c: missing * p for c, p in likely.items() if c & one and c & other and not c & apart}
     return dict(sorted(across.items(), key=lambda pair: -pair[1]))
 
 
 def _log_conductance(logs: Array, start: int, end: int) -> float:
-    """Return the log conductance between two nodes, from the log conductances of all connections."""
     order = [*(k for k in range(len(logs)) if k not in (start, end)), start, end]
     left = logs[np.ix_(order, order)]
     for _ in order[2:]:
@@ -145,19 +136,16 @@ def tree_path(tree: Iterable[frozenset[NodeT]], start: NodeT, end: NodeT) -> lis
                     reached.append(neighbour)
     if end not in before:
         return []
-    way = [end]
-    while way[-1] != start:
-        way.append(before[way[-1]])
-    return way[::-1]
+    path = [end]
+    while path[-1] != start:
+        path.append(before[path[-1]])
+    return path[::-1]
 
 
 def orient_tree(
     first: Iterable[NodeT], nodes: Sequence[NodeT], tree: Iterable[frozenset[NodeT]]
 ) -> tuple[tuple[NodeT, ...], list[tuple[NodeT, NodeT]]]:
-    """Return the roots and the connections directed away from them.
-
-    In each component of the forest, the node that comes first in ``first`` is the root.
-    """
+    """Return the roots, the first node of each component in ``first``, and the connections away from them."""
     connections = list(tree)
     roots: list[NodeT] = []
     directed: list[tuple[NodeT, NodeT]] = []
@@ -221,7 +209,7 @@ def find_rigid_bodies(
     result = []
     for parts in dict.fromkeys(group.values()):
         # The world represents its body, else the part that was observed most often, points last.
-        often = {p: (p == WORLD, not tracks[p].is_point, int(tracks[p].seen.sum())) for p in parts}
+        often = {p: (p == WORLD, not tracks[p].is_point, int(tracks[p].observed.sum())) for p in parts}
         ordered = sorted(parts, key=lambda p: (*(-n for n in often[p]), list(tracks).index(p)))
         places = _poses_in_first(ordered, pairs, {p for p in parts if tracks[p].is_point})
         result.append(RigidBody(tuple(ordered), places, surest[parts[0]]))
@@ -354,8 +342,8 @@ class KinematicGraph:
             if loop.closure is None:
                 raise ModelError(
                     f"The loop of '{loop.parent}' and '{loop.child}' cannot be closed: it has coordinates "
-                    "that cannot follow others, as those of a ball, or it is a screw that would close it. "
-                    "Say close=False for a model in which it is open."
+                    "that cannot depend on others, as those of a ball, or would be closed by a screw. Say "
+                    "close=False for a model in which it is open."
                 )
             yield from loop.closure.operations(name)
 
@@ -408,7 +396,7 @@ def identify_graph(
         (6, 6) or (N, 6, 6). A pose of NaN only is a gap. For a part observed as a point, positions (N, 3)
         with (3, 3) or (N, 3, 3).
     noise
-        Covariance, (6, 6), of parts that have none of their own, see :mod:`kineverse.estimation.noise`.
+        Default covariance, (6, 6), see :mod:`kineverse.estimation.noise`.
     world
         True if the frame of the poses is the world. The world is then a part, too, with an exact pose. False
         for a moving observer.
@@ -429,15 +417,13 @@ def identify_graph(
     tracks = check_tracks(poses, noise, points=True)
     if world:
         if WORLD in tracks:
-            raise DuplicateNameError(
-                "The world is a part already; call the part otherwise, or say world=False."
-            )
+            raise DuplicateNameError("The world is a part already; rename the part, or say world=False.")
         tracks = {WORLD: exact_track(max((len(t.poses) for t in tracks.values()), default=0)), **tracks}
     if len(tracks) < 2:
-        raise InvalidValueError("How parts are connected takes at least two of them, or one and the world.")
+        raise InvalidValueError("A kinematic graph takes at least two parts, or one and the world.")
     if all(track.is_point for track in tracks.values()):
         raise InvalidValueError(
-            "Only positions were seen, of all parts. What a part hangs on has to be seen as a pose, "
+            "Only positions were observed, of all parts. The parent of a part has to be observed as a pose, "
             "(N, 4, 4); the world is one, unless world=False."
         )
     pairs = identify_pairs(tracks, families, progress)
@@ -449,7 +435,13 @@ def identify_graph(
     # The root is the world, else the part with the most connections, and never a point.
     first = sorted(firsts, key=lambda n: (n != WORLD, n in points, -sum(n in c for c in tree)))
     roots, directed = orient_tree(first, firsts, tree)
-    joints = [_orient_pair(between[frozenset(ends)], ends[0], tracks, families) for ends in directed]
+    joints = []
+    for parent, child in directed:
+        joint = between[frozenset((parent, child))]
+        if joint.parent != parent:
+            # Identified again in the other direction.
+            joint = identify_pair(tracks, parent, child, families) or joint
+        joints.append(joint)
     loops = _find_loops({c: p for c, p in between.items() if not c & points}, joints)
     # A joint that closes a loop is no alternative to a joint of the tree.
     gains = {c: p.gain for c, p in between.items() if c not in loops}
@@ -459,39 +451,27 @@ def identify_graph(
         connection = frozenset((joint.parent, joint.child))
         others = {}
         if likely[connection] < SURE:
-            found = replacement_probabilities(connection, tree, gains, points)
-            others = {(between[c].parent, between[c].child): p for c, p in found.items() if p > 1.0 - SURE}
-        edges.append(
-            KinematicEdge(joint.parent, joint.child, joint.result, joint.times, likely[connection], others)
-        )
+            instead = replacement_probabilities(connection, tree, gains, points)
+            others = {(between[c].parent, between[c].child): p for c, p in instead.items() if p > 1.0 - SURE}
+        ends = joint.parent, joint.child
+        edges.append(KinematicEdge(*ends, joint.result, joint.times, likely[connection], others))
     ordered = sorted(likely.items(), key=lambda pair: -pair[1])
     connections = {(between[c].parent, between[c].child): p for c, p in ordered}
     of_points = tuple(name for name in tracks if name in points)
     return KinematicGraph(bodies, tuple(edges), tuple(loops.values()), roots, connections, of_points)
 
 
-def _orient_pair(
-    known: PartPair, parent: str, tracks: Mapping[str, PoseTrack], families: FamilyChoice
-) -> PartPair:
-    """Return a pair with the given parent, identified again in the other direction if necessary."""
-    if known.parent == parent:
-        return known
-    turned = identify_pair(tracks, known.child, known.parent, families)
-    return known if turned is None else turned
-
-
 def _find_loops(
     between: Mapping[frozenset[str], PartPair], joints: Sequence[PartPair]
 ) -> dict[frozenset[str], KinematicEdge]:
-    """Return the joints that close loops of a tree, by their two parts."""
     tree = {frozenset((joint.parent, joint.child)): joint for joint in joints}
     candidates = []
-    for connection, known in between.items():
-        way = [tree[frozenset(ends)] for ends in pairwise(tree_path(tree, known.parent, known.child))]
-        if connection not in tree and way and closes_loop(known, way):
-            candidates.append(ObservedLoop(known, way))
-    found = {}
+    for connection, pair in between.items():
+        path = [tree[frozenset(ends)] for ends in pairwise(tree_path(tree, pair.parent, pair.child))]
+        if connection not in tree and path and closes_loop(pair, path):
+            candidates.append(ObservedLoop(pair, path))
+    loops = {}
     for (joint, _), closure in close_loops(candidates, joints):
         edge = KinematicEdge(joint.parent, joint.child, joint.result, joint.times, closure=closure)
-        found[frozenset((joint.parent, joint.child))] = edge
-    return found
+        loops[frozenset((joint.parent, joint.child))] = edge
+    return loops

@@ -6,14 +6,14 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.estimation.identification.families import FamilyMotion, GroupMotion
 from kineverse.estimation.identification.joint_operations import family_coordinates, rigid_pose
-from kineverse.estimation.identification.result import Fit, IdentificationResult
+from kineverse.estimation.identification.result import Fit
 from kineverse.estimation.linear_algebra import invert_matrices
 from kineverse.lie import Array, inverse, skew, transform
 from kineverse.loops import CloseLoop
@@ -81,9 +81,9 @@ class DependentCoordinates:
                     common = np.intersect1d(common, new[u].times)
             rows = np.searchsorted(times, common)
             total: dict[str, Array] = {}
-            for u, own in by_others.items():
+            for u, by_u in by_others.items():
                 for v, slope in self._slopes(u, common).items():
-                    total[v] = total.get(v, 0.0) + own[rows] * slope
+                    total[v] = total.get(v, 0.0) + by_u[rows] * slope
             self._known[x] = _Slopes(common, total)
 
     def _slopes(self, name: str, times: Times) -> Mapping[str, Array]:
@@ -108,40 +108,16 @@ _WRAPPING = math.pi
 _PERTURBATION = 0.3
 
 
-class ObservedJoint(Protocol):
-    """Joint between two parts, with the indices of the observations of both."""
-
-    @property
-    def parent(self) -> str:
-        """Name of the parent part."""
-        ...
-
-    @property
-    def child(self) -> str:
-        """Name of the child part."""
-        ...
-
-    @property
-    def result(self) -> IdentificationResult:
-        """Identification result of the pair."""
-        ...
-
-    @property
-    def times(self) -> npt.NDArray[np.int_]:
-        """Indices of the observations of both parts."""
-        ...
-
-
 @dataclass(frozen=True)
 class Chain:
     """Chain of joints, at the times at which all of its parts were observed."""
 
-    poses: Array  # poses of the last part in the first, (N, 4, 4)
-    twists: Array  # (N, 6, m)
+    poses: Array  # of the last part in the first, (N, 4, 4)
+    twists: Array  # of the last part per unit of each joint value, (N, 6, m)
     values: Array  # joint values and their standard deviations, (N, m)
     deviations: Array
     is_angle: tuple[bool, ...]  # mask of the joint values that are angles, (m,)
-    times: npt.NDArray[np.int_]  # indices of the observations
+    times: Times
 
     @property
     def mobility(self) -> int:
@@ -154,14 +130,8 @@ class Chain:
         return int(np.median(np.sum(values > RANK_TOLERANCE * values[:, :1], axis=1)))
 
 
-def build_chain(
-    joints: Sequence[ObservedJoint], start: str, random: np.random.Generator | None = None
-) -> Chain:
-    """Return the chain of successive joints from the part ``start`` on.
-
-    With ``random``, the joint values are permuted and perturbed independently, for configurations that were
-    not observed.
-    """
+def build_chain(joints: Sequence[PartPair], start: str, random: np.random.Generator | None = None) -> Chain:
+    """Return the chain of successive joints from the part ``start`` on, observed or with random values."""
     times = joints[0].times
     for one in joints[1:]:
         times = np.intersect1d(times, one.times)
@@ -173,14 +143,13 @@ def build_chain(
     for one in joints:
         fit = one.result.best
         rows = np.searchsorted(one.times, times)
-        values_taken = fit.joint_values[rows]
+        q = fit.joint_values[rows]
         if random is not None:
-            values_taken = random.permuted(values_taken, axis=0)
+            # For configurations that were not observed.
+            q = random.permuted(q, axis=0)
             if isinstance(fit.motion, GroupMotion):
-                values_taken = values_taken + random.uniform(
-                    -_PERTURBATION, _PERTURBATION, values_taken.shape
-                )
-        linear = fit.motion.linearise(values_taken)
+                q = q + random.uniform(-_PERTURBATION, _PERTURBATION, q.shape)
+        linear = fit.motion.linearise(q)
         forward = one.parent == start
         step = linear.pose if forward else inverse(linear.pose)
         # A joint that is traversed backwards has the opposite twist, in the axes of its child.
@@ -189,34 +158,32 @@ def build_chain(
         v, w = turned @ linear.by_joints[:, :3], turned @ linear.by_joints[:, 3:]
         place = (parent @ linear.pose)[:, :3, 3]
         twists.append(np.concatenate([v + skew(place) @ w, w], axis=1))
-        values.append(values_taken)
+        values.append(q)
         deviations.append(fit.deviations[rows])
         poses = poses @ step
         start = one.child if forward else one.parent
     columns = np.concatenate(twists, axis=2)
     columns[:, :3] -= skew(poses[:, :3, 3]) @ columns[:, 3:]
     angles = tuple(angle for one in joints for angle in find_angles(one.result.best))
-    joined, known = np.concatenate(values, axis=1), np.concatenate(deviations, axis=1)
-    return Chain(poses, columns, joined, known, angles, times)
+    joined, spread = np.concatenate(values, axis=1), np.concatenate(deviations, axis=1)
+    return Chain(poses, columns, joined, spread, angles, times)
 
 
-def closes_loop(known: PartPair, joints: Sequence[ObservedJoint]) -> bool:
+def closes_loop(pair: PartPair, joints: Sequence[PartPair]) -> bool:
     """Return True if a pair is constrained beyond the chain of joints from its parent to its child."""
-    if known.result.is_ambiguous or not known.is_consistent:
+    if pair.result.is_ambiguous or not pair.is_consistent:
         return False
-    chain = build_chain(joints, known.parent)
-    fit = known.result.best
+    chain = build_chain(joints, pair.parent)
+    fit = pair.result.best
     count = fit.motion.joints
     if len(chain.times) < 2 or chain.mobility <= count:
         return False
-    own = np.searchsorted(known.times, chain.times)
-    values = np.concatenate([chain.values, fit.joint_values[own]], axis=1)
-    deviations = np.concatenate([chain.deviations, fit.deviations[own]], axis=1)
-    angles = [*chain.is_angle, *find_angles(fit)]
-    samples = [
-        _JointSamples(values[:, k], deviations[:, k], angle and bool(np.ptp(values[:, k]) > _WRAPPING))
-        for k, angle in enumerate(angles)
-    ]
+    rows = np.searchsorted(pair.times, chain.times)
+    values = np.concatenate([chain.values, fit.joint_values[rows]], axis=1)
+    deviations = np.concatenate([chain.deviations, fit.deviations[rows]], axis=1)
+    is_wide = np.ptp(values, axis=0) > _WRAPPING
+    is_periodic = np.logical_and([*chain.is_angle, *find_angles(fit)], is_wide).tolist()
+    samples = [_JointSamples(*each) for each in zip(values.T, deviations.T, is_periodic, strict=True)]
     return any(_determine(samples, chosen) for chosen in combinations(range(len(samples)), count))
 
 
@@ -239,8 +206,7 @@ class _JointSamples(NamedTuple):
 
 def find_angles(fit: Fit) -> list[bool]:
     """Return the mask of the joint values that are angles."""
-    own = isinstance(fit.motion, GroupMotion)
-    return [own and bool(kind) for kind in fit.motion.kinds]
+    return [isinstance(fit.motion, GroupMotion) and bool(kind) for kind in fit.motion.kinds]
 
 
 def _determine(samples: Sequence[_JointSamples], chosen: Sequence[int]) -> bool:
@@ -255,9 +221,8 @@ def _determine(samples: Sequence[_JointSamples], chosen: Sequence[int]) -> bool:
         for term in samples[k].terms(1):
             moved = term - term.mean()
             left = moved - features @ np.linalg.lstsq(features, moved, rcond=None)[0]
-            noise = np.mean(samples[k].deviations ** 2) / (
-                1.0 if samples[k].is_periodic else samples[k].values.var() or 1.0
-            )
+            variance = 1.0 if samples[k].is_periodic else samples[k].values.var() or 1.0
+            noise = np.mean(samples[k].deviations ** 2) / variance
             if np.mean(left**2) >= _UNEXPLAINED * np.mean(moved**2) + 4.0 * noise:
                 return False
     return True
@@ -283,20 +248,17 @@ _WELL_KNOWN, _SMALL = 4.0, 0.15
 class ObservedLoop(NamedTuple):
     """Joint outside the tree, and the chain of tree joints from its parent to its child."""
 
-    joint: ObservedJoint
-    chain: Sequence[ObservedJoint]
+    joint: PartPair
+    chain: Sequence[PartPair]
 
     @property
     def strength(self) -> float:
-        """Range of the joint in standard deviations, reduced for small rotations.
-
-        Any short motion resembles a rotation about a distant axis.
-        """
+        """Range of the joint in standard deviations, less for small rotations, which are like any motion."""
         fit = self.joint.result.best
         moved = np.ptp(fit.joint_values, axis=0)
-        known = np.maximum(fit.deviations.mean(axis=0), 1e-12)
+        spread = np.maximum(fit.deviations.mean(axis=0), 1e-12)
         bent = np.where(find_angles(fit), np.minimum(moved, 1.0), 1.0)
-        return float((moved * bent / known).min(initial=math.inf))
+        return float((moved * bent / spread).min(initial=math.inf))
 
 
 @dataclass(frozen=True)
@@ -306,9 +268,9 @@ class LoopClosure:
     name: str  # prefix of the names of frames and articulations
     seat_in: str  # name of the part with the seat, and pose of the seat in it, (4, 4)
     seat: Array
-    pin_in: str  # name of the part with the pin, and pose of the pin in it, (4, 4)
+    pin_in: str
     pin: Array
-    mask: tuple[str, ...]  # as for kineverse.CloseLoop
+    mask: tuple[str, ...]  # mask, dependent and home are those of kineverse.CloseLoop
     dependent: tuple[str, ...]
     home: tuple[tuple[str, float], ...]
 
@@ -329,22 +291,18 @@ class LoopClosure:
 
 @dataclass(frozen=True)
 class _Ends:
-    """Seat and pin of a loop, see :class:`LoopClosure`."""
+    """Poses of the seat and the pin of a loop."""
 
     seat: Array
     pin: Array
-    motion: Twists  # twists of the pin in the axes of the seat
+    motion: Twists  # of the pin in the axes of the seat
     constrained: tuple[int, ...]  # components that coincide
 
 
 def close_loops(
-    loops: Iterable[ObservedLoop], joints: Sequence[ObservedJoint]
+    loops: Iterable[ObservedLoop], joints: Sequence[PartPair]
 ) -> Iterator[tuple[ObservedLoop, LoopClosure | None]]:
-    """Yield the loops that remove mobility, the shortest first, with their closures.
-
-    The closure is None if a coordinate cannot be dependent, as that of a ball, and for joints that couple
-    components, such as screws.
-    """
+    """Yield the loops that remove mobility, the shortest first, with their closures, or None."""
     # Loops are selected by strength and then closed by length.
     selected = []
     dependents = DependentCoordinates()
@@ -355,11 +313,10 @@ def close_loops(
         elif _can_move(loop) and (plan := _plan(loop, ends, dependents)) is not None:
             dependents.add(plan.motion, plan.columns, plan.slopes)
             selected.append((loop, ends))
-    observed = {
-        x: (joint.times, joint.result.best.joint_values[:, k])
-        for joint in joints
-        for k, x in enumerate(_coordinates(joint.result.best, joint.child) or ())
-    }
+    observed = {}
+    for joint in joints:
+        for k, x in enumerate(_coordinates(joint.result.best, joint.child) or ()):
+            observed[x] = joint.times, joint.result.best.joint_values[:, k]
     dependents = DependentCoordinates()
     for loop, ends in sorted(selected, key=lambda pair: len(pair[0].chain)):
         plan = _plan(loop, ends, dependents, dependents.leading)
@@ -369,19 +326,17 @@ def close_loops(
         dependents.add(plan.motion, plan.columns, plan.slopes)
         joint, names = loop.joint, plan.motion.names
         turn = transform(plan.axes, np.zeros(3))
-        yield (
-            loop,
-            LoopClosure(
-                _title(loop),
-                joint.parent,
-                ends.seat @ turn,
-                joint.child,
-                ends.pin @ turn,
-                mask=tuple(AXES[ends.constrained[k]] for k in plan.rows),
-                dependent=tuple(names[k] for k in plan.columns),
-                home=_find_home(observed, names, plan.columns, plan.motion.times),
-            ),
+        closure = LoopClosure(
+            f"{joint.child}/{joint.parent}",
+            joint.parent,
+            ends.seat @ turn,
+            joint.child,
+            ends.pin @ turn,
+            mask=tuple(AXES[ends.constrained[k]] for k in plan.rows),
+            dependent=tuple(names[k] for k in plan.columns),
+            home=_find_home(observed, names, plan.columns, plan.motion.times),
         )
+        yield loop, closure
 
 
 class _Plan(NamedTuple):
@@ -422,10 +377,6 @@ def _can_move(loop: ObservedLoop) -> bool:
     return _rank(equations, _tolerance(loop)) < len(elsewhere.motion.names)
 
 
-def _title(loop: ObservedLoop) -> str:
-    return f"{loop.joint.child}/{loop.joint.parent}"
-
-
 def _coordinates(fit: Fit, name: str) -> tuple[str, ...] | None:
     """Return the coordinates of the joint values of a fit; None if they are not the joint values."""
     if isinstance(fit.motion, FamilyMotion):
@@ -438,10 +389,7 @@ def _coordinates(fit: Fit, name: str) -> tuple[str, ...] | None:
 
 
 def _ends(loop: ObservedLoop, random: np.random.Generator | None = None) -> _Ends | None:
-    """Return the ends of a loop in the observed configurations, or in random ones.
-
-    The result is None if the loop cannot be closed.
-    """
+    """Return the ends of a loop in observed or random configurations; None if it cannot be closed."""
     joint, fit = loop.joint, loop.joint.result.best
     names: list[str] = []
     for other in loop.chain:
@@ -453,17 +401,11 @@ def _ends(loop: ObservedLoop, random: np.random.Generator | None = None) -> _End
         return None
     ring = build_chain(loop.chain, joint.parent, random)
     seat, pin = fit.motion.left, inverse(fit.motion.right)
-    axes = np.broadcast_to(seat[:3, :3], (len(ring.times), 3, 3))
-    twists = _transform_twists(ring.twists, ring.poses[:, :3, :3] @ pin[:3, 3], axes)
+    # Twists of the pin, in the axes of the seat.
+    linear = ring.twists[:, :3] - skew(ring.poses[:, :3, :3] @ pin[:3, 3]) @ ring.twists[:, 3:]
+    back = seat[:3, :3].T
+    twists = np.concatenate([back @ linear, back @ ring.twists[:, 3:]], axis=1)
     return _Ends(seat, pin, Twists(tuple(names), ring.times, twists), CONSTRAINED_COMPONENTS[fit.family])
-
-
-def _transform_twists(twists: Array, offset: Array, parent_R_axes: Array) -> Array:
-    """Return twists (N, 6, n) of a point at an offset, in other axes."""
-    linear = twists[:, :3] - skew(offset) @ twists[:, 3:]
-    axes_R_parent = np.swapaxes(parent_R_axes, 1, 2)
-    moved: Array = np.concatenate([axes_R_parent @ linear, axes_R_parent @ twists[:, 3:]], axis=1)
-    return moved
 
 
 def _align_axes(twists: Array, about_z: bool) -> Array:
@@ -500,7 +442,6 @@ def _tolerance(loop: ObservedLoop) -> float:
 
 
 def _rank(equations: Array, tolerance: float, whole: Array | None = None) -> int:
-    """Return the median rank of the equations, relative to the largest singular value of ``whole``."""
     values = np.linalg.svd(equations, compute_uv=False)
     most = values if whole is None else np.linalg.svd(whole, compute_uv=False)
     return int(np.median(np.sum(values > tolerance * np.median(most[:, 0]), axis=1)))
@@ -512,9 +453,8 @@ def _choose_equations(equations: Array, count: int, eligible: Sequence[int]) -> 
     def conditioning(square: Array) -> float:
         return float(np.linalg.svd(square, compute_uv=False)[:, -1].min())
 
-    rows = max(
-        combinations(range(equations.shape[1]), count), key=lambda some: conditioning(equations[:, some])
-    )
+    each = combinations(range(equations.shape[1]), count)
+    rows = max(each, key=lambda some: conditioning(equations[:, some]))
     chosen = equations[:, rows]
     columns = max(combinations(eligible, count), key=lambda some: conditioning(chosen[:, :, some]))
     return list(rows), list(columns)
@@ -527,8 +467,7 @@ def _find_home(
 
     def at(x: str, time: Times | np.int_) -> Array:
         when, values = observed[x]
-        there: Array = values[np.searchsorted(when, time)]
-        return there
+        return np.asarray(values[np.searchsorted(when, time)])
 
     off = np.zeros(len(times))
     for k in set(range(len(names))) - {*columns}:

@@ -45,11 +45,11 @@ SURPRISE_DEVIATIONS = 4.0
 class PartPair:
     """Joint identified between two parts that were observed together."""
 
-    parent: str  # names of the parts
+    parent: str
     child: str
-    result: IdentificationResult  # identification result
+    result: IdentificationResult
     times: npt.NDArray[np.int_]  # indices of the observations of both parts
-    gain: float
+    gain: float  # log evidence of a connection against none
     is_consistent: bool  # True if the residuals are as large as the noise
 
     @property
@@ -63,25 +63,21 @@ class PartPair:
 def identify_pair(
     tracks: Mapping[str, PoseTrack], parent: str, child: str, families: FamilyChoice
 ) -> PartPair | None:
-    """Identify the joint between two parts.
-
-    A part observed as a point becomes the child. The result is None for two points, and for parts that were
-    observed together fewer than two times.
-    """
+    """Identify the joint between two parts, a point as the child; None without two common observations."""
     if tracks[parent].is_point:
         parent, child = child, parent
     a, b = tracks[parent], tracks[child]
     if a.is_point:
         return None
-    times = np.flatnonzero(a.seen & b.seen)
+    times = np.flatnonzero(a.observed & b.observed)
     if len(times) < 2:
         return None
     observations = pair_tracks(a, b, times)
-    found = identify_observations(observations, families)
+    result = identify_observations(observations, families)
     weights = {str(getattr(f, "name", f)): w for f, w in _joint_weights(families).items()}
-    best = found.best
+    best = result.best
     log = best.log_evidence + math.log(weights[best.family] / best.probability / sum(weights.values()))
-    squares = chi_squared(observations, best)
+    squares = float(squared_errors(best.residuals, relative_covariance(observations, best)).sum())
     expected = max(best.residuals.size - best.joint_values.size - len(best.covariance), 1)
     explained = abs(squares - expected) < SURPRISE_DEVIATIONS * math.sqrt(2.0 * expected)
     if explained:
@@ -89,17 +85,11 @@ def identify_pair(
         log += 0.5 * (squares - expected)
     if a.covariances is not None:
         # The noise of the parent must not favour a connection to the world, which is exact.
-        log += _log_volume(relative_covariance(observations, best), best) - _log_volume(
-            child_covariance(observations), best
-        )
+        log += _log_volume(relative_covariance(observations, best), best)
+        log -= _log_volume(child_covariance(observations), best)
     rotation = 0.0 if b.is_point else _LOG_ROTATION
     log += LOG_ANYWHERE - _LOG_ROTATION + rotation - len(times) * (_LOG_ROOM + rotation)
-    return PartPair(parent, child, found, times, log, explained)
-
-
-def chi_squared(observations: Observations, fit: Fit) -> float:
-    """Return χ² of the residuals of a fit."""
-    return float(squared_errors(fit.residuals, relative_covariance(observations, fit)).sum())
+    return PartPair(parent, child, result, times, log, explained)
 
 
 def relative_covariance(observations: Observations, fit: Fit) -> Array:
@@ -116,8 +106,7 @@ def relative_covariance(observations: Observations, fit: Fit) -> Array:
 def child_covariance(observations: Observations) -> Array:
     """Return the covariances of the child's observed pose or position, in the parent's axes, (N, m, m)."""
     rotation = _parent_rotations(observations, observations.rows)
-    covariance: Array = rotation @ observations.child_covariance @ np.swapaxes(rotation, 1, 2)
-    return covariance
+    return np.asarray(rotation @ observations.child_covariance @ np.swapaxes(rotation, 1, 2))
 
 
 def _parent_rotations(observations: Observations, rows: int) -> Array:
@@ -137,12 +126,8 @@ def _log_volume(covariance: Array, fit: Fit) -> float:
 def identify_observations(
     observations: Observations, families: FamilyChoice, outliers: Outliers | None = None
 ) -> IdentificationResult:
-    """Identify the joint between two parts from their observations.
-
-    The result is not checked: pairs and models are compared by their evidence under one stated noise.
-    """
-    exact = observations.parent_covariance is None
-    if exact:
+    """Identify the joint between two parts by its evidence under one stated noise, without a check."""
+    if observations.parent_covariance is None:
         identities = np.tile(np.eye(4), (len(observations), 1, 1))
         observations = Observations(identities, observations.relative, None, observations.child_covariance)
     weights = _joint_weights(families)
@@ -151,29 +136,26 @@ def identify_observations(
 
 
 def _joint_weights(families: FamilyChoice) -> dict[str | Family, float]:
-    """Return the families and their weights, by default all but the curve."""
     weights = family_weights(families)
     if families is not None and CURVE in weights:
         raise InvalidValueError(
-            f"Pairs of parts are compared by the joints that they may have, and {CURVE!r} is none. "
-            "kv.estimation.identify takes it for a single pair."
+            f"Pairs of parts are compared by their joints, and {CURVE!r} is none. kv.estimation.identify "
+            "takes it for a single pair."
         )
     return without_curve(weights)
 
 
 def identify_pairs(
-    tracks: Mapping[str, PoseTrack],
-    families: FamilyChoice,
-    progress: Callable[[int, int], object] | None,
+    tracks: Mapping[str, PoseTrack], families: FamilyChoice, progress: Callable[[int, int], object] | None
 ) -> dict[frozenset[str], PartPair]:
     """Identify the joints between all pairs of parts that were observed together."""
     names = list(combinations(tracks, 2))
-    found: dict[frozenset[str], PartPair] = {}
+    result: dict[frozenset[str], PartPair] = {}
     for done, (a, b) in enumerate(names):
         if progress is not None:
             progress(done, len(names))
-        if (known := identify_pair(tracks, a, b, families)) is not None:
-            found[frozenset((a, b))] = known
+        if (pair := identify_pair(tracks, a, b, families)) is not None:
+            result[frozenset((a, b))] = pair
     if progress is not None:
         progress(len(names), len(names))
-    return found
+    return result

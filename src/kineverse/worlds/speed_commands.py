@@ -1,0 +1,133 @@
+"""Commands of speeds to a world: checks of its arguments, and the command that acts at a time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse._checks import finite_number
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.lie import Array
+from kineverse.model.frame import is_of_robot
+from kineverse.model.model_view import ModelView
+from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol
+
+ROUNDING = 1e-9  # difference of times that counts as none [s]
+
+SpeedColumns = Mapping[Symbol | str, int | None]  # by symbol and name; None for a speed that is not read
+
+
+class _Command(NamedTuple):
+    speeds: Array
+    start: float
+    end: float
+
+
+class SpeedCommands:
+    """Speeds (n,) that were commanded to a robot, each with the time in which it acts [s].
+
+    After its end everything stops but the fingers, which keep their last speed.
+    """
+
+    def __init__(
+        self,
+        columns: SpeedColumns,
+        fingers: npt.NDArray[np.bool_],
+        timeout: float,
+        delay: float,
+        report: Callable[[str], object],
+    ) -> None:
+        self._columns, self._fingers, self._report = columns, fingers, report
+        self._timeout, self._delay = timeout, delay
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all commands."""
+        self.refused = 0
+        self._last: Array = np.zeros(len(self._fingers))
+        self._active = _Command(self._last, 0.0, 0.0)
+        self._coming: deque[_Command] = deque()
+
+    def take(self, speeds: StateLike, duration: float, stamp: float | None, now: float) -> float:
+        """Take speeds for a duration [s], and return its end; those with a stale stamp stop the robot."""
+        until = end = now + check_duration(duration)
+        taken = None if stamp is None else finite_number(stamp)
+        if stamp is not None and taken is None:
+            raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
+        vector = parse_speeds(speeds, self._columns, self._stop(self._last))
+        if taken is not None and now - self._timeout <= taken + ROUNDING <= now + 2 * ROUNDING:
+            until = min(end, taken + self._timeout)
+        elif taken is not None:
+            self.refused += 1
+            self._report(f"speeds with the stamp {taken:g} s are refused")
+            vector = self._stop(self._last)
+        self._last = vector
+        self._coming.append(_Command(vector, now + self._delay, until + self._delay))
+        return end
+
+    def acting(self, time: float) -> Array:
+        """Return the speeds that act at a time [s], which is not before that of the last call."""
+        while self._coming and self._coming[0].start <= time + ROUNDING:
+            self._active = self._coming.popleft()
+        return self._active.speeds if time < self._active.end - ROUNDING else self._stop(self._active.speeds)
+
+    def next_change(self, time: float) -> float:
+        """Return the time after another one at which other speeds may act [s]; infinite if none is known."""
+        changes = (self._active.end, *(command.start for command in self._coming))
+        return min((t for t in changes if t > time + ROUNDING), default=np.inf)
+
+    def _stop(self, speeds: Array) -> Array:
+        return np.where(self._fingers, speeds, 0.0)
+
+
+def parse_speeds(speeds: StateLike, columns: SpeedColumns, vector: Array) -> Array:
+    """Write speeds into a vector (n,) of all columns, and return it."""
+    if not isinstance(speeds, Mapping):
+        raise InvalidValueError(f"Speeds are a mapping from symbols or names to numbers, not {speeds!r}.")
+    for key, value in speeds.items():
+        if key not in columns:
+            if isinstance(speeds, State):
+                continue  # a state may have further values
+            names = [name for name in columns if isinstance(name, str)]
+            raise UnknownNameError(
+                f"The model has no free speed '{key}'. {suggest(str(key), names, 'speed')}"
+            )
+        if (column := columns[key]) is not None:
+            number = finite_number(value)
+            if number is None:
+                raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
+            vector[column] = number
+    return vector
+
+
+def check_duration(duration: float) -> float:
+    """Return the duration of a step [s], or raise InvalidValueError if it is no positive number."""
+    length = finite_number(duration)
+    if length is None or length <= 0:
+        raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
+    return length
+
+
+def check_settings(positive: Mapping[str, Any], others: Mapping[str, Any]) -> None:
+    """Raise InvalidValueError for a setting of a world that is no positive number, or none from 0 on."""
+    for name, value in (*positive.items(), *others.items()):
+        number = finite_number(value)
+        if number is None or number < 0 or (name in positive and not number):
+            kind = "positive number" if name in positive else "number from 0 on"
+            raise InvalidValueError(f"'{name}' of a world is a {kind}, not {value!r}.")
+
+
+def find_robot_coordinates(model: ModelView, robot: str) -> list[Symbol]:
+    """Return the degrees of freedom of a robot, or raise UnknownNameError if it has none."""
+    result = [s for s in model.degrees_of_freedom if is_of_robot(s.path, robot)]
+    if not result:
+        prefixes = sorted({s.path.partition("/")[0] for s in model.degrees_of_freedom})
+        raise UnknownNameError(
+            f"No coordinate of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
+        )
+    return result
