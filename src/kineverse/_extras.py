@@ -7,7 +7,6 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable
-from importlib import metadata
 from pathlib import Path
 
 DISTRIBUTION = "kineverse-articulation"
@@ -64,6 +63,8 @@ def requirements(extra: str, declared: Iterable[str]) -> list[str]:
 
 
 def _declared() -> list[str]:
+    from importlib import metadata  # for start-up time
+
     try:
         return metadata.requires(DISTRIBUTION) or []
     except metadata.PackageNotFoundError:

@@ -412,9 +412,33 @@ class LimitDifference:
 
 
 class BehaviourComparison:
-    """Differences in poses and limits between two models, beyond a tolerance."""
+    """Differences in poses and limits between two models, as ``kineverse diff --values`` prints them.
 
-    def __init__(self, before: ModelView, after: ModelView, tolerance: float) -> None:
+    Parameters
+    ----------
+    before, after
+        The models.
+    tolerance
+        Largest difference of equal numbers [m], [rad].
+
+    Attributes
+    ----------
+    states
+        Number of states at which poses are compared.
+    frames, freedoms
+        Names that are ``removed``, ``added`` and ``common``.
+    helpers
+        Frames without bodies that are in between in one of the models; they do not count.
+    apart
+        Frames whose poses differ by more than the tolerance, the farthest first, each with the largest
+        ``distance`` [m] and ``angle`` [rad].
+    largest
+        Largest distance [m] and angle [rad] of all.
+    ranges
+        Limits of positions and speeds that differ, each with those ``before`` and ``after``.
+    """
+
+    def __init__(self, before: ModelView, after: ModelView, tolerance: float = 1e-9) -> None:
         self.tolerance = tolerance
         self.helpers = [*find_helper_frames(before, after), *find_helper_frames(after, before)]
         self.frames = _partition_names(
