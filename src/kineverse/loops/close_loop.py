@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeVar
 
 from kineverse._checks import real_number
@@ -84,6 +84,23 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
     home: tuple[tuple[str, float], ...] = ()
     branch: int = 0
     within: tuple[tuple[str, float, float], ...] = ()
+
+    def below(self, prefix: str) -> CloseLoop:
+        """Return the same loop with its names below a prefix that ends with a slash; ``world`` stays."""
+
+        def place(name: str) -> str:
+            return name if name == WORLD else prefix + name
+
+        return replace(
+            self,
+            name=place(self.name),
+            frame=place(self.frame),
+            to=place(self.to),
+            more=tuple((place(a), place(b)) for a, b in self.more),
+            dependent=None if self.dependent is None else tuple(map(place, self.dependent)),
+            home=tuple((place(name), value) for name, value in self.home),
+            within=tuple((place(name), lower, upper) for name, lower, upper in self.within),
+        )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mask", as_mask(self.mask, self.name))

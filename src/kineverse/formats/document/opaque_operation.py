@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from kineverse.errors import KineverseError, ModelError, UnknownNameError
+from kineverse.loops import CloseLoop
 from kineverse.model.operation import Cell, Operation, Writes
 from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder
 from kineverse.model.traces import Trace
@@ -20,8 +21,9 @@ class OpaqueOperation(Operation):
     """Operation from a document, without the class of the original.
 
     While its reads are unchanged, it writes what the original wrote, to the last bit. When a read changes, it
-    is run again by its trace. Without a trace it is *frozen*, and the change is refused. Then, or if the
-    original branched on the changed value, replace it by an operation of its class in the same edit.
+    is run again by its trace. Without a trace it is *frozen*: a :class:`~kineverse.loops.CloseLoop` is closed
+    again, any other change is refused. Then, or if the original branched on the changed value, replace it by an
+    operation of its class in the same edit.
 
     Attributes
     ----------
@@ -81,6 +83,8 @@ class OpaqueOperation(Operation):
         changed = self._changed(model)
         if not changed:
             return self._effects
+        if self.kind == "CloseLoop" and self.trace is None:
+            return CloseLoop(**self.parameters).below(self.scope).apply(model)
         error: KineverseError = ModelError(f"{self.frozen or 'it looked whether it is there'}.")
         if self.trace is not None:
             try:
