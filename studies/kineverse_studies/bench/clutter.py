@@ -36,22 +36,12 @@ _STEP_ANGLE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Clutter:
-    """Arm of hulls, boxes and capsules that moves in small steps among static boxes.
+    """Arm of hulls, boxes and capsules that moves in small steps among static boxes."""
 
-    Attributes
-    ----------
-    corners
-        Corners of each link's hull, (24, 3) [m]; used by every third link.
-    sizes, poses
-        Edges of the boxes (N, 3) [m], and their poses (N, 4, 4).
-    angles
-        Joint angles of the steps, (steps, 20) [rad].
-    """
-
-    corners: list[Array]
-    sizes: Array
+    corners: list[Array]  # corners of each link's hull, (24, 3) [m]; used by every third link
+    sizes: Array  # edges of the boxes (N, 3) [m], and their poses (N, 4, 4)
     poses: Array
-    angles: Array
+    angles: Array  # joint angles of the steps, (steps, 20) [rad]
 
     def kind(self, link: int) -> str:
         """Return the kind of shape of a link."""
@@ -139,7 +129,6 @@ def _link_centres(angles: Array) -> Array:
 
 
 def _clearance(points: Array, size: Array, pose: Array) -> float:
-    """Return the least distance of points from a box."""
     inside = (points - pose[:3, 3]) @ pose[:3, :3]
     return float(np.linalg.norm(np.maximum(np.abs(inside) - size / 2, 0.0), axis=1).min())
 

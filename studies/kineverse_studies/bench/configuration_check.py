@@ -20,17 +20,7 @@ FINER = 20.0
 
 
 class ConfigurationCheck:
-    """Collision check of configurations, for planners that call Python for each of them.
-
-    Parameters
-    ----------
-    scene
-        The scene; its rules decide about pairs.
-    symbols
-        Coordinates of configurations.
-    state
-        State of everything else; the default state of the model if None.
-    """
+    """Collision check of configurations, for planners that call Python for each of them."""
 
     def __init__(self, scene: Scene, symbols: Sequence[Symbol], state: StateLike | None = None) -> None:
         self.scene, self._symbols = scene, tuple(symbols)
@@ -53,15 +43,7 @@ class ConfigurationCheck:
         return len(self._query()) == 0
 
     def count_contacts(self, points: Array, density: float = FINER * CHECKS_PER_RADIAN) -> int:
-        """Return the number of samples of a path that are in contact.
-
-        Parameters
-        ----------
-        points
-            Configurations of the path, shape (N, n).
-        density
-            Number of samples over a motion of length 1 in all coordinates [1/rad], [1/m].
-        """
+        """Return the number of samples of a path that are in contact."""
         samples, contacts = interpolate_path(points, density), 0
         self(samples[0])
         while (k := self._query.first_within(self._symbols, samples)) is not None:

@@ -51,33 +51,15 @@ class ControlLoop(Protocol):
 
 @dataclass(frozen=True)
 class ControlWorkload:
-    """Robot, start and rate of a control benchmark.
+    """Robot, start and rate of a control benchmark."""
 
-    Attributes
-    ----------
-    origin
-        Library and file of the published example.
-    robot
-        Returns the model.
-    start
-        Positions of joints at the start [m], [rad] by name; the others are zero.
-    held
-        Joints that the peers' models have as fixed ones.
-    period
-        Control period [s].
-    steps
-        Number of control periods of one motion.
-    substitute
-        Difference between this robot and that of the example; empty if there is none.
-    """
-
-    origin: str
-    robot: Callable[[], Model]
-    start: Mapping[str, float]
-    held: tuple[str, ...] = ()
-    period: float = 0.005
-    steps: int = 1000
-    substitute: str = ""
+    origin: str  # library and file of the published example
+    robot: Callable[[], Model]  # returns the model
+    start: Mapping[str, float]  # positions of joints at the start [m], [rad] by name; the others are zero
+    held: tuple[str, ...] = ()  # joints that the peers' models have as fixed ones
+    period: float = 0.005  # control period [s]
+    steps: int = 1000  # number of control periods of one motion
+    substitute: str = ""  # difference between this robot and that of the example; empty if there is none
 
     def urdf(self) -> str:
         """Return the robot as URDF text without shapes."""
@@ -333,21 +315,11 @@ def drive(time: float) -> Array:
 
 @dataclass(frozen=True)
 class CollisionSphere:
-    """Sphere on a link.
+    """Sphere on a link."""
 
-    Attributes
-    ----------
-    link
-        Link that carries it.
-    centre
-        Centre in the link's frame [m].
-    radius
-        Radius [m].
-    """
-
-    link: str
-    centre: tuple[float, float, float]
-    radius: float
+    link: str  # link that carries it
+    centre: tuple[float, float, float]  # centre in the link's frame [m]
+    radius: float  # radius [m]
 
 
 HAND_SPHERES = tuple(CollisionSphere(hand, (0.06, 0.0, 0.0), 0.06) for hand in HANDS)

@@ -13,24 +13,7 @@ from kineverse.symbols import Symbol
 
 
 class ControllerLoop:
-    """Control loop of a controller, with vectors for states.
-
-    Parameters
-    ----------
-    controller
-        The controller.
-    start
-        State at the start.
-    clock
-        Parameter that is the time in the targets, or None.
-    task
-        Name of the task whose error counts, of its first three entries; by default the first one.
-
-    Attributes
-    ----------
-    command
-        The last command.
-    """
+    """Control loop of a controller, with vectors for states."""
 
     command: Command
 

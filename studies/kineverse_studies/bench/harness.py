@@ -101,22 +101,7 @@ class DisagreementError(KineverseError, ArithmeticError):
 def check_equal(
     what: str, results: Sequence[tuple[str, Sequence[Array]]], tolerance: float = EQUALITY_TOLERANCE
 ) -> None:
-    """Compare the results of contenders with those of the first one.
-
-    Parameters
-    ----------
-    what
-        The benchmark, for the message.
-    results
-        Names, each with its arrays.
-    tolerance
-        Largest difference of numbers.
-
-    Raises
-    ------
-    DisagreementError
-        If an array differs in shape, or in a number by more than the tolerance, or is not finite.
-    """
+    """Compare the results of contenders with those of the first one."""
     (first, expected), *others = results
     if not all(np.isfinite(array).all() for array in expected):
         raise DisagreementError(f"Benchmark {what!r}: {first!r} computed what is not finite.")
@@ -138,40 +123,18 @@ def check_equal(
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """Library or implementation that is measured.
+    """Library or implementation that is measured."""
 
-    Attributes
-    ----------
-    name
-        Library and method.
-    sample
-        Does the work and returns its cost in ``unit``.
-    results
-        Returns the results of the work, which must equal those of the others; None to compare nothing.
-    unit
-        ``s`` for times, else the unit of the count.
-    """
-
-    name: str
-    sample: Callable[[], float]
+    name: str  # library and method
+    sample: Callable[[], float]  # does the work and returns its cost in ``unit``
     results: Callable[[], Sequence[Array]] | None = None
-    unit: str = "s"
+    unit: str = "s"  # ``s`` for times, else the unit of the count
 
 
 def time_calls(
     run: Callable[..., object], count: int = 1, prepare: Callable[[], Any] | None = None
 ) -> Callable[[], float]:
-    """Return a function that measures the time of ``run`` divided by ``count`` [s].
-
-    Parameters
-    ----------
-    run
-        Work to measure.
-    count
-        Number of equal parts of the work.
-    prepare
-        Called before the time is taken; its result is the argument of ``run``.
-    """
+    """Return a function that measures the time of ``run`` divided by ``count`` [s]."""
 
     def sample() -> float:
         arguments = () if prepare is None else (prepare(),)
@@ -185,24 +148,7 @@ def time_calls(
 def time_contenders(
     what: str, contenders: Sequence[Contender], rounds: int, progress: Progress
 ) -> dict[str, Measurement]:
-    """Check that contenders agree, then measure them interleaved; return measurements by name.
-
-    Parameters
-    ----------
-    what
-        The benchmark.
-    contenders
-        Contenders to measure.
-    rounds
-        Number of samples of each contender, after one that is not counted.
-    progress
-        See :class:`.harness.BenchmarkSettings`.
-
-    Raises
-    ------
-    DisagreementError
-        If their results differ.
-    """
+    """Check that contenders agree, then measure them interleaved; return measurements by name."""
     results = [(c.name, c.results()) for c in contenders if c.results is not None]
     if results:
         check_equal(what, results)
@@ -230,18 +176,10 @@ BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink", "ompl")
 
 @dataclass(slots=True)
 class Contenders:
-    """Contenders of a benchmark, and missing peers.
+    """Contenders of a benchmark, and missing peers."""
 
-    Attributes
-    ----------
-    contenders
-        Contenders to measure.
-    missing
-        A line for each missing peer.
-    """
-
-    contenders: list[Contender] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
+    contenders: list[Contender] = field(default_factory=list)  # contenders to measure
+    missing: list[str] = field(default_factory=list)  # A line for each missing peer
 
     def add_peer(self, module: str, contenders: Callable[[], Iterable[Contender]]) -> None:
         """Add the contenders of a peer, or a line on the missing peer."""
@@ -298,22 +236,7 @@ class ProgramError(KineverseError, RuntimeError):
 
 
 def run_program(name: str, *arguments: str, cache: str | None = None) -> dict[str, Any]:
-    """Run a function of :mod:`.fresh_process` in a fresh process, and return its JSON object.
-
-    Parameters
-    ----------
-    name
-        Name of the function.
-    arguments
-        Its arguments.
-    cache
-        Folder of the cache of compiled code; the default one if None.
-
-    Raises
-    ------
-    ProgramError
-        If it fails, with its last line of output.
-    """
+    """Run a function of :mod:`.fresh_process` in a fresh process, and return its JSON object."""
     environment = dict(os.environ)
     if cache is not None:
         environment["KINEVERSE_CACHE_DIR"] = cache

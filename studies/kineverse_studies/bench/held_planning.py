@@ -42,34 +42,16 @@ _BETWEEN = (0.25, 0.5, 0.75)
 
 @dataclass(frozen=True)
 class HeldMotion:
-    """Motion of a door or drawer that hands hold.
-
-    Attributes
-    ----------
-    robot
-        Name of the shipped robot.
-    joint
-        Joint of the door or drawer in the shipped kitchen.
-    closed, opened
-        Its positions at the start and the goal [m], [rad].
-    hands
-        Frames of the hands, each with the pose of its grasp in the frame of the handle: x, y, z [m] and roll,
-        pitch, yaw [rad].
-    handle
-        Frame of the handle.
-    moving
-        Patterns of the coordinates that move, the joint besides.
-    base
-        Ranges of the base's x, y [m] and angle [rad], shape (2, 3).
-    """
+    """Motion of a door or drawer that hands hold."""
 
     robot: str
-    joint: str
-    closed: float
+    joint: str  # joint of the door or drawer in the shipped kitchen
+    closed: float  # its positions at the start and the goal [m], [rad]
     opened: float
     hands: Mapping[str, tuple[float, ...]]
     handle: str
-    moving: tuple[str, ...]
+    moving: tuple[str, ...]  # patterns of the coordinates that move, the joint besides
+    # ranges of the base's x, y [m] and angle [rad], shape (2, 3)
     base: tuple[tuple[float, float, float], tuple[float, float, float]]
 
     @cached_property
@@ -131,25 +113,13 @@ MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
 
 @dataclass
 class HeldResults:
-    """Attempts at a motion with holds.
-
-    Attributes
-    ----------
-    name
-        Name of the motion.
-    attempts
-        Attempts, :data:`STARTS` of them from each place of the base.
-    residual, residual_between
-        Largest residual of the holds at points of the paths, and between them [m], [rad].
-    tried
-        Number of places of the base that were tried to find these.
-    """
+    """Attempts at a motion with holds."""
 
     name: str
     attempts: list[Attempt] = field(default_factory=list)
-    residual: float = 0.0
+    residual: float = 0.0  # largest residual of the holds at points of the paths, and between them [m], [rad]
     residual_between: float = 0.0
-    tried: int = 0
+    tried: int = 0  # number of places of the base that were tried to find these
 
     @property
     def summary(self) -> AttemptSummary:

@@ -39,31 +39,15 @@ LEAST_SOLVED, MEDIAN, P99, FASTER = 98.0, 2e-3, 0.2, 100.0
 
 @dataclass
 class KitchenResults:
-    """Attempts at queries in kitchens.
+    """Attempts at queries in kitchens."""
 
-    Attributes
-    ----------
-    ours
-        Our attempts by robot and kitchen.
-    solvable
-        Number of queries that we or OMPL solve.
-    sampled
-        Attempts of OMPL at some of the queries that we solve.
-    unsolved
-        Number of queries that neither solves; None without OMPL.
-    checked, contacts
-        Number of our paths that the scene checked, and of those with a contact.
-    missing
-        A line for each robot, kitchen or peer that is missing.
-    """
-
-    ours: dict[str, list[Attempt]] = field(default_factory=dict)
-    solvable: int = 0
+    ours: dict[str, list[Attempt]] = field(default_factory=dict)  # our attempts by robot and kitchen
+    solvable: int = 0  # number of queries that we or OMPL solve
     sampled: list[tuple[Attempt, Attempt]] = field(default_factory=list)
-    unsolved: int = 0
-    checked: int = 0
+    unsolved: int = 0  # number of queries that neither solves; None without OMPL
+    checked: int = 0  # number of our paths that the scene checked, and of those with a contact
     contacts: list[str] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)  # A line for each robot, kitchen or peer that is missing
 
     @property
     def summary(self) -> AttemptSummary:
@@ -100,19 +84,7 @@ class KitchenResults:
 def run_kitchen_queries(
     queries: int, progress: Progress, pairs: Sequence[tuple[str, str]] | None = None, seed: int = 0
 ) -> KitchenResults:
-    """Return attempts at queries, shared by robots and kitchens; every path is checked by the scene.
-
-    Parameters
-    ----------
-    queries
-        Number of queries, all pairs of a robot and a kitchen together.
-    progress
-        See :class:`.harness.BenchmarkSettings`.
-    pairs
-        Names of robots and kitchens; all that are on the model path if None.
-    seed
-        Seed of the queries.
-    """
+    """Return attempts at queries, shared by robots and kitchens; every path is checked by the scene."""
     results = KitchenResults()
     wanted = [(robot, kitchen) for kitchen in KITCHENS for robot in ARMS] if pairs is None else [*pairs]
     absent = {pair: find_missing(*pair) for pair in wanted}
@@ -150,7 +122,6 @@ def _run_pair(arm: KitchenArm, count: int, seed: int, results: KitchenResults) -
 
 
 def _make_ompl(arm: KitchenArm, check: ConfigurationCheck) -> Any:
-    """Return OMPL's planner."""
     module = importlib.import_module(f"{__package__}.peers.ompl_rrt_connect")
     return module.OmplRrtConnect(check, *arm.limits)
 

@@ -31,27 +31,13 @@ ROBOT, KITCHEN, BASE = "robot", "kitchen", "robot/base"
 
 @dataclass(frozen=True)
 class KitchenRobotArm:
-    """Robot with an arm.
+    """Robot with an arm."""
 
-    Attributes
-    ----------
-    file
-        Name or path of the model.
-    tool
-        Frame of the hand.
-    axis
-        Direction of approach in that frame.
-    length
-        Distance of the fingertips from that frame [m].
-    without
-        Bodies that cannot be used, as their meshes are missing.
-    """
-
-    file: str
-    tool: str
-    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    length: float = 0.0
-    without: tuple[str, ...] = ()
+    file: str  # name or path of the model
+    tool: str  # frame of the hand
+    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)  # direction of approach in that frame
+    length: float = 0.0  # distance of the fingertips from that frame [m]
+    without: tuple[str, ...] = ()  # bodies that cannot be used, as their meshes are missing
 
 
 ARMS: Mapping[str, KitchenRobotArm] = MappingProxyType(
@@ -109,37 +95,16 @@ _STARTS = 4
 
 @dataclass(frozen=True, eq=False)
 class PlanningQuery:
-    """Start and goal of an arm at one place of the base.
+    """Start and goal of an arm at one place of the base."""
 
-    Attributes
-    ----------
-    start, goal
-        Configurations of the arm, shape (n,) [m], [rad].
-    state
-        State of the model, with the arm at the start.
-    """
-
-    start: Array
+    start: Array  # configurations of the arm, shape (n,) [m], [rad]
     goal: Array
-    state: State
+    state: State  # state of the model, with the arm at the start
 
 
 @dataclass(frozen=True, eq=False)
 class KitchenArm:
-    """Arm of a robot that stands in a kitchen.
-
-    Attributes
-    ----------
-    name
-        Names of both.
-    model
-        Model of both, with the prefixes ``robot`` and ``kitchen``. Its rules except pairs within the kitchen,
-        and pairs of the robot that always touch.
-    arm
-        The robot.
-    handles
-        Frames of the handles.
-    """
+    """Arm of a robot that stands in a kitchen."""
 
     name: str
     model: Model
@@ -199,20 +164,7 @@ class KitchenArm:
 
 
 def make_kitchen_arm(robot: str, kitchen: str, except_touching: bool = True) -> KitchenArm:
-    """Return a robot of :data:`ARMS` in a kitchen of :data:`KITCHENS`.
-
-    Parameters
-    ----------
-    robot, kitchen
-        Their names.
-    except_touching
-        Whether the rules except pairs of the robot that always touch. Otherwise no mesh is read.
-
-    Raises
-    ------
-    UnknownNameError
-        If one of them is not among the models.
-    """
+    """Return a robot of :data:`ARMS` in a kitchen of :data:`KITCHENS`."""
     arm, room = ARMS[robot], KITCHENS[kitchen]
     model = Model()
     with model.edit() as edit:

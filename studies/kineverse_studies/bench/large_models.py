@@ -145,18 +145,10 @@ NODES_PER_CONSTRAINT = 9
 
 @dataclass(frozen=True, slots=True)
 class DocumentTimes:
-    """Size and times of one document.
-
-    Attributes
-    ----------
-    nodes
-        Number of nodes.
-    written, read, packed, unpacked
-        Times [s] to write a model as text, to read it, and of both for msgpack.
-    """
+    """Size and times of one document."""
 
     nodes: int
-    written: float
+    written: float  # times [s] to write a model as text, to read it, and of both for msgpack
     read: float
     packed: float
     unpacked: float

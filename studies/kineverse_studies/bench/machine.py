@@ -29,23 +29,11 @@ VERSIONS = (
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Machine and software of a run.
-
-    Attributes
-    ----------
-    tier
-        Evaluation of functions: ``interpreter``, ``c``, or ``c extension``, which calls the C directly.
-    compiler
-        C compiler, with the vector unit and the number of cores.
-    processor, system, python
-        Names of processor, operating system and Python implementation, with versions.
-    versions
-        Versions of this package and of peers, by distribution; None for missing ones.
-    """
+    """Machine and software of a run."""
 
     tier: str
-    compiler: CompilerInformation
-    processor: str
+    compiler: CompilerInformation  # C compiler, with the vector unit and the number of cores
+    processor: str  # names of processor, operating system and Python implementation, with versions
     system: str
     python: str
     versions: dict[str, str | None]

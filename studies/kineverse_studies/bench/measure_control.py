@@ -78,7 +78,6 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def _near_the_kitchen(opening: Opening) -> TimedLoop:
-    """Return the opening without collisions."""
     scene = opening.scene()
     controller = opening.controller(scene)
     controller.wait()

@@ -21,21 +21,11 @@ from .timed_loop import TimedLoop
 
 @dataclass(frozen=True)
 class Example:
-    """Example of another library.
-
-    Attributes
-    ----------
-    library
-        The library.
-    lines
-        Number of lines of the original, without imports, viewer, comments and empty lines.
-    task
-        Name of our task whose error counts; by default the first.
-    """
+    """Example of another library."""
 
     library: str
-    lines: int
-    task: str | None = None
+    lines: int  # number of lines of the original, without imports, viewer, comments and empty lines
+    task: str | None = None  # name of our task whose error counts; by default the first
 
 
 EXAMPLES: Mapping[str, Example] = MappingProxyType(

@@ -118,11 +118,6 @@ def check_distances(entries: Sequence[SearchEntry], rows: Array) -> None:
 
     If a search misses a pair of another, its distance counts as the radius, so that only pairs near the
     radius may be missing. Penetration depths are not compared; they count as contact.
-
-    Raises
-    ------
-    DisagreementError
-        If distances differ by more than the tolerance of the search.
     """
     for row in rows[:: max(len(rows) // _CHECKED, 1)]:
         found = [_distances(entry.search, row) for entry in entries]

@@ -59,13 +59,7 @@ def _packages() -> Iterator[Measurement]:
 
 
 def find_requirements(distribution: str) -> set[str]:
-    """Return a distribution and all that it requires here, without extras.
-
-    Raises
-    ------
-    importlib.metadata.PackageNotFoundError
-        If one of them is not installed.
-    """
+    """Return a distribution and all that it requires here, without extras."""
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 

@@ -151,7 +151,6 @@ def search_from_same_starts(problem: ReachingProblem) -> Iterator[Search]:
 
 
 def _agree(found: Array, wanted: Array) -> bool:
-    """Return whether two poses agree within the tolerances."""
     cosine = 0.5 * (np.trace(found[:3, :3].T @ wanted[:3, :3]) - 1.0)
     sine = 0.5 * np.linalg.norm(found[:3, :3] @ wanted[:3, :3].T - wanted[:3, :3] @ found[:3, :3].T) / 2**0.5
     near = np.linalg.norm(found[:3, 3] - wanted[:3, 3]) <= POSITION_TOLERANCE

@@ -93,7 +93,6 @@ def _ours(angles: Array) -> Iterator[Contender]:
 
 
 def _rootfinder(angles: Array) -> Contender:
-    """Return CasADi's rootfinder, started near the solution."""
     crank, x = ca.SX.sym("crank"), ca.SX.sym("x", 2)
     end = _link_transform(crank, _CRANK) + _link_transform(x[0], _COUPLER)
     gap = end - _link_transform(x[1], _ROCKER) - ca.vertcat(_GROUND, 0)

@@ -18,13 +18,7 @@ LOADED, EVALUATED = "kineverse, loaded", "kineverse, pose and Jacobian compiled"
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure memory, each time in a fresh process.
-
-    Raises
-    ------
-    KineverseError
-        If the system does not report the memory of a process.
-    """
+    """Measure memory, each time in a fresh process."""
     if not os.path.exists("/proc/self/statm"):
         raise KineverseError("Benchmark 'memory' needs Linux, which reports the memory of a process.")
     robot = find_benchmark_robot(settings)

@@ -50,21 +50,11 @@ _STARTS, _SEEDS = 64, 20
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """Robot at the closed fridge.
-
-    Attributes
-    ----------
-    robot
-        Name of the robot.
-    model
-        The robot in the kitchen.
-    tasks
-        Grasp, held; and opening of the door.
-    """
+    """Robot at the closed fridge."""
 
     robot: str
-    model: Model
-    tasks: tuple[Hold, Goal]
+    model: Model  # the robot in the kitchen
+    tasks: tuple[Hold, Goal]  # grasp, held; and opening of the door
 
     def scene(self) -> Scene:
         """Return the scene, in which only the gripper may touch the door, and the kitchen does not count."""
@@ -79,13 +69,7 @@ class Opening:
         )
 
     def find_start(self, controller: Controller, scene: Scene | None = None) -> State:
-        """Return a state at the handle, by inverse kinematics, from which the controller opens the door.
-
-        Raises
-        ------
-        NoSolutionError
-            If there is none among the solutions that were tried.
-        """
+        """Return a state at the handle, by inverse kinematics, from which the controller opens the door."""
         solver = InverseKinematics(
             self.model, self.tasks[:1], still=[DOOR], scene=scene, margin=2 * MARGIN if scene else 0.0
         )
@@ -120,13 +104,7 @@ def make_opening(robot: str) -> Opening:
 
 
 def peer_workload(opening: Opening, start: State, kept: Iterable[str] | None = None) -> ControlWorkload:
-    """Return the workload for peers, from a start.
-
-    Parameters
-    ----------
-    kept
-        Coordinates that move, the others have fixed joints; None for all joints.
-    """
+    """Return the workload for peers, from a start."""
     names = None if kept is None else set(kept)
     joints = opening.model.articulations.items()
     held = [

@@ -19,27 +19,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """Result of a planner for one problem.
+    """Result of a planner for one problem."""
 
-    Attributes
-    ----------
-    found
-        True if a path was found.
-    seconds
-        Time of the search, without anything that is done once for a robot [s].
-    judged
-        Time with the judgement of the path by a scene [s]; the same for planners that do not judge.
-    points
-        Configurations of the path, shape (N, n) [m], [rad]; empty without one.
-    why
-        How the path was found, or why there is none.
-    """
-
-    found: bool
-    seconds: float
+    found: bool  # true if a path was found
+    seconds: float  # time of the search, without anything that is done once for a robot [s]
+    # time with the judgement of the path by a scene [s]; the same for planners that do not judge
     judged: float
+    # configurations of the path, shape (N, n) [m], [rad]; empty without one
     points: Array = field(default_factory=lambda: np.empty((0, 0)))
-    why: str = ""
+    why: str = ""  # how the path was found, or why there is none
 
 
 def attempt_with_kineverse(
@@ -67,17 +55,9 @@ def attempt_first_path(planner: Planner, start: Array, goal: Array, seconds: flo
 
 @dataclass(frozen=True)
 class AttemptSummary:
-    """Times and success of a planner over problems.
+    """Times and success of a planner over problems."""
 
-    Attributes
-    ----------
-    name
-        Planner and problems.
-    attempts
-        Its attempts.
-    """
-
-    name: str
+    name: str  # planner and problems
     attempts: Sequence[Attempt]
 
     @property

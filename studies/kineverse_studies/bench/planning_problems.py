@@ -36,24 +36,12 @@ ROBOTS = ("panda", "fetch")
 
 @dataclass(frozen=True, eq=False)
 class PublishedProblem:
-    """Start and goal of an arm among obstacles.
+    """Start and goal of an arm among obstacles."""
 
-    Attributes
-    ----------
-    name
-        Name of the problem set, and number of the problem in it.
-    start, goal
-        Configurations, in the order of :attr:`ProblemSet.symbols` [m], [rad].
-    state
-        State of the model with the obstacles where they are, and the arm at the start.
-    objects
-        The obstacles as they are in the file: name, kind, 4×4 pose, dimensions.
-    """
-
-    name: str
-    start: Array
+    name: str  # name of the problem set, and number of the problem in it
+    start: Array  # configurations, in the order of :attr:`ProblemSet.symbols` [m], [rad]
     goal: Array
-    state: State
+    state: State  # state of the model with the obstacles where they are, and the arm at the start
     objects: Sequence[Sequence[Any]]
 
 
@@ -62,41 +50,17 @@ class ProblemSet:
     """Problems that differ by the poses of the same obstacles.
 
     The poses are coordinates of one model: to place the obstacles of a problem takes no edit.
-
-    Attributes
-    ----------
-    robot, name
-        Robot and name of the set.
-    model
-        Robot and obstacles, with the rules of the SRDF.
-    symbols
-        Coordinates of the arm.
-    problems
-        The problems.
     """
 
     robot: str
-    name: str
-    model: Model
-    symbols: tuple[Symbol, ...]
+    name: str  # robot and name of the set
+    model: Model  # robot and obstacles, with the rules of the SRDF
+    symbols: tuple[Symbol, ...]  # coordinates of the arm
     problems: tuple[PublishedProblem, ...]
 
 
 def load_problem_sets(robot: str, most: int | None = None) -> Iterator[ProblemSet]:
-    """Yield the problem sets of a robot of :data:`ROBOTS`.
-
-    Parameters
-    ----------
-    robot
-        Name of the robot.
-    most
-        Largest number of problems of a set; None for all.
-
-    Raises
-    ------
-    UnknownNameError
-        If the folder ``planning_problems`` is not on the model path.
-    """
+    """Yield the problem sets of a robot of :data:`ROBOTS`."""
     file = locate_model(f"{FOLDER}/{robot}/{robot}_spherized.urdf").path
     content = json.loads(file.with_name("problems.json").read_text(encoding="utf-8"))
     joints = content["joints"]

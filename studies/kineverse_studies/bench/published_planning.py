@@ -27,19 +27,11 @@ SLOWER, FEWER = 2.0, -3.0
 
 @dataclass(frozen=True)
 class PublishedFigures:
-    """Figures of VAMP 0.6.4 for these problems, measured on another machine (AVX2, one core, gcc 12).
+    """Figures of VAMP 0.6.4 for these problems, measured on another machine (AVX2, one core, gcc 12)."""
 
-    Attributes
-    ----------
-    median, mean
-        Times of what was solved, five trials each; of two runs the faster [s].
-    solved
-        Share of attempts that found a path [%].
-    """
-
-    median: float
+    median: float  # times of what was solved, five trials each; of two runs the faster [s]
     mean: float
-    solved: float
+    solved: float  # share of attempts that found a path [%]
 
 
 FIGURES: Mapping[str, PublishedFigures] = MappingProxyType(
@@ -58,22 +50,6 @@ def run_published_problems(
     """Return the attempts of each planner at the problems of a robot.
 
     All planners attempt a problem before the next one, because times drift.
-
-    Parameters
-    ----------
-    robot
-        One of :data:`.planning_problems.ROBOTS`.
-    most
-        Largest number of problems of a set; None for all.
-    seeds
-        Number of attempts at each problem.
-    progress
-        See :class:`.harness.BenchmarkSettings`.
-
-    Raises
-    ------
-    UnknownNameError
-        If the problems are not on the model path.
     """
     attempts: dict[str, list[Attempt]] = {}
     for problems in progress([*load_problem_sets(robot, most)], f"planning, {robot}", "set"):

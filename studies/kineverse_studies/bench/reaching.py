@@ -38,34 +38,16 @@ ARMS: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class ReachingProblem:
-    """Poses that an arm can reach, with the starts of their searches.
-
-    Attributes
-    ----------
-    model
-        Model of the robot.
-    frame
-        Frame that reaches.
-    joints
-        Joints that move the frame.
-    lower, upper
-        Their limits [m], [rad], shape (n,); ±π for continuous joints.
-    bounded
-        True for joints with limits, shape (n,).
-    targets
-        Poses of the frame at uniform states within limits, shape (count, 4, 4).
-    starts
-        Uniform states within limits, shape (count, starts, n); the first is the middle of the
-        limits.
-    """
+    """Poses that an arm can reach, with the starts of their searches."""
 
     model: Model
-    frame: str
-    joints: tuple[Symbol, ...]
-    lower: Array
+    frame: str  # frame that reaches
+    joints: tuple[Symbol, ...]  # joints that move the frame
+    lower: Array  # their limits [m], [rad], shape (n,); ±π for continuous joints
     upper: Array
-    bounded: Array
-    targets: Array
+    bounded: Array  # true for joints with limits, shape (n,)
+    targets: Array  # poses of the frame at uniform states within limits, shape (count, 4, 4)
+    # uniform states within limits, shape (count, starts, n); the first is the middle of the limits
     starts: Array
 
     def urdf(self) -> str:
@@ -109,15 +91,9 @@ def make_reaching_problem(arm: str, count: int, starts: int = STARTS, seed: int 
 
 
 class IterativeSolver(Protocol):
-    """Iterative inverse kinematics of a library.
+    """Iterative inverse kinematics of a library."""
 
-    Attributes
-    ----------
-    iterations
-        Largest number of iterations from one start.
-    """
-
-    iterations: int
+    iterations: int  # largest number of iterations from one start
 
     def aim(self, target: Array) -> None:
         """Set the target pose, (4, 4)."""
@@ -137,24 +113,12 @@ class IterativeSolver(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Search for joint positions that reach a target.
+    """Search for joint positions that reach a target."""
 
-    Attributes
-    ----------
-    solved
-        True if a start led to the target within limits.
-    starts
-        Number of starts used.
-    iterations
-        Number of iterations.
-    seconds
-        CPU time [s].
-    """
-
-    solved: bool
-    starts: int
+    solved: bool  # true if a start led to the target within limits
+    starts: int  # number of starts used
     iterations: int
-    seconds: float
+    seconds: float  # CPU time [s]
 
 
 def search(solver: IterativeSolver, problem: ReachingProblem, index: int, budget: float) -> Search:

@@ -37,13 +37,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
 
 
 def select_benchmarks(names: Sequence[str]) -> list[str]:
-    """Return the names of the benchmarks to run, each once and in their order; all if none is named.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such benchmark, with similar names.
-    """
+    """Return the names of the benchmarks to run, each once and in their order; all if none is named."""
     for name in names:
         if name not in BENCHMARKS:
             raise UnknownNameError(

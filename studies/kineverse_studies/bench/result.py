@@ -121,15 +121,6 @@ def compare_speed(
 
     It is the median over the rounds of the ratio within a round, because a temporary slowdown of the machine
     affects both.
-
-    Parameters
-    ----------
-    measured
-        Measurements by name.
-    ours, theirs
-        Names of two of them; the second may be missing.
-    at_least
-        Target of the ratio.
     """
     bar = None if at_least is None else Bar(at_least, at_least=True)
     name = f"{ours}, beside {theirs}"

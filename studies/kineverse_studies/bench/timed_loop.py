@@ -13,22 +13,7 @@ from .result import Bar, Comparison, Measurement
 
 
 class TimedLoop:
-    """Control loop whose steps are timed, from the state in to the command out.
-
-    Parameters
-    ----------
-    name
-        Name of the contender.
-    loop
-        The loop.
-    period, steps
-        Control period [s] and number of steps of a motion.
-
-    Attributes
-    ----------
-    times
-        CPU times of all steps so far [s].
-    """
+    """Control loop whose steps are timed, from the state in to the command out."""
 
     def __init__(self, name: str, loop: ControlLoop, period: float, steps: int) -> None:
         self.name, self.loop = name, loop

@@ -32,21 +32,11 @@ _ONE_COORDINATE = ("fixed", "revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class BenchmarkRobot:
-    """Robot of a URDF file, with one frame of interest.
+    """Robot of a URDF file, with one frame of interest."""
 
-    Attributes
-    ----------
-    file
-        File that all libraries read.
-    model
-        Model of the file in Kineverse, without prefix.
-    frame
-        Frame of the pose and Jacobian, which are relative to the robot's root.
-    """
-
-    file: Path
-    model: Model
-    frame: str
+    file: Path  # file that all libraries read
+    model: Model  # model of the file in Kineverse, without prefix
+    frame: str  # frame of the pose and Jacobian, which are relative to the robot's root
 
     @cached_property
     def coordinates(self) -> tuple[Symbol, ...]:
@@ -104,16 +94,7 @@ class BenchmarkRobot:
 
 
 def find_benchmark_robot(settings: BenchmarkSettings) -> BenchmarkRobot:
-    """Return the requested robot, else the first PR2 that is found.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such robot, or no such frame on it.
-    InvalidValueError
-        If a joint has other coordinates in peers than in Kineverse: planar and floating joints, and mimic
-        joints that move the frame.
-    """
+    """Return the requested robot, else the first PR2 that is found."""
     file = _robot_file(settings.robot)
     if file.suffix != ".urdf":
         raise InvalidValueError(f"Peers read URDF, and {str(file)!r} is none; give another --robot.")
@@ -171,13 +152,7 @@ def _mimic_joint(model: Model, frame: str) -> str | None:
 
 
 def strip_shapes(file: str | os.PathLike[str]) -> str:
-    """Return the text of a URDF file without shapes, so that no library opens meshes.
-
-    Raises
-    ------
-    KineverseError
-        If it cannot be parsed.
-    """
+    """Return the text of a URDF file without shapes, so that no library opens meshes."""
     try:
         root = ElementTree.parse(file).getroot()
     except ElementTree.ParseError as error:
@@ -200,20 +175,11 @@ _WALK_STEP, _WALK_RANGE = 0.003, 0.3
 
 @dataclass(frozen=True)
 class KitchenRobot:
-    """Robot in a kitchen.
-
-    Attributes
-    ----------
-    name
-        Names of both.
-    model
-        Model of both, with the prefixes ``robot`` and ``kitchen``.
-    values
-        Values of ``scene().inputs``, (steps, n) [m], [rad]: a random walk of all joints of the robot.
-    """
+    """Robot in a kitchen."""
 
     name: str
-    model: Model
+    model: Model  # model of both, with the prefixes ``robot`` and ``kitchen``
+    # values of ``scene().inputs``, (steps, n) [m], [rad]: a random walk of all joints of the robot
     values: Array
 
     @property

@@ -133,15 +133,7 @@ def benchmark_to_markdown(result: BenchmarkResult) -> str:
 
 
 def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
-    """Return a result as tables; missing peers are listed once, after all results.
-
-    Parameters
-    ----------
-    result
-        Result of the benchmark.
-    targets
-        True to print the targets of the developers as well.
-    """
+    """Return a result as tables; missing peers are listed once, after all results."""
     measured = [
         (m.name, format_quantity(m.median, m.unit), format_quantity(m.best, m.unit))
         for m in result.measurements

@@ -42,21 +42,11 @@ _BEFORE_CLOSED = tuple(10.0**-k for k in range(1, 9))
 
 @dataclass(frozen=True)
 class GarageDoorCurves:
-    """Curves of the three plots.
+    """Curves of the three plots."""
 
-    Attributes
-    ----------
-    paths
-        Paths of points in x and z by name, (20, 2) each [m].
-    unlocked
-        Upper bound of the speed by the position of the door, (50,) each.
-    published, regular
-        Speed of the upper edge per unit of a [m/m], and of the angle [m/rad], (200,) each.
-    """
-
-    paths: dict[str, Array]
-    unlocked: dict[float, Array]
-    published: Array
+    paths: dict[str, Array]  # paths of points in x and z by name, (20, 2) each [m]
+    unlocked: dict[float, Array]  # upper bound of the speed by the position of the door, (50,) each
+    published: Array  # speed of the upper edge per unit of a [m/m], and of the angle [m/rad], (200,) each
     regular: Array
 
 

@@ -57,13 +57,7 @@ class Options:
     record: Path | None = None
 
     def check(self, name: str, supported: Sequence[str]) -> None:
-        """Check that an experiment supports the options that are set.
-
-        Raises
-        ------
-        InvalidValueError
-            If one is not supported, with those that are; or for a number that is too small.
-        """
+        """Check that an experiment supports the options that are set."""
         given = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         for option in given:
             if option not in supported:

@@ -67,12 +67,7 @@ class BulletSearch:
 
 
 def create_static_bodies(pybullet: Any, shapes: list[int], poses: Array, client: int) -> dict[int, int]:
-    """Create static bodies of shapes at poses, (N, 3, 4) or larger, each shape a link.
-
-    Returns
-    -------
-    Index of the shape of the first link, by body.
-    """
+    """Create static bodies of shapes at poses, (N, 3, 4) or larger, each shape a link."""
     bodies = {}
     for first in range(0, len(shapes), _LINKS_PER_BODY):
         some = slice(first, first + _LINKS_PER_BODY)

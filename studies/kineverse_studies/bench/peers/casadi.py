@@ -32,13 +32,7 @@ def make_casadi_function(robot: BenchmarkRobot) -> Any:
 
 
 def compile_map(function: Any, rows: int, folder: Path) -> Any:
-    """Return the map of a function over rows, compiled in a folder.
-
-    Raises
-    ------
-    CompileError
-        If the compiler fails.
-    """
+    """Return the map of a function over rows, compiled in a folder."""
     mapped = function.map(rows)
     generator = ca.CodeGenerator("map.c")
     generator.add(mapped)
@@ -53,17 +47,7 @@ def compile_map(function: Any, rows: int, folder: Path) -> Any:
 
 
 class BoundMap:
-    """CasADi map bound to its input and output memory.
-
-    Parameters
-    ----------
-    function
-        CasADi map.
-    points
-        Input, a row for each point.
-    outputs
-        Output arrays.
-    """
+    """CasADi map bound to its input and output memory."""
 
     def __init__(self, function: Any, points: Array, outputs: tuple[Array, ...]) -> None:
         self._references = function, points, outputs
@@ -100,18 +84,7 @@ NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = MappingProxyType(
 
 
 class NumpyGraph:
-    """CasADi function of one vector, evaluated with numpy at many points.
-
-    Parameters
-    ----------
-    function
-        Function with scalar instructions only, such as one of ``SX``.
-
-    Raises
-    ------
-    CompileError
-        If it contains an operation that is not in :data:`NUMPY_OPERATIONS`.
-    """
+    """CasADi function of one vector, evaluated with numpy at many points."""
 
     def __init__(self, function: Any) -> None:
         self._columns = np.zeros((function.sz_w(), CHUNK_SIZE))

@@ -17,20 +17,7 @@ CONVERGED = 1e-5
 
 
 class NumpyFilter:
-    """Iterated extended Kalman filter of all coordinates from poses of frames.
-
-    Parameters
-    ----------
-    model, frames
-        Model and observed frames, whose poses and Jacobians are compiled as one function.
-    covariance
-        Covariance of each pose, (6, 6).
-    mean, variances
-        Initial means and variances of the coordinates.
-    form
-        ``"gain"``: K = P Hᵀ (H P Hᵀ + R)⁻¹, as in textbooks (Bell and Cathey, IEEE Trans. Automatic Control
-        38, 1993). ``"information"``: Λ + Hᵀ R⁻¹ H, a system as large as the state.
-    """
+    """Iterated extended Kalman filter of all coordinates from poses of frames."""
 
     def __init__(
         self,

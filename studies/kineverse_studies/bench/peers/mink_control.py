@@ -43,22 +43,7 @@ SOLVER = "daqp"
 
 
 class MinkRobot:
-    """Robot in mink.
-
-    Parameters
-    ----------
-    model
-        Model of MuJoCo.
-    start
-        Positions of joints at the start [m], [rad] by name.
-    speeds
-        Limits of joint speeds [m/s], [rad/s] by name, which MuJoCo does not read.
-
-    Attributes
-    ----------
-    configuration
-        Configuration of mink, at the start.
-    """
+    """Robot in mink."""
 
     def __init__(self, model: Any, start: Mapping[str, float], speeds: Mapping[str, float]) -> None:
         self.model, self.speeds = model, speeds
@@ -80,36 +65,16 @@ class MinkRobot:
 
 @dataclass
 class MinkLoop:
-    """Control loop of mink.
-
-    Attributes
-    ----------
-    robot
-        Robot.
-    period
-        Control period [s].
-    tasks
-        Tasks of mink.
-    move
-        Moves the targets of the tasks to a time [s].
-    error
-        Returns the error of the most important position [m].
-    damping
-        Weight of squared displacements.
-    limits
-        Limits of mink. Those of positions are made here if none are given: mink makes them anew in each call
-        without limits, which takes longer than the rest of a step.
-    constraints
-        Returns the tasks to be kept exactly at a time [s].
-    """
+    """Control loop of mink."""
 
     robot: MinkRobot
-    period: float
+    period: float  # control period [s]
     tasks: list[Any]
-    move: Callable[[float], None]
-    error: Callable[[], float]
-    damping: float = 1e-3
+    move: Callable[[float], None]  # moves the targets of the tasks to a time [s]
+    error: Callable[[], float]  # returns the error of the most important position [m]
+    damping: float = 1e-3  # weight of squared displacements
     limits: list[Any] = field(default_factory=list)
+    # returns the tasks to be kept exactly at a time [s]
     constraints: Callable[[float], list[Any] | None] = field(default=lambda time: None)
 
     def __post_init__(self) -> None:

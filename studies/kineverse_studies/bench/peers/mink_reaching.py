@@ -17,13 +17,7 @@ from .mujoco_kinematics import add_mujoco_options
 
 
 class MinkReaching:
-    """Full Gauss-Newton steps of mink within the limits of positions; see :class:`.IterativeSolver`.
-
-    Parameters
-    ----------
-    lm_damping
-        Levenberg-Marquardt damping of the task.
-    """
+    """Full Gauss-Newton steps of mink within the limits of positions; see :class:`.IterativeSolver`."""
 
     def __init__(self, problem: ReachingProblem, iterations: int = 25, lm_damping: float = 1e-2) -> None:
         self.iterations = iterations

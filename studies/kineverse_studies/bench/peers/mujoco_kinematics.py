@@ -13,22 +13,7 @@ from kineverse_studies.bench.workloads import BenchmarkRobot, strip_shapes
 
 
 class MujocoRobot:
-    """Robot in MuJoCo, with all links and without shapes.
-
-    Parameters
-    ----------
-    robot
-        Robot whose file is read.
-
-    Attributes
-    ----------
-    model, data
-        Model and data of MuJoCo.
-    body
-        Index of the frame's body.
-    jacobian
-        Output array of :meth:`pose_and_jacobian`, the Jacobian of all joints, (6, nv).
-    """
+    """Robot in MuJoCo, with all links and without shapes."""
 
     def __init__(self, robot: BenchmarkRobot) -> None:
         self.model: Any = mujoco.MjModel.from_xml_string(make_robot_mjcf(robot))

@@ -19,15 +19,7 @@ RANGE = 1.0
 
 
 class OmplRrtConnect:
-    """RRT-Connect of OMPL over a box of coordinates, which calls Python for each configuration.
-
-    Parameters
-    ----------
-    check
-        Returns True for a configuration without collisions.
-    lower, upper
-        Limits of the coordinates, shape (n,) [m], [rad].
-    """
+    """RRT-Connect of OMPL over a box of coordinates, which calls Python for each configuration."""
 
     def __init__(self, check: Callable[[Sequence[float]], bool], lower: Array, upper: Array) -> None:
         ou.setLogLevel(ou.LOG_NONE)
@@ -42,17 +34,7 @@ class OmplRrtConnect:
         self._resolution = 1.0 / (CHECKS_PER_RADIAN * extent)
 
     def plan(self, start: Array, goal: Array, seconds: float, seed: int) -> Attempt:
-        """Return the attempt at one problem.
-
-        Parameters
-        ----------
-        start, goal
-            Configurations, shape (n,) [m], [rad].
-        seconds
-            Largest time [s].
-        seed
-            Seed of the random numbers.
-        """
+        """Return the attempt at one problem."""
         check, size = self._check, self._size
         # Of generators that are made after this.
         ou.RNG.setSeed(seed + 1)

@@ -37,15 +37,7 @@ SOLVER = "daqp"
 
 
 class PinkRobot:
-    """Robot in pink.
-
-    Attributes
-    ----------
-    model
-        Model of pinocchio.
-    configuration
-        Configuration of pink, at the start.
-    """
+    """Robot in pink."""
 
     def __init__(self, workload: ControlWorkload) -> None:
         self.model: Any = pin.buildModelFromXML(workload.urdf())
@@ -74,33 +66,15 @@ class PinkRobot:
 
 @dataclass
 class PinkLoop:
-    """Control loop of pink.
-
-    Attributes
-    ----------
-    robot
-        Robot.
-    period
-        Control period [s].
-    tasks
-        Tasks of pink.
-    move
-        Moves the targets of the tasks to a time [s].
-    error
-        Returns the error of the most important position [m].
-    options
-        Further options of ``pink.solve_ik``.
-    after
-        Called with the velocity of each step.
-    """
+    """Control loop of pink."""
 
     robot: PinkRobot
-    period: float
+    period: float  # control period [s]
     tasks: list[Any]
-    move: Callable[[float], None]
-    error: Callable[[], float]
-    options: dict[str, Any] = field(default_factory=dict)
-    after: Callable[[Array], None] | None = None
+    move: Callable[[float], None]  # moves the targets of the tasks to a time [s]
+    error: Callable[[], float]  # returns the error of the most important position [m]
+    options: dict[str, Any] = field(default_factory=dict)  # further options of ``pink.solve_ik``
+    after: Callable[[Array], None] | None = None  # called with the velocity of each step
 
     def __post_init__(self) -> None:
         self._q = self.robot.start

@@ -41,13 +41,7 @@ class _PinocchioArm:
 
 
 class PinkReaching:
-    """Full Gauss-Newton steps of pink within the limits of positions; see :class:`.IterativeSolver`.
-
-    Parameters
-    ----------
-    lm_damping
-        Levenberg-Marquardt damping of the task.
-    """
+    """Full Gauss-Newton steps of pink within the limits of positions; see :class:`.IterativeSolver`."""
 
     def __init__(self, problem: ReachingProblem, iterations: int = 25, lm_damping: float = 1e-2) -> None:
         self.iterations = iterations
@@ -95,11 +89,6 @@ class PinocchioReaching:
     """Closed-loop inverse kinematics as in pinocchio's example: damped pseudoinverse, no limits.
 
     Positions are taken modulo 2π before they are compared with limits.
-
-    Parameters
-    ----------
-    rate
-        Part of the error that an iteration removes.
     """
 
     def __init__(self, problem: ReachingProblem, iterations: int = 1000, rate: float = 0.1) -> None:

@@ -12,24 +12,7 @@ from kineverse_studies.bench.workloads import BenchmarkRobot
 
 
 class PinocchioRobot:
-    """Robot in pinocchio.
-
-    Parameters
-    ----------
-    robot
-        Robot whose file is read.
-    reduced
-        True to keep only the joints that move the robot's frame, which is several times as fast.
-
-    Attributes
-    ----------
-    model, data
-        Model and data of pinocchio.
-    frame
-        Index of the frame.
-    pose
-        Placement of the frame within ``data``. A lookup in each call would take longer than the kinematics.
-    """
+    """Robot in pinocchio."""
 
     def __init__(self, robot: BenchmarkRobot, reduced: bool = False) -> None:
         model = pin.buildModelFromUrdf(str(robot.file))

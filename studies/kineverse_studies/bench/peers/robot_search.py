@@ -18,17 +18,7 @@ from .clutter_search import UNIT_BOX_CORNERS, MujocoSearch, PairDistances, forma
 
 
 class RobotSurroundings:
-    """Collision objects of a scene, divided into those of a robot and the static ones of a room.
-
-    Parameters
-    ----------
-    scene
-        Scene of both.
-    values
-        Values of the scene's inputs, for the poses of the room.
-    robot
-        Prefix of the names of the robot's bodies.
-    """
+    """Collision objects of a scene, divided into those of a robot and the static ones of a room."""
 
     def __init__(self, scene: Scene, values: Array, robot: str) -> None:
         self._scene, self._world = scene, scene.collision_world

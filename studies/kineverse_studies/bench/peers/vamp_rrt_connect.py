@@ -15,11 +15,6 @@ class VampRrtConnect:
 
     As in its own evaluation, cylinders are capsules, and boxes in the problems of the set ``box``, where the
     hand has to come close to one from above.
-
-    Parameters
-    ----------
-    robot
-        Name of the robot: ``panda`` or ``fetch``.
     """
 
     def __init__(self, robot: str) -> None:

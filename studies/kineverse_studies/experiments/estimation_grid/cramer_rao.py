@@ -32,17 +32,10 @@ UNKNOWNS_PER_OBSERVATION = 7
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """Lower bounds of the covariances of the estimates of each sample.
+    """Lower bounds of the covariances of the estimates of each sample."""
 
-    Attributes
-    ----------
-    direction
-        Direction of the axis, in two directions across it, (S, 2, 2) [rad²].
-    point
-        Position of the axis across it, at the middle of the child's path, (S, 2, 2) [m²]; NaN for sliders.
-    """
-
-    direction: Array
+    direction: Array  # direction of the axis, in two directions across it, (S, 2, 2) [rad²]
+    # position of the axis across it, at the middle of the child's path, (S, 2, 2) [m²]; NaN for sliders
     point: Array
 
     @property

@@ -58,19 +58,7 @@ def make_quick_grid() -> list[Cell]:
 def fit_all(
     cells: Sequence[Cell], samples: int, progress: Progress, workers: int | None = None
 ) -> list[CellResult]:
-    """Fit samples of each cell and return the results in the same order.
-
-    Parameters
-    ----------
-    cells
-        Cells to fit.
-    samples
-        Number of samples of each cell.
-    progress
-        Progress reporter.
-    workers
-        Number of processes; None for one on each core.
-    """
+    """Fit samples of each cell and return the results in the same order."""
     workers = workers or os.cpu_count() or 1
     if workers == 1:
         return [fit_cell(cell, samples) for cell in progress(cells, "estimation-grid", "cell")]

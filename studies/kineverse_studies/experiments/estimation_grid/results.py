@@ -26,40 +26,20 @@ FAR_OFF = 6.0
 
 @dataclass(frozen=True, eq=False)
 class CellResult:
-    """Results of the samples of a cell.
-
-    Attributes
-    ----------
-    cell
-        Cell of the samples.
-    degrees, metres
-        Errors of the axis in direction [deg] and position [m], (S,); NaN without an estimate, and for the
-        position of a slider.
-    bound_degrees, bound_metres
-        Their Cramér-Rao bounds, (S,), see :func:`.cramer_rao.compute_bound`.
-    attainable_degrees, attainable_metres
-        Their attainable bounds, (S,), see :func:`.cramer_rao.compute_attainable_bound`.
-    spread
-        Relative variance of the sum of squares of ``degrees`` at the attainable bound.
-    right
-        Mask of the samples in which the most probable family is the true one, (S,).
-    told
-        Mask of the samples with an unambiguous result, (S,).
-    called
-        Most probable family of each sample.
-    """
+    """Results of the samples of a cell."""
 
     cell: Cell
     degrees: Array
     metres: Array
-    bound_degrees: Array
+    bound_degrees: Array  # their Cramér-Rao bounds, (S,), see :func:`.cramer_rao.compute_bound`
     bound_metres: Array
+    # their attainable bounds, (S,), see :func:`.cramer_rao.compute_attainable_bound`
     attainable_degrees: Array
     attainable_metres: Array
-    spread: float
-    right: Flags
-    told: Flags
-    called: tuple[str, ...]
+    spread: float  # relative variance of the sum of squares of ``degrees`` at the attainable bound
+    right: Flags  # mask of the samples in which the most probable family is the true one, (S,)
+    told: Flags  # mask of the samples with an unambiguous result, (S,)
+    called: tuple[str, ...]  # most probable family of each sample
 
     @property
     def bound(self) -> float:
@@ -98,61 +78,29 @@ class CellResult:
 
 @dataclass(frozen=True)
 class ErrorRatios:
-    """Ratios of errors to a bound, in the cells with a small bound.
+    """Ratios of errors to a bound, in the cells with a small bound."""
 
-    Attributes
-    ----------
-    near
-        Number of these cells.
-    direction, place
-        Root mean square ratios of direction and position over all fits; NaN without cells.
-    worst
-        Largest ratio of the direction in a cell.
-    over
-        Number of cells above the target ratio.
-    """
-
-    near: int
-    direction: float
+    near: int  # number of these cells
+    direction: float  # root mean square ratios of direction and position over all fits; NaN without cells
     place: float
-    worst: float
-    over: int
+    worst: float  # largest ratio of the direction in a cell
+    over: int  # number of cells above the target ratio
 
 
 @dataclass(frozen=True)
 class GridSummary:
-    """Summary of several cells.
+    """Summary of several cells."""
 
-    Attributes
-    ----------
-    cells, fits
-        Numbers of cells and fits.
-    bound, attainable
-        Ratios of errors to the Cramér-Rao bound and to the attainable bound.
-    over_by_chance
-        Expected number of cells above the target ratio at the attainable bound.
-    right
-        Share of right families in cells with a small Cramér-Rao bound; NaN without such cells.
-    right_attainable
-        The same for cells with a small attainable bound.
-    told
-        Share of unambiguous results in the cells of ``right``.
-    told_wrong
-        Number of fits with an unambiguous and wrong family.
-    diverged
-        Number of divergent fits.
-    """
-
-    cells: int
+    cells: int  # numbers of cells and fits
     fits: int
-    bound: ErrorRatios
+    bound: ErrorRatios  # ratios of errors to the Cramér-Rao bound and to the attainable bound
     attainable: ErrorRatios
-    over_by_chance: float
-    right: float
-    right_attainable: float
-    told: float
-    told_wrong: int
-    diverged: int
+    over_by_chance: float  # expected number of cells above the target ratio at the attainable bound
+    right: float  # share of right families in cells with a small Cramér-Rao bound; NaN without such cells
+    right_attainable: float  # the same for cells with a small attainable bound
+    told: float  # share of unambiguous results in the cells of ``right``
+    told_wrong: int  # number of fits with an unambiguous and wrong family
+    diverged: int  # number of divergent fits
 
 
 def summarize_cells(results: Sequence[CellResult]) -> GridSummary:

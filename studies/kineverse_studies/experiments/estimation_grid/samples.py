@@ -24,57 +24,26 @@ TO_AXIS, LEVER = 0.5, 0.4
 
 @dataclass(frozen=True)
 class Cell:
-    """Cell of the grid: joint, noise, number and range of observations.
-
-    Attributes
-    ----------
-    joint
-        Joint family.
-    position, orientation
-        Standard deviations of each coordinate of both poses [m], [rad].
-    count
-        Number of observations.
-    range
-        Range of the joint [rad] or [m].
-    """
+    """Cell of the grid: joint, noise, number and range of observations."""
 
     joint: Joint
-    position: float
+    position: float  # standard deviations of each coordinate of both poses [m], [rad]
     orientation: float
-    count: int
-    range: float
+    count: int  # number of observations
+    range: float  # range of the joint [rad] or [m]
 
 
 @dataclass(frozen=True, eq=False)
 class JointSamples:
-    """Random recordings of one cell, with the true joints.
-
-    Attributes
-    ----------
-    cell
-        Cell of the samples.
-    axis
-        Unit vectors of the axes in the parent's frame, (S, 3).
-    point
-        Points of the axes nearest to the middle of the child's path, (S, 3) [m]; for a slider, the middle of
-        the path itself.
-    zero
-        Poses of the child in the parent at the joint's zero, (S, 4, 4).
-    joint_values
-        Joint values, evenly over the range, (S, N).
-    parents
-        True poses of the parent in the observer's frame, (S, N, 4, 4).
-    seen_parents, seen_children
-        Measured poses of both, (S, N, 4, 4).
-    """
+    """Random recordings of one cell, with the true joints."""
 
     cell: Cell
-    axis: Array
+    axis: Array  # unit vectors of the axes in the parent's frame, (S, 3)
     point: Array
-    zero: Array
-    joint_values: Array
-    parents: Array
-    seen_parents: Array
+    zero: Array  # poses of the child in the parent at the joint's zero, (S, 4, 4)
+    joint_values: Array  # joint values, evenly over the range, (S, N)
+    parents: Array  # true poses of the parent in the observer's frame, (S, N, 4, 4)
+    seen_parents: Array  # measured poses of both, (S, N, 4, 4)
     seen_children: Array
 
 

@@ -34,21 +34,11 @@ REPORTED_MAX = (0.065, 0.115, 0.156, 0.247)
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors |q̂ - q| at one level of noise.
-
-    Attributes
-    ----------
-    noise
-        Level of noise.
-    by_filter
-        Errors of all coordinates by filter, (seeds, C, n) [m] or [rad].
-    nees
-        Mean of (q̂ - q)²/σ² over all states by filter; 1 for a consistent filter.
-    """
+    """Errors |q̂ - q| at one level of noise."""
 
     noise: PoseNoise
-    by_filter: dict[str, Array]
-    nees: dict[str, float]
+    by_filter: dict[str, Array]  # errors of all coordinates by filter, (seeds, C, n) [m] or [rad]
+    nees: dict[str, float]  # mean of (q̂ - q)²/σ² over all states by filter; 1 for a consistent filter
 
     def summary(self, filter_name: str, coordinates: Any = slice(None)) -> dict[str, Any]:
         """Return mean, standard deviation and maximum of errors, and means and maxima by seed."""

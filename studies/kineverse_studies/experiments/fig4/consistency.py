@@ -43,31 +43,18 @@ _STEP = 1e-5
 
 @dataclass(frozen=True)
 class FilterConsistency:
-    """Statistics of a filter at one level of noise.
+    """Statistics of a filter at one level of noise."""
 
-    Attributes
-    ----------
-    nees_inside, nees
-        Mean of (q̂ - q)²/σ² over interior states and over all states; 1 for a consistent filter.
-    nis, nis_band
-        Normalised innovation squared over its degrees of freedom, and its 95 % interval for a consistent
-        filter; NaN if not computed.
-    over_bound
-        Root mean square of (q̂ - q) over the bound, over interior states.
-    rms, bound
-        Root mean square error and bound of ``"shifting"`` [m] and ``"turning"`` [rad] coordinates.
-    states
-        Number of interior states.
-    """
-
+    # mean of (q̂ - q)²/σ² over interior states and over all states; 1 for a consistent filter
     nees_inside: float
     nees: float
     nis: float
     nis_band: tuple[float, float]
-    over_bound: float
+    over_bound: float  # root mean square of (q̂ - q) over the bound, over interior states
+    # root mean square error and bound of ``"shifting"`` [m] and ``"turning"`` [rad] coordinates
     rms: dict[str, float]
     bound: dict[str, float]
-    states: int
+    states: int  # number of interior states
 
     def as_json(self) -> dict[str, Any]:
         """Return the statistics as JSON data."""

@@ -41,22 +41,13 @@ MECHANISMS: dict[str, tuple[Operation, str]] = {
 
 @dataclass(frozen=True)
 class CoordinateErrors:
-    """Error of a filter in one coordinate.
+    """Error of a filter in one coordinate."""
 
-    Attributes
-    ----------
-    mean, max
-        Mean and maximum of |q̂ - q| [rad] or [m] over the configurations not lost; NaN if all are lost.
-    nees
-        Mean of (q̂ - q)²/σ² over these; 1 for a consistent filter.
-    lost_percent
-        Share of configurations in which the filter left the domain of the model [%].
-    """
-
+    # mean and maximum of |q̂ - q| [rad] or [m] over the configurations not lost; NaN if all are lost
     mean: float
     max: float
-    nees: float
-    lost_percent: float
+    nees: float  # mean of (q̂ - q)²/σ² over these; 1 for a consistent filter
+    lost_percent: float  # share of configurations in which the filter left the domain of the model [%]
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,7 @@ SHIFTING_FIRST = 7
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Noise of a pose.
-
-    Attributes
-    ----------
-    position, orientation
-        Standard deviations of position [m] and orientation [rad], along and about a random direction, or on
-        each of the three axes.
-    """
+    """Noise of a pose."""
 
     position: float
     orientation: float
@@ -60,27 +53,13 @@ LEVELS = tuple(PoseNoise(0.05 * k, math.radians(7.5 * k)) for k in (1, 2, 3, 4))
 
 @dataclass(frozen=True)
 class ObservedModel:
-    """Model with all moving frames observed, in groups that share coordinates.
-
-    Attributes
-    ----------
-    model
-        Model.
-    frames
-        Observed frames, m, group by group.
-    sizes
-        Cumulative numbers of frames and coordinates over the groups.
-    symbols
-        Coordinates, n, group by group.
-    limits
-        Lower and upper limits, (n, 2).
-    """
+    """Model with all moving frames observed, in groups that share coordinates."""
 
     model: ModelView
-    frames: tuple[str, ...]
-    sizes: tuple[tuple[int, int], ...]
-    symbols: tuple[Symbol, ...]
-    limits: Array
+    frames: tuple[str, ...]  # observed frames, m, group by group
+    sizes: tuple[tuple[int, int], ...]  # cumulative numbers of frames and coordinates over the groups
+    symbols: tuple[Symbol, ...]  # coordinates, n, group by group
+    limits: Array  # lower and upper limits, (n, 2)
 
     @cached_property
     def turning(self) -> npt.NDArray[np.bool_]:
@@ -113,11 +92,6 @@ def make_observed_model(model: ModelView) -> ObservedModel:
 
     Groups of frames that share coordinates are in the model's order, except that up to seven groups without
     rotation come first, as in the papers, whose time per update jumps at the eighth group.
-
-    Raises
-    ------
-    ModelError
-        If no frame moves.
     """
     frames = [frame for frame in model.frames if model.fk(frame).symbols]
     if not frames:
@@ -152,18 +126,6 @@ def add_published_noise(
 
     a and b are N(0, σ), d and e random directions. Each of the three axes has the variance σ²/3. The errors
     are in the axes of the frame.
-
-    Parameters
-    ----------
-    poses
-        True poses, (..., 4, 4).
-    noise
-        σ of a and b.
-    rng
-        Random generator.
-    directions
-        ``"published"`` draws d and e like the authors' code over a quarter of the sphere. With the signs of a
-        and b that is half of it, and y and z have a correlation of 2/π. ``"uniform"`` draws over the sphere.
     """
     lead = poses.shape[:-2]
     shift = _directions(rng, lead, directions) * rng.normal(0, noise.position, (*lead, 1))
@@ -189,18 +151,9 @@ def _directions(rng: Generator, lead: tuple[int, ...], how: Directions) -> Array
 
 @dataclass(frozen=True)
 class FilterRun:
-    """Final estimates of a filter for C configurations.
+    """Final estimates of a filter for C configurations."""
 
-    Attributes
-    ----------
-    q, variance
-        Estimates, and their variances according to the filter, (C, n).
-    nis, dof
-        Sums of the normalised innovation squared and of its degrees of freedom over all updates except the
-        first of each configuration, whose prior is not the distribution of true states; 0 if not computed.
-    """
-
-    q: Array
+    q: Array  # estimates, and their variances according to the filter, (C, n)
     variance: Array
     nis: float = 0.0
     dof: int = 0
@@ -209,17 +162,7 @@ class FilterRun:
 def run_published(
     scene: ObservedModel, observations: Array, training: Array, steps: int = STEPS, spread: float = SPREAD
 ) -> FilterRun:
-    """Run the papers' filter on observations (25, C, m, 4, 4), with all configurations in parallel.
-
-    Parameters
-    ----------
-    scene
-        Observed model.
-    observations, training
-        Observations, and those from which R is learnt, (400, m, 4, 4).
-    steps, spread
-        See :class:`~kineverse_studies.experiments.fig4.paper_ekf.PaperEkf`.
-    """
+    """Run the papers' filter on observations (25, C, m, 4, 4), with all configurations in parallel."""
     filters = PaperEkf(scene.model, scene.frames, steps, spread, copies=observations.shape[1])
     filters.learn_noise(training)
     for poses in observations:

@@ -23,25 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fig4Results:
-    """Results of all parts of the experiment, see the modules of this package.
+    """Results of all parts of the experiment, see the modules of this package."""
 
-    Attributes
-    ----------
-    model, scene
-        Name of the model, and the model with its observed frames.
-    seeds, configurations
-        Seeds, and number of configurations of each.
-    errors, variants, consistency, mechanisms
-        See :mod:`.accuracy`, :mod:`.consistency`, :mod:`.mechanisms`.
-    by_size, by_noise
-        Times by degrees of freedom, and by noise with all of them.
-    """
-
-    model: str
+    model: str  # name of the model, and the model with its observed frames
     scene: ObservedModel
-    seeds: tuple[int, ...]
+    seeds: tuple[int, ...]  # seeds, and number of configurations of each
     configurations: int
-    errors: tuple[Errors, ...]
+    errors: tuple[Errors, ...]  # see :mod:`.accuracy`, :mod:`.consistency`, :mod:`.mechanisms`
     variants: Mapping[str, list[float]]
     by_size: list[tuple[int, dict[str, Duration]]]
     by_noise: list[tuple[PoseNoise, dict[str, Duration]]]

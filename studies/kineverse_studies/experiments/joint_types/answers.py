@@ -24,18 +24,10 @@ _CHUNK = 10
 
 @dataclass(frozen=True)
 class Setting:
-    """Observations and noise that the estimator is given of a case.
+    """Observations and noise that the estimator is given of a case."""
 
-    Attributes
-    ----------
-    poses
-        True for poses of the child, False for its positions.
-    stated
-        True if the noise is stated.
-    """
-
-    poses: bool
-    stated: bool
+    poses: bool  # true for poses of the child, False for its positions
+    stated: bool  # true if the noise is stated
 
     @property
     def title(self) -> str:
@@ -48,34 +40,16 @@ SETTINGS = tuple(Setting(poses, stated) for poses in (True, False) for stated in
 
 @dataclass(frozen=True, eq=False)
 class TypeAnswer:
-    """Identified family of a case.
-
-    Attributes
-    ----------
-    number
-        Number of the case.
-    true, family
-        True and most probable family.
-    probability
-        Its probability.
-    is_ambiguous
-        True if the answer is not sure for another reason, too.
-    count
-        Number of observations.
-    truth
-        True standard deviations of the noise.
-    noise
-        Estimated ones; None if the noise was stated.
-    """
+    """Identified family of a case."""
 
     number: int
-    true: str
+    true: str  # true and most probable family
     family: str
     probability: float
-    is_ambiguous: bool
-    count: int
-    truth: NoiseDeviations
-    noise: NoiseDeviations | None
+    is_ambiguous: bool  # true if the answer is not sure for another reason, too
+    count: int  # number of observations
+    truth: NoiseDeviations  # true standard deviations of the noise
+    noise: NoiseDeviations | None  # estimated ones; None if the noise was stated
 
     @property
     def is_right(self) -> bool:
@@ -109,17 +83,7 @@ def identify_case(number: int, setting: Setting) -> TypeAnswer:
 def identify_cases(
     count: int, progress: Progress, workers: int | None = None
 ) -> dict[Setting, list[TypeAnswer]]:
-    """Identify the families of the first cases in all settings.
-
-    Parameters
-    ----------
-    count
-        Number of cases.
-    progress
-        Progress reporter.
-    workers
-        Number of processes; None for one on each core.
-    """
+    """Identify the families of the first cases in all settings."""
     workers = workers or os.cpu_count() or 1
     chunks = [range(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
     if workers == 1:

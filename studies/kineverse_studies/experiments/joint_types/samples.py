@@ -44,28 +44,15 @@ MOVING = 0.6
 
 @dataclass(frozen=True, eq=False)
 class JointCase:
-    """Observations of a random joint.
+    """Observations of a random joint."""
 
-    Attributes
-    ----------
-    joint
-        True family.
-    position, orientation
-        Standard deviations of the errors [m], [rad].
-    range
-        Range of the joint [rad], [m].
-    parent
-        Measured poses of the parent, (N, 4, 4); None if they are exact and the observer's frame.
-    child
-        Measured poses of the child, (N, 4, 4).
-    """
-
-    joint: Joint
-    position: float
+    joint: Joint  # true family
+    position: float  # standard deviations of the errors [m], [rad]
     orientation: float
-    range: float
+    range: float  # range of the joint [rad], [m]
+    # measured poses of the parent, (N, 4, 4); None if they are exact and the observer's frame
     parent: Array | None
-    child: Array
+    child: Array  # measured poses of the child, (N, 4, 4)
 
 
 def draw_case(number: int) -> JointCase:
@@ -112,5 +99,4 @@ def _random_direction(rng: np.random.Generator) -> Array:
 
 
 def _random_orthogonal(rng: np.random.Generator, axis: Array) -> Array:
-    """Return a random unit vector orthogonal to an axis."""
     return unit_vector(np.cross(axis, _random_direction(rng)))

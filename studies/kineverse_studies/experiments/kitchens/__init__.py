@@ -48,27 +48,13 @@ OPEN_SHARE = 0.98
 
 @dataclass(frozen=True)
 class KitchenJob:
-    """All objects of one kitchen, with one robot in one world.
+    """All objects of one kitchen, with one robot in one world."""
 
-    Attributes
-    ----------
-    kitchen
-        Name or path of its model, such as ``"kitchens/17"``.
-    robot
-        The robot.
-    setting
-        World, noise and recordings.
-    most
-        Largest number of objects; None for all.
-    only
-        Name of the coordinate of the only object; None for all.
-    """
-
-    kitchen: str
+    kitchen: str  # name or path of its model, such as ``"kitchens/17"``
     robot: RobotSource
-    setting: TrialSetting = field(default_factory=TrialSetting)
-    most: int | None = None
-    only: str | None = None
+    setting: TrialSetting = field(default_factory=TrialSetting)  # world, noise and recordings
+    most: int | None = None  # largest number of objects; None for all
+    only: str | None = None  # name of the coordinate of the only object; None for all
 
 
 def run(progress: Progress, options: Options) -> Report:
@@ -147,11 +133,6 @@ def start_in_aisle(robot: RobotSource, model: Model) -> State:
     """Return a state with the robot in the aisle, as near to its middle as it stands free.
 
     It looks along the aisle, where its arms fit. Where the aisle is too narrow, it stands before its end.
-
-    Raises
-    ------
-    NoSolutionError
-        If there is no such place.
     """
     floor, begin = f"{KITCHEN}/floor", robot.start_state(model)
     states = (

@@ -89,23 +89,13 @@ class PlannerJob:
 
 @dataclass(frozen=True, slots=True)
 class PlannerResult:
-    """Plan of a box.
-
-    Attributes
-    ----------
-    verdict, moves
-        Verdict, and number of moves.
-    wrong
-        True if the constraints contradict the plan, or exhaustive search the verdict.
-    reading, planning
-        CPU times of reading the interlocks and of planning [s].
-    """
+    """Plan of a box."""
 
     job: PlannerJob
-    verdict: str
+    verdict: str  # verdict, and number of moves
     moves: int
-    wrong: bool
-    reading: float
+    wrong: bool  # true if the constraints contradict the plan, or exhaustive search the verdict
+    reading: float  # CPU times of reading the interlocks and of planning [s]
     planning: float
 
 

@@ -17,15 +17,7 @@ _DT = 0.05
 
 
 def record_thesis_box(folder: Path) -> None:
-    """Record how the lockbox of the thesis is opened, a file for each of the three ways.
-
-    Raises
-    ------
-    FormatError
-        If the folder cannot be made.
-    MissingDependencyError
-        If the extra ``recording`` is not installed.
-    """
+    """Record how the lockbox of the thesis is opened, a file for each of the three ways."""
     make_record_folder(folder)
     with _start(folder, "trends") as (_, recorder):
         run = run_unlocking(THESIS, recorder=recorder)

@@ -17,20 +17,7 @@ Combination: TypeAlias = tuple[bool, ...]
 
 
 class LockboxTrials:
-    """Box whose parts are moved from end to end, and the number of tries.
-
-    Parameters
-    ----------
-    box
-        The box, shut.
-
-    Attributes
-    ----------
-    positions
-        Position of each part [m].
-    tries
-        Number of tries so far, whether or not the part moved.
-    """
+    """Box whose parts are moved from end to end, and the number of tries."""
 
     def __init__(self, box: Lockbox) -> None:
         self.box, self.tries = box, 0

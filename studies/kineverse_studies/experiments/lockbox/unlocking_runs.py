@@ -34,22 +34,12 @@ _BEGUN = 0.1
 
 @dataclass(frozen=True, slots=True)
 class UnlockingRun:
-    """Opening of a box.
+    """Opening of a box."""
 
-    Attributes
-    ----------
-    done, steps
-        Whether the goal was reached, and the number of steps.
-    order
-        Parts in the order in which they began to move by more than a tenth of their range.
-    cpu
-        CPU times of the steps [s].
-    """
-
-    done: bool
+    done: bool  # whether the goal was reached, and the number of steps
     steps: int
     order: tuple[str, ...]
-    cpu: tuple[float, ...]
+    cpu: tuple[float, ...]  # CPU times of the steps [s]
 
     def as_data(self) -> dict[str, Any]:
         """Return the run as data for JSON, without its times."""
@@ -59,20 +49,7 @@ class UnlockingRun:
 def run_unlocking(
     box: Lockbox, rule: Rule = "and", steps: int = STEPS, recorder: Recorder | None = None
 ) -> UnlockingRun:
-    """Open a box by the tasks of :func:`kineverse.control.unlock`.
-
-    Parameters
-    ----------
-    box
-        The box.
-    rule
-        Rule of trends. Demand is passed on along trends, so with the product rule it would end where two
-        conditions fail; there all locks are pursued.
-    steps
-        Largest number of steps.
-    recorder
-        Recorder of the states and commands.
-    """
+    """Open a box by the tasks of :func:`kineverse.control.unlock`."""
     model = make_lockbox_model(box, None, mul if rule == "product" else and_)
     q = {name: position(name) for name in box.parts}
     tasks = unlock(model, box.goal, demand=rule not in ("product", "undemanded"))

@@ -14,24 +14,12 @@ Cell = float | str
 
 @dataclass(frozen=True)
 class Column:
-    """Column of a table.
+    """Column of a table."""
 
-    Attributes
-    ----------
-    key
-        Name in JSON data.
-    title
-        Title with the unit.
-    of
-        Function from the trials of a row to the value.
-    digits
-        Significant digits of numbers that are printed.
-    """
-
-    key: str
-    title: str
-    of: Callable[[Sequence[Trial]], Any]
-    digits: int = 3
+    key: str  # name in JSON data
+    title: str  # title with the unit
+    of: Callable[[Sequence[Trial]], Any]  # function from the trials of a row to the value
+    digits: int = 3  # significant digits of numbers that are printed
 
     def cell(self, trials: Sequence[Trial]) -> str:
         """Return the printed value; empty for NaN."""

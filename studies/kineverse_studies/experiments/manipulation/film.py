@@ -35,27 +35,13 @@ _NEAREST = 0.035
 
 @dataclass(frozen=True, eq=False)
 class FilmRow:
-    """Row of pictures of one model.
-
-    Attributes
-    ----------
-    title
-        Title.
-    load
-        Function that returns the model; it is called when the row is drawn.
-    states
-        Values by name, one mapping for each picture.
-    labels
-        Texts of the pictures.
-    shown
-        Beginnings of the names of the bodies that have to be seen.
-    """
+    """Row of pictures of one model."""
 
     title: str
-    load: Callable[[], Model]
-    states: Sequence[Mapping[str, float]]
-    labels: Sequence[str]
-    shown: tuple[str, ...]
+    load: Callable[[], Model]  # function that returns the model; it is called when the row is drawn
+    states: Sequence[Mapping[str, float]]  # values by name, one mapping for each picture
+    labels: Sequence[str]  # texts of the pictures
+    shown: tuple[str, ...]  # beginnings of the names of the bodies that have to be seen
 
 
 def make_film(rows: Sequence[FilmRow], size: tuple[int, int] = (420, 420)) -> Figure:
@@ -90,21 +76,11 @@ def choose_moments(film: Sequence[Moment], count: int) -> list[Moment]:
 
 @dataclass(frozen=True, eq=False)
 class RowView:
-    """Things that a camera has to see.
+    """Things that a camera has to see."""
 
-    Attributes
-    ----------
-    scenes
-        All bodies at some times.
-    wanted
-        Which parts have to be seen (N,).
-    points
-        Points that have to be in view (M, 3) [m].
-    """
-
-    scenes: Sequence[TriangleSoup]
-    wanted: npt.NDArray[np.bool_]
-    points: Array
+    scenes: Sequence[TriangleSoup]  # all bodies at some times
+    wanted: npt.NDArray[np.bool_]  # which parts have to be seen (N,)
+    points: Array  # points that have to be in view (M, 3) [m]
 
     @staticmethod
     def of(model: Model, states: Sequence[Mapping[str, float]], shown: Sequence[str]) -> RowView:

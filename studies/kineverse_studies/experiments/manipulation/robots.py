@@ -17,13 +17,7 @@ DATA_FOLDERS = ("pr2", "fetch", "hsrb", "iai_kitchen")
 
 
 def check_data(data: Path | None) -> Path | None:
-    """Return the folder of the authors' files; None if none is given.
-
-    Raises
-    ------
-    InvalidValueError
-        If a given folder does not exist, or has nothing of the authors in it.
-    """
+    """Return the folder of the authors' files; None if none is given."""
     if data is None:
         return None
     if not data.is_dir():
@@ -38,21 +32,7 @@ def check_data(data: Path | None) -> Path | None:
 
 
 def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[RobotSource, ...]:
-    """Return robots by name.
-
-    Parameters
-    ----------
-    names
-        Names of robots; by default the three that ship, and those of the authors where their files are.
-    data
-        Folder with the folders ``pr2``, ``fetch`` and ``hsrb`` of the authors' robots, None for
-        none.
-
-    Raises
-    ------
-    UnknownNameError
-        For a name that is none of these, with similar names.
-    """
+    """Return robots by name."""
     known = dict(SHIPPED)
     if data is not None:
         for name, (like, file, hand) in _AUTHORS.items():

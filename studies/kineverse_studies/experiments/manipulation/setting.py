@@ -32,21 +32,11 @@ _FILM_STEPS = 5
 
 @dataclass(frozen=True)
 class TrialSetting:
-    """World of a trial, and what is known of it.
-
-    Attributes
-    ----------
-    world
-        Name of the world.
-    noise
-        Noise of the sensors whose readings are all that the skill gets; empty if it acts on the truth.
-    record
-        Folder of recordings; None for none.
-    """
+    """World of a trial, and what is known of it."""
 
     world: str = WORLDS[0]
     noise: str = ""
-    record: Path | None = None
+    record: Path | None = None  # folder of recordings; None for none
 
     def make_world(
         self, model: Model, robot: str, state: StateLike, seed: int = 0, dt: float = _USUAL_STEP
@@ -68,15 +58,7 @@ class TrialSetting:
 
 
 def make_record_folder(folder: Path) -> None:
-    """Make the folder of recordings.
-
-    Raises
-    ------
-    FormatError
-        If it cannot be made.
-    MissingDependencyError
-        If the extra ``recording`` is not installed.
-    """
+    """Make the folder of recordings."""
     import_mcap("mcap.writer")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -85,13 +67,7 @@ def make_record_folder(folder: Path) -> None:
 
 
 def make_settings(options: Options) -> tuple[TrialSetting, ...]:
-    """Return the settings that options ask for, one for each world.
-
-    Raises
-    ------
-    KineverseError
-        For a noise that cannot be read, a folder that cannot be made, and a missing extra.
-    """
+    """Return the settings that options ask for, one for each world."""
     noise = "" if options.noise is None else str(Sensors.parse(options.noise))
     if options.record is not None:
         make_record_folder(options.record)
@@ -100,30 +76,7 @@ def make_settings(options: Options) -> tuple[TrialSetting, ...]:
 
 
 class TrialWatch:
-    """Session of a trial that is recorded and filmed, where that is wanted; a context.
-
-    Parameters
-    ----------
-    setting
-        The setting.
-    model
-        Model of the world.
-    about
-        Words that name the trial, also its file.
-    film
-        Whether moments are kept.
-
-    Attributes
-    ----------
-    session
-        The last session that was opened.
-    moments
-        Moments of that session.
-    commands
-        Commanded speeds of each of its steps, with the time before it, if it is filmed.
-    view
-        Vectors of a pushing controller, for recordings and film; set by the skill.
-    """
+    """Session of a trial that is recorded and filmed, where that is wanted; a context."""
 
     def __init__(
         self, setting: TrialSetting, model: Model, about: Mapping[str, str], *, film: bool = False

@@ -29,33 +29,15 @@ _PLANS = ("plan", "place", "placement")
 
 @dataclass(frozen=True)
 class TrialCase:
-    """One robot at one object, in one setting.
+    """One robot at one object, in one setting."""
 
-    Attributes
-    ----------
-    case
-        Kitchen, or name of the set-up.
-    robot
-        The robot.
-    what
-        Coordinate of the object.
-    setting
-        The setting.
-    seed
-        Seed of the skill's searches.
-    film
-        Whether the trial has commanded speeds as series, and a film.
-    measures
-        Further figures of the trial.
-    """
-
-    case: str
+    case: str  # kitchen, or name of the set-up
     robot: RobotSource
-    what: str
+    what: str  # coordinate of the object
     setting: TrialSetting
-    seed: int = 0
-    film: bool = False
-    measures: tuple[tuple[str, Any], ...] = ()
+    seed: int = 0  # seed of the skill's searches
+    film: bool = False  # whether the trial has commanded speeds as series, and a film
+    measures: tuple[tuple[str, Any], ...] = ()  # further figures of the trial
 
     def run(self, skill: str, model: Model, act: Callable[[TrialWatch], Outcome]) -> Trial:
         """Return the trial of a skill. Any error is a failure of the class ``other``, and is named."""
@@ -110,17 +92,6 @@ def open_then_close(
     """Return the trials of opening an object in a world and, if that was done, of closing it.
 
     Closing knows the ways on which the object was opened.
-
-    Parameters
-    ----------
-    case
-        Robot, object and setting.
-    model, world
-        The model, and its world.
-    start
-        State at the beginning.
-    targets
-        Value of the open and of the closed object [m], [rad].
     """
     world.reset(start)
     trials: list[Trial] = []
@@ -153,21 +124,7 @@ def run_push_trial(
     steps: int = 1200,
     logic: str | None = "and",
 ) -> Trial:
-    """Return the trial of a push in a world: from a start, or from one that base placement finds.
-
-    Parameters
-    ----------
-    case
-        Robot, object and setting.
-    model, world, start
-        As for :func:`open_then_close`.
-    skill
-        Name of the push in tables.
-    dt, steps
-        Control period [s], and largest number of steps.
-    logic
-        As for :func:`.try_push`.
-    """
+    """Return the trial of a push in a world: from a start, or from one that base placement finds."""
 
     def act(watch: TrialWatch) -> Outcome:
         judge = PushJudge(model, world, case.what, watch)
@@ -189,17 +146,7 @@ def run_push_trial(
 
 
 class PushJudge:
-    """Judge of a push, which is called after each step of its session.
-
-    Parameters
-    ----------
-    model, world
-        The model, and its world.
-    what
-        The coordinate of the object.
-    watch
-        The watch of the trial.
-    """
+    """Judge of a push, which is called after each step of its session."""
 
     def __init__(self, model: Model, world: World, what: str, watch: TrialWatch) -> None:
         try:

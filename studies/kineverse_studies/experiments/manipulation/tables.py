@@ -24,17 +24,7 @@ _TIMED = (
 def make_trial_tables(
     trials: Sequence[Trial], title: str, more: Iterable[ReportTable] = ()
 ) -> tuple[ReportTable, ...]:
-    """Return the tables of trials: success, times, quality, excepted pairs and failures.
-
-    Parameters
-    ----------
-    trials
-        The trials.
-    title
-        Title of the table of success.
-    more
-        Further tables, which follow that of success.
-    """
+    """Return the tables of trials: success, times, quality, excepted pairs and failures."""
     tables = (
         make_group_table(title, trials, (*ROW, *SUCCESS)),
         *more,

@@ -23,21 +23,7 @@ def run_jobs(
     unit: str,
     processes: int | None = None,
 ) -> list[Result]:
-    """Return the results of all jobs, such as trials, in the order of the jobs.
-
-    Parameters
-    ----------
-    run
-        Function of a module, from a job to its results.
-    jobs
-        The jobs.
-    progress
-        Progress reporter.
-    what, unit
-        Names of the activity and of a job, for the progress.
-    processes
-        Number of processes; None for one on each core.
-    """
+    """Return the results of all jobs, such as trials, in the order of the jobs."""
     count = min(processes or os.cpu_count() or 1, len(jobs))
     if count <= 1:
         return [trial for job in progress(jobs, what, unit) for trial in run(job)]

@@ -61,74 +61,35 @@ class StepTimeStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One time of a trial.
+    """One time of a trial."""
 
-    Attributes
-    ----------
-    time
-        Time in the world [s].
-    phase
-        Phase of the skill.
-    values
-        True values of all coordinates by name.
-    vectors
-        Vectors of the controller by name, each with its origin in the world (3,).
-    """
-
-    time: float
+    time: float  # time in the world [s]
     phase: str
-    values: Mapping[str, float]
+    values: Mapping[str, float]  # true values of all coordinates by name
+    # vectors of the controller by name, each with its origin in the world (3,)
     vectors: Mapping[str, tuple[Any, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One skill of one robot at one object.
+    """One skill of one robot at one object."""
 
-    Attributes
-    ----------
-    case
-        Kitchen, or name of the set-up.
-    robot, what, skill
-        Names of the robot, the coordinate and the skill.
-    done
-        Whether it was done.
-    value
-        Value of the coordinate at the end [m], [rad].
-    failure, reason
-        Class of the failure, empty if it was done; and the words of the skill.
-    seconds, steps
-        Time in the world [s], and number of control steps.
-    cpu
-        CPU times of the steps [s].
-    wall
-        Wall times of the steps [s].
-    measures
-        Further figures by name, in SI units; those of :class:`kineverse.worlds.Judge` among them.
-    world, noise
-        Name of the world; noise of the sensors, empty if the skill acted on the truth.
-    dof
-        Number of degrees of freedom of the robot, its base included.
-    series, film
-        Series of numbers by name, and moments, for figures: they are no part of the JSON data.
-    """
-
-    case: str
-    robot: str
+    case: str  # kitchen, or name of the set-up
+    robot: str  # names of the robot, the coordinate and the skill
     what: str
     skill: str
-    done: bool
-    value: float
-    failure: Failure
+    done: bool  # whether it was done
+    value: float  # value of the coordinate at the end [m], [rad]
+    failure: Failure  # class of the failure, empty if it was done; and the words of the skill
     reason: str
-    seconds: float
+    seconds: float  # time in the world [s], and number of control steps
     steps: int
-    cpu: tuple[float, ...] = ()
-    wall: tuple[float, ...] = ()
+    cpu: tuple[float, ...] = ()  # CPU times of the steps [s]
+    wall: tuple[float, ...] = ()  # wall times of the steps [s]
     measures: Mapping[str, Any] = field(default_factory=dict)
-    world: str = "kinematic"
+    world: str = "kinematic"  # name of the world; noise of the sensors, empty if the skill acted on the truth
     noise: str = ""
-    dof: int = 0
+    dof: int = 0  # number of degrees of freedom of the robot, its base included
     series: Mapping[str, Sequence[float]] = field(default_factory=dict)
     film: Sequence[Moment] = ()
 
@@ -156,18 +117,9 @@ def find_failure(outcome: Outcome) -> Failure:
 
 
 class ObjectCount(NamedTuple):
-    """Success at objects: one counts as done if all trials of it are.
+    """Success at objects: one counts as done if all trials of it are."""
 
-    Attributes
-    ----------
-    objects, done
-        Number of objects, and of those that were done.
-    excused
-        Number of objects that :data:`PLACEMENTS` placements prove to be out of reach, at most the share
-        :data:`MOST_EXCUSED` of all; others beyond that are failures.
-    """
-
-    objects: int
+    objects: int  # number of objects, and of those that were done
     done: int
     excused: int
 

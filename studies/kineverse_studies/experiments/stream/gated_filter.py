@@ -20,17 +20,7 @@ _STEP = 1e-6
 
 
 def run_gated_filter(stream: Stream, markers: Markers, acceleration: float) -> tuple[Array, Array]:
-    """Return angles and their variances after each look (N,), (N,); it starts at the true angle.
-
-    Parameters
-    ----------
-    stream
-        The looks.
-    markers
-        The model of the markers.
-    acceleration
-        Spectral density of the acceleration [rad²/s³].
-    """
+    """Return angles and their variances after each look (N,), (N,); it starts at the true angle."""
     noise = np.diag([POSITION**2] * 3 + [ORIENTATION**2] * 3)
     x, p, before = np.array([stream.angles[0], 0.0]), np.diag([0.01, 0.01]), float(stream.times[0])
     angles, variances = [], []

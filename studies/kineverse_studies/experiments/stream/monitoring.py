@@ -42,30 +42,15 @@ MakeStream: TypeAlias = Callable[[Model, np.random.Generator, float, StreamError
 
 @dataclass(frozen=True)
 class MonitoringRow:
-    """Results of the monitor on streams of one kind.
+    """Results of the monitor on streams of one kind."""
 
-    Attributes
-    ----------
-    case
-        Description of the streams.
-    runs, looks
-        Number of streams, and of looks in all of them until the alarms.
-    alarms
-        Number of streams with an alarm.
-    median, worst
-        Looks from the time when the door has turned by :data:`TURNED` until the alarm; negative before it.
-        NaN without alarms; infinite where streams ended without.
-    cpu, cpu_99
-        Mean CPU time of a look and its 99th percentile [ms].
-    """
-
-    case: str
-    runs: int
+    case: str  # description of the streams
+    runs: int  # number of streams, and of looks in all of them until the alarms
     looks: int
-    alarms: int
+    alarms: int  # number of streams with an alarm
     median: float
     worst: float
-    cpu: float
+    cpu: float  # mean CPU time of a look and its 99th percentile [ms]
     cpu_99: float
 
     def __str__(self) -> str:
@@ -81,19 +66,7 @@ class MonitoringRow:
 def measure_monitoring(
     model: Model, seeds: int = 20, minutes: float = 6.0, displacements: tuple[float, ...] = (0.02, 0.01)
 ) -> list[MonitoringRow]:
-    """Run the monitor over streams of a door as modelled, and of doors with a displaced axis.
-
-    Parameters
-    ----------
-    model
-        The served model, with the frames :data:`~.observations.FRAMES`.
-    seeds
-        Number of streams of each kind.
-    minutes
-        Length of each stream of the door as modelled.
-    displacements
-        Displacements of the axis [m].
-    """
+    """Run the monitor over streams of a door as modelled, and of doors with a displaced axis."""
     long, short = 60.0 * minutes, PERIOD
     rows = [
         _measure("as modelled", model, seeds, long, _as_modelled, None),

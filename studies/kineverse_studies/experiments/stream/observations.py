@@ -31,45 +31,23 @@ OPEN_ANGLE, HALF_SHUT_ANGLE = 1.3, 0.65
 
 @dataclass(frozen=True)
 class StreamErrors:
-    """Errors of a stream of looks.
-
-    Attributes
-    ----------
-    correlation, share
-        Correlation of successive errors, and the correlated fraction of the variance; the rest is white.
-    dropouts, outliers
-        Fractions of markers that are missing, and that are somewhere else.
-    reach
-        Outliers are uniform in a cube of this edge about the marker [m], in any orientation.
-    """
+    """Errors of a stream of looks."""
 
     correlation: float = 0.95
     share: float = 0.7
-    dropouts: float = 0.15
+    dropouts: float = 0.15  # fractions of markers that are missing, and that are somewhere else
     outliers: float = 0.05
-    reach: float = 2.0
+    reach: float = 2.0  # outliers are uniform in a cube of this edge about the marker [m], in any orientation
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Stream of looks at the markers of a door.
+    """Stream of looks at the markers of a door."""
 
-    Attributes
-    ----------
-    times
-        Times of the looks (N,) [s].
-    angles
-        True angles of the door (N,) [rad].
-    poses
-        Measured poses of the markers (N, 2, 4, 4).
-    seen, gross
-        True where a marker was seen, and where its pose is an outlier (N, 2).
-    """
-
-    times: Array
-    angles: Array
-    poses: Array
-    seen: npt.NDArray[np.bool_]
+    times: Array  # times of the looks (N,) [s]
+    angles: Array  # true angles of the door (N,) [rad]
+    poses: Array  # measured poses of the markers (N, 2, 4, 4)
+    seen: npt.NDArray[np.bool_]  # true where a marker was seen, and where its pose is an outlier (N, 2)
     gross: npt.NDArray[np.bool_]
 
     @property
@@ -96,19 +74,7 @@ def hand_motion(times: Array) -> Array:
 def simulate_stream(
     model: Model, angles: Array, random: np.random.Generator, errors: StreamErrors | None = None
 ) -> Stream:
-    """Return a stream of looks at a door with the given angles (N,), one for each look.
-
-    Parameters
-    ----------
-    model
-        The true model; it has the frames :data:`FRAMES`.
-    angles
-        Angle of the door at each look [rad].
-    random
-        Source of the errors.
-    errors
-        Kind of the errors; the default :class:`StreamErrors` if None.
-    """
+    """Return a stream of looks at a door with the given angles (N,), one for each look."""
     errors = StreamErrors() if errors is None else errors
     count = len(angles)
     true = np.stack(

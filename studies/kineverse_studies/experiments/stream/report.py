@@ -42,7 +42,6 @@ def make_report(tracked: Mapping[str, Sequence[TrackedStream]], monitored: Seque
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values for JSON, which has no infinity."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in values.items()

@@ -33,25 +33,13 @@ _WRONG = 5.0
 
 @dataclass(frozen=True, eq=False)
 class TrackedStream:
-    """Estimates of the door in one stream.
-
-    Attributes
-    ----------
-    stream
-        The stream.
-    angles, variances
-        Estimates and their variances (N,).
-    lost
-        True where the filter says that it is lost (N,).
-    seconds
-        CPU time of each update (N,) [s]; empty if it was not measured.
-    """
+    """Estimates of the door in one stream."""
 
     stream: Stream
-    angles: Array
+    angles: Array  # estimates and their variances (N,)
     variances: Array
-    lost: Array
-    seconds: Array
+    lost: Array  # true where the filter says that it is lost (N,)
+    seconds: Array  # CPU time of each update (N,) [s]; empty if it was not measured
 
     @property
     def errors(self) -> Array:
@@ -71,34 +59,16 @@ class TrackedStream:
 
 @dataclass(frozen=True)
 class TrackingSummary:
-    """Results of a filter over all streams.
-
-    Attributes
-    ----------
-    name
-        Name of the filter.
-    moving, resting
-        Root mean square error while the door moves, and at rest after the first second [rad].
-    nees
-        Mean normalised estimation error squared after the first second, over each whole stream.
-    worst_nees
-        The same of the stream where it is farthest from 1.
-    silently_lost
-        Longest time that a filter was lost without saying so [s].
-    lost
-        Share of the time that it said to be lost.
-    mean_time, high_time
-        CPU time of an update: mean, and what one in a hundred exceeds [s].
-    """
+    """Results of a filter over all streams."""
 
     name: str
-    moving: float
+    moving: float  # root mean square error while the door moves, and at rest after the first second [rad]
     resting: float
-    nees: float
-    worst_nees: float
-    silently_lost: float
-    lost: float
-    mean_time: float
+    nees: float  # mean normalised estimation error squared after the first second, over each whole stream
+    worst_nees: float  # the same of the stream where it is farthest from 1
+    silently_lost: float  # longest time that a filter was lost without saying so [s]
+    lost: float  # share of the time that it said to be lost
+    mean_time: float  # CPU time of an update: mean, and what one in a hundred exceeds [s]
     high_time: float
 
 

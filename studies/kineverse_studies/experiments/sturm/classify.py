@@ -37,18 +37,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Classification:
-    """Identification result of a recording.
+    """Identification result of a recording."""
 
-    Attributes
-    ----------
-    recording
-        Recording with its label.
-    result
-        Identification result with the probabilities of all families.
-    """
-
-    recording: LabelledRecording
-    result: IdentificationResult
+    recording: LabelledRecording  # recording with its label
+    result: IdentificationResult  # identification result with the probabilities of all families
 
     @property
     def predicted(self) -> str:

@@ -35,25 +35,13 @@ STATEMENTS: Mapping[str, str] = MappingProxyType(
 
 @dataclass(frozen=True)
 class StatementAnswer:
-    """Answer for a recording under a statement of the noise.
+    """Answer for a recording under a statement of the noise."""
 
-    Attributes
-    ----------
-    name, label
-        Name and label of the recording.
-    statement
-        One of :data:`STATEMENTS`.
-    family
-        Most probable family.
-    is_sure
-        True if the joint is told, False for "cannot tell".
-    """
-
-    name: str
+    name: str  # name and label of the recording
     label: Label
-    statement: str
-    family: str
-    is_sure: bool
+    statement: str  # one of :data:`STATEMENTS`
+    family: str  # most probable family
+    is_sure: bool  # true if the joint is told, False for "cannot tell"
 
     @property
     def verdict(self) -> str:

@@ -61,21 +61,11 @@ THINNED = 20
 
 @dataclass(frozen=True, eq=False)
 class LabelledRecording:
-    """Recording with its label.
+    """Recording with its label."""
 
-    Attributes
-    ----------
-    name
-        Path of the file in its folder, without suffix.
-    label
-        True joint family.
-    poses
-        (N, 4, 4) of a marker, or positions (N, 3) of a handle, in the camera's frame [m].
-    """
-
-    name: str
-    label: Label
-    poses: Array
+    name: str  # path of the file in its folder, without suffix
+    label: Label  # true joint family
+    poses: Array  # (N, 4, 4) of a marker, or positions (N, 3) of a handle, in the camera's frame [m]
 
     @property
     def covariance(self) -> Array:
@@ -96,18 +86,7 @@ def read_labelled_recordings(folder: Path | None) -> Iterator[LabelledRecording]
 
 
 def read_labelled_pairs(folder: Path | None) -> Iterator[tuple[str, Label, RecordedPair]]:
-    """Return names, labels and all poses of the recordings in a folder, sorted by name.
-
-    Parameters
-    ----------
-    folder
-        Folder that contains ``cabinet_one`` and the others; None for ``sturm_tracks`` in the current folder.
-
-    Raises
-    ------
-    FormatError
-        If the folder does not exist, contains none of the recordings, or one cannot be read.
-    """
+    """Return names, labels and all poses of the recordings in a folder, sorted by name."""
     place = Path(FOLDER) if folder is None else folder
     found = sorted((file, label) for pattern, label in LABELS.items() for file in place.glob(pattern))
     if not found:

@@ -31,27 +31,13 @@ _AREA = {"x": (-0.4, 0.5), "y": (-0.8, 0.4), "angle": (-0.8, 0.8)}
 
 @dataclass(frozen=True)
 class GraspedObject:
-    """Object that is opened by its handle.
-
-    Attributes
-    ----------
-    name
-        Name in tables.
-    source
-        Name of its model.
-    coordinate
-        Coordinate that is opened, without the prefix.
-    handle
-        Frame of the handle, without the prefix.
-    grasp
-        Pose handle_T_hand: x of the hand points out of it, its fingers close along y.
-    """
+    """Object that is opened by its handle."""
 
     name: str
     source: str
-    coordinate: str
-    handle: str
-    grasp: Expression
+    coordinate: str  # coordinate that is opened, without the prefix
+    handle: str  # frame of the handle, without the prefix
+    grasp: Expression  # pose handle_T_hand: x of the hand points out of it, its fingers close along y
 
 
 _BAR_GRASP = translation(0.04, 0.0, 0.0) @ rpy(math.pi / 2, 0.0, math.pi)
@@ -73,24 +59,12 @@ OBJECTS: Mapping[str, GraspedObject] = MappingProxyType(
 
 @dataclass(frozen=True, eq=False)
 class OpeningSetup:
-    """Robot before an object.
-
-    Attributes
-    ----------
-    robot, thing
-        The robot, and the object.
-    model
-        Model of both.
-    what
-        Coordinate of the object.
-    hand, grasp
-        Poses of the grasping point of the gripper, and of the grasp on the handle, in the world.
-    """
+    """Robot before an object."""
 
     robot: RobotSource
-    thing: GraspedObject
+    thing: GraspedObject  # the robot, and the object
     model: Model
-    what: Symbol
+    what: Symbol  # coordinate of the object
     hand: Expression
     grasp: Expression
 
@@ -109,11 +83,6 @@ class OpeningSetup:
         """Return a state with the hand at the grasp, the object shut and without contacts.
 
         Inverse kinematics begins at the robot's start for the seed 0, else at random positions nearby.
-
-        Raises
-        ------
-        NoSolutionError
-            If inverse kinematics has none.
         """
         held = Hold(same_pose(self.grasp, self.hand), name="grasp")
         gripper = self.robot.gripper(self.model)

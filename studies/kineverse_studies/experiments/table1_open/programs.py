@@ -36,31 +36,18 @@ LOST = 0.01
 
 @dataclass(slots=True)
 class ProgramRun:
-    """Opening of an object by a program.
-
-    Attributes
-    ----------
-    done, value, steps
-        Whether it is open and still grasped; the value of its coordinate; the number of control steps.
-    solve, cpu
-        Times of the solver's calls of each control step, and CPU times of the steps [s].
-    position_error, rotation_error
-        Largest grasp errors [m], [rad].
-    violation
-        Largest violation of a limit on positions [m], [rad].
-    programs
-        Number of quadratic programs solved.
-    """
+    """Opening of an object by a program."""
 
     done: bool = False
     value: float = 0.0
     steps: int = 0
+    # times of the solver's calls of each control step, and CPU times of the steps [s]
     solve: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
-    position_error: float = 0.0
+    position_error: float = 0.0  # largest grasp errors [m], [rad]
     rotation_error: float = 0.0
-    violation: float = 0.0
-    programs: int = 0
+    violation: float = 0.0  # largest violation of a limit on positions [m], [rad]
+    programs: int = 0  # number of quadratic programs solved
 
 
 class LeaderFollower:

@@ -31,34 +31,16 @@ QUICK_OBJECTS = ("fridge door", "sink trash drawer")
 
 @dataclass(frozen=True)
 class PushJob:
-    """Push of one object by one robot.
-
-    Attributes
-    ----------
-    robot
-        The robot.
-    kitchen, data
-        Name of the kitchen, and the folder of the authors' files.
-    thing
-        Name of the object.
-    paper
-        Paper whose control period and steps count.
-    setting
-        World, noise and recordings.
-    seed
-        Seed of the base placement.
-    logic
-        Rule of trends: ``"and"``, ``"product"``, or None for exact gradients alone.
-    """
+    """Push of one object by one robot."""
 
     robot: RobotSource
-    kitchen: str
+    kitchen: str  # name of the kitchen, and the folder of the authors' files
     data: Path | None
     thing: str
-    paper: str = "2022"
-    setting: TrialSetting = field(default_factory=TrialSetting)
-    seed: int = 0
-    logic: str | None = "and"
+    paper: str = "2022"  # paper whose control period and steps count
+    setting: TrialSetting = field(default_factory=TrialSetting)  # world, noise and recordings
+    seed: int = 0  # seed of the base placement
+    logic: str | None = "and"  # rule of trends: ``"and"``, ``"product"``, or None for exact gradients alone
 
 
 def run(progress: Progress, options: Options) -> Report:

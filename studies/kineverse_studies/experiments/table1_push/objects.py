@@ -54,24 +54,12 @@ OBJECTS = (*_COORDINATES, FOLDING_DOOR)
 
 @dataclass(frozen=True, eq=False)
 class PushSetup:
-    """Robot before an open object.
-
-    Attributes
-    ----------
-    kitchen
-        Name of the kitchen.
-    model
-        Model of robot and furniture.
-    what
-        Name of the coordinate.
-    start
-        State with the robot at the papers' start, its base at the origin, and the object open.
-    """
+    """Robot before an open object."""
 
     kitchen: str
-    model: Model
+    model: Model  # model of robot and furniture
     what: str
-    start: State
+    start: State  # state with the robot at the papers' start, its base at the origin, and the object open
 
 
 def find_kitchens(data: Path | None) -> Mapping[str, tuple[str, ...]]:
@@ -86,13 +74,7 @@ def find_kitchens(data: Path | None) -> Mapping[str, tuple[str, ...]]:
 
 
 def make_push_setup(robot: RobotSource, kitchen: str, thing: str, data: Path | None = None) -> PushSetup:
-    """Return a robot before an open object.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such object, with similar names.
-    """
+    """Return a robot before an open object."""
     if thing not in OBJECTS:
         raise UnknownNameError(f"There is no object {thing!r}. {suggest(thing, OBJECTS, 'object')}")
     model = robot.load()

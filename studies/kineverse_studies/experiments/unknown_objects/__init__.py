@@ -50,20 +50,12 @@ _PLACE = translation(1.6, 0.0, 0.7)
 
 @dataclass(frozen=True)
 class UnknownObject:
-    """Object of which the robot knows the bodies alone.
+    """Object of which the robot knows the bodies alone."""
 
-    Attributes
-    ----------
-    source, part, handle
-        Name of the model; frames of the part and of its handle. The part's joint has its name.
-    family
-        True family of the joint.
-    """
-
-    source: str
+    source: str  # name of the model; frames of the part and of its handle. The part's joint has its name
     part: str
     handle: str
-    family: str
+    family: str  # true family of the joint
 
 
 OBJECTS = {
