@@ -32,7 +32,7 @@ from kineverse.manipulation.session import Session
 from kineverse.manipulation.tracked_belief import TrackedBelief
 from kineverse.model.body import Body, Box, Pose, Shape
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
-from kineverse_studies.experiments.table1_push.objects import SHIPPED_KITCHEN, make_push_setup
+from kineverse_studies.experiments.table1_push import SHIPPED_KITCHEN, make_push_setup
 
 PUSHER = "robot/finger"
 TIP = kv.array([0.0, 0.0, 0.0])

@@ -4,10 +4,20 @@
 no build fails because of them.
 """
 
-from .harness import QUICK, BenchmarkSettings, DisagreementError
-from .machine import Machine, describe_machine
-from .registry import BENCHMARKS, run_benchmarks, select_benchmarks
-from .result import Bar, BenchmarkResult, Comparison, Measurement
+from .harness import (
+    BENCHMARKS,
+    QUICK,
+    Bar,
+    BenchmarkResult,
+    BenchmarkSettings,
+    Comparison,
+    DisagreementError,
+    Machine,
+    Measurement,
+    describe_machine,
+    run_benchmarks,
+    select_benchmarks,
+)
 
 __all__ = [
     "BENCHMARKS",

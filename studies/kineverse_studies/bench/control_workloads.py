@@ -26,8 +26,7 @@ from kineverse.model.model import Model
 
 from .workloads import strip_shapes
 
-ROOT = "root_joint"
-"""Name of floating joints; pink finds the floating base by it."""
+ROOT = "root_joint"  # name of floating joints; pink finds the floating base by it
 
 
 class ControlLoop(Protocol):
@@ -146,7 +145,6 @@ HANDS = ("left_rubber_hand", "right_rubber_hand")
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
 QUADRUPED_FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
 FINGERS = ("hand/link_3.0_tip", "hand/link_7.0_tip", "hand/link_11.0_tip", "hand/link_15.0_tip")
-
 _BENT = {"shoulder_lift_joint": 1.0, "shoulder_pan_joint": 1.0, "elbow_joint": 1.0}
 _PANDA = {"panda_joint4": -1.5708, "panda_joint6": 1.5708, "panda_joint7": -0.7854}
 _SQUAT = {
@@ -196,7 +194,6 @@ _CAMERA = {
 
 G1, GO2 = "g1_description/urdf/g1_29dof_rev_1_0.urdf", "go2_description/urdf/go2.urdf"
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
-
 WORKLOADS: Mapping[str, ControlWorkload] = MappingProxyType(
     {
         "arm_ur5": ControlWorkload(

@@ -95,7 +95,7 @@ def build_controller(robot: str) -> dict[str, Any]:
 
     ``build_controller ROBOT``
     """
-    from kineverse_studies.bench.opening import make_opening
+    from .control import make_opening
 
     opening = make_opening(robot)
     start = perf_counter()
@@ -111,7 +111,8 @@ def build_planner(robot: str) -> dict[str, Any]:
     ``build_planner ROBOT``; a robot of :data:`kineverse_studies.bench.kitchen_queries.ARMS`.
     """
     from kineverse.planning import Planner
-    from kineverse_studies.bench.kitchen_queries import make_kitchen_arm
+
+    from .kitchen_queries import make_kitchen_arm
 
     arm = make_kitchen_arm(robot, "kitchen (shipped)", except_touching=False)
     start = perf_counter()

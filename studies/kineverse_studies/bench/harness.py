@@ -9,23 +9,29 @@ import contextlib
 import importlib
 import json
 import os
+import platform
+import statistics
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from time import perf_counter
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from kineverse import position, rotation_z
 from kineverse._extras import install_studies
 from kineverse._gc import no_collection
-from kineverse.errors import KineverseError
+from kineverse._version import __version__
+from kineverse.compile import CompilerInformation, compile, compiler_information  # noqa: A004
+from kineverse.compile.call_extension import call_extension
+from kineverse.compile.toolchain import toolchain
+from kineverse.errors import CompileError, KineverseError, MissingDependencyError, UnknownNameError, suggest
 from kineverse.lie import Array
-
-from .result import Measurement
 
 Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]
 
@@ -90,8 +96,7 @@ QUICK = BenchmarkSettings(rounds=5, processes=3, steps=20, operations=1_000, pro
 """Settings for an order of magnitude."""
 
 
-EQUALITY_TOLERANCE = 1e-9
-"""Tolerance of poses and Jacobians [m], [rad]."""
+EQUALITY_TOLERANCE = 1e-9  # tolerance of poses and Jacobians [m], [rad]
 
 
 class DisagreementError(KineverseError, ArithmeticError):
@@ -251,3 +256,260 @@ def run_program(name: str, *arguments: str, cache: str | None = None) -> dict[st
         last = (done.stderr.strip() or "it said nothing").splitlines()[-1]
         raise ProgramError(f"The program {name!r} ended with status {done.returncode}: {last}") from None
     return output
+
+
+Status: TypeAlias = Literal["met", "missed", "missing", "no bar"]
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """Times of one contender.
+
+    Attributes
+    ----------
+    name
+        Contender.
+    unit
+        ``s`` for times, else the unit of the count.
+    samples
+        A number for each round; a single one if it does not vary.
+    """
+
+    name: str
+    unit: str
+    samples: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.samples)
+
+    @property
+    def best(self) -> float:
+        """Least of the samples."""
+        return min(self.samples)
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """Target of a figure: at least, or at most, the limit."""
+
+    limit: float
+    at_least: bool
+
+    def met_by(self, value: float) -> bool:
+        """Return whether a figure reaches the target."""
+        return value >= self.limit if self.at_least else value <= self.limit
+
+    def __str__(self) -> str:
+        return f"{'>=' if self.at_least else '<='} {self.limit:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Figure computed from measurements, and its target.
+
+    Attributes
+    ----------
+    name
+        Description.
+    value
+        The figure; None if a peer is missing.
+    unit
+        ``x`` for ratios, else as in measurements.
+    bar
+        Target in the same unit; None if there is none.
+    ours, theirs
+        Contenders of a ratio of speeds; empty for other figures.
+    """
+
+    name: str
+    value: float | None
+    unit: str
+    bar: Bar | None = None
+    ours: str = ""
+    theirs: str = ""
+
+    @property
+    def status(self) -> Status:
+        """Status of the figure: target met or missed, peer missing, or no target."""
+        if self.value is None:
+            return "missing"
+        if self.bar is None:
+            return "no bar"
+        return "met" if self.bar.met_by(self.value) else "missed"
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkResult:
+    """Result of a benchmark.
+
+    Attributes
+    ----------
+    name
+        The benchmark.
+    work
+        Description of the work.
+    measurements
+        Measurements of all contenders.
+    comparisons
+        Figures computed from them.
+    missing
+        A line for each missing peer, with advice.
+    """
+
+    name: str
+    work: str
+    measurements: tuple[Measurement, ...]
+    comparisons: tuple[Comparison, ...]
+    missing: tuple[str, ...] = ()
+
+
+def compare_speed(
+    measured: Mapping[str, Measurement], ours: str, theirs: str, at_least: float | None = None
+) -> Comparison:
+    """Return the speed of a contender relative to a peer.
+
+    It is the median over the rounds of the ratio within a round, because a temporary slowdown of the machine
+    affects both.
+    """
+    bar = None if at_least is None else Bar(at_least, at_least=True)
+    name = f"{ours}, beside {theirs}"
+    if theirs not in measured:
+        return Comparison(name, None, "x", bar, ours, theirs)
+    pairs = zip(measured[theirs].samples, measured[ours].samples, strict=True)
+    ratio = statistics.median(their / our for their, our in pairs)
+    return Comparison(name, ratio, "x", bar, ours, theirs)
+
+
+def bound_median(measurement: Measurement, limit: float) -> Comparison:
+    """Return the median of a measurement, with an upper limit in its unit as the target."""
+    return Comparison(measurement.name, measurement.median, measurement.unit, Bar(limit, at_least=False))
+
+
+BENCHMARKS: Mapping[str, str] = MappingProxyType(
+    {
+        "load": "a robot's file to its first pose and Jacobian, in a fresh process",
+        "call": "pose and Jacobian of one frame at one configuration",
+        "frames": "the poses of all frames at one configuration",
+        "batch": "pose and Jacobian at 100 000 configurations",
+        "loop": "a closed loop and its derivative at one configuration",
+        "motion": "coordinates after a step, and constraints: a robot in a kitchen, as a control loop asks",
+        "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
+        "inverse_kinematics": "joint positions for poses of five arms, with restarts",
+        "tracking": "a kitchen's coordinates from noisy poses of its doors and drawers",
+        "identification": "the joint between two parts, from twenty poses of both and from one more",
+        "control": "a controller's step, a robot that opens a fridge; beside pink and mink",
+        "planning": "paths without collisions: published problems, robots in kitchens, held doors",
+        "examples": "published examples of pink and mink, beside the same ones of this library",
+        "import": "importing the library, and how many packages that takes",
+        "memory": "the memory of a loaded robot",
+        "document": "a robot in a kitchen, written down and read again; models of up to a million nodes",
+        "edit": "models of 10 000 operations, and a robot with one joint replaced",
+    }
+)
+"""Benchmarks in the order of running; each name belongs to the module ``measure_NAME``."""
+
+
+def select_benchmarks(names: Sequence[str]) -> list[str]:
+    """Return the names of the benchmarks to run, each once and in their order; all if none is named."""
+    for name in names:
+        if name not in BENCHMARKS:
+            raise UnknownNameError(
+                f"There is no benchmark {name!r}. {suggest(name, BENCHMARKS, 'benchmark')} "
+                "'kineverse bench --list' says what each measures."
+            )
+    return [name for name in BENCHMARKS if name in names or not names]
+
+
+def run_benchmarks(
+    names: Sequence[str] = (), settings: BenchmarkSettings | None = None
+) -> Iterator[BenchmarkResult]:
+    """Run benchmarks, and yield each result.
+
+    The result of a benchmark whose extra is not installed, or for which there is no C compiler, has only a
+    line that names it.
+
+    Parameters
+    ----------
+    names
+        Names of benchmarks; all if empty.
+    settings
+        Settings; the defaults if None.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such benchmark, before any is run.
+    DisagreementError
+        If the results of contenders differ.
+    """
+    for name in select_benchmarks(names):
+        # Imported here, because a benchmark imports its peers.
+        module = importlib.import_module(f"{__package__}.measure_{name}")
+        try:
+            result: BenchmarkResult = module.measure(settings or BenchmarkSettings())
+        except (MissingDependencyError, CompileError) as error:
+            if isinstance(error, CompileError) and toolchain() is not None:
+                raise
+            result = BenchmarkResult(name, BENCHMARKS[name], (), (), (f"{name} is left out: {error}",))
+        yield result
+
+
+VERSIONS = (
+    "casadi",
+    "numpy",
+    "pin",
+    "mujoco",
+    "coal",
+    "pybullet",
+    "daqp",
+    "pin-pink",
+    "mink",
+    "qpsolvers",
+    "ompl",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Machine and software of a run."""
+
+    tier: str
+    compiler: CompilerInformation  # C compiler, with the vector unit and the number of cores
+    processor: str  # names of processor, operating system and Python implementation, with versions
+    system: str
+    python: str
+    versions: dict[str, str | None]
+
+
+def describe_machine() -> Machine:
+    """Return the machine and software of this process."""
+    return Machine(
+        tier=_evaluation_tier(),
+        compiler=compiler_information(),
+        processor=_processor(),
+        system=f"{platform.system()} {platform.release()} {platform.machine()}",
+        python=f"{platform.python_implementation()} {platform.python_version()}",
+        versions={"kineverse": __version__, **{name: _version(name) for name in VERSIONS}},
+    )
+
+
+def _evaluation_tier() -> str:
+    function = compile(rotation_z(position("angle")), wait=True)
+    return "c extension" if function.tier == "c" and call_extension.module is not None else function.tier
+
+
+def _processor() -> str:
+    if sys.platform == "linux":
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None

@@ -19,25 +19,19 @@ from kineverse.planning import Planner
 from kineverse.spatial import rpy, translation
 from kineverse.state import State
 
-from .harness import Progress
-from .planning_attempts import Attempt, AttemptSummary
-from .result import Bar, Comparison, Measurement, bound_median
+from .harness import Bar, Comparison, Measurement, Progress, bound_median
+from .planning_problems import Attempt, AttemptSummary
 
-SECONDS, SOON = 10.0, 0.1
-"""Largest time of a search, and the time in which nearly all are to be solved [s]."""
-
+SECONDS, SOON = 10.0, 0.1  # largest time of a search, and the time in which nearly all are to be solved [s]
 MEDIAN, LEAST_SOON, RESIDUAL = 1e-3, 95.0, 1e-5
 """Targets: median time of the search at the fridge, with its path shortened, polished and certified [s],
 share solved soon of what is solved [%], residual of holds [m], [rad]."""
 
-STARTS = 5
-"""Number of starts at each place of the base, each with a goal of its own."""
-
+STARTS = 5  # number of starts at each place of the base, each with a goal of its own
 _TRIES, _PATIENCE = 300, 0.2
 """Largest number of places of the base, and time of the search for grasps at each [s]."""
 
-_BETWEEN = (0.25, 0.5, 0.75)
-"""Fractions of edges at which residuals are measured as well."""
+_BETWEEN = (0.25, 0.5, 0.75)  # fractions of edges at which residuals are measured as well
 
 
 @dataclass(frozen=True)
@@ -123,7 +117,6 @@ class HeldResults:
 
     @property
     def summary(self) -> AttemptSummary:
-        """Summary of the attempts."""
         return AttemptSummary(f"kineverse, {self.name}", self.attempts)
 
     def measurements(self) -> Iterator[Measurement]:

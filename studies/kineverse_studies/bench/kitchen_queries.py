@@ -23,16 +23,13 @@ from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .configuration_check import ConfigurationCheck
+from .planning_problems import ConfigurationCheck
 
-ROBOT, KITCHEN, BASE = "robot", "kitchen", "robot/base"
-"""Prefixes of both, and the base of the robot."""
+ROBOT, KITCHEN, BASE = "robot", "kitchen", "robot/base"  # prefixes of both, and the base of the robot
 
 
 @dataclass(frozen=True)
 class KitchenRobotArm:
-    """Robot with an arm."""
-
     file: str  # name or path of the model
     tool: str  # frame of the hand
     axis: tuple[float, float, float] = (1.0, 0.0, 0.0)  # direction of approach in that frame
@@ -66,31 +63,20 @@ KITCHENS: Mapping[str, str] = MappingProxyType(
 FRIDGE_OPEN: Mapping[str, float] = MappingProxyType({f"{KITCHEN}/fridge_door": 1.4})
 """Position of the door of the shipped fridge for the queries there [rad]."""
 
-FRIDGE_BASE = np.array([0.45, -1.5, 0.0])
-"""Place of the base there: x, y [m] and angle [rad]."""
-
+FRIDGE_BASE = np.array([0.45, -1.5, 0.0])  # place of the base there: x, y [m] and angle [rad]
 BESIDE_FRIDGE = np.array([[0.9, -1.2, 0.5], [1.1, -0.9, 1.3]])
 INSIDE_FRIDGE = np.array([[1.3, -1.8, 0.8], [1.5, -1.4, 1.5]])
 """Corners of the boxes of points that the hand points at: starts and goals [m]."""
 
-OFFSET = 0.06, 0.12
-"""Range of the distance of the fingertips from the handle [m]."""
-
-CLEARANCE = 0.005
-"""Least distance of the robot from the kitchen at starts and goals [m]."""
-
-_CONE = 0.5
-"""Least cosine of the angle between the direction of approach and that to the handle."""
-
+OFFSET = 0.06, 0.12  # range of the distance of the fingertips from the handle [m]
+CLEARANCE = 0.005  # least distance of the robot from the kitchen at starts and goals [m]
+_CONE = 0.5  # least cosine of the angle between the direction of approach and that to the handle
 _SAMPLES, _HEIGHT, _NEAR = 20_000, 0.03, 0.2
 """Number of random configurations from which poses of the hand are taken, and how far in height, and in all
 directions, they may be off the handle [m]. Those of the goal are then brought to it by inverse kinematics."""
 
-_STATES = 200
-"""Number of random states at which pairs of the robot touch that always do."""
-
-_STARTS = 4
-"""Number of starts of inverse kinematics."""
+_STATES = 200  # number of random states at which pairs of the robot touch that always do
+_STARTS = 4  # number of starts of inverse kinematics
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +150,6 @@ class KitchenArm:
 
 
 def make_kitchen_arm(robot: str, kitchen: str, except_touching: bool = True) -> KitchenArm:
-    """Return a robot of :data:`ARMS` in a kitchen of :data:`KITCHENS`."""
     arm, room = ARMS[robot], KITCHENS[kitchen]
     model = Model()
     with model.edit() as edit:

@@ -26,7 +26,6 @@ PR2 = ("pr2_description/robots/pr2.urdf", "pr2_description/urdf/pr2.urdf", "pr2"
 """A real PR2 from the model path or from example-robot-data, else the one that ships."""
 
 GRIPPER = "r_gripper_tool_frame"
-
 _ONE_COORDINATE = ("fixed", "revolute", "continuous", "prismatic")
 
 
@@ -175,8 +174,6 @@ _WALK_STEP, _WALK_RANGE = 0.003, 0.3
 
 @dataclass(frozen=True)
 class KitchenRobot:
-    """Robot in a kitchen."""
-
     name: str
     model: Model  # model of both, with the prefixes ``robot`` and ``kitchen``
     # values of ``scene().inputs``, (steps, n) [m], [rad]: a random walk of all joints of the robot

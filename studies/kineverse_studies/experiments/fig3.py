@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 
 OPTIONS = ()
-
 LENGTH = 2.0
 PARTS = {"A": 0.0, "25 %": 0.25, "50 %": 0.5, "75 %": 0.75, "B": 1.0}
 """Points along the door by name, from the lower edge A to the upper edge B, as fractions of its length."""

@@ -13,8 +13,7 @@ from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
 from .report import Report
 
-WORLDS, BOTH = ("kinematic", "mujoco"), "both"
-"""Worlds of trials, and the option for all of them."""
+WORLDS, BOTH = ("kinematic", "mujoco"), "both"  # worlds of trials, and the option for all of them
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,6 @@ class Options:
 
 
 Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]
-
 EXPERIMENTS: Mapping[str, str] = MappingProxyType(
     {
         "fig3": "the garage door and its lock (2022 paper, Fig. 3 and Eqs. 11-13)",

@@ -23,7 +23,7 @@ from kineverse.estimation.plausibility.correlation import CorrelationSettings
 from kineverse.estimation.plausibility.known_motion import KnownJoint
 from kineverse.estimation.plausibility.known_residuals import compute_residuals
 from kineverse.lie import exp_so3
-from kineverse_studies.experiments.stream.observations import (
+from kineverse_studies.experiments.stream import (
     DOOR,
     FRAMES,
     ORIENTATION,

@@ -7,8 +7,7 @@ import pytest
 
 from kineverse.geometry import Scene
 from kineverse_studies.bench import DisagreementError, run_benchmarks
-from kineverse_studies.bench.clutter import RADIUS, RULES, make_clutter
-from kineverse_studies.bench.measure_geometry import SearchEntry, check_distances
+from kineverse_studies.bench.geometry import RADIUS, RULES, SearchEntry, check_distances, make_clutter
 from kineverse_studies.bench.peers.clutter_search import (
     CoalSearch,
     KineverseSearch,

@@ -10,12 +10,19 @@ import pytest
 
 import kineverse as kv
 from kineverse_studies.bench import measure_control, run_benchmarks
+from kineverse_studies.bench.control import (
+    DOOR,
+    OPENING,
+    PERIOD,
+    STEPS,
+    ControllerLoop,
+    TimedLoop,
+    make_opening,
+    peer_workload,
+)
 from kineverse_studies.bench.control_workloads import WORKLOADS, export_urdf
-from kineverse_studies.bench.controller_loop import ControllerLoop
+from kineverse_studies.bench.examples import EXAMPLES, make_example_loop
 from kineverse_studies.bench.harness import Contender
-from kineverse_studies.bench.measure_examples import EXAMPLES, make_example_loop
-from kineverse_studies.bench.opening import DOOR, OPENING, PERIOD, STEPS, make_opening, peer_workload
-from kineverse_studies.bench.timed_loop import TimedLoop
 
 pytest.importorskip("daqp")
 
@@ -33,9 +40,9 @@ def urdf_written_once(monkeypatch):
 def peer_loop(library, name, workload=None):
     pytest.importorskip(library)
     if library == "pink":
-        from kineverse_studies.bench.peers.pink_control import make_pink_loop as make
+        from kineverse_studies.bench.peers.pink import make_pink_loop as make
     else:
-        from kineverse_studies.bench.peers.mink_control import make_mink_loop as make
+        from kineverse_studies.bench.peers.mink import make_mink_loop as make
     return make(name, workload)
 
 

@@ -11,13 +11,22 @@ from kineverse.errors import UnknownNameError
 from kineverse.geometry import Scene
 from kineverse.spatial import rotation_z, translation
 from kineverse_studies.bench import kitchen_queries, measure_planning
-from kineverse_studies.bench.configuration_check import ConfigurationCheck, interpolate_path
 from kineverse_studies.bench.held_planning import HeldResults
-from kineverse_studies.bench.kitchen_planning import KitchenResults, run_kitchen_queries
 from kineverse_studies.bench.kitchen_queries import CLEARANCE, make_kitchen_arm
-from kineverse_studies.bench.planning_attempts import Attempt, AttemptSummary
-from kineverse_studies.bench.planning_problems import load_problem_sets
-from kineverse_studies.bench.published_planning import FIGURES, compare_with_vamp, run_published_problems
+from kineverse_studies.bench.planning import (
+    FIGURES,
+    KitchenResults,
+    compare_with_vamp,
+    run_kitchen_queries,
+    run_published_problems,
+)
+from kineverse_studies.bench.planning_problems import (
+    Attempt,
+    AttemptSummary,
+    ConfigurationCheck,
+    interpolate_path,
+    load_problem_sets,
+)
 
 PAIR = ("lift", "posts")
 
@@ -164,7 +173,7 @@ def test_paths_of_queries_are_checked(posts, tiny):
 
 def test_ompl_finds_a_way_around_an_obstacle():
     pytest.importorskip("ompl")
-    from kineverse_studies.bench.peers.ompl_rrt_connect import OmplRrtConnect
+    from kineverse_studies.bench.peers.ompl import OmplRrtConnect
 
     def free(q):
         return abs(q[0]) > 0.2 or q[1] > 0.5

@@ -9,21 +9,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from kineverse_studies.experiments.estimation_grid.cramer_rao import (
-    compute_attainable_bound,
-    compute_bound,
-    orthonormal_complement,
-)
-from kineverse_studies.experiments.estimation_grid.fits import (
+from kineverse_studies.experiments.estimation_grid import (
     SAMPLES,
+    CellResult,
     fit_all,
     fit_cell,
     make_grid,
     make_quick_grid,
+    report_grid,
+    summarize_cells,
 )
-from kineverse_studies.experiments.estimation_grid.report import report_grid
-from kineverse_studies.experiments.estimation_grid.results import CellResult, summarize_cells
-from kineverse_studies.experiments.estimation_grid.samples import LEVER, TO_AXIS, Cell, draw_samples
+from kineverse_studies.experiments.estimation_grid.cramer_rao import (
+    LEVER,
+    TO_AXIS,
+    Cell,
+    compute_attainable_bound,
+    compute_bound,
+    draw_samples,
+    orthonormal_complement,
+)
 
 DEG = np.pi / 180
 CELLS = [

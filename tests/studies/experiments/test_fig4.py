@@ -15,9 +15,13 @@ import kineverse as kv
 from kineverse.cli import main
 from kineverse.errors import ModelError
 from kineverse_studies.experiments import Options, fig4, reproduce
-from kineverse_studies.experiments.fig4.accuracy import REPORTED_MEAN, simulate_observations
-from kineverse_studies.experiments.fig4.consistency import _evaluate_consistency, cramer_rao
-from kineverse_studies.experiments.fig4.mechanisms import _coordinate_errors
+from kineverse_studies.experiments.fig4.accuracy import (
+    REPORTED_MEAN,
+    _coordinate_errors,
+    _evaluate_consistency,
+    cramer_rao,
+    simulate_observations,
+)
 from kineverse_studies.experiments.fig4.protocol import (
     LEVELS,
     FilterRun,

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from kineverse.lie import inverse, rotation_angle
-from kineverse_studies.experiments.joint_types import report
-from kineverse_studies.experiments.joint_types.answers import SETTINGS, identify_cases
-from kineverse_studies.experiments.joint_types.samples import (
+from kineverse_studies.experiments.joint_types import (
     COUNTS,
     LEVERS,
     MOVING,
     POSITIONS,
     RANGES,
+    SETTINGS,
     draw_case,
+    identify_cases,
+    report,
 )
 
 

@@ -20,13 +20,16 @@ from kineverse_studies.experiments.lockbox import (
     list_explorer_jobs,
     list_planner_jobs,
     make_lockbox_report,
+    record_thesis_box,
     run_explorer,
     run_planner,
 )
-from kineverse_studies.experiments.lockbox.exhaustive_search import can_be_opened
-from kineverse_studies.experiments.lockbox.recordings import record_thesis_box
-from kineverse_studies.experiments.lockbox.systematic_search import count_systematic_tries
-from kineverse_studies.experiments.lockbox.unknown_locks import list_unknown_jobs, run_unknown
+from kineverse_studies.experiments.lockbox.unknown_locks import (
+    can_be_opened,
+    count_systematic_tries,
+    list_unknown_jobs,
+    run_unknown,
+)
 from kineverse_studies.experiments.lockbox.unlocking_runs import LOCK_RULES, run_unlocking
 
 

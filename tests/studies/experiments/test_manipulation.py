@@ -18,23 +18,35 @@ from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.start_state import find_free_state
 from kineverse.worlds import read_run_recording
 from kineverse_studies.commands.reproduce import format_report
+from kineverse_studies.execution import run_jobs
 from kineverse_studies.experiments import Options, kitchens, reproduce, table1_open, table1_push
 from kineverse_studies.experiments.lockbox.unlocking_runs import RULES, run_unlocking
 from kineverse_studies.experiments.manipulation import setting, skills
 from kineverse_studies.experiments.manipulation.film import draw_vectors, find_telling_moment
-from kineverse_studies.experiments.manipulation.robots import check_data, find_robots
-from kineverse_studies.experiments.manipulation.setting import (
+from kineverse_studies.experiments.manipulation.skills import (
     TrialSetting,
     TrialWatch,
+    check_data,
+    find_robots,
     list_series,
     make_settings,
 )
-from kineverse_studies.experiments.manipulation.tables import make_exception_table, make_trial_tables
-from kineverse_studies.experiments.manipulation.trial_pool import run_jobs
-from kineverse_studies.experiments.manipulation.trials import Moment, Trial, count_objects, find_failure
-from kineverse_studies.experiments.table1_open.objects import OBJECTS, make_opening_setup
-from kineverse_studies.experiments.table1_open.programs import LeaderFollower, SpeedScale, open_by_program
-from kineverse_studies.experiments.table1_push.objects import find_kitchens, make_push_setup
+from kineverse_studies.experiments.manipulation.trials import (
+    Moment,
+    Trial,
+    count_objects,
+    find_failure,
+    make_exception_table,
+    make_trial_tables,
+)
+from kineverse_studies.experiments.table1_open.programs import (
+    OBJECTS,
+    LeaderFollower,
+    SpeedScale,
+    make_opening_setup,
+    open_by_program,
+)
+from kineverse_studies.experiments.table1_push import find_kitchens, make_push_setup
 
 
 def _trial(what, failure="", *, skill="open", placements=0, case="7", cpu=()):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse_studies.experiments.stream.monitoring import PERIOD, measure_monitoring, repeated_motion
+from kineverse_studies.experiments.stream import PERIOD, measure_monitoring, repeated_motion
 
 
 def test_repeated_motion_is_smooth() -> None:

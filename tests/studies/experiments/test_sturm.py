@@ -13,23 +13,19 @@ from kineverse.errors import FormatError
 from kineverse.estimation.identification.solver import solver
 from kineverse.estimation.recordings import RecordedPair
 from kineverse_studies.experiments import Options, reproduce
-from kineverse_studies.experiments.sturm.classify import (
+from kineverse_studies.experiments.sturm import (
+    POSITION,
+    STATEMENTS,
+    THINNED,
+    LabelledRecording,
+    answer_statements,
     classify_recording,
     draw_recordings,
     figure_size,
+    read_labelled_recordings,
     report_recordings,
-)
-from kineverse_studies.experiments.sturm.noise_statements import (
-    STATEMENTS,
-    answer_statements,
     statement_numbers,
     statement_table,
-)
-from kineverse_studies.experiments.sturm.recordings import (
-    POSITION,
-    THINNED,
-    LabelledRecording,
-    read_labelled_recordings,
 )
 
 RNG = np.random.default_rng(0)

@@ -6,7 +6,7 @@ import itertools
 from typing import Any
 
 from kineverse.lie import Array, to_quaternion
-from kineverse_studies.bench.clutter import (
+from kineverse_studies.bench.geometry import (
     BOX_SIZE,
     CAPSULE_SIZE,
     CENTRE,
@@ -18,8 +18,7 @@ from kineverse_studies.bench.clutter import (
 
 from .clutter_search import PairDistances
 
-_LINKS_PER_BODY = 100
-"""Number of boxes in one body, as Bullet limits the number of links."""
+_LINKS_PER_BODY = 100  # number of boxes in one body, as Bullet limits the number of links
 
 
 class BulletSearch:
@@ -45,7 +44,6 @@ class BulletSearch:
         self.results: list[Any] = []
 
     def update(self, angles: Array) -> None:
-        """Set the joint angles."""
         rows = angles[:, None].tolist()
         self._bullet.resetJointStatesMultiDof(
             self._arm, self._joints, targetValues=rows, physicsClientId=self._client

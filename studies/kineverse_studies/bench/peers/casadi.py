@@ -57,13 +57,10 @@ class BoundMap:
             self._buffer.set_res(k, output.reshape(-1).data)
 
     def __call__(self) -> None:
-        """Evaluate at all points."""
         self._run()
 
 
-CHUNK_SIZE = 1024
-"""Number of points of a chunk: columns stay in the cache, and numpy's overhead is small."""
-
+CHUNK_SIZE = 1024  # number of points of a chunk: columns stay in the cache, and numpy's overhead is small
 NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = MappingProxyType(
     {
         ca.OP_ADD: np.add,

@@ -12,7 +12,7 @@ from kineverse.geometry import Scene
 from kineverse.geometry.shapes import import_coal
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
-from kineverse_studies.bench.clutter import (
+from kineverse_studies.bench.geometry import (
     BOX_SIZE,
     CAPSULE_SIZE,
     CENTRE,
@@ -230,5 +230,4 @@ UNIT_BOX_CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
 
 
 def format_mjcf_numbers(numbers: Any) -> str:
-    """Return numbers as an MJCF attribute."""
     return " ".join(map(repr, np.asarray(numbers, dtype=float).ravel().tolist()))

@@ -12,8 +12,6 @@ from kineverse_studies.bench.workloads import BenchmarkRobot
 
 
 class PinocchioRobot:
-    """Robot in pinocchio."""
-
     def __init__(self, robot: BenchmarkRobot, reduced: bool = False) -> None:
         model = pin.buildModelFromUrdf(str(robot.file))
         moving = [symbol.path for symbol in robot.chain]

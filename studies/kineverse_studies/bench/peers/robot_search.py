@@ -11,7 +11,7 @@ from kineverse.geometry.shapes import Solid
 from kineverse.lie import Array
 from kineverse.model.body import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from kineverse.view.poses import to_wxyz
-from kineverse_studies.bench.clutter import RADIUS
+from kineverse_studies.bench.geometry import RADIUS
 
 from .bullet import create_static_bodies, xyzw_quaternions
 from .clutter_search import UNIT_BOX_CORNERS, MujocoSearch, PairDistances, format_mjcf_numbers, make_mjcf
@@ -38,7 +38,6 @@ class RobotSurroundings:
         return self._world.table.poses[objects]
 
     def solid(self, index: int) -> Solid:
-        """Return the solid of an object."""
         return self._world.solid(index)
 
 

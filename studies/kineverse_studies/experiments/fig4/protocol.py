@@ -1,40 +1,40 @@
-"""Protocol of the papers: observed frames, noise, and runs of both filters."""
+"""Protocol of the papers: observed frames, noise, runs of both filters, and their times."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from time import process_time
 from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._gc import no_collection
 from kineverse.compile import CompiledFunction, compile  # noqa: A004
 from kineverse.errors import ModelError
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.lie import Array, exp_so3, retract, transform
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
-from kineverse_studies.experiments.fig4.paper_ekf import SPREAD, STEPS, PaperEkf
+from kineverse_studies.experiments.registry import Progress
+
+from .accuracy import simulate_observations
+from .paper_ekf import SPREAD, STEPS, PaperEkf
 
 Generator: TypeAlias = np.random.Generator
-
-DT = 0.05
-"""Time between two observations [s]."""
+DT = 0.05  # time between two observations [s]
 OBSERVATIONS = 25
 CONFIGURATIONS = 300
-TRAINING = 400
-"""Number of noisy observations of one configuration from which the papers' filter estimates R."""
-SHIFTING_FIRST = 7
-"""Number of drawers before the first door in the papers' order."""
+TRAINING = 400  # number of noisy observations of one configuration from which the papers' filter estimates R
+SHIFTING_FIRST = 7  # number of drawers before the first door in the papers' order
 
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Noise of a pose."""
-
     position: float
     orientation: float
 
@@ -172,12 +172,9 @@ def run_published(
 
 
 def make_tracker(scene: ObservedModel, noise: PoseNoise) -> Tracker:
-    """Return the tracker of a scene, for noise on each axis."""
     covariance = pose_covariance(noise.position, noise.orientation)
     return Tracker(
-        scene.model,
-        [ObservedPose(frame, covariance=covariance) for frame in scene.frames],
-        process="static",
+        scene.model, [ObservedPose(frame, covariance=covariance) for frame in scene.frames], process="static"
     )
 
 
@@ -196,3 +193,85 @@ def run_proper(scene: ObservedModel, observations: Array, noise: PoseNoise) -> F
         q.append([estimate.state[s] for s in scene.symbols])
         variance.append([estimate.deviation[s] ** 2 for s in scene.symbols])
     return FilterRun(np.array(q), np.array(variance), nis, dof)
+
+
+Step: TypeAlias = Callable[[Array], None]
+REPORTED = 4.0  # upper bound of the times in the papers, with 23 degrees of freedom [ms]
+
+
+@dataclass(frozen=True)
+class Duration:
+    """Mean, standard deviation and median of processor times [ms], and number of updates.
+
+    The papers plot mean and deviation.
+    """
+
+    mean: float
+    sd: float
+    median: float
+    updates: int
+
+
+def time_updates_by_size(
+    scene: ObservedModel, configurations: int, progress: Progress
+) -> list[tuple[int, dict[str, Duration]]]:
+    """Return degrees of freedom and times for the first group, the first two groups, and so on."""
+    times = []
+    for groups in progress(range(1, len(scene.sizes) + 1), "fig4: time", "size"):
+        part = scene.first(groups)
+        times.append((len(part.symbols), time_updates(part, LEVELS[-1], configurations)))
+    return times
+
+
+def time_updates(scene: ObservedModel, noise: PoseNoise, configurations: int) -> dict[str, Duration]:
+    """Return the times of both filters for all updates except the first."""
+    _, observations, training = simulate_observations(scene, noise, 0, configurations)
+    published = PaperEkf(scene.model, scene.frames)
+    published.learn_noise(training)
+    published.function.wait()
+    initial = make_tracker(scene, noise.on_axes)
+    initial.wait()
+
+    def start_published() -> Step:
+        published.reset()
+
+        def step(poses: Array) -> None:
+            published.predict(DT)
+            published.update(poses)
+
+        return step
+
+    def start_tracker() -> Step:
+        tracker = copy(initial)
+
+        def step(poses: Array) -> None:
+            tracker.predict(DT)
+            tracker.update_poses(poses)
+
+        return step
+
+    return {
+        "published": _time_steps(start_published, observations),
+        "proper": _time_steps(start_tracker, observations),
+    }
+
+
+def _time_steps(start: Callable[[], Step], observations: Array) -> Duration:
+    """Time steps on observations (K, C, m, 4, 4); the first of each configuration is not counted."""
+    _run_step(start(), observations[:, 0])  # fills caches
+    with no_collection():
+        times = [t for c in range(observations.shape[1]) for t in _run_step(start(), observations[:, c])]
+    milliseconds = 1e3 * np.array(times)
+    return Duration(
+        float(milliseconds.mean()), float(milliseconds.std()), float(np.median(milliseconds)), len(times)
+    )
+
+
+def _run_step(step: Step, observations: Array) -> list[float]:
+    step(observations[0])
+    times = []
+    for poses in observations[1:]:
+        before = process_time()
+        step(poses)
+        times.append(process_time() - before)
+    return times

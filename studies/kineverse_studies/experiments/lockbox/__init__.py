@@ -6,8 +6,10 @@ The boxes are that of the thesis behind the 2020 paper, random ones, and the Chi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from time import process_time
 from typing import Literal, TypeAlias
 
@@ -20,36 +22,60 @@ from kineverse.gallery.lockboxes import (
     draw_tangled_lockbox,
     make_lockbox_model,
     make_rings,
+    remove_locks,
 )
+from kineverse.manipulation import PartMover, Session, execute_unlocking, explore_locks
 from kineverse.reasoning import interlocks, plan_unlocking, plan_violations
 from kineverse.view.plots import Figure
-from kineverse_studies.experiments.manipulation.trial_pool import run_jobs
+from kineverse.worlds import MechanismWorld, Recorder
+from kineverse_studies.execution import run_jobs
+from kineverse_studies.experiments.manipulation.skills import make_record_folder
 from kineverse_studies.experiments.registry import Options, Progress
 from kineverse_studies.experiments.report import Report, ReportTable
 
-from .exhaustive_search import can_be_opened
-from .figure import FIGURE_SIZE, draw_boxes
-from .recordings import record_thesis_box
 from .unknown_locks import (
     UnknownLockResult,
+    can_be_opened,
     list_unknown_jobs,
     list_unknown_numbers,
     make_unknown_table,
     run_unknown,
 )
-from .unlocking_runs import LOCK_RULES, Rule, UnlockingRun, run_unlocking
+from .unlocking_runs import FIGURE_SIZE, LOCK_RULES, Rule, UnlockingRun, draw_boxes, run_unlocking
+
+_DT = 0.05
+
+
+def record_thesis_box(folder: Path) -> None:
+    """Record how the lockbox of the thesis is opened, a file for each of the three ways."""
+    make_record_folder(folder)
+    with _start(folder, "trends") as (_, recorder):
+        run = run_unlocking(THESIS, recorder=recorder)
+        recorder.write_outcome({"done": run.done, "reason": f"{run.steps} steps"})
+    with _start(folder, "plan") as (world, recorder):
+        recorder.write_outcome(execute_unlocking(world, THESIS.goal, on_step=recorder).as_data())
+    with _start(folder, "unknown-locks") as (world, recorder):
+        model = make_lockbox_model(remove_locks(THESIS), None)
+        mover = PartMover(model.snapshot(), Session(world, dt=_DT, on_step=recorder))
+        done = explore_locks(model, THESIS.goal, mover.move)
+        recorder.write_outcome({"done": done.done, "reason": f"{len(done.tries)} tries"})
+
+
+@contextmanager
+def _start(folder: Path, name: str) -> Iterator[tuple[MechanismWorld, Recorder]]:
+    world = MechanismWorld(make_lockbox_model(THESIS, None))
+    with Recorder(folder / f"thesis-{name}.mcap", world.model, {"box": "thesis", "by": name}) as recorder:
+        yield world, recorder
+
 
 OPTIONS = ("quick", "seed", "count", "processes", "record")
-
 COUNT, QUICK_COUNT = 1000, 4
 """Number of random boxes without negations; half as many have some, a tenth is for each ablation."""
 NEGATED = 0.25
 _STEPS_A_PART = 40
 _LARGEST, _LARGEST_NEGATED = 100, 40
 _ABLATED = (10, 40)
-_SMALL = 7
-"""Largest number of parts of boxes on which plans are compared with exhaustive search."""
-
+_SMALL = 7  # largest number of parts of boxes on which plans are compared with exhaustive search
 Kind: TypeAlias = Literal["monotone", "negated", "tangled", "rings"]
 KINDS: dict[Kind, str] = {
     "monotone": "& and |",
@@ -201,7 +227,6 @@ def make_lockbox_report(
     unknown: Sequence[UnknownLockResult],
     seed: int,
 ) -> Report:
-    """Return the report on explorer, planner and unknown locks."""
     groups: dict[tuple[Rule, bool], list[ExplorerResult]] = {}
     for one in explored:
         groups.setdefault((one.job.rule, bool(one.job.negated)), []).append(one)
@@ -284,7 +309,6 @@ def _format_parts(parts: Iterable[int]) -> str:
 
 
 def make_planner_table(plans: dict[Kind, list[PlannerResult]]) -> ReportTable:
-    """Return the table of plans by kind of box."""
     rows: list[tuple[float | str, ...]] = []
     for kind, own in plans.items():
         counts = [sum(p.verdict == v for p in own) for v in ("found", "refuted", "undecided")]

@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import and_, mul
 from time import thread_time
 from types import MappingProxyType
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
 
 from kineverse.control import Controller, unlock
 from kineverse.gallery.lockboxes import Lockbox, make_lockbox_model
 from kineverse.symbols import position
 from kineverse.worlds import Recorder
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
 Rule: TypeAlias = Literal["and", "product", "none", "undemanded"]
 RULES: Mapping[Rule, str] = MappingProxyType(
-    {
-        "and": "trends of & and |",
-        "product": "product rule",
-        "none": "exact gradients alone",
-    }
+    {"and": "trends of & and |", "product": "product rule", "none": "exact gradients alone"}
 )
 """Rules of trends, with their names in tables."""
 LOCK_RULES: Mapping[Rule, str] = MappingProxyType({**RULES, "undemanded": "trends without demand"})
 """Rules for locks: also the pursuit of all locks, whether or not something needs them."""
 
-DT, STEPS = 0.19, 200
-"""Control period [s] and largest number of steps (thesis)."""
+DT, STEPS = 0.19, 200  # control period [s] and largest number of steps (thesis)
 _REACHED = 0.01
 _BEGUN = 0.1
 
@@ -72,3 +72,34 @@ def run_unlocking(
         begun = (name for name, part in box.parts.items() if state[q[name]] > _BEGUN * min(part.upper, 1.2))
         order.update(dict.fromkeys(begun))
     return UnlockingRun(False, steps, tuple(order), tuple(cpu))
+
+
+FIGURE_SIZE = (9.0, 3.5)
+_COLORS: Mapping[Rule, str] = {
+    "and": "tab:blue",
+    "product": "tab:orange",
+    "none": "0.5",
+    "undemanded": "tab:green",
+}
+
+
+def draw_boxes(canvas: Canvas, boxes: Mapping[tuple[Rule, int], Sequence[UnlockingRun]]) -> None:
+    """Draw the share of opened boxes over the number of steps, a panel for each number of parts."""
+    longest = 1.1 * max((run.steps for own in boxes.values() for run in own if run.done), default=1)
+    parts = list(dict.fromkeys(count for _, count in boxes))
+    panels = np.atleast_1d(canvas.subplots(1, len(parts), sharey=True))
+    for axes, count in zip(panels, parts, strict=True):
+        for rule, name in LOCK_RULES.items():
+            own = boxes.get((rule, count))
+            if not own:
+                continue
+            steps = sorted(run.steps for run in own if run.done)
+            share = np.arange(len(steps) + 1) / len(own)
+            axes.step(
+                [0, *steps, longest], [*share, share[-1]], where="post", color=_COLORS[rule], label=name
+            )
+        axes.set_title(f"boxes of {count} parts")
+        axes.set_xlabel("steps")
+        axes.set_ylim(-0.02, 1.02)
+    panels[0].set_ylabel("share opened")
+    panels[0].legend(loc="center right", frameon=False)

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
 _DIRECTIONS, _ELEVATIONS = 16, (0.3, 0.55)
 _TRIAL_HEIGHT = 60
-_NEAREST = 0.035
-"""Distance within which a push has nearest points [m]."""
+_NEAREST = 0.035  # distance within which a push has nearest points [m]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,234 @@
+"""Benchmarks of estimation: ``tracking`` and ``identification``."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.estimation import Identifier, ObservedPose, Tracker, identify, pose_covariance
+from kineverse.estimation.identification.solver import solver
+from kineverse.formats import load
+from kineverse.lie import Array, exp_so3, inverse, log_so3, pose_difference, retract, transform, translation
+from kineverse.model.model import Model
+
+from .harness import (
+    BenchmarkResult,
+    BenchmarkSettings,
+    Contender,
+    Contenders,
+    bound_median,
+    compare_speed,
+    time_calls,
+    time_contenders,
+)
+from .peers.numpy_filter import Form, NumpyFilter
+
+ARRAY, MAPPING = "kineverse, poses as one array", "kineverse, poses by frame"
+GAIN, INFORMATION = "numpy, textbook gain", "numpy, information form"
+POSITION, ORIENTATION = 0.01, math.radians(1.0)
+LONGEST = 1e-4  # target time of an update [s]; the papers report 4 ms
+_UPDATES = 25
+# Number of updates compared, and done with the textbook gain, which takes a hundred times as long.
+_CHECKED = 3
+
+
+def measure_tracking(settings: BenchmarkSettings) -> BenchmarkResult:
+    """Measure updates of a tracker beside filters written in numpy."""
+    model = load("kitchen")
+    frames = [name for name in model.frames if model.speeds_of(name)]
+    readings = _readings(model, frames, min(_UPDATES, settings.configurations))
+    covariance = pose_covariance(POSITION, ORIENTATION)
+    participants = Contenders(
+        [
+            *_track_with_kineverse(model, frames, covariance, readings),
+            *_track_with_numpy(model, frames, covariance, readings),
+        ]
+    )
+    measured = time_contenders("tracking", participants.contenders, settings.rounds, settings.progress)
+    return BenchmarkResult(
+        name="tracking",
+        work=(
+            f"an update of the {len(model.degrees_of_freedom)} coordinates of the shipped kitchen from the "
+            f"poses of {len(frames)} frames, iterated until it stands still; mean of {len(readings)} in "
+            f"a row, with the textbook gain of the first {len(readings[:_CHECKED])}"
+        ),
+        measurements=tuple(measured.values()),
+        comparisons=(
+            bound_median(measured[ARRAY], LONGEST),
+            bound_median(measured[MAPPING], 3 * LONGEST),
+            compare_speed(measured, ARRAY, INFORMATION),
+            compare_speed(measured, ARRAY, GAIN),
+        ),
+    )
+
+
+def _readings(model: Model, frames: list[str], count: int) -> list[Array]:
+    """Return noisy poses of a kitchen whose coordinates are so far from limits that these have no effect."""
+    rng = np.random.default_rng(0)
+    symbols = model.degrees_of_freedom
+    low, high = np.array([model.limits(s) for s in symbols]).T
+    truth = low + rng.uniform(0.4, 0.6, len(symbols)) * (high - low)
+    poses = np.array(compile([model.fk(f) for f in frames], symbols)(truth))
+    return [_noisy_poses(poses, rng) for _ in range(count)]
+
+
+def _noisy_poses(poses: Array, rng: np.random.Generator) -> Array:
+    moved = POSITION * rng.standard_normal((len(poses), 3))
+    turned = ORIENTATION * rng.standard_normal((len(poses), 3))
+    return retract(poses, np.concatenate([moved, turned], axis=1))
+
+
+def _track_with_kineverse(
+    model: Model, frames: list[str], covariance: Array, readings: list[Array]
+) -> Iterator[Contender]:
+    first = Tracker(model, [ObservedPose(f, covariance=covariance) for f in frames])
+    first.wait()
+    mappings = [dict(zip(frames, seen, strict=True)) for seen in readings]
+
+    def by_array() -> None:
+        tracker = first.copy()
+        for seen in readings:
+            tracker.update_poses(seen)
+
+    def by_frame() -> None:
+        tracker = first.copy()
+        for seen in mappings:
+            tracker.update(seen)
+
+    def results() -> list[Array]:
+        tracker = first.copy()
+        estimates = [tracker.update_poses(seen) for seen in readings[:_CHECKED]]
+        states = np.array([[e.state[s] for s in tracker.symbols] for e in estimates])
+        return [states, np.array([np.diag(e.covariance) for e in estimates])]
+
+    yield Contender(ARRAY, time_calls(by_array, len(readings)), results)
+    yield Contender(MAPPING, time_calls(by_frame, len(readings)), results)
+
+
+def _track_with_numpy(
+    model: Model, frames: list[str], covariance: Array, readings: list[Array]
+) -> Iterator[Contender]:
+    low, high = np.array([model.limits(s) for s in model.degrees_of_freedom]).T
+    forms: tuple[tuple[str, Form, int], ...] = (
+        (GAIN, "gain", _CHECKED),
+        (INFORMATION, "information", len(readings)),
+    )
+    for name, form, count in forms:
+        other = NumpyFilter(model, frames, covariance, (low + high) / 2, (high - low) ** 2 / 4, form)
+        some = readings[:count]
+
+        def results(other: NumpyFilter = other) -> list[Array]:
+            found = other.run(readings[:_CHECKED])
+            return [np.array([x for x, _ in found]), np.array([np.diag(P) for _, P in found])]
+
+        def run(other: NumpyFilter = other, some: list[Array] = some) -> None:
+            other.run(some)
+
+        yield Contender(name, time_calls(run, len(some)), results)
+
+
+ALL = "kineverse, all families"
+HINGE = "kineverse, a hinge alone"
+ONE = "kineverse, one new pose"
+SCIPY = "scipy least_squares, a hinge with all true poses as unknowns"
+RIPL = "ripl-articulation, one joint"
+_COUNT = 20
+_POSITION, _ORIENTATION = 0.03, math.radians(3.0)
+_RANGE = math.pi / 2
+
+
+def measure_identification(settings: BenchmarkSettings) -> BenchmarkResult:
+    """Measure the identification of a hinge observed over a right angle."""
+    solver.prepare(wait=True)
+    parents, children = _recording()
+    participants = Contenders([*_identify_with_kineverse(parents, children)])
+    for module, peer in (("scipy", _identify_with_scipy), ("ripl_articulation", _identify_with_ripl)):
+        participants.add_peer(module, lambda peer=peer: [peer(parents, children)])  # type: ignore[misc]
+    measured = time_contenders("identification", participants.contenders, settings.rounds, settings.progress)
+    return BenchmarkResult(
+        name="identification",
+        work=(
+            f"a hinge over 90° from {_COUNT} poses of both parts with errors of 3 cm and 3°; scipy and "
+            "ripl-articulation solve for one joint and do not weigh it against others"
+        ),
+        measurements=tuple(measured.values()),
+        comparisons=(bound_median(measured[ALL], 5e-3), bound_median(measured[ONE], 1e-3)),
+        missing=tuple(participants.missing),
+    )
+
+
+def _recording() -> tuple[Array, Array]:
+    """Return noisy poses of parent and child, one more than the batch uses."""
+    random = np.random.default_rng(0)
+    count = _COUNT + 1
+    angles = random.uniform(-_RANGE / 2, _RANGE / 2, count)
+    turns = exp_so3(angles[:, None] * (0.0, 0.0, 1.0))
+    hinge = transform(exp_so3(np.array([0.3, -0.2, 0.1])), np.array([0.5, 0.0, 0.0]))
+    relative = hinge @ transform(turns, np.zeros((count, 3))) @ translation(np.array([0.4, 0.0, 0.0]))
+    parents = transform(exp_so3(random.normal(0.0, 1.0, (count, 3))), random.uniform(-1.0, 1.0, (count, 3)))
+    return _noisy_parts(parents, random), _noisy_parts(parents @ relative, random)
+
+
+def _noisy_parts(poses: Array, random: np.random.Generator) -> Array:
+    turned = random.normal(0.0, _ORIENTATION, (len(poses), 3))
+    moved = random.normal(0.0, _POSITION, (len(poses), 3))
+    return retract(poses, np.concatenate([moved, turned], axis=1))
+
+
+def _identify_with_kineverse(parents: Array, children: Array) -> Iterator[Contender]:
+    noise = pose_covariance(_POSITION, _ORIENTATION)
+    a, b = parents[:_COUNT], children[:_COUNT]
+    yield Contender(ALL, time_calls(lambda: identify(a, b, noise=noise)))
+    yield Contender(HINGE, time_calls(lambda: identify(a, b, noise=noise, families=["revolute"])))
+
+    def make_identifier() -> Identifier:
+        identifier = Identifier(noise=noise)
+        for parent, child in zip(a, b, strict=True):
+            identifier.add(parent, child)
+        assert identifier.result
+        return identifier
+
+    def add_pose(identifier: Identifier) -> None:
+        identifier.add(parents[_COUNT], children[_COUNT])
+        assert identifier.result
+
+    yield Contender(ONE, time_calls(add_pose, prepare=make_identifier))
+
+
+def _identify_with_scipy(parents: Array, children: Array) -> Contender:
+    """Return the fit with scipy; unknowns are the frames on both sides, the angles and the true poses."""
+    optimize: Any = importlib.import_module("scipy.optimize")
+    a, b = parents[:_COUNT], children[:_COUNT]
+    scale = np.array([1.0 / _POSITION] * 3 + [1.0 / _ORIENTATION] * 3)
+    start = identify(a, b, noise=pose_covariance(_POSITION, _ORIENTATION), families=["revolute"]).best
+
+    def weighted_difference(measured: Array, true: Array) -> Array:
+        weighted: Array = pose_difference(measured, true) * scale
+        return weighted
+
+    def errors(unknown: Array) -> Array:
+        left = transform(exp_so3(unknown[:3]), unknown[3:6])
+        right = transform(exp_so3(unknown[6:9]), unknown[9:12])
+        turns = exp_so3(unknown[12 : 12 + _COUNT, None] * (0.0, 0.0, 1.0))
+        moved = unknown[12 + _COUNT :].reshape(_COUNT, 6)
+        true = retract(a, moved)
+        child = true @ left @ transform(turns, np.zeros((_COUNT, 3))) @ right
+        return np.concatenate([weighted_difference(a, true), weighted_difference(b, child)]).ravel()
+
+    left, right = start.frame, inverse(start.frame) @ start.parameters["reference"]
+    sides = [np.concatenate([log_so3(side[:3, :3]), side[:3, 3]]) for side in (left, right)]
+    first = np.concatenate([*sides, start.joint_values[:, 0], np.zeros(6 * _COUNT)])
+    return Contender(SCIPY, time_calls(lambda: optimize.least_squares(errors, first, method="lm")))
+
+
+def _identify_with_ripl(parents: Array, children: Array) -> Contender:
+    peer: Any = importlib.import_module("ripl_articulation")
+    a, b = parents[:_COUNT], children[:_COUNT]
+    # It assumes that the parts coincide at joint value 0.
+    aligned = b @ inverse(inverse(a[0]) @ b[0])
+    return Contender(RIPL, time_calls(lambda: peer.solve_articulation_from_poses(a, aligned)))

@@ -1,0 +1,327 @@
+"""Benchmark ``geometry``: pairs within a radius with distances, points and normals, along a motion."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from kineverse.geometry import Rule, Scene
+from kineverse.geometry.bindings import collision_library
+from kineverse.lie import Array
+from kineverse.model.body import Body, Box, Capsule, Geometry, Mesh, Pose, Shape
+from kineverse.model.model import Model
+from kineverse.spatial import rotation_x, rotation_y, rotation_z, translation
+from kineverse.symbols import position
+
+from .harness import (
+    Bar,
+    BenchmarkResult,
+    BenchmarkSettings,
+    Comparison,
+    Contender,
+    Contenders,
+    Measurement,
+    bound_median,
+    check_equal,
+    compare_speed,
+    has_peer,
+    install_advice,
+    time_contenders,
+)
+from .peers.clutter_search import CoalSearch, KineverseSearch, MujocoPairSearch, MujocoSearch, ProximitySearch
+from .peers.robot_search import BulletRobotSearch, MujocoRobotSearch, RobotSurroundings
+from .workloads import KitchenRobot, make_kitchen_robot
+
+LINKS, RADIUS = 20, 0.1  # number of links of the arm, and radius of the queries [m]
+KINDS = ("hull", "box", "capsule")  # shapes of the links, in cyclic order
+LINK_LENGTH = 0.1
+CAPSULE_SIZE = 0.03, 0.06  # radius of a capsule, and distance between the centres of its ends [m]
+BOX_SIZE = 0.06, 0.07, 0.09  # edges of a link that is a box [m]
+
+# Least distances of the first boxes and of others from the middles of links, so that nothing touches [m].
+_CLEARANCE, _FAR = 0.12, 0.6
+_BOXES_NEAR_ARM = 60
+# Amplitude of each joint, in steps of about a tenth of it [rad].
+_STEP_ANGLE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Clutter:
+    """Arm of hulls, boxes and capsules that moves in small steps among static boxes."""
+
+    corners: list[Array]  # corners of each link's hull, (24, 3) [m]; used by every third link
+    sizes: Array  # edges of the boxes (N, 3) [m], and their poses (N, 4, 4)
+    poses: Array
+    angles: Array  # joint angles of the steps, (steps, 20) [rad]
+
+    def kind(self, link: int) -> str:
+        return KINDS[link % len(KINDS)]
+
+    def axis(self, link: int) -> tuple[int, int, int]:
+        """Return the axis of the joint of a link, at the end of the link before."""
+        return ((0, 0, 1), (0, 1, 0))[link % 2]
+
+    def model(self, folder: Path) -> Model:
+        """Return the model of arm and boxes; hulls are written to files in a folder."""
+        model = Model()
+        with model.edit() as edit:
+            parent = "world"
+            for link in range(LINKS):
+                turn = (rotation_z, rotation_y)[link % 2](position(f"joint{link:02}"))
+                there = translation(0, 0, LINK_LENGTH if link else 0.0) @ turn
+                edit.add_frame(f"link{link}", parent, there, _make_body(self._geometry(link, folder)))
+                parent = f"link{link}"
+            for k, (size, pose) in enumerate(zip(self.sizes.tolist(), self.poses, strict=True)):
+                edit.add_frame(f"box{k}", "world", pose, Body(collisions=(Shape(Box(tuple(size))),)))
+        return model
+
+    def _geometry(self, link: int, folder: Path) -> Geometry:
+        kind = self.kind(link)
+        if kind == "box":
+            return Box(BOX_SIZE)
+        if kind == "capsule":
+            return Capsule(*CAPSULE_SIZE)
+        corners = self.corners[link]
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in corners.tolist()]
+        lines += [f"f {k} {k + 1} {k + 2}" for k in range(1, len(corners) - 1)]
+        (folder / f"link{link}.obj").write_text("\n".join(lines), encoding="utf-8")
+        return Mesh(f"link{link}.obj", folder=str(folder))
+
+
+RULES = (Rule("link*", "link*", why="only boxes are of interest here"),)
+CENTRE = 0.0, 0.0, LINK_LENGTH / 2  # position of the centre of a link's shape in its frame [m]
+
+
+def make_clutter(boxes: int = _BOXES_NEAR_ARM, steps: int = 200, seed: int = 0) -> Clutter:
+    """Return an arm among boxes, the same for equal arguments.
+
+    The first 60 boxes stand along the arm. Others stand further away, with a density independent of their
+    number.
+    """
+    rng = np.random.default_rng(seed)
+    corners = [_round_to_float32(rng.normal(size=(24, 3)) * (0.02, 0.02, 0.028)) for _ in range(LINKS)]
+    home = rng.uniform(-0.35, 0.35, LINKS)
+    phases = rng.uniform(0, 2 * np.pi, LINKS) + np.outer(np.arange(steps), rng.uniform(0.05, 0.15, LINKS))
+    angles = home + _STEP_ANGLE * np.sin(phases)
+    arm, random = _link_centres(home), np.random.default_rng(seed + 1)
+    span = 1.0 + 0.2 * boxes ** (1 / 3)
+    sizes, poses = np.empty((boxes, 3)), np.empty((boxes, 4, 4))
+    for k in range(boxes):
+        clear = _CLEARANCE if k < _BOXES_NEAR_ARM else _FAR
+        while True:
+            size, (yaw, roll) = (
+                _round_to_float32(random.uniform(0.05, 0.2, 3)),
+                random.uniform(-3, 3, 2).tolist(),
+            )
+            pose = (rotation_z(yaw) @ rotation_x(roll))()
+            if k < _BOXES_NEAR_ARM:
+                offset = random.normal(size=3)
+                offset *= random.uniform(0.15, 0.28) / np.linalg.norm(offset)
+                pose[:3, 3] = arm[random.integers(LINKS)] + offset
+            else:
+                pose[:3, 3] = arm.mean(axis=0) + random.uniform(-span, span, 3)
+            if _clearance(arm, size, pose) > clear:
+                break
+        sizes[k], poses[k] = size, pose
+    return Clutter(corners, sizes, poses, angles)
+
+
+def _link_centres(angles: Array) -> Array:
+    """Return the centres of the links at joint angles, (20, 3)."""
+    pose, centres = np.eye(4), []
+    for link, angle in enumerate(angles.tolist()):
+        turn = (rotation_z, rotation_y)[link % 2](angle)
+        pose = pose @ translation(0, 0, LINK_LENGTH if link else 0.0)() @ turn()
+        centres.append(pose[:3] @ (*CENTRE, 1.0))
+    return np.array(centres)
+
+
+def _clearance(points: Array, size: Array, pose: Array) -> float:
+    inside = (points - pose[:3, 3]) @ pose[:3, :3]
+    return float(np.linalg.norm(np.maximum(np.abs(inside) - size / 2, 0.0), axis=1).min())
+
+
+def _round_to_float32(numbers: Array) -> Array:
+    """Round numbers to single precision, like MuJoCo those of meshes."""
+    return numbers.astype(np.float32).astype(np.float64)
+
+
+def _make_body(geometry: Geometry) -> Body:
+    return Body(collisions=(Shape(geometry, Pose.from_matrix(translation(*CENTRE)())),))
+
+
+OURS, COAL = "kineverse", "coal and numpy"
+SEARCH, PAIRS, BULLET = "mujoco, mj_collision", "mujoco, mj_geomDistance and numpy", "bullet"
+UPDATE, QUERY = "update", "query"
+_EXACT, _CURVED, _MARGINS = 1e-6, 1e-4, 3e-3
+"""Tolerances of distances [m]: polytopes and capsules; all shapes of a robot; Bullet, which adds margins."""
+
+_NEAR, _WHOLE = 0.06, " without rules, within .06 m"
+"""Radius [m] of the query without rules, whose results are mostly pairs of the robot's own links."""
+
+_WATCHED = " without rules, within .05 m, what the arm's speeds move"
+_WATCH_RADIUS = 0.05  # radius [m] of the query of a controller, about the pairs that it can move
+_CHECKED = 20
+
+
+@dataclass(frozen=True)
+class SearchEntry:
+    """Proximity search, and the tolerance of its distances [m]."""
+
+    name: str
+    search: ProximitySearch
+    accuracy: float
+
+
+def measure_geometry(settings: BenchmarkSettings) -> BenchmarkResult:
+    """Measure an arm among boxes, among more boxes with as many near ones, and a robot in a kitchen."""
+    collision_library.prepare(wait=True)
+    steps = min(settings.configurations, settings.steps)
+    sizes = [settings.boxes // part for part in (30, 10, 3, 1)]
+    participants = Contenders()
+    with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
+        arm = list(_among_boxes(participants, Path(folder), steps))
+        robot = make_kitchen_robot(steps)
+        rooms = list(_around_robot(robot))
+        angles = make_clutter(steps=steps).angles
+        check_distances(arm, angles)
+        check_distances(rooms, robot.values)
+        everything = [
+            SearchEntry(
+                f"{robot.name}: {OURS}{_WHOLE}", KineverseSearch(robot.whole_scene(), _NEAR), _CURVED
+            ),
+            SearchEntry(f"{robot.name}: {COAL}{_WHOLE}", CoalSearch(robot.whole_scene(), _NEAR), _CURVED),
+        ]
+        many = [
+            SearchEntry(
+                f"{OURS} among {boxes} boxes", KineverseSearch(_scene(Path(folder), boxes, steps)), _EXACT
+            )
+            for boxes in sizes
+        ]
+        participants.contenders += [*_timed(arm, angles), *_timed(many, angles), *_timed(rooms, robot.values)]
+        moving = robot.model.speeds_of(robot.gripper)
+        watch = KineverseSearch(robot.whole_scene(), _WATCH_RADIUS, moving)
+        everything.append(SearchEntry(f"{robot.name}: {OURS}{_WATCHED}", watch, _CURVED))
+        participants.contenders += _timed(everything, robot.values)
+        measured = time_contenders("geometry", participants.contenders, settings.rounds, settings.progress)
+    peers = (SEARCH, PAIRS, BULLET, COAL)
+    room = {name: f"{robot.name}: {name}, {QUERY}" for name in (OURS, SEARCH, BULLET, COAL)}
+    whole = f"{robot.name}: {OURS}{_WHOLE}, {QUERY}"
+    return BenchmarkResult(
+        name="geometry",
+        work=(
+            f"an arm of {LINKS} hulls, boxes and capsules among 60 boxes: all pairs within {RADIUS} m with "
+            f"distance, points and normal, {steps} steps of about 0.002 rad a joint; a query is what comes "
+            "after the update of the poses"
+        ),
+        measurements=tuple(measured.values()),
+        comparisons=(
+            bound_median(measured[f"{OURS}, {QUERY}"], 40e-6),
+            *(compare_speed(measured, f"{OURS}, {QUERY}", f"{peer}, {QUERY}", 1.0) for peer in peers),
+            *(compare_speed(measured, f"{OURS}, {UPDATE}", f"{peer}, {UPDATE}") for peer in peers),
+            compare_speed(measured, room[OURS], room[SEARCH]),
+            *(compare_speed(measured, room[OURS], room[peer], 1.0) for peer in (BULLET, COAL)),
+            bound_median(measured[whole], 150e-6),
+            bound_median(measured[f"{robot.name}: {OURS}{_WATCHED}, {QUERY}"], 130e-6),
+            compare_speed(measured, whole, room[OURS]),
+            compare_speed(measured, whole, f"{robot.name}: {COAL}{_WHOLE}, {QUERY}", 1.0),
+            _growth(measured, sizes),
+        ),
+        missing=tuple(participants.missing),
+    )
+
+
+def check_distances(entries: Sequence[SearchEntry], rows: Array) -> None:
+    """Compare the results of all searches at some states with those of the first.
+
+    If a search misses a pair of another, its distance counts as the radius, so that only pairs near the
+    radius may be missing. Penetration depths are not compared; they count as contact.
+    """
+    for row in rows[:: max(len(rows) // _CHECKED, 1)]:
+        found = [_distances(entry.search, row) for entry in entries]
+        pairs = sorted({pair for each in found for pair in each})
+        table = [np.array([each.get(pair, RADIUS) for pair in pairs]) for each in found]
+        for entry, distances in zip(entries[1:], table[1:], strict=True):
+            names = [(entries[0].name, [table[0]]), (entry.name, [distances])]
+            check_equal("geometry", names, entry.accuracy)
+
+
+def _distances(search: ProximitySearch, row: Array) -> dict[tuple[str, str], float]:
+    search.update(row)
+    search.query()
+    least: dict[tuple[str, str], float] = {}
+    for a, b, distance in search.distances():
+        pair = min(a, b), max(a, b)
+        least[pair] = min(least.get(pair, RADIUS), max(distance, 0.0))
+    return least
+
+
+def _among_boxes(participants: Contenders, folder: Path, steps: int) -> Iterator[SearchEntry]:
+    arm = make_clutter(steps=steps)
+    yield SearchEntry(OURS, KineverseSearch(_scene(folder, 60, steps)), _EXACT)
+    yield SearchEntry(COAL, CoalSearch(_scene(folder, 60, steps)), _EXACT)
+    if has_peer("mujoco"):
+        yield SearchEntry(SEARCH, MujocoSearch(arm), _EXACT)
+        yield SearchEntry(PAIRS, MujocoPairSearch(arm), _EXACT)
+    else:
+        participants.add_peer("mujoco", list)
+    if has_peer("pybullet"):
+        from .peers.bullet import BulletSearch
+
+        yield SearchEntry(BULLET, BulletSearch(arm), _MARGINS)
+    else:
+        participants.missing.append(install_advice("pybullet"))
+
+
+def _around_robot(robot: KitchenRobot) -> Iterator[SearchEntry]:
+    """Yield the searches that support a moving robot; :func:`_among_boxes` lists missing peers."""
+    yield SearchEntry(f"{robot.name}: {OURS}", KineverseSearch(robot.scene()), _CURVED)
+    yield SearchEntry(f"{robot.name}: {COAL}", CoalSearch(robot.scene()), _CURVED)
+    if has_peer("mujoco"):
+        yield SearchEntry(f"{robot.name}: {SEARCH}", MujocoRobotSearch(_robot_surroundings(robot)), _CURVED)
+    if has_peer("pybullet"):
+        yield SearchEntry(f"{robot.name}: {BULLET}", BulletRobotSearch(_robot_surroundings(robot)), _MARGINS)
+
+
+def _robot_surroundings(robot: KitchenRobot) -> RobotSurroundings:
+    return RobotSurroundings(robot.scene(), robot.values[0], "robot/")
+
+
+def _scene(folder: Path, boxes: int, steps: int) -> Scene:
+    return Scene(make_clutter(boxes, steps).model(folder), rules=RULES)
+
+
+def _timed(entries: Iterable[SearchEntry], rows: Array) -> Iterator[Contender]:
+    """Yield two contenders for each search, one for the time of updates and one for that of queries."""
+    for entry in entries:
+        yield Contender(f"{entry.name}, {UPDATE}", _sample(entry.search, rows, queries=False))
+        yield Contender(f"{entry.name}, {QUERY}", _sample(entry.search, rows, queries=True))
+
+
+def _sample(search: ProximitySearch, rows: Array, queries: bool) -> Callable[[], float]:
+    states = list(rows)
+
+    def sample() -> float:
+        update, query = search.update, search.query
+        update_time = query_time = 0.0
+        for state in states:
+            start = perf_counter()
+            update(state)
+            updated = perf_counter()
+            query()
+            query_time += perf_counter() - updated
+            update_time += updated - start
+        return (query_time if queries else update_time) / len(states)
+
+    return sample
+
+
+def _growth(measured: Mapping[str, Measurement], sizes: Sequence[int]) -> Comparison:
+    few, many = (f"{OURS} among {boxes} boxes, {QUERY}" for boxes in (sizes[0], sizes[-1]))
+    ratio = compare_speed(measured, few, many)
+    return Comparison(f"{many}, over {sizes[0]}, as many near", ratio.value, "x", Bar(2.0, at_least=False))
