@@ -1,8 +1,4 @@
-"""Benchmarks of the package beside peer libraries (layer 7).
-
-:func:`run_benchmarks` yields a :class:`BenchmarkResult` for each benchmark. Benchmarks only measure;
-no build fails because of them.
-"""
+"""Benchmarks of the package, with peer libraries. They only measure: no build fails because of them."""
 
 from .harness import (
     BENCHMARKS,

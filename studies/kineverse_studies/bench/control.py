@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from time import thread_time_ns
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -23,20 +23,16 @@ from kineverse.spatial import rotation_y, rpy, translation
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .control_workloads import ControlLoop, ControlWorkload
+from .control_workloads import WORKLOADS, ControlLoop, ControlWorkload
 from .harness import (
     Bar,
+    Benchmark,
     BenchmarkResult,
     BenchmarkSettings,
     Comparison,
     Contender,
     Measurement,
-    bound_median,
-    compare_speed,
-    has_peer,
-    install_advice,
     run_program,
-    time_contenders,
 )
 
 
@@ -112,22 +108,28 @@ class TimedLoop:
         """The contender; its cost is the median step of a motion."""
         return Contender(self.name, self.run)
 
-    def run(self) -> float:
-        """Run the motion; return the median CPU time of a step [s]."""
-        loop, own = self.loop, isinstance(self.loop, ControllerLoop)
-        times: list[float] = []
-        solver: list[float] = []
+    def _steps(self, count: int) -> Iterator[int]:
+        """Run the motion from its start, and yield the CPU time of each step [ns] before it is integrated."""
+        loop = self.loop
         loop.reset()
-        for k in range(self.steps):
+        for k in range(count):
             loop.aim(k * self.period)
             start = thread_time_ns()
             loop.step()
-            times.append((thread_time_ns() - start) * 1e-9)
-            if own:
-                solver.append(loop.command.times.solve)  # type: ignore[attr-defined]
+            yield thread_time_ns() - start
             loop.advance()
+
+    def run(self) -> float:
+        """Run the motion; return the median CPU time of a step [s]."""
+        loop = self.loop
+        times: list[float] = []
+        solver: list[float] = []
+        for nanoseconds in self._steps(self.steps):
+            times.append(nanoseconds * 1e-9)
+            if isinstance(loop, ControllerLoop):
+                solver.append(loop.command.times.solve)
         self.times += times
-        if own:
+        if solver:
             self._solver.append(float(np.median(solver)))
         return float(np.median(times))
 
@@ -146,12 +148,7 @@ class TimedLoop:
         """Run the motion of our controller; return the mean number of contact slots in use."""
         loop = self.loop
         assert isinstance(loop, ControllerLoop)
-        loop.reset()
-        used = []
-        for _ in range(self.steps):
-            loop.step()
-            loop.advance()
-            used.append(min(len(loop.command.contacts), count))
+        used = [min(len(loop.command.contacts), count) for _ in self._steps(self.steps)]
         return Measurement(f"{self.name}, in use", "slots", (float(np.mean(used)),))
 
     def p99(self) -> Measurement:
@@ -165,14 +162,14 @@ class TimedLoop:
 
     def bounds(self, **limits: float) -> list[Comparison]:
         """Return statistics of all steps with their targets [s]: ``mean``, ``median``, ``p99``, ``worst``."""
-        values = {
-            "mean": np.mean(self.times),
-            "median": np.median(self.times),
-            "p99": np.percentile(self.times, 99),
-            "worst": np.max(self.times),
-        }
+        shares = {"median": 50, "p99": 99, "worst": 100}
         return [
-            Comparison(f"{self.name}, {kind}", float(values[kind]), "s", Bar(limit, at_least=False))
+            Comparison(
+                f"{self.name}, {kind}",
+                float(np.percentile(self.times, shares[kind]) if kind in shares else np.mean(self.times)),
+                "s",
+                Bar(limit, at_least=False),
+            )
             for kind, limit in limits.items()
         ]
 
@@ -232,6 +229,13 @@ class Opening:
         raise NoSolutionError(f"The {self.robot} opens the fridge from none of {_SEEDS} solutions.")
 
 
+def make_peer_loop(library: str, name: str, workload: ControlWorkload | None = None) -> ControlLoop:
+    """Return the control loop of pink or mink for a workload, by default that of the name."""
+    peer = importlib.import_module(f"{__package__}.peers.{library}")
+    loop: ControlLoop = peer.make_loop(name, workload or WORKLOADS[name])
+    return loop
+
+
 def _opens(loop: ControllerLoop) -> bool:
     for _ in range(STEPS):
         loop.step()
@@ -255,22 +259,18 @@ def make_opening(robot: str) -> Opening:
 
 
 def peer_workload(opening: Opening, start: State, kept: Iterable[str] | None = None) -> ControlWorkload:
-    names = None if kept is None else set(kept)
-    joints = opening.model.articulations.items()
-    held = [
-        name
-        for name, joint in joints
-        if names is not None
-        and joint.kind != "fixed"
-        and not names.intersection(symbol.path for symbol in joint.coordinates)
-    ]
-    positions = {
-        symbol.path: value for symbol, value in start.items() if names is None or symbol.path in names
-    }
+    held, positions = [], {symbol.path: value for symbol, value in start.items()}
+    if kept is not None:
+        names = set(kept)
+        for name, joint in opening.model.articulations.items():
+            if joint.kind != "fixed" and names.isdisjoint(symbol.path for symbol in joint.coordinates):
+                held.append(name)
+        positions = {path: value for path, value in positions.items() if path in names}
     return ControlWorkload("", lambda: opening.model, positions, tuple(held), period=PERIOD, steps=STEPS)
 
 
 COMPARED = "pr2"  # robot of the peers
+TIMED_STEPS = STEPS  # steps of an opening that are measured
 BUILD, READY = f"{COMPARED}: build of the controller", f"{COMPARED}: from there until C runs"
 PEERS = ("pink", "mink")
 REDUCED = "reduced by hand"
@@ -278,7 +278,7 @@ REDUCED = "reduced by hand"
 
 def measure_control(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure the steps of controllers that open a fridge, without and with contact slots."""
-    missing: list[str] = []
+    one = Benchmark("control", settings)
     plain: list[TimedLoop] = []
     close: list[TimedLoop] = []
     others: list[TimedLoop] = []
@@ -287,46 +287,33 @@ def measure_control(settings: BenchmarkSettings) -> BenchmarkResult:
         controller = opening.controller()
         controller.wait()
         start = opening.find_start(controller)
-        plain.append(TimedLoop(f"{robot}: kineverse", ControllerLoop(controller, start), PERIOD, STEPS))
+        plain.append(TimedLoop(f"{robot}: kineverse", ControllerLoop(controller, start), PERIOD, TIMED_STEPS))
         if robot == COMPARED:
-            others += [loop for peer in PEERS if has_peer(peer) for loop in _peers(peer, opening, start)]
-            missing += [install_advice(peer) for peer in PEERS if not has_peer(peer)]
+            others += [loop for peer in filter(one.has, PEERS) for loop in _peers(peer, opening, start)]
         try:
             close.append(_near_the_kitchen(opening))
         except MissingDependencyError as error:
-            missing.append(f"contact slots are left out: {error}")
-    own = [*plain, *close]
-    loops = [*own, *others]
+            one.missing.append(f"contact slots are left out: {error}")
+    loops = [*plain, *close, *others]
     errors = [loop.mean_error() for loop in (*plain, *others)]
-    contenders = [loop.contender for loop in loops]
-    measured = time_contenders("control", contenders, settings.rounds, settings.progress)
-    fresh = time_contenders("control", _fresh_builds(), settings.processes, settings.progress)
-    comparisons: list[Comparison] = [bound_median(fresh[BUILD], 0.3), bound_median(fresh[READY], 10.0)]
+    one.time(_fresh_builds(), settings.processes)
+    one.time(loop.contender for loop in loops)
+    for alone in (*plain, *close):
+        one.add(*alone.solver_alone())
+    one.add(*(loop.p99() for loop in loops), *errors, *(loop.slots_in_use(CONTACTS) for loop in close))
+    one.bound(0.3, BUILD)
+    one.bound(10.0, READY)
     for loop in plain:
-        comparisons += loop.bounds(mean=50e-6, p99=200e-6, worst=2e-3)
+        one.comparisons += loop.bounds(mean=50e-6, p99=200e-6, worst=2e-3)
     for loop in close:
-        comparisons += loop.bounds(median=300e-6, p99=1e-3)
-    ours = f"{COMPARED}: kineverse"
-    if ours in measured:
-        comparisons += [compare_speed(measured, ours, f"{COMPARED}: {peer}", 5.0) for peer in PEERS]
-        comparisons += [compare_speed(measured, ours, f"{COMPARED}: {peer}, {REDUCED}") for peer in PEERS]
-    return BenchmarkResult(
-        name="control",
-        work=(
-            f"robots with base and arm hold a fridge's handle and open the door, {STEPS} steps of {PERIOD:g} "
-            f"s: CPU time from the state to the command; with {CONTACTS} contact slots this includes the "
-            "queries of the scene"
-        ),
-        measurements=(
-            *fresh.values(),
-            *measured.values(),
-            *(alone for loop in own for alone in loop.solver_alone()),
-            *(loop.p99() for loop in loops),
-            *errors,
-            *(loop.slots_in_use(CONTACTS) for loop in close),
-        ),
-        comparisons=tuple(comparisons),
-        missing=tuple(dict.fromkeys(missing)),
+        one.comparisons += loop.bounds(median=300e-6, p99=1e-3)
+    if (ours := f"{COMPARED}: kineverse") in one.measured:
+        one.speed(ours, *(f"{COMPARED}: {peer}" for peer in PEERS), at_least=5.0)
+        one.speed(ours, *(f"{COMPARED}: {peer}, {REDUCED}" for peer in PEERS))
+    return one.result(
+        f"robots with base and arm hold a fridge's handle and open the door, {STEPS} steps of {PERIOD:g} "
+        f"s: CPU time from the state to the command; with {CONTACTS} contact slots this includes the "
+        "queries of the scene"
     )
 
 
@@ -336,24 +323,15 @@ def _near_the_kitchen(opening: Opening) -> TimedLoop:
     controller.wait()
     start = opening.find_start(controller, scene)
     name = f"{opening.robot}: kineverse, {CONTACTS} contact slots"
-    return TimedLoop(name, ControllerLoop(controller, start), PERIOD, STEPS)
+    return TimedLoop(name, ControllerLoop(controller, start), PERIOD, TIMED_STEPS)
 
 
 def _peers(library: str, opening: Opening, start: State) -> Iterator[TimedLoop]:
     """Yield a peer with all joints, and with those alone that our controller found."""
     moving = {symbol.path for task in opening.tasks for symbol in task.error.symbols}
     for name, kept in ((library, None), (f"{library}, {REDUCED}", moving)):
-        workload = peer_workload(opening, start, kept)
-        loop: Any
-        if library == "pink":
-            from .peers.pink import make_pink_loop
-
-            loop = make_pink_loop(OPENING, workload)
-        else:
-            from .peers.mink import make_mink_loop
-
-            loop = make_mink_loop(OPENING, workload)
-        yield TimedLoop(f"{opening.robot}: {name}", loop, PERIOD, STEPS)
+        loop = make_peer_loop(library, OPENING, peer_workload(opening, start, kept))
+        yield TimedLoop(f"{opening.robot}: {name}", loop, PERIOD, TIMED_STEPS)
 
 
 def _fresh_builds() -> list[Contender]:

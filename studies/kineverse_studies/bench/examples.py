@@ -7,23 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import Any
 
 import kineverse
+from kineverse._extras import checkout
 from kineverse.errors import MissingDependencyError, UnknownNameError, suggest
 
-from .control import ControllerLoop, TimedLoop
-from .control_workloads import WORKLOADS, reachable_targets
-from .harness import (
-    BenchmarkResult,
-    BenchmarkSettings,
-    Comparison,
-    Measurement,
-    compare_speed,
-    has_peer,
-    install_advice,
-    time_contenders,
-)
+from .control import ControllerLoop, TimedLoop, make_peer_loop
+from .control_workloads import WORKLOADS, ControlLoop, reachable_targets
+from .harness import Benchmark, BenchmarkResult, BenchmarkSettings
 
 
 @dataclass(frozen=True)
@@ -54,7 +45,6 @@ EXAMPLES: Mapping[str, Example] = MappingProxyType(
 """Examples by name, which is that of the workload and of the file."""
 
 _STEPS = 10  # steps of a motion for each of the settings
-FOLDER = Path(kineverse.__file__).parents[2] / "examples"  # folder of the examples; only a checkout has it
 
 
 def measure_examples(settings: BenchmarkSettings) -> BenchmarkResult:
@@ -62,45 +52,40 @@ def measure_examples(settings: BenchmarkSettings) -> BenchmarkResult:
     for name in settings.examples:
         if name not in EXAMPLES:
             raise UnknownNameError(f"There is no example {name!r}. {suggest(name, EXAMPLES, 'example')}")
-    if not FOLDER.is_dir():
-        raise MissingDependencyError(f"the examples are in the repository, not in the package ({FOLDER}).")
-    measurements: list[Measurement] = []
-    comparisons: list[Comparison] = []
-    missing: list[str] = []
+    folder = find_examples(settings.folder)
+    one = Benchmark("examples", settings)
     for name in settings.examples or EXAMPLES:
-        library = EXAMPLES[name].library
-        steps = min(_STEPS * settings.steps, WORKLOADS[name].steps)
-        loops = [_timed(f"{name}: kineverse", make_example_loop(name), name, steps)]
-        if has_peer(library):
-            loops.append(_timed(f"{name}: {library}", _peer_loop(name), name, steps))
-        else:
-            missing.append(install_advice(library))
-        errors = [loop.mean_error(WORKLOADS[name].steps) for loop in loops]
-        measured = time_contenders(
-            name, [loop.contender for loop in loops], settings.rounds, settings.progress
-        )
-        measurements += measured.values()
-        measurements += [*loops[0].solver_alone(), *(loop.p99() for loop in loops), *errors]
-        comparisons.append(compare_speed(measured, loops[0].name, f"{name}: {library}", 1.0))
-    return BenchmarkResult(
-        name="examples",
-        work=(
-            "published examples of pink and mink on the same robots and trajectories: CPU time from the "
-            "state to the command; for a target in inverse_kinematics_ur10"
-        ),
-        measurements=tuple(measurements),
-        comparisons=tuple(comparisons),
-        missing=tuple(dict.fromkeys(missing)),
+        library, workload = EXAMPLES[name].library, WORKLOADS[name]
+        loops: dict[str, ControlLoop] = {f"{name}: kineverse": make_example_loop(name, folder)}
+        if one.has(library):
+            loops[f"{name}: {library}"] = make_peer_loop(library, name)
+        steps = min(_STEPS * settings.steps, workload.steps)
+        timed = [TimedLoop(label, loop, workload.period, steps) for label, loop in loops.items()]
+        errors = [loop.mean_error(workload.steps) for loop in timed]
+        one.time((loop.contender for loop in timed), what=name)
+        one.add(*timed[0].solver_alone(), *(loop.p99() for loop in timed), *errors)
+        one.speed(timed[0].name, f"{name}: {library}", at_least=1.0)
+    return one.result(
+        "published examples of pink and mink on the same robots and trajectories: CPU time from the "
+        "state to the command; for a target in inverse_kinematics_ur10"
     )
 
 
-def _timed(label: str, loop: Any, name: str, steps: int) -> TimedLoop:
-    return TimedLoop(label, loop, WORKLOADS[name].period, steps)
+def find_examples(folder: Path | None = None) -> Path:
+    """Return the folder of our examples, by default that of the checkout."""
+    here = checkout(Path(kineverse.__file__))
+    found = folder or (here and here / "examples")
+    if found is None or not (found / "from_pink").is_dir():
+        where = "they are in the repository of kineverse, and not installed" if found is None else found
+        raise MissingDependencyError(
+            f"There are no examples: {where}. Say where they are: --examples FOLDER."
+        )
+    return found
 
 
-def load_example(name: str) -> ModuleType:
-    """Return the example of this library, as a module that has not run."""
-    file = FOLDER / f"from_{EXAMPLES[name].library}" / f"{name}.py"
+def load_example(name: str, folder: Path) -> ModuleType:
+    """Return an example of this library, as a module that has not run."""
+    file = folder / f"from_{EXAMPLES[name].library}" / f"{name}.py"
     specification = importlib.util.spec_from_file_location(f"example_{name}", file)
     assert specification is not None
     assert specification.loader is not None
@@ -109,9 +94,9 @@ def load_example(name: str) -> ModuleType:
     return module
 
 
-def make_example_loop(name: str) -> Any:
-    """Return the control loop of the example of this library, compiled."""
-    module = load_example(name)
+def make_example_loop(name: str, folder: Path | None = None) -> ControlLoop:
+    """Return the control loop of an example of this library, compiled."""
+    module = load_example(name, find_examples(folder))
     if name == "inverse_kinematics_ur10":
         return TargetLoop(module, WORKLOADS[name].period)
     module.controller.wait()
@@ -141,13 +126,3 @@ class TargetLoop:
 
     def error(self) -> float:
         return float(self._found.residuals["hand"])
-
-
-def _peer_loop(name: str) -> Any:
-    if EXAMPLES[name].library == "pink":
-        from .peers.pink import make_pink_loop
-
-        return make_pink_loop(name)
-    from .peers.mink import make_mink_loop
-
-    return make_mink_loop(name)

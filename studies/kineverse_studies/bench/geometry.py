@@ -2,39 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.bindings import collision_library
+from kineverse.geometry.shapes import Solid, import_coal
 from kineverse.lie import Array
 from kineverse.model.body import Body, Box, Capsule, Geometry, Mesh, Pose, Shape
 from kineverse.model.model import Model
 from kineverse.spatial import rotation_x, rotation_y, rotation_z, translation
-from kineverse.symbols import position
+from kineverse.symbols import Symbol, position
 
 from .harness import (
-    Bar,
+    Benchmark,
     BenchmarkResult,
     BenchmarkSettings,
-    Comparison,
     Contender,
-    Contenders,
-    Measurement,
-    bound_median,
     check_equal,
     compare_speed,
     has_peer,
-    install_advice,
-    time_contenders,
 )
-from .peers.clutter_search import CoalSearch, KineverseSearch, MujocoPairSearch, MujocoSearch, ProximitySearch
-from .peers.robot_search import BulletRobotSearch, MujocoRobotSearch, RobotSurroundings
 from .workloads import KitchenRobot, make_kitchen_robot
 
 LINKS, RADIUS = 20, 0.1  # number of links of the arm, and radius of the queries [m]
@@ -155,6 +150,140 @@ def _make_body(geometry: Geometry) -> Body:
     return Body(collisions=(Shape(geometry, Pose.from_matrix(translation(*CENTRE)())),))
 
 
+PairDistances: TypeAlias = Iterator[tuple[str, str, float]]
+
+
+class ProximitySearch(Protocol):
+    """Search for pairs of bodies within :data:`RADIUS`, with points and normals."""
+
+    def update(self, angles: Array) -> None:
+        """Set the state of the moving bodies."""
+
+    def query(self) -> object:
+        """Search for pairs within the radius."""
+
+    def distances(self) -> PairDistances:
+        """Return the pairs of the last search, with distances [m]; of a pair the least one counts."""
+
+
+class KineverseSearch:
+    """Search with Kineverse: all checked pairs, or those whose distance depends on some symbols."""
+
+    def __init__(self, scene: Scene, radius: float = RADIUS, moving: Sequence[Symbol] | None = None) -> None:
+        self.scene = scene
+        self._query = scene.watch(radius=radius, moving=moving)
+        self.results: Any = ()
+
+    def update(self, angles: Array) -> None:
+        """Set the state of the moving bodies."""
+        self.scene.update(angles)
+
+    def query(self) -> object:
+        """Search for pairs within the radius."""
+        self.results = self._query()
+        return self.results
+
+    def distances(self) -> PairDistances:
+        """Return the pairs of the last search, with distances [m]."""
+        return ((near.a, near.b, near.distance) for near in self.results)
+
+
+class CoalSearch:
+    """Search with coal: broadphase of boxes and spheres in numpy, then a functor for each pair.
+
+    Poses are written in place by Kineverse's compiled function.
+    """
+
+    def __init__(self, scene: Scene, radius: float = RADIUS) -> None:
+        coal = import_coal()
+        self._radius = radius
+        self._scene, world = scene, scene.collision_world
+        scene.update(np.zeros(len(scene.inputs)))
+        world.prepare()
+        self._table = table = world.table
+        self._checked = np.triu(table.allowed[table.body[: table.moving, None], table.body] == 1)
+        self._reach = (table.radius[: table.moving, None] + table.radius + radius) ** 2
+        self._solids = [world.solid(k) for k in range(table.count)]
+        self._names = [piece.body for piece in world.objects]
+        self._transforms = [coal.Transform3s(pose[:, :3], pose[:, 3]) for pose in table.poses]
+        self._make, self._functors = coal.ComputeDistance, dict[tuple[int, int], Any]()
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+        self.results: list[tuple[int, int, float, Array, Array, Array]] = []
+
+    def update(self, angles: Array) -> None:
+        """Set the state of the moving bodies."""
+        self._scene.update(angles)
+        for transform, pose in zip(self._transforms, self._table.poses[: self._table.moving], strict=False):
+            transform.setTransform(pose[:, :3], pose[:, 3])
+
+    def query(self) -> object:
+        """Search for pairs within the radius."""
+        transforms, request, result = self._transforms, self._request, self._result
+        functors, results = self._functors, []
+        for i, j in self._broadphase():
+            functor = functors.get((i, j))
+            if functor is None:
+                functor = functors[i, j] = self._make(self._solids[i].engine, self._solids[j].engine)
+            result.clear()
+            distance = functor(transforms[i], transforms[j], request, result)
+            if distance <= self._radius:
+                points = result.getNearestPoint1(), result.getNearestPoint2()
+                results.append((i, j, distance, *points, np.array(result.normal)))
+        self.results = results
+        return results
+
+    def distances(self) -> PairDistances:
+        """Return the pairs of the last search, with distances [m]."""
+        return ((self._names[i], self._names[j], distance) for i, j, distance, *_ in self.results)
+
+    def _broadphase(self) -> Iterable[tuple[int, int]]:
+        table = self._table
+        moving = slice(0, table.moving)
+        here = table.low[moving, None] - table.high
+        apart = np.maximum(np.maximum(here, table.low - table.high[moving, None]), 0.0)
+        gaps = np.einsum("ijk,ijk->ij", apart, apart)
+        between = table.position[moving, None] - table.position
+        centres = np.einsum("ijk,ijk->ij", between, between)
+        near = (gaps <= self._radius**2) & (centres <= self._reach) & self._checked
+        first, second = np.nonzero(near)
+        return zip(first.tolist(), second.tolist(), strict=True)
+
+
+UNIT_BOX_CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))  # of a box with edges of 1 m
+
+
+class RobotSurroundings:
+    """Collision objects of a scene, divided into those of a robot and the static ones of a room."""
+
+    def __init__(self, scene: Scene, values: Array, robot: str) -> None:
+        self._scene, self._world = scene, scene.collision_world
+        scene.update(values)
+        self._world.prepare()
+        self.names = [piece.body for piece in self._world.objects]
+        self.robot = [k for k, name in enumerate(self.names) if name.startswith(robot)]
+        self.others = [k for k, name in enumerate(self.names) if not name.startswith(robot)]
+
+    def update(self, values: Array) -> Array:
+        """Move the robot, and return the poses of its objects, (N, 3, 4)."""
+        self._scene.update(values)
+        return self.poses(self.robot)
+
+    def poses(self, objects: list[int]) -> Array:
+        """Return the poses of objects, (N, 3, 4)."""
+        return self._world.table.poses[objects]
+
+    def solid(self, index: int) -> Solid:
+        return self._world.solid(index)
+
+
+def solid_corners(solid: Solid) -> Array:
+    """Return the corners of a box or hull, (N, 3)."""
+    if isinstance(solid.surface, Box):
+        return UNIT_BOX_CORNERS * solid.surface.size
+    assert solid.core is not None
+    return np.unique(solid.core.corners.T, axis=0)
+
+
 OURS, COAL = "kineverse", "coal and numpy"
 SEARCH, PAIRS, BULLET = "mujoco, mj_collision", "mujoco, mj_geomDistance and numpy", "bullet"
 UPDATE, QUERY = "update", "query"
@@ -183,56 +312,47 @@ def measure_geometry(settings: BenchmarkSettings) -> BenchmarkResult:
     collision_library.prepare(wait=True)
     steps = min(settings.configurations, settings.steps)
     sizes = [settings.boxes // part for part in (30, 10, 3, 1)]
-    participants = Contenders()
-    with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        arm = list(_among_boxes(participants, Path(folder), steps))
+    one = Benchmark("geometry", settings)
+    with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as text:
+        folder = Path(text)
+        arm = list(_among_boxes(one, folder, steps))
         robot = make_kitchen_robot(steps)
-        rooms = list(_around_robot(robot))
+        name, rooms = robot.name, list(_around_robot(robot))
         angles = make_clutter(steps=steps).angles
         check_distances(arm, angles)
         check_distances(rooms, robot.values)
-        everything = [
-            SearchEntry(
-                f"{robot.name}: {OURS}{_WHOLE}", KineverseSearch(robot.whole_scene(), _NEAR), _CURVED
-            ),
-            SearchEntry(f"{robot.name}: {COAL}{_WHOLE}", CoalSearch(robot.whole_scene(), _NEAR), _CURVED),
-        ]
         many = [
-            SearchEntry(
-                f"{OURS} among {boxes} boxes", KineverseSearch(_scene(Path(folder), boxes, steps)), _EXACT
-            )
+            SearchEntry(f"{OURS} among {boxes} boxes", KineverseSearch(_scene(folder, boxes, steps)), _EXACT)
             for boxes in sizes
         ]
-        participants.contenders += [*_timed(arm, angles), *_timed(many, angles), *_timed(rooms, robot.values)]
-        moving = robot.model.speeds_of(robot.gripper)
-        watch = KineverseSearch(robot.whole_scene(), _WATCH_RADIUS, moving)
-        everything.append(SearchEntry(f"{robot.name}: {OURS}{_WATCHED}", watch, _CURVED))
-        participants.contenders += _timed(everything, robot.values)
-        measured = time_contenders("geometry", participants.contenders, settings.rounds, settings.progress)
+        watch = KineverseSearch(robot.whole_scene(), _WATCH_RADIUS, robot.model.speeds_of(robot.gripper))
+        everything = [
+            SearchEntry(f"{name}: {OURS}{_WHOLE}", KineverseSearch(robot.whole_scene(), _NEAR), _CURVED),
+            SearchEntry(f"{name}: {COAL}{_WHOLE}", CoalSearch(robot.whole_scene(), _NEAR), _CURVED),
+            SearchEntry(f"{name}: {OURS}{_WATCHED}", watch, _CURVED),
+        ]
+        moved = ((arm, angles), (many, angles), (rooms, robot.values), (everything, robot.values))
+        one.time(contender for entries, rows in moved for contender in _timed(entries, rows))
     peers = (SEARCH, PAIRS, BULLET, COAL)
-    room = {name: f"{robot.name}: {name}, {QUERY}" for name in (OURS, SEARCH, BULLET, COAL)}
-    whole = f"{robot.name}: {OURS}{_WHOLE}, {QUERY}"
-    return BenchmarkResult(
-        name="geometry",
-        work=(
-            f"an arm of {LINKS} hulls, boxes and capsules among 60 boxes: all pairs within {RADIUS} m with "
-            f"distance, points and normal, {steps} steps of about 0.002 rad a joint; a query is what comes "
-            "after the update of the poses"
-        ),
-        measurements=tuple(measured.values()),
-        comparisons=(
-            bound_median(measured[f"{OURS}, {QUERY}"], 40e-6),
-            *(compare_speed(measured, f"{OURS}, {QUERY}", f"{peer}, {QUERY}", 1.0) for peer in peers),
-            *(compare_speed(measured, f"{OURS}, {UPDATE}", f"{peer}, {UPDATE}") for peer in peers),
-            compare_speed(measured, room[OURS], room[SEARCH]),
-            *(compare_speed(measured, room[OURS], room[peer], 1.0) for peer in (BULLET, COAL)),
-            bound_median(measured[whole], 150e-6),
-            bound_median(measured[f"{robot.name}: {OURS}{_WATCHED}, {QUERY}"], 130e-6),
-            compare_speed(measured, whole, room[OURS]),
-            compare_speed(measured, whole, f"{robot.name}: {COAL}{_WHOLE}, {QUERY}", 1.0),
-            _growth(measured, sizes),
-        ),
-        missing=tuple(participants.missing),
+    room = {search: f"{name}: {search}, {QUERY}" for search in (OURS, SEARCH, BULLET, COAL)}
+    whole = f"{name}: {OURS}{_WHOLE}, {QUERY}"
+    one.bound(40e-6, f"{OURS}, {QUERY}")
+    one.speed(f"{OURS}, {QUERY}", *(f"{peer}, {QUERY}" for peer in peers), at_least=1.0)
+    one.speed(f"{OURS}, {UPDATE}", *(f"{peer}, {UPDATE}" for peer in peers))
+    one.speed(room[OURS], room[SEARCH])
+    one.speed(room[OURS], room[BULLET], room[COAL], at_least=1.0)
+    one.bound(150e-6, whole)
+    one.bound(130e-6, f"{name}: {OURS}{_WATCHED}, {QUERY}")
+    one.speed(whole, room[OURS])
+    one.speed(whole, f"{name}: {COAL}{_WHOLE}, {QUERY}", at_least=1.0)
+    few, most = (f"{OURS} among {boxes} boxes, {QUERY}" for boxes in (sizes[0], sizes[-1]))
+    one.compare(
+        f"{most}, over {sizes[0]}, as many near", compare_speed(one.measured, few, most).value, "x", 2.0
+    )
+    return one.result(
+        f"an arm of {LINKS} hulls, boxes and capsules among 60 boxes: all pairs within {RADIUS} m with "
+        f"distance, points and normal, {steps} steps of about 0.002 rad a joint; a query is what comes "
+        "after the update of the poses"
     )
 
 
@@ -261,21 +381,19 @@ def _distances(search: ProximitySearch, row: Array) -> dict[tuple[str, str], flo
     return least
 
 
-def _among_boxes(participants: Contenders, folder: Path, steps: int) -> Iterator[SearchEntry]:
+def _among_boxes(one: Benchmark, folder: Path, steps: int) -> Iterator[SearchEntry]:
     arm = make_clutter(steps=steps)
     yield SearchEntry(OURS, KineverseSearch(_scene(folder, 60, steps)), _EXACT)
     yield SearchEntry(COAL, CoalSearch(_scene(folder, 60, steps)), _EXACT)
-    if has_peer("mujoco"):
+    if one.has("mujoco"):
+        from .peers.mujoco import MujocoPairSearch, MujocoSearch
+
         yield SearchEntry(SEARCH, MujocoSearch(arm), _EXACT)
         yield SearchEntry(PAIRS, MujocoPairSearch(arm), _EXACT)
-    else:
-        participants.add_peer("mujoco", list)
-    if has_peer("pybullet"):
+    if one.has("pybullet"):
         from .peers.bullet import BulletSearch
 
         yield SearchEntry(BULLET, BulletSearch(arm), _MARGINS)
-    else:
-        participants.missing.append(install_advice("pybullet"))
 
 
 def _around_robot(robot: KitchenRobot) -> Iterator[SearchEntry]:
@@ -283,13 +401,15 @@ def _around_robot(robot: KitchenRobot) -> Iterator[SearchEntry]:
     yield SearchEntry(f"{robot.name}: {OURS}", KineverseSearch(robot.scene()), _CURVED)
     yield SearchEntry(f"{robot.name}: {COAL}", CoalSearch(robot.scene()), _CURVED)
     if has_peer("mujoco"):
-        yield SearchEntry(f"{robot.name}: {SEARCH}", MujocoRobotSearch(_robot_surroundings(robot)), _CURVED)
+        from .peers.mujoco import MujocoRobotSearch
+
+        room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
+        yield SearchEntry(f"{robot.name}: {SEARCH}", MujocoRobotSearch(room), _CURVED)
     if has_peer("pybullet"):
-        yield SearchEntry(f"{robot.name}: {BULLET}", BulletRobotSearch(_robot_surroundings(robot)), _MARGINS)
+        from .peers.bullet import BulletRobotSearch
 
-
-def _robot_surroundings(robot: KitchenRobot) -> RobotSurroundings:
-    return RobotSurroundings(robot.scene(), robot.values[0], "robot/")
+        room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
+        yield SearchEntry(f"{robot.name}: {BULLET}", BulletRobotSearch(room), _MARGINS)
 
 
 def _scene(folder: Path, boxes: int, steps: int) -> Scene:
@@ -319,9 +439,3 @@ def _sample(search: ProximitySearch, rows: Array, queries: bool) -> Callable[[],
         return (query_time if queries else update_time) / len(states)
 
     return sample
-
-
-def _growth(measured: Mapping[str, Measurement], sizes: Sequence[int]) -> Comparison:
-    few, many = (f"{OURS} among {boxes} boxes, {QUERY}" for boxes in (sizes[0], sizes[-1]))
-    ratio = compare_speed(measured, few, many)
-    return Comparison(f"{many}, over {sizes[0]}, as many near", ratio.value, "x", Bar(2.0, at_least=False))

@@ -14,7 +14,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from time import perf_counter
@@ -42,60 +42,26 @@ def _no_progress(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkSettings:
-    """Settings of benchmarks: robot, number of rounds, size of workloads.
+    """Settings of benchmarks: robot, number of rounds, size of workloads."""
 
-    Attributes
-    ----------
-    robot
-        Name or file of the robot; an available PR2 if None, see :func:`.workloads.find_benchmark_robot`.
-    frame
-        Frame of the pose and Jacobian; a gripper if None.
-    rounds
-        Number of samples of each contender.
-    processes
-        Number of samples if each is taken in a fresh process.
-    configurations
-        Number of configurations of single calls in one sample.
-    steps
-        Largest number of states in distance queries.
-    rows
-        Number of configurations of a batch.
-    operations
-        Number of operations and constraints of large models.
-    boxes
-        Largest number of boxes around the arm.
-    robots
-        Robots that open a fridge.
-    problems
-        Largest number of problems of each published set of planning problems; None for all.
-    queries
-        Number of planning queries in kitchens.
-    examples
-        Examples of other libraries; all if empty.
-    progress
-        Progress reporter that wraps an iterable, such as :func:`kineverse.cli.output.show_progress`.
-    """
-
-    robot: str | None = None
-    frame: str | None = None
-    rounds: int = 25
-    processes: int = 9
-    configurations: int = 1000
-    steps: int = 200
-    rows: int = 100_000
-    operations: int = 10_000
-    boxes: int = 3000
-    robots: Sequence[str] = ("pr2", "fetch", "hsr")
-    problems: int | None = None
-    queries: int = 1000
-    examples: Sequence[str] = ()
-    progress: Progress = _no_progress
+    robot: str | None = None  # name or file of the robot; an available PR2 if None
+    frame: str | None = None  # frame of the pose and Jacobian; a gripper if None
+    rounds: int = 25  # number of samples of each contender
+    processes: int = 9  # number of samples if each is taken in a fresh process
+    configurations: int = 1000  # number of configurations of single calls in one sample
+    steps: int = 200  # largest number of states in distance queries
+    rows: int = 100_000  # number of configurations of a batch
+    operations: int = 10_000  # number of operations and constraints of large models
+    boxes: int = 3000  # largest number of boxes around the arm
+    robots: Sequence[str] = ("pr2", "fetch", "hsr")  # robots that open a fridge
+    problems: int | None = None  # largest number of problems of each published set; None for all
+    queries: int = 1000  # number of planning queries in kitchens
+    examples: Sequence[str] = ()  # examples of other libraries; all if empty
+    folder: Path | None = None  # folder of our examples; None for that of the checkout
+    progress: Progress = _no_progress  # such as kineverse.cli.output.show_progress
 
 
 QUICK = BenchmarkSettings(rounds=5, processes=3, steps=20, operations=1_000, problems=4, queries=60)
-"""Settings for an order of magnitude."""
-
-
 EQUALITY_TOLERANCE = 1e-9  # tolerance of poses and Jacobians [m], [rad]
 
 
@@ -170,28 +136,70 @@ def time_contenders(
     return {c.name: Measurement(c.name, c.unit, tuple(samples[c.name])) for c in contenders}
 
 
+class Benchmark:
+    """Measurements and comparisons of a benchmark, as they are made, and lines on what is missing."""
+
+    def __init__(self, name: str, settings: BenchmarkSettings) -> None:
+        self.name, self.settings = name, settings
+        self.measured: dict[str, Measurement] = {}
+        self.comparisons: list[Comparison] = []
+        self.missing: list[str] = []
+
+    def peers(self, function: str, modules: Iterable[str], *arguments: object) -> Iterator[Contender]:
+        """Yield what a function of modules in :mod:`.peers` makes; note modules that are not installed."""
+        for module in modules:
+            if self.has(module):
+                make = getattr(importlib.import_module(f"{__package__}.peers.{module}"), function)
+                yield from make(*arguments)
+
+    def has(self, module: str) -> bool:
+        """Return whether a peer is installed, and note it otherwise."""
+        found = has_peer(module)
+        self.missing += [] if found else [install_advice(module)]
+        return found
+
+    def time(self, contenders: Iterable[Contender], rounds: int | None = None, what: str = "") -> None:
+        """Measure contenders, interleaved, for the rounds of the settings if no number is given."""
+        rounds = self.settings.rounds if rounds is None else rounds
+        self.measured |= time_contenders(what or self.name, [*contenders], rounds, self.settings.progress)
+
+    def add(self, *measurements: Measurement) -> None:
+        """Add measurements."""
+        self.measured |= {one.name: one for one in measurements}
+
+    def note(self, name: str, unit: str, *samples: float) -> Measurement:
+        """Add the measurement of samples, and return it."""
+        self.measured[name] = Measurement(name, unit, tuple(map(float, samples)))
+        return self.measured[name]
+
+    def speed(self, ours: str | Iterable[str], *theirs: str, at_least: float | None = None) -> None:
+        """Compare contenders with peers, see :func:`compare_speed`."""
+        for one in (ours,) if isinstance(ours, str) else ours:
+            self.comparisons += [compare_speed(self.measured, one, peer, at_least) for peer in theirs]
+
+    def bound(self, limit: float, *names: str) -> None:
+        """Compare medians with an upper limit."""
+        self.comparisons += [bound_median(self.measured[name], limit) for name in names]
+
+    def compare(
+        self, name: str, value: float | None, unit: str, limit: float, at_least: bool = False
+    ) -> None:
+        """Compare a figure with its limit."""
+        self.comparisons.append(Comparison(name, value, unit, Bar(limit, at_least)))
+
+    def result(self, work: str) -> BenchmarkResult:
+        """Return the result, with a description of the work."""
+        measurements, missing = tuple(self.measured.values()), tuple(dict.fromkeys(self.missing))
+        return BenchmarkResult(self.name, work, measurements, tuple(self.comparisons), missing)
+
+
 DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
     {"pinocchio": "pin", "pink": "pin-pink", "ripl_articulation": "ripl-articulation", "vamp": "vamp-planner"}
 )
 """Distributions of modules with another name."""
 
-BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink", "ompl")
-"""Modules that the extra ``bench`` installs."""
-
-
-@dataclass(slots=True)
-class Contenders:
-    """Contenders of a benchmark, and missing peers."""
-
-    contenders: list[Contender] = field(default_factory=list)  # contenders to measure
-    missing: list[str] = field(default_factory=list)  # A line for each missing peer
-
-    def add_peer(self, module: str, contenders: Callable[[], Iterable[Contender]]) -> None:
-        """Add the contenders of a peer, or a line on the missing peer."""
-        if has_peer(module):
-            self.contenders += contenders()
-        else:
-            self.missing.append(install_advice(module))
+PEERS_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink", "ompl")
+"""Modules that the extra ``peers`` installs."""
 
 
 def has_peer(module: str) -> bool:
@@ -213,7 +221,7 @@ def _ignore_warning(warning: str) -> None:
 def install_advice(module: str) -> str:
     """Return a line on how to install a peer."""
     distribution = DISTRIBUTIONS.get(module, module)
-    if module in BENCH_EXTRA:
+    if module in PEERS_EXTRA:
         called = "" if distribution == module else f" (the package {distribution!r})"
         return f"{module} is not installed: {install_studies('peers')} brings it{called}"
     return f"{module} is not installed: it is the package {distribution!r}"
@@ -263,21 +271,11 @@ Status: TypeAlias = Literal["met", "missed", "missing", "no bar"]
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Times of one contender.
+    """Times of one contender."""
 
-    Attributes
-    ----------
-    name
-        Contender.
-    unit
-        ``s`` for times, else the unit of the count.
-    samples
-        A number for each round; a single one if it does not vary.
-    """
-
-    name: str
-    unit: str
-    samples: tuple[float, ...]
+    name: str  # contender
+    unit: str  # ``s`` for times, else the unit of the count
+    samples: tuple[float, ...]  # a number for each round; a single one if it does not vary
 
     @property
     def median(self) -> float:
@@ -285,7 +283,6 @@ class Measurement:
 
     @property
     def best(self) -> float:
-        """Least of the samples."""
         return min(self.samples)
 
 
@@ -306,27 +303,13 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Figure computed from measurements, and its target.
-
-    Attributes
-    ----------
-    name
-        Description.
-    value
-        The figure; None if a peer is missing.
-    unit
-        ``x`` for ratios, else as in measurements.
-    bar
-        Target in the same unit; None if there is none.
-    ours, theirs
-        Contenders of a ratio of speeds; empty for other figures.
-    """
+    """Figure computed from measurements, and its target."""
 
     name: str
-    value: float | None
-    unit: str
-    bar: Bar | None = None
-    ours: str = ""
+    value: float | None  # None if a peer is missing
+    unit: str  # ``x`` for ratios, else as in measurements
+    bar: Bar | None = None  # target in the same unit; None if there is none
+    ours: str = ""  # contenders of a ratio of speeds; empty for other figures
     theirs: str = ""
 
     @property
@@ -341,27 +324,13 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkResult:
-    """Result of a benchmark.
-
-    Attributes
-    ----------
-    name
-        The benchmark.
-    work
-        Description of the work.
-    measurements
-        Measurements of all contenders.
-    comparisons
-        Figures computed from them.
-    missing
-        A line for each missing peer, with advice.
-    """
+    """Result of a benchmark."""
 
     name: str
     work: str
-    measurements: tuple[Measurement, ...]
-    comparisons: tuple[Comparison, ...]
-    missing: tuple[str, ...] = ()
+    measurements: tuple[Measurement, ...]  # of all contenders
+    comparisons: tuple[Comparison, ...]  # figures computed from them
+    missing: tuple[str, ...] = ()  # a line for each missing peer, with advice
 
 
 def compare_speed(
@@ -407,7 +376,14 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "edit": "models of 10 000 operations, and a robot with one joint replaced",
     }
 )
-"""Benchmarks in the order of running; each name belongs to the module ``measure_NAME``."""
+"""Benchmarks in the order of running; each is a function ``measure_NAME`` of a module of this package."""
+
+_MODULES = {
+    "kinematics": ("call", "frames", "batch", "loop"),
+    "processes": ("load", "import", "memory"),
+    "models": ("motion", "document", "edit"),
+    "estimation": ("tracking", "identification"),
+}
 
 
 def select_benchmarks(names: Sequence[str]) -> list[str]:
@@ -445,9 +421,10 @@ def run_benchmarks(
     """
     for name in select_benchmarks(names):
         # Imported here, because a benchmark imports its peers.
-        module = importlib.import_module(f"{__package__}.measure_{name}")
+        place = next((module for module, own in _MODULES.items() if name in own), name)
+        measure = getattr(importlib.import_module(f"{__package__}.{place}"), f"measure_{name}")
         try:
-            result: BenchmarkResult = module.measure(settings or BenchmarkSettings())
+            result: BenchmarkResult = measure(settings or BenchmarkSettings())
         except (MissingDependencyError, CompileError) as error:
             if isinstance(error, CompileError) and toolchain() is not None:
                 raise
@@ -455,7 +432,7 @@ def run_benchmarks(
         yield result
 
 
-VERSIONS = (
+VERSIONS = [
     "casadi",
     "numpy",
     "pin",
@@ -467,7 +444,7 @@ VERSIONS = (
     "mink",
     "qpsolvers",
     "ompl",
-)
+]
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from time import thread_time_ns
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -21,16 +20,7 @@ from kineverse.model.model import Model
 from kineverse.symbols import Symbol
 
 from .control_workloads import export_urdf
-from .harness import (
-    Bar,
-    BenchmarkResult,
-    BenchmarkSettings,
-    Comparison,
-    Measurement,
-    compare_speed,
-    has_peer,
-    install_advice,
-)
+from .harness import Benchmark, BenchmarkResult, BenchmarkSettings, install_advice
 
 POSITION_TOLERANCE, ANGLE_TOLERANCE, LIMIT_TOLERANCE = 1e-4, 1e-3, 1e-6
 """Largest errors of a solution [m], [rad], and beyond limits [m], [rad]."""
@@ -163,88 +153,62 @@ def searches(solver: IterativeSolver, problem: ReachingProblem, budget: float = 
         yield search(solver, problem, index, budget)
 
 
-def summarise(results: list[Search]) -> dict[str, Any]:
-    """Return the success rate, and the median and mean CPU time of all searches [s]."""
-    seconds = np.array([result.seconds for result in results])
-    return {
-        "solved": float(np.mean([result.solved for result in results])),
-        "median": float(np.median(seconds)),
-        "mean": float(np.mean(seconds)),
-        "iterations": float(np.mean([result.iterations for result in results])),
-    }
-
-
 OURS, SAME_STARTS = "kineverse", "kineverse, starts of the peers"
 PEERS = {
-    "pink": ("pink", "pink_reaching", "PinkReaching"),
-    "mink": ("mink", "mink_reaching", "MinkReaching"),
-    "pinocchio's example": ("pink", "pink_reaching", "PinocchioReaching"),
+    "pink": ("pink", "PinkReaching"),
+    "mink": ("mink", "MinkReaching"),
+    "pinocchio's example": ("pink", "PinocchioReaching"),
 }
-"""Peers by name: package, module and class; the example's loop is in the module of pink."""
+"""Module and class of each peer; the example's loop is in the module of pink."""
 
 LEAST_SOLVED = 99.0  # target share of solved poses [%]
 _MORE = 10  # number of our targets per configuration, and of configurations per target of a peer
 
 
-@dataclass(frozen=True)
-class ArmSearches:
-    """Searches of one contender for the targets of one arm."""
-
-    arm: str
-    contender: str
-    searches: tuple[Search, ...]
-
-    @property
-    def name(self) -> str:
-        """Name of the measurement of times."""
-        return f"{self.contender}, {self.arm}"
-
-    @property
-    def solved(self) -> float:
-        """Share of the targets that are solved within the budget [%]."""
-        return 100.0 * float(np.mean([s.solved for s in self.searches]))
-
-    def times(self, rounds: int) -> Measurement:
-        """Return the mean CPU time of a target in each of some groups of targets."""
-        groups = np.array_split([s.seconds for s in self.searches], rounds)
-        return Measurement(self.name, "s", tuple(float(group.mean()) for group in groups))
-
-
 def measure_inverse_kinematics(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure CPU times from pose to joint positions, without building; and the share of solved poses."""
-    missing = [install_advice(package) for package in ("pink", "mink") if not has_peer(package)]
-    results: dict[tuple[str, str], ArmSearches] = {}
+    one = Benchmark("inverse_kinematics", settings)
+    installed = [*filter(one.has, ("pink", "mink"))]
+    found: dict[tuple[str, str], tuple[Search, ...]] = {}
     count = max(_MORE * settings.configurations, settings.rounds)
     few = max(settings.configurations // _MORE, settings.rounds)
-    for arm in settings.progress(tuple(ARMS), "inverse_kinematics", "arm"):
+    for arm in settings.progress(tuple(ARMS), one.name, "arm"):
         try:
             problem = make_reaching_problem(arm, count, starts=1)
             peer_problem = make_reaching_problem(arm, few)
         except UnknownNameError:
-            missing.append(f"the arm {arm} is not among the models")
+            one.missing.append(f"the arm {arm} is not among the models")
             continue
-        results[arm, OURS] = ArmSearches(arm, OURS, tuple(search_with_kineverse(problem)))
+        found[arm, OURS] = tuple(search_with_kineverse(problem))
         runs = {SAME_STARTS: search_from_same_starts(peer_problem)}
-        runs |= {peer: run(peer_problem) for peer, run in _peers()}
+        for peer, (module, kind) in PEERS.items():
+            if module in installed:
+                make = getattr(importlib.import_module(f"{__package__}.peers.{module}"), kind)
+                runs[peer] = searches(make(peer_problem), peer_problem)
         # All search for one target before the next one, because times drift.
         interleaved = zip(*zip(*runs.values(), strict=True), strict=True)
-        for contender, found in zip(runs, interleaved, strict=True):
-            results[arm, contender] = ArmSearches(arm, contender, found)
-    if not results:
+        found |= {(arm, contender): own for contender, own in zip(runs, interleaved, strict=True)}
+    if not found:
         raise MissingDependencyError(f"no arm is among the models. {install_advice('pinocchio')}")
-    times = {r.name: r.times(settings.rounds) for r in results.values()}
-    shares = [Measurement(f"{r.name}, solved", "%", (r.solved,)) for r in results.values()]
-    return BenchmarkResult(
-        name="inverse_kinematics",
-        work=(
-            f"{count} poses of uniform states, solved to {1e3 * POSITION_TOLERANCE:g} mm and "
-            f"{1e3 * ANGLE_TOLERANCE:g} mrad within limits, with at most {STARTS} starts and "
-            f"{1e3 * BUDGET:g} ms of CPU time; {few} of them in turns with the peers, from the same "
-            "starts; mean time of a pose"
-        ),
-        measurements=(*times.values(), *shares),
-        comparisons=tuple(_compare(results, times)),
-        missing=tuple(missing),
+    solved = {pair: 100.0 * float(np.mean([s.solved for s in own])) for pair, own in found.items()}
+    for (arm, contender), own in found.items():
+        groups = np.array_split([s.seconds for s in own], settings.rounds)
+        one.note(f"{contender}, {arm}", "s", *(group.mean() for group in groups))
+    for (arm, contender), share in solved.items():
+        one.note(f"{contender}, {arm}, solved", "%", share)
+    for (arm, contender), share in solved.items():
+        if contender == OURS:
+            one.compare(f"{OURS}, {arm}, solved", share, "%", LEAST_SOLVED, at_least=True)
+        for peer in PEERS if contender == SAME_STARTS else ():
+            one.speed(f"{SAME_STARTS}, {arm}", f"{peer}, {arm}", at_least=1.0)
+            more = share - solved[arm, peer] if (arm, peer) in solved else None
+            name = f"{SAME_STARTS}, {arm}, solved more than {peer}, {arm}"
+            one.compare(name, more, "%", 0.0, at_least=True)
+    return one.result(
+        f"{count} poses of uniform states, solved to {1e3 * POSITION_TOLERANCE:g} mm and "
+        f"{1e3 * ANGLE_TOLERANCE:g} mrad within limits, with at most {STARTS} starts and "
+        f"{1e3 * BUDGET:g} ms of CPU time; {few} of them in turns with the peers, from the same "
+        "starts; mean time of a pose"
     )
 
 
@@ -297,30 +261,3 @@ def _agree(found: Array, wanted: Array) -> bool:
     sine = 0.5 * np.linalg.norm(found[:3, :3] @ wanted[:3, :3].T - wanted[:3, :3] @ found[:3, :3].T) / 2**0.5
     near = np.linalg.norm(found[:3, 3] - wanted[:3, 3]) <= POSITION_TOLERANCE
     return bool(near and np.arctan2(sine, cosine) <= ANGLE_TOLERANCE)
-
-
-def _peers() -> Iterator[tuple[str, Callable[[ReachingProblem], Iterator[Search]]]]:
-    for name, (package, module, kind) in PEERS.items():
-        if has_peer(package):
-            make = getattr(importlib.import_module(f"{__package__}.peers.{module}"), kind)
-            yield name, partial(_search_with, make)
-
-
-def _search_with(make: Callable[[ReachingProblem], object], problem: ReachingProblem) -> Iterator[Search]:
-    return searches(make(problem), problem)  # type: ignore[arg-type]
-
-
-def _compare(
-    results: dict[tuple[str, str], ArmSearches], times: dict[str, Measurement]
-) -> Iterator[Comparison]:
-    for (arm, contender), result in results.items():
-        if contender == OURS:
-            yield Comparison(f"{result.name}, solved", result.solved, "%", Bar(LEAST_SOLVED, at_least=True))
-        if contender != SAME_STARTS:
-            continue
-        for peer in PEERS:
-            name = f"{peer}, {arm}"
-            yield compare_speed(times, result.name, name, at_least=1.0)
-            other = results.get((arm, peer))
-            more = None if other is None else result.solved - other.solved
-            yield Comparison(f"{result.name}, solved more than {name}", more, "%", Bar(0.0, at_least=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,19 +26,7 @@ from kineverse.model.violations import Violations
 from kineverse.state import State
 from kineverse.symbols import position
 
-from .harness import (
-    Bar,
-    BenchmarkResult,
-    BenchmarkSettings,
-    Comparison,
-    Contender,
-    Contenders,
-    Measurement,
-    bound_median,
-    compare_speed,
-    time_calls,
-    time_contenders,
-)
+from .harness import Benchmark, BenchmarkResult, BenchmarkSettings, Contender, time_calls
 from .workloads import BenchmarkRobot, find_benchmark_robot, make_kitchen_model, strip_shapes
 
 TO_EMPTY, TO_LARGE = "append an operation to an empty model", "append it to a large model"
@@ -158,17 +145,6 @@ def count_reruns(large: Model) -> int:
 NODES_PER_CONSTRAINT = 9  # number of nodes that one constraint adds to a document
 
 
-@dataclass(frozen=True, slots=True)
-class DocumentTimes:
-    """Size and times of one document."""
-
-    nodes: int
-    written: float  # times [s] to write a model as text, to read it, and of both for msgpack
-    read: float
-    packed: float
-    unpacked: float
-
-
 def make_document_model(nodes: int) -> Model:
     """Return a model of constraints on two coordinates each, with about ``nodes`` nodes as a document."""
     model = Model()
@@ -188,22 +164,22 @@ def read_document(text: str) -> Model:
     return model
 
 
-def time_document(nodes: int) -> DocumentTimes:
-    """Measure once the times of a document of about ``nodes`` nodes."""
-    model = make_document_model(nodes)
+def time_document(nodes: int) -> tuple[int, dict[str, float]]:
+    """Return the exact number of nodes of a document, and its times [s] by what is done."""
+    model, times = make_document_model(nodes), {}
+
+    def timed(what: str, work: Callable[[], Any]) -> Any:
+        start = perf_counter()
+        found = work()
+        times[what] = perf_counter() - start
+        return found
+
     with no_collection():
-        times = [perf_counter()]
-        text = to_json(model)
-        times.append(perf_counter())
-        read_document(text)
-        times.append(perf_counter())
-        data = to_bytes(model)
-        times.append(perf_counter())
-        from_bytes(data)
-        times.append(perf_counter())
-    return DocumentTimes(
-        text.count("\n[") - 1, *(after - before for before, after in itertools.pairwise(times))
-    )
+        text = timed("written", lambda: to_json(model))
+        timed("read", lambda: read_document(text))
+        data = timed("written as msgpack", lambda: to_bytes(model))
+        timed("read from msgpack", lambda: from_bytes(data))
+    return text.count("\n[") - 1, times
 
 
 INTEGRATOR, INTEGRATE = "kineverse, integrator", "kineverse, model.integrate"
@@ -215,20 +191,16 @@ _CHECKED = 10
 def measure_motion(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure the compiled objects, from arrays to arrays, and the plain methods, from states to states."""
     name, model = make_kitchen_model()
-    count = settings.configurations
-    random = np.random.default_rng(0)
+    count, random = settings.configurations, np.random.default_rng(0)
     q = random.uniform(-1, 1, (count, len(model.symbols)))
     v = random.uniform(-1, 1, (count, len(model.speeds)))
-    measured = time_contenders("motion", _steps(model, q, v), settings.rounds, settings.progress)
-    measured |= time_contenders("motion", _checks(model, q, v), settings.rounds, settings.progress)
-    return BenchmarkResult(
-        name="motion",
-        work=(
-            f"{name}: {len(model.symbols)} coordinates after {_STEP} s at constant speeds, and "
-            f"{len(model.constraints)} constraints; {count} random configurations"
-        ),
-        measurements=tuple(measured.values()),
-        comparisons=(bound_median(measured[INTEGRATOR], 5e-6), bound_median(measured[CHECKER], 5e-6)),
+    one = Benchmark("motion", settings)
+    one.time(_steps(model, q, v))
+    one.time(_checks(model, q, v))
+    one.bound(5e-6, INTEGRATOR, CHECKER)
+    return one.result(
+        f"{name}: {len(model.symbols)} coordinates after {_STEP} s at constant speeds, and "
+        f"{len(model.constraints)} constraints; {count} random configurations"
     )
 
 
@@ -289,44 +261,33 @@ def _checks(model: Model, q: Array, v: Array) -> list[Contender]:
 WRITTEN, READ = "robot and kitchen, written", "robot and kitchen, read"
 PACKED, UNPACKED = f"{WRITTEN} as msgpack", f"{READ} from msgpack"
 OURS, MSGPACK = "robot, written and read", "robot, written and read as msgpack"
-PINOCCHIO_ARCHIVE, XML, MJB = "pinocchio, archive", "mujoco, MJCF", "mujoco, MJB"
 
 
 def measure_document(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure documents of a robot in a kitchen beside formats of peers, and of large models."""
+    """Measure documents of a robot in a kitchen, with formats of peers, and of large models."""
     robot = find_benchmark_robot(settings)
     home = robot.model.copy()
     home.include("kitchen")
     text = to_json(home)
-    measured = time_contenders(
-        "document", list(_home_contenders(robot, home, text)), settings.rounds, settings.progress
-    )
-    size = Measurement("robot and kitchen, size", "byte", (float(len(text.encode())),))
-    participants = Contenders(list(_robot_contenders(robot)))
-    participants.add_peer("pinocchio", lambda: [_pinocchio(robot)])
-    participants.add_peer("mujoco", lambda: list(_mujoco(robot)))
-    peers = time_contenders("document", participants.contenders, settings.rounds, settings.progress)
+    one = Benchmark("document", settings)
+    one.time(_home_contenders(robot, home, text))
+    size = one.note("robot and kitchen, size", "byte", len(text.encode()))
+    one.time([*_robot_contenders(robot), *one.peers("document", ("pinocchio", "mujoco"), robot)])
     sizes = [settings.operations * factor for factor in (1, 10, 100)]
     growth = [time_document(nodes) for nodes in settings.progress(sizes, "document", "size")]
-    return BenchmarkResult(
-        name="document",
-        work=(
-            f"{robot.file.name} with the kitchen that ships, {len(home.history.tags)} operations; the robot "
-            f"alone; constraints of {', '.join(f'{g.nodes:,}' for g in growth)} nodes"
-        ),
-        measurements=(*measured.values(), size, *peers.values(), *_times(growth)),
-        comparisons=(
-            bound_median(measured[WRITTEN], 0.05),
-            bound_median(measured[READ], 0.05),
-            bound_median(size, 2e6),
-            *(
-                compare_speed(peers, ours, peer)
-                for ours in (OURS, MSGPACK)
-                for peer in (PINOCCHIO_ARCHIVE, XML, MJB)
-            ),
-            *_node_time_ratios(growth[0], growth[-1]),
-        ),
-        missing=tuple(participants.missing),
+    for nodes, times in growth:
+        for what, seconds in times.items():
+            one.note(f"{nodes:,} nodes, {what}", "s", seconds)
+    one.bound(0.05, WRITTEN, READ)
+    one.bound(2e6, size.name)
+    one.speed((OURS, MSGPACK), "pinocchio, archive", "mujoco, MJCF", "mujoco, MJB")
+    (small, before), (large, after) = growth[0], growth[-1]
+    for what, seconds in after.items():
+        ratio = seconds / (large / small) / before[what]
+        one.compare(f"{what}, a node of {large:,} beside one of {small:,}", ratio, "x", 3)
+    return one.result(
+        f"{robot.file.name} with the kitchen that ships, {len(home.history.tags)} operations; the robot "
+        f"alone; constraints of {', '.join(f'{nodes:,}' for nodes, _ in growth)} nodes"
     )
 
 
@@ -348,66 +309,8 @@ def _robot_contenders(robot: BenchmarkRobot) -> Iterator[Contender]:
     yield Contender(MSGPACK, time_calls(lambda: from_bytes(to_bytes(robot.model))))
 
 
-def _pinocchio(robot: BenchmarkRobot) -> Contender:
-    import pinocchio
-
-    from .peers.pinocchio import PinocchioRobot
-
-    model = PinocchioRobot(robot).model
-    return Contender(
-        PINOCCHIO_ARCHIVE, time_calls(lambda: pinocchio.Model().loadFromString(model.saveToString()))
-    )
-
-
-def _mujoco(robot: BenchmarkRobot) -> Iterator[Contender]:
-    import mujoco
-    import numpy as np
-
-    from .peers.mujoco_kinematics import MujocoRobot, make_robot_mjcf
-
-    model: Any = MujocoRobot(robot).model
-    spec: Any = mujoco.MjSpec.from_string(make_robot_mjcf(robot))
-    spec.compile()
-
-    def binary() -> None:
-        buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
-        mujoco.mj_saveModel(model, None, buffer)
-        mujoco.MjModel.from_binary_path("robot.mjb", {"robot.mjb": buffer.tobytes()})
-
-    yield Contender(XML, time_calls(lambda: mujoco.MjModel.from_xml_string(spec.to_xml())))
-    yield Contender(MJB, time_calls(binary))
-
-
-def _times(growth: list[DocumentTimes]) -> Iterator[Measurement]:
-    for g in growth:
-        for what, time in _times_by_label(g).items():
-            yield Measurement(f"{g.nodes:,} nodes, {what}", "s", (time,))
-
-
-def _node_time_ratios(small: DocumentTimes, large: DocumentTimes) -> Iterator[Comparison]:
-    ratio = large.nodes / small.nodes
-    before = _times_by_label(small)
-    for what, time in _times_by_label(large).items():
-        name = f"{what}, a node of {large.nodes:,} beside one of {small.nodes:,}"
-        yield Comparison(name, time / ratio / before[what], "x", Bar(3, at_least=False))
-
-
-def _times_by_label(growth: DocumentTimes) -> dict[str, float]:
-    return {
-        "written": growth.written,
-        "read": growth.read,
-        "written as msgpack": growth.packed,
-        "read from msgpack": growth.unpacked,
-    }
-
-
-JOINT, PINOCCHIO, MUJOCO = (
-    "kineverse, joint replaced",
-    "pinocchio, file read again",
-    "mujoco, joint moved, compiled",
-)
-
-_SHIFT = 0.01  # displacement of the joint [m]
+JOINT = "kineverse, joint replaced"
+SHIFT = 0.01  # displacement of the joint [m]
 _CONFIGURATION_RANGE = 0.3  # value of all coordinates [rad], [m]
 
 
@@ -427,7 +330,7 @@ def replace_joint(robot: BenchmarkRobot) -> Contender:
 
     # Each shift differs from the last, because an edit that changes nothing takes no time.
     return Contender(
-        JOINT, time_calls(lambda: edited_pose(_SHIFT * next(shifts))), lambda: [edited_pose(_SHIFT)]
+        JOINT, time_calls(lambda: edited_pose(SHIFT * next(shifts))), lambda: [edited_pose(SHIFT)]
     )
 
 
@@ -447,57 +350,6 @@ def _shift_origin(origin: Pose, shift: float) -> Pose:
     return Pose.from_matrix(matrix)
 
 
-def _sampled_configurations(robot: BenchmarkRobot) -> dict[str, Array]:
-    return robot.positions(np.full((1, len(robot.coordinates)), _CONFIGURATION_RANGE))
-
-
-def reread_file(robot: BenchmarkRobot, folder: Path) -> Contender:
-    """Return the contender that reads a file with the joint moved, as pinocchio models are immutable."""
-    import pinocchio as pin
-
-    from .peers.pinocchio import PinocchioRobot
-
-    file = folder / "edited.urdf"
-    file.write_text(_edited_text(robot), encoding="utf-8")
-    edited = replace(robot, file=file)
-
-    def edited_pose() -> Array:
-        peer = PinocchioRobot(edited)
-        (row,) = peer.rows(_sampled_configurations(robot))
-        pin.framesForwardKinematics(peer.model, peer.data, row)
-        pose: Array = peer.pose.homogeneous
-        return pose
-
-    return Contender(PINOCCHIO, time_calls(edited_pose), lambda: [edited_pose()])
-
-
-def recompile_specification(robot: BenchmarkRobot) -> Contender:
-    """Return the contender that moves a body in MuJoCo's specification and compiles it."""
-    import mujoco
-
-    from .peers.mujoco_kinematics import MujocoRobot, make_robot_mjcf
-
-    joint = _middle_joint(robot)[1]
-    peer = MujocoRobot(robot)
-    (row,) = peer.rows(_sampled_configurations(robot))
-    specification = mujoco.MjSpec.from_string(make_robot_mjcf(robot))
-    place = specification.body(joint.child).pos
-    start = np.array(place)
-    shifts = count(1)
-
-    def edited_pose(shift: float) -> Array:
-        place[:] = start + np.array([shift, 0.0, 0.0])
-        peer.model = specification.compile()
-        peer.data = mujoco.MjData(peer.model)
-        peer.data.qpos[:] = row
-        mujoco.mj_kinematics(peer.model, peer.data)
-        return peer.pose(peer.body)
-
-    return Contender(
-        MUJOCO, time_calls(lambda: edited_pose(_SHIFT * next(shifts))), lambda: [edited_pose(_SHIFT)]
-    )
-
-
 def _edited_text(robot: BenchmarkRobot) -> str:
     """Return the robot's file with the joint moved, without shapes."""
     name = _middle_joint(robot)[1].name
@@ -507,7 +359,7 @@ def _edited_text(robot: BenchmarkRobot) -> str:
     if origin is None:
         origin = ElementTree.SubElement(element, "origin")
     x, y, z = map(float, origin.get("xyz", "0 0 0").split())
-    origin.set("xyz", f"{x + _SHIFT!r} {y!r} {z!r}")
+    origin.set("xyz", f"{x + SHIFT!r} {y!r} {z!r}")
     return ElementTree.tostring(root, encoding="unicode")
 
 
@@ -515,31 +367,22 @@ def measure_edit(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure edits of a large model and of a robot."""
     robot = find_benchmark_robot(settings)
     large = make_large_model(settings.operations)
-    measured = time_contenders(
-        "edit", list(large_model_contenders(large)), settings.rounds, settings.progress
-    )
-    runs = Measurement("operations run by that", "operations", (float(count_reruns(large)),))
+    one = Benchmark("edit", settings)
+    one.time(large_model_contenders(large))
+    runs = one.note("operations run by that", "operations", count_reruns(large))
+    positions = robot.positions(np.full((1, len(robot.coordinates)), _CONFIGURATION_RANGE))
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        participants = Contenders([replace_joint(robot)])
-        participants.add_peer("pinocchio", lambda: [reread_file(robot, Path(folder))])
-        participants.add_peer("mujoco", lambda: [recompile_specification(robot)])
-        edited = time_contenders("edit", participants.contenders, settings.rounds, settings.progress)
-    ratio = compare_speed(measured, TO_LARGE, TO_EMPTY)
-    return BenchmarkResult(
-        name="edit",
-        work=(
-            f"edits of a model of {len(large.history.tags)} operations and {len(large.constraints)} "
-            f"constraints; one joint of {robot.file.name} replaced, until the next pose of {robot.frame}"
-        ),
-        measurements=(*measured.values(), runs, *edited.values()),
-        comparisons=(
-            replace(ratio, bar=Bar(0.5, at_least=True)),
-            Comparison(runs.name, runs.median, runs.unit, Bar(1 + READERS, at_least=False)),
-            bound_median(measured[RELEVANT], 50e-6),
-            bound_median(measured[COPY], 20e-6),
-            bound_median(edited[JOINT], 5e-3),
-            compare_speed(edited, JOINT, PINOCCHIO),
-            compare_speed(edited, JOINT, MUJOCO),
-        ),
-        missing=tuple(participants.missing),
+        moved = replace(robot, file=Path(folder, "edited.urdf"))
+        moved.file.write_text(_edited_text(robot), encoding="utf-8")
+        arguments = robot, moved, _middle_joint(robot)[1].child, positions
+        one.time([replace_joint(robot), *one.peers("edit", ("pinocchio", "mujoco"), *arguments)])
+    one.speed(TO_LARGE, TO_EMPTY, at_least=0.5)
+    one.compare(runs.name, runs.median, runs.unit, 1 + READERS)
+    one.bound(50e-6, RELEVANT)
+    one.bound(20e-6, COPY)
+    one.bound(5e-3, JOINT)
+    one.speed(JOINT, "pinocchio, file read again", "mujoco, joint moved, compiled")
+    return one.result(
+        f"edits of a model of {len(large.history.tags)} operations and {len(large.constraints)} "
+        f"constraints; one joint of {robot.file.name} replaced, until the next pose of {robot.frame}"
     )

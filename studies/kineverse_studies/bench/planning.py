@@ -19,6 +19,7 @@ from kineverse.planning import Planner
 
 from .harness import (
     Bar,
+    Benchmark,
     BenchmarkResult,
     BenchmarkSettings,
     Comparison,
@@ -26,11 +27,9 @@ from .harness import (
     Measurement,
     Progress,
     bound_median,
-    compare_speed,
     has_peer,
     install_advice,
     run_program,
-    time_contenders,
 )
 from .held_planning import MOTIONS, run_held_motion
 from .kitchen_queries import ARMS, KITCHENS, KitchenArm, PlanningQuery, find_missing, make_kitchen_arm
@@ -111,7 +110,7 @@ def _planners(problems: ProblemSet) -> Iterator[tuple[str, tuple[Place, Plan]]]:
     yield OURS, (lambda problem: planner.place(problem.state), plan)
     yield SEARCH, (lambda problem: None, search)
     if has_peer(VAMP):
-        module: Any = importlib.import_module(f"{__package__}.peers.vamp_rrt_connect")
+        module: Any = importlib.import_module(f"{__package__}.peers.vamp")
         peer = module.VampRrtConnect(problems.robot)
         yield VAMP, (peer.place, peer.plan)
 
@@ -227,56 +226,43 @@ def _run_pair(arm: KitchenArm, count: int, seed: int, results: KitchenResults) -
 
 
 def _make_ompl(arm: KitchenArm, check: ConfigurationCheck) -> Any:
-    module = importlib.import_module(f"{__package__}.peers.ompl_rrt_connect")
+    module = importlib.import_module(f"{__package__}.peers.ompl")
     return module.OmplRrtConnect(check, *arm.limits)
 
 
-def fridge_queries() -> tuple[KitchenArm, dict[str, PlanningQuery]]:
-    """Return the arm at the open fridge, and the problems there by name."""
-    arm = make_kitchen_arm(*FRIDGE)
-    queries = [*arm.fridge_queries(1 + max(PROBLEMS.values()))]
-    return arm, {name: queries[number] for name, number in PROBLEMS.items()}
-
-
-def time_fridge_problems(rounds: int, progress: Progress) -> tuple[list[Measurement], list[Comparison]]:
-    """Return the times of the problems at the open fridge, in turns with OMPL where it is installed.
+def time_fridge_problems(one: Benchmark, rounds: int) -> None:
+    """Measure the problems at the open fridge, in turns with OMPL where it is installed.
 
     Each round has another seed. A search that fails counts with the largest time that it may take. The target
     is about the first path. For the whole plan there is none, as OMPL neither shortens nor judges.
     """
-    arm, queries = fridge_queries()
+    arm = make_kitchen_arm(*FRIDGE)
+    queries = [*arm.fridge_queries(1 + max(PROBLEMS.values()))]
     planner, scene = Planner(arm.model, move=arm.symbols), Scene(arm.model)
+
+    def search(query: PlanningQuery, attempt: Callable[..., Attempt], seed: int) -> Attempt:
+        planner.place(query.state)
+        return attempt(planner, query.start, query.goal, KITCHEN_SECONDS, seed)
+
     contenders: list[Contender] = []
     attempts: dict[str, list[Attempt]] = {}
-    for name, query in queries.items():
-        searches = {
-            f"{OURS}, {name}": partial(_search_at_fridge, planner, query),
-            f"{OURS}, {name}, whole plan": partial(_plan_at_fridge, planner, query),
+    for name, number in PROBLEMS.items():
+        query = queries[number]
+        searches: dict[str, Callable[[int], Attempt]] = {
+            f"{OURS}, {name}": partial(search, query, attempt_first_path),
+            f"{OURS}, {name}, whole plan": partial(search, query, attempt_with_kineverse),
         }
         if has_peer("ompl"):
             peer = _make_ompl(arm, ConfigurationCheck(scene, arm.symbols, query.state))
             searches[f"{OMPL}, {name}"] = partial(peer.plan, query.start, query.goal, KITCHEN_SECONDS)
         for contender, plan in searches.items():
             contenders.append(Contender(contender, _with_seeds(plan, attempts.setdefault(contender, []))))
-    measured = time_contenders("planning, fridge", contenders, rounds, progress)
-    compared = []
-    for name in queries:
+    one.time(contenders, rounds, "planning, fridge")
+    for name in PROBLEMS:
         ours, theirs, whole = f"{OURS}, {name}", f"{OMPL}, {name}", f"{OURS}, {name}, whole plan"
-        samples = tuple(a.judged if a.found else KITCHEN_SECONDS for a in attempts[whole][-rounds:])
-        measured[whole] = Measurement(whole, "s", samples)
-        compared.append(compare_speed(measured, ours, theirs, at_least=FASTER))
-        compared.append(compare_speed(measured, whole, theirs))
-    return [*measured.values()], compared
-
-
-def _search_at_fridge(planner: Planner, query: PlanningQuery, seed: int) -> Attempt:
-    planner.place(query.state)
-    return attempt_first_path(planner, query.start, query.goal, KITCHEN_SECONDS, seed)
-
-
-def _plan_at_fridge(planner: Planner, query: PlanningQuery, seed: int) -> Attempt:
-    planner.place(query.state)
-    return attempt_with_kineverse(planner, query.start, query.goal, KITCHEN_SECONDS, seed)
+        one.note(whole, "s", *(a.judged if a.found else KITCHEN_SECONDS for a in attempts[whole][-rounds:]))
+        one.speed(ours, theirs, at_least=FASTER)
+        one.speed(whole, theirs)
 
 
 def _with_seeds(plan: Callable[[int], Attempt], attempts: list[Attempt]) -> Callable[[], float]:
@@ -289,7 +275,6 @@ def _with_seeds(plan: Callable[[int], Attempt], attempts: list[Attempt]) -> Call
     return sample
 
 
-PEERS = ("ompl", "vamp")
 PARTS = ("published", "fridge", "kitchens", "held", "build")  # parts of the benchmark
 SEEDS = 5  # number of attempts at each published problem
 BUILT = ("pr2", "pr2 (shipped)")
@@ -301,54 +286,41 @@ FIRST, AGAIN = "planner from its file, spheres and compiling", "planner from the
 
 def measure_planning(settings: BenchmarkSettings, parts: Sequence[str] = PARTS) -> BenchmarkResult:
     """Measure times of searches, and the shares of problems that are solved."""
-    measured: list[Measurement] = []
-    compared: list[Comparison] = []
-    missing = [install_advice(peer) for peer in PEERS if not has_peer(peer)]
-    if "published" in parts:
-        for robot in ROBOTS:
-            try:
-                summaries = run_published_problems(robot, settings.problems, SEEDS, settings.progress)
-            except UnknownNameError:
-                missing.append(
-                    f"the problems of {robot} are not on the model path: planning_problems/{robot}"
-                )
-                continue
-            for summary in summaries.values():
-                measured += summary.measurements()
-            compared += compare_with_vamp(robot, summaries)
+    one = Benchmark("planning", settings)
+    one.missing += [install_advice(peer) for peer in ("ompl", "vamp") if not has_peer(peer)]
+    for robot in ROBOTS if "published" in parts else ():
+        try:
+            summaries = run_published_problems(robot, settings.problems, SEEDS, settings.progress)
+        except UnknownNameError:
+            one.missing.append(
+                f"the problems of {robot} are not on the model path: planning_problems/{robot}"
+            )
+            continue
+        one.add(*(m for summary in summaries.values() for m in summary.measurements()))
+        one.comparisons += compare_with_vamp(robot, summaries)
     if "fridge" in parts:
-        times, ratios = time_fridge_problems(settings.processes, settings.progress)
-        measured += times
-        compared += ratios
+        time_fridge_problems(one, settings.processes)
     if "kitchens" in parts and settings.queries:
         kitchens = run_kitchen_queries(settings.queries, settings.progress)
-        measured += kitchens.measurements()
-        compared += kitchens.comparisons()
-        missing += kitchens.missing
-    if "held" in parts:
-        for name in MOTIONS:
-            held = run_held_motion(name, settings.rounds, settings.progress)
-            measured += held.measurements()
-            if not held.attempts:
-                missing.append(f"{name}: no grasps without collisions at {held.tried} places of the base")
-            compared += held.comparisons()
+        one.add(*kitchens.measurements())
+        one.comparisons += kitchens.comparisons()
+        one.missing += kitchens.missing
+    for name in MOTIONS if "held" in parts else ():
+        held = run_held_motion(name, settings.rounds, settings.progress)
+        one.add(*held.measurements())
+        if not held.attempts:
+            one.missing.append(f"{name}: no grasps without collisions at {held.tried} places of the base")
+        one.comparisons += held.comparisons()
     if "build" in parts:
         robot = next(robot for robot in BUILT if find_missing(robot, "kitchen (shipped)") is None)
-        built = time_contenders("planning, build", _fresh_builds(robot), 1, settings.progress)
-        measured += built.values()
-        bounds = ((FIRST, 30.0), (AGAIN, 0.3))
-        compared += [bound_median(built[f"{robot}: {name}"], seconds) for name, seconds in bounds]
-    return BenchmarkResult(
-        name="planning",
-        work=(
-            f"paths without collisions: published problems of Panda and Fetch, {SEEDS} attempts each with at "
-            f"most {PUBLISHED_SECONDS:g} s; three problems at an open fridge; {settings.queries} queries "
-            "between handles of kitchens, whose paths the scene checks 20 times finer; a fridge and a drawer that "
-            "are held; times of the search, with the judgement by the scene where that is said"
-        ),
-        measurements=tuple(measured),
-        comparisons=tuple(compared),
-        missing=tuple(dict.fromkeys(missing)),
+        one.time(_fresh_builds(robot), 1, "planning, build")
+        one.bound(30.0, f"{robot}: {FIRST}")
+        one.bound(0.3, f"{robot}: {AGAIN}")
+    return one.result(
+        f"paths without collisions: published problems of Panda and Fetch, {SEEDS} attempts each with at "
+        f"most {PUBLISHED_SECONDS:g} s; three problems at an open fridge; {settings.queries} queries between "
+        "handles of kitchens, whose paths the scene checks 20 times finer; a fridge and a drawer that "
+        "are held; times of the search, with the judgement by the scene where that is said"
     )
 
 

@@ -65,8 +65,7 @@ def programs_run_once(monkeypatch):
             answers[program] = run_program(*words, cache=cache)
         return answers[program]
 
-    for name in ("import", "load", "memory"):
-        monkeypatch.setattr(f"kineverse_studies.bench.measure_{name}.run_program", run_once)
+    monkeypatch.setattr("kineverse_studies.bench.processes.run_program", run_once)
 
 
 @pytest.mark.parametrize(
@@ -76,9 +75,8 @@ def programs_run_once(monkeypatch):
 def test_a_benchmark_measures_all_installed_peers_and_its_rows_are_documented(name, tiny, monkeypatch):
     workload = replace(WORKLOADS[tiny.examples[0]], steps=40)
     monkeypatch.setattr("kineverse_studies.bench.examples.WORKLOADS", {tiny.examples[0]: workload})
-    for module in ("measure_inverse_kinematics", "reaching"):
-        arms = {arm: ARMS[arm] for arm in ("ur5", "tiago")}  # one without a base and one with
-        monkeypatch.setattr(f"kineverse_studies.bench.{module}.ARMS", arms)
+    arms = {arm: ARMS[arm] for arm in ("ur5", "tiago")}  # one without a base and one with
+    monkeypatch.setattr("kineverse_studies.bench.inverse_kinematics.ARMS", arms)
     (result,) = run_benchmarks([name], tiny)
     assert result.name == name
     assert result.work
@@ -131,7 +129,7 @@ def test_a_benchmark_that_needs_a_compiler_is_left_out_without_one(tiny, monkeyp
     def measure(settings):
         require("Planning", {}, compiler=True)
 
-    monkeypatch.setattr("kineverse_studies.bench.planning.measure", measure)
+    monkeypatch.setattr("kineverse_studies.bench.planning.measure_planning", measure)
     (result,) = run_benchmarks(["planning"], tiny)
     assert result.measurements == ()
     assert result.missing[0].startswith("planning is left out: Planning needs a C compiler")

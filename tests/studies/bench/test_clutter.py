@@ -7,14 +7,16 @@ import pytest
 
 from kineverse.geometry import Scene
 from kineverse_studies.bench import DisagreementError, run_benchmarks
-from kineverse_studies.bench.geometry import RADIUS, RULES, SearchEntry, check_distances, make_clutter
-from kineverse_studies.bench.peers.clutter_search import (
+from kineverse_studies.bench.geometry import (
+    RADIUS,
+    RULES,
     CoalSearch,
     KineverseSearch,
-    MujocoPairSearch,
-    MujocoSearch,
+    RobotSurroundings,
+    SearchEntry,
+    check_distances,
+    make_clutter,
 )
-from kineverse_studies.bench.peers.robot_search import BulletRobotSearch, MujocoRobotSearch, RobotSurroundings
 from kineverse_studies.bench.workloads import make_kitchen_robot
 
 
@@ -36,6 +38,8 @@ def names(search, angles):
 
 def test_peers_find_the_same_pairs(arm, scene):
     pytest.importorskip("mujoco")
+    from kineverse_studies.bench.peers.mujoco import MujocoPairSearch, MujocoSearch
+
     ours, *peers = KineverseSearch(scene), CoalSearch(scene), MujocoSearch(arm), MujocoPairSearch(arm)
     for angles in arm.angles[::8]:
         found = names(ours, angles)
@@ -60,6 +64,8 @@ def robot():
 
 def test_mujoco_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("mujoco")
+    from kineverse_studies.bench.peers.mujoco import MujocoRobotSearch
+
     ours = SearchEntry("ours", KineverseSearch(robot.scene()), 0.0)
     room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
     assert len(names(ours.search, robot.values[0])) > 20
@@ -68,6 +74,8 @@ def test_mujoco_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
 
 def test_bullet_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("pybullet")
+    from kineverse_studies.bench.peers.bullet import BulletRobotSearch
+
     room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
     entries = [
         SearchEntry("ours", KineverseSearch(robot.scene()), 0.0),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse_studies.bench import measure_control, run_benchmarks
+from kineverse_studies.bench import control, run_benchmarks
 from kineverse_studies.bench.control import (
     DOOR,
     OPENING,
@@ -18,6 +18,7 @@ from kineverse_studies.bench.control import (
     ControllerLoop,
     TimedLoop,
     make_opening,
+    make_peer_loop,
     peer_workload,
 )
 from kineverse_studies.bench.control_workloads import WORKLOADS, export_urdf
@@ -39,11 +40,7 @@ def urdf_written_once(monkeypatch):
 
 def peer_loop(library, name, workload=None):
     pytest.importorskip(library)
-    if library == "pink":
-        from kineverse_studies.bench.peers.pink import make_pink_loop as make
-    else:
-        from kineverse_studies.bench.peers.mink import make_mink_loop as make
-    return make(name, workload)
+    return make_peer_loop(library, name, workload)
 
 
 @cache
@@ -133,10 +130,10 @@ def test_control_is_measured_without_contacts_where_coal_is_missing(tiny, monkey
     def refuse(opening):
         raise kv.errors.MissingDependencyError("distances need coal")
 
-    monkeypatch.setattr(measure_control, "_near_the_kitchen", refuse)
-    monkeypatch.setattr(measure_control, "STEPS", 20)
-    builds = [Contender(name, lambda: 0.1) for name in (measure_control.BUILD, measure_control.READY)]
-    monkeypatch.setattr(measure_control, "_fresh_builds", lambda: builds)
+    monkeypatch.setattr(control, "_near_the_kitchen", refuse)
+    monkeypatch.setattr(control, "TIMED_STEPS", 20)
+    builds = [Contender(name, lambda: 0.1) for name in (control.BUILD, control.READY)]
+    monkeypatch.setattr(control, "_fresh_builds", lambda: builds)
     (result,) = run_benchmarks(["control"], tiny)
     assert result.missing == ("contact slots are left out: distances need coal",)
     assert all(c.value is not None for c in result.comparisons)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,6 +14,8 @@ import numpy as np
 from kineverse.compile import compiler_information
 from kineverse.errors import CompileError
 from kineverse.lie import Array
+from kineverse_studies.bench.harness import Contender, time_calls
+from kineverse_studies.bench.kinematics import CHECKED, COUPLER, CRANK, GROUND, ROCKER, pin_to_one_core
 from kineverse_studies.bench.workloads import BenchmarkRobot
 
 COMPILER_FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
@@ -117,3 +119,82 @@ class NumpyGraph:
                 columns[written[0]].fill(argument)
             else:
                 argument(*[columns[place] for place in read], out=columns[written[0]])
+
+
+def batch(robot: BenchmarkRobot, points: Array, folder: Path, missing: list[str]) -> Iterator[Contender]:
+    """Yield contenders that evaluate Kineverse's graph with numpy, or CasADi's map in C."""
+    rows, function = len(points), make_casadi_function(robot)
+
+    def contender(name: str, run: Callable[[], object], outputs: tuple[Array, ...]) -> Contender:
+        def results() -> list[Array]:
+            run()
+            return list(outputs)
+
+        return Contender(name, pin_to_one_core(time_calls(run, rows)), results)
+
+    def outputs() -> tuple[Array, Array]:
+        return np.zeros((rows, 4, 4)), np.zeros((rows, 6, len(robot.chain)))
+
+    graph, arrays = NumpyGraph(function), outputs()
+    yield contender("numpy, same graph", lambda: graph(points, arrays), arrays)
+    if compiler_information().compiler is None:
+        missing.append("casadi's map in C is missing: there is no C compiler")
+        return
+    mapped = outputs()
+    yield contender("casadi, map in C", BoundMap(compile_map(function, rows, folder), points, mapped), mapped)
+
+
+def loop(angles: Array) -> Iterator[Contender]:
+    """Yield the contender that closes a four-bar linkage by CasADi's rootfinder."""
+    crank, x = ca.SX.sym("crank"), ca.SX.sym("x", 2)
+    end = _link_transform(crank, CRANK) + _link_transform(x[0], COUPLER)
+    gap = end - _link_transform(x[1], ROCKER) - ca.vertcat(GROUND, 0)
+    solver = ca.rootfinder("four_bar", "fast_newton", {"x": x, "p": crank, "g": gap})
+    start, angle = ca.MX.sym("start", 2), ca.MX.sym("angle")
+    solution = solver(x0=start, p=angle)["x"]
+    position = ca.Function("end", [x, crank], [end])(solution, angle)
+    function: Any = ca.Function("loop", [start, angle], [position, ca.jacobian(position, angle)])
+    starts = [_closing_angles(angle) for angle in angles]
+    buffer, run = function.buffer()
+    guess, given, out, derivative = np.zeros(2), np.zeros(1), np.zeros(2), np.zeros(2)
+    buffer.set_arg(0, guess.data)
+    buffer.set_arg(1, given.data)
+    buffer.set_res(0, out.data)
+    buffer.set_res(1, derivative.data)
+
+    def evaluate(angle: float, near: Array, reference: Any = buffer) -> None:
+        guess[:] = near
+        given[0] = angle
+        run()
+
+    def work() -> None:
+        for angle, near in zip(angles, starts, strict=True):
+            evaluate(angle, near)
+
+    def results() -> list[Array]:
+        found = []
+        for angle, near in zip(angles[:CHECKED], starts, strict=False):
+            evaluate(angle, near)
+            found.append((out.copy(), derivative.copy()))
+        return [np.array([p for p, _ in found]), np.array([d for _, d in found])]
+
+    yield Contender("casadi, rootfinder in the interpreter", time_calls(work, len(angles)), results)
+
+
+def _link_transform(angle: ca.SX, length: float) -> ca.SX:
+    return length * ca.vertcat(ca.cos(angle), ca.sin(angle))
+
+
+def _closing_angles(crank: float) -> Array:
+    """Return angles of coupler and rocker near those that close the loop, by intersecting two circles."""
+    pin = CRANK * np.array([np.cos(crank), np.sin(crank)])
+    offset = np.array([GROUND, 0.0]) - pin
+    distance = np.linalg.norm(offset)
+    along = (COUPLER**2 - ROCKER**2 + distance**2) / (2 * distance)
+    across = np.sqrt(COUPLER**2 - along**2)
+    end = pin + (along * offset + across * np.array([-offset[1], offset[0]])) / distance
+    to_end, from_ground = end - pin, end - np.array([GROUND, 0.0])
+    angles = np.array(
+        [np.arctan2(to_end[1], to_end[0]), np.arctan2(from_ground[1], from_ground[0])], dtype=np.float64
+    )
+    return angles + 0.05

@@ -24,7 +24,6 @@ from kineverse_studies.bench.control_workloads import (
     TABLE_CENTRE,
     TABLE_SIZE,
     THIGH_SPHERES,
-    WORKLOADS,
     CollisionSphere,
     ControlWorkload,
     drive,
@@ -38,7 +37,7 @@ from kineverse_studies.bench.control_workloads import (
 )
 from kineverse_studies.bench.inverse_kinematics import ReachingProblem
 
-from .mujoco_kinematics import add_mujoco_options
+from .mujoco import add_mujoco_options
 
 SOLVER = "daqp"
 
@@ -109,11 +108,11 @@ class MinkLoop:
         self._q = self.robot.configuration.q
 
 
-def make_mink_loop(name: str, workload: ControlWorkload | None = None) -> MinkLoop:
-    workload = workload or WORKLOADS[name]
-    make_model, make_loop = MINK_LOOPS[name]
+def make_loop(name: str, workload: ControlWorkload) -> MinkLoop:
+    """Return the control loop of a workload."""
+    make_model, make = MINK_LOOPS[name]
     speeds = {} if make_model is _with_loops else joint_speeds(workload.urdf())
-    return make_loop(MinkRobot(make_model(workload), workload.start, speeds), workload.period)
+    return make(MinkRobot(make_model(workload), workload.start, speeds), workload.period)
 
 
 # -- models ------------------------------------------------------------------------------------------------

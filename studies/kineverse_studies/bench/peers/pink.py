@@ -100,8 +100,8 @@ class PinkLoop:
             self.after(self._velocity)
 
 
-def make_pink_loop(name: str, workload: ControlWorkload | None = None) -> PinkLoop:
-    workload = workload or WORKLOADS[name]
+def make_loop(name: str, workload: ControlWorkload) -> PinkLoop:
+    """Return the control loop of a workload."""
     return PINK_LOOPS[name](PinkRobot(workload), workload.period)
 
 
