@@ -142,17 +142,19 @@ def stream_monitoring() -> Tables:
 @cache
 def joint_types() -> Tables:
     """Identify the first cases."""
+    from kineverse_studies.experiments import Options
     from kineverse_studies.experiments.joint_types import identify_cases, report_answers
 
-    return as_tables(report_answers(identify_cases(TYPE_CASES, _quiet, workers=1)))
+    return as_tables(report_answers(identify_cases(TYPE_CASES, _quiet, Options(processes=1))))
 
 
 @cache
 def estimation_grid() -> Tables:
     """Fit few samples of each cell."""
+    from kineverse_studies.experiments import Options
     from kineverse_studies.experiments.estimation_grid import fit_all, make_quick_grid, report_grid
 
-    return as_tables(report_grid(fit_all(make_quick_grid(), GRID_SAMPLES, _quiet, workers=1)))
+    return as_tables(report_grid(fit_all(make_quick_grid(), GRID_SAMPLES, _quiet, Options(processes=1))))
 
 
 @cache

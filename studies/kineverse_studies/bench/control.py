@@ -63,22 +63,18 @@ class ControllerLoop:
         self._q = self._start.copy()
 
     def aim(self, time: float) -> None:
-        """Move the targets to a time [s]."""
         self._input[self._clock] = time
 
     def step(self) -> None:
-        """Compute the command at the present state."""
         self._input[self._own] = self._q[self._places]
         self.command = self.controller.step(self._input)
 
     def advance(self) -> None:
-        """Integrate the command."""
         self._q = self._integrate(
             self._q, np.fromiter(self.command.speeds.values(), float), self.controller.dt
         )
 
     def error(self) -> float:
-        """Return the error of the task [m], [rad]."""
         self._input[self._own] = self._q[self._places]
         return float(self._error(self._input))
 
@@ -199,8 +195,6 @@ _STARTS, _SEEDS = 64, 20
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """Robot at the closed fridge."""
-
     robot: str
     model: Model  # the robot in the kitchen
     tasks: tuple[Hold, Goal]  # grasp, held; and opening of the door
@@ -277,7 +271,6 @@ REDUCED = "reduced by hand"
 
 
 def measure_control(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure the steps of controllers that open a fridge, without and with contact slots."""
     one = Benchmark("control", settings)
     plain: list[TimedLoop] = []
     close: list[TimedLoop] = []
@@ -327,7 +320,6 @@ def _near_the_kitchen(opening: Opening) -> TimedLoop:
 
 
 def _peers(library: str, opening: Opening, start: State) -> Iterator[TimedLoop]:
-    """Yield a peer with all joints, and with those alone that our controller found."""
     moving = {symbol.path for task in opening.tasks for symbol in task.error.symbols}
     for name, kept in ((library, None), (f"{library}, {REDUCED}", moving)):
         loop = make_peer_loop(library, OPENING, peer_workload(opening, start, kept))

@@ -312,8 +312,6 @@ def drive(time: float) -> Array:
 
 @dataclass(frozen=True)
 class CollisionSphere:
-    """Sphere on a link."""
-
     link: str  # link that carries it
     centre: tuple[float, float, float]  # centre in the link's frame [m]
     radius: float  # radius [m]

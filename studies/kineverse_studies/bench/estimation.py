@@ -28,7 +28,6 @@ _CHECKED = 3
 
 
 def measure_tracking(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure updates of a tracker, and of filters written in numpy."""
     model = load("kitchen")
     frames = [name for name in model.frames if model.speeds_of(name)]
     readings = _readings(model, frames, min(_UPDATES, settings.configurations))
@@ -189,7 +188,6 @@ _RANGE = math.pi / 2
 
 
 def measure_identification(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure the identification of a hinge observed over a right angle."""
     solver.prepare(wait=True)
     parents, children = _recording()
     one = Benchmark("identification", settings)
@@ -205,7 +203,6 @@ def measure_identification(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def _recording() -> tuple[Array, Array]:
-    """Return noisy poses of parent and child, one more than the batch uses."""
     random = np.random.default_rng(0)
     count = _COUNT + 1
     angles = random.uniform(-_RANGE / 2, _RANGE / 2, count)

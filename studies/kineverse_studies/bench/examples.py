@@ -19,8 +19,6 @@ from .harness import Benchmark, BenchmarkResult, BenchmarkSettings
 
 @dataclass(frozen=True)
 class Example:
-    """Example of another library."""
-
     library: str
     lines: int  # number of lines of the original, without imports, viewer, comments and empty lines
     task: str | None = None  # name of our task whose error counts; by default the first
@@ -48,7 +46,6 @@ _STEPS = 10  # steps of a motion for each of the settings
 
 
 def measure_examples(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure the steps of each example and of its original."""
     for name in settings.examples:
         if name not in EXAMPLES:
             raise UnknownNameError(f"There is no example {name!r}. {suggest(name, EXAMPLES, 'example')}")

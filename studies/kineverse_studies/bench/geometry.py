@@ -142,7 +142,6 @@ def _clearance(points: Array, size: Array, pose: Array) -> float:
 
 
 def _round_to_float32(numbers: Array) -> Array:
-    """Round numbers to single precision, like MuJoCo those of meshes."""
     return numbers.astype(np.float32).astype(np.float64)
 
 
@@ -175,16 +174,13 @@ class KineverseSearch:
         self.results: Any = ()
 
     def update(self, angles: Array) -> None:
-        """Set the state of the moving bodies."""
         self.scene.update(angles)
 
     def query(self) -> object:
-        """Search for pairs within the radius."""
         self.results = self._query()
         return self.results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search, with distances [m]."""
         return ((near.a, near.b, near.distance) for near in self.results)
 
 
@@ -211,13 +207,11 @@ class CoalSearch:
         self.results: list[tuple[int, int, float, Array, Array, Array]] = []
 
     def update(self, angles: Array) -> None:
-        """Set the state of the moving bodies."""
         self._scene.update(angles)
         for transform, pose in zip(self._transforms, self._table.poses[: self._table.moving], strict=False):
             transform.setTransform(pose[:, :3], pose[:, 3])
 
     def query(self) -> object:
-        """Search for pairs within the radius."""
         transforms, request, result = self._transforms, self._request, self._result
         functors, results = self._functors, []
         for i, j in self._broadphase():
@@ -233,7 +227,6 @@ class CoalSearch:
         return results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search, with distances [m]."""
         return ((self._names[i], self._names[j], distance) for i, j, distance, *_ in self.results)
 
     def _broadphase(self) -> Iterable[tuple[int, int]]:
@@ -300,15 +293,12 @@ _CHECKED = 20
 
 @dataclass(frozen=True)
 class SearchEntry:
-    """Proximity search, and the tolerance of its distances [m]."""
-
     name: str
     search: ProximitySearch
     accuracy: float
 
 
 def measure_geometry(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure an arm among boxes, among more boxes with as many near ones, and a robot in a kitchen."""
     collision_library.prepare(wait=True)
     steps = min(settings.configurations, settings.steps)
     sizes = [settings.boxes // part for part in (30, 10, 3, 1)]
@@ -397,7 +387,6 @@ def _among_boxes(one: Benchmark, folder: Path, steps: int) -> Iterator[SearchEnt
 
 
 def _around_robot(robot: KitchenRobot) -> Iterator[SearchEntry]:
-    """Yield the searches that support a moving robot; :func:`_among_boxes` lists missing peers."""
     yield SearchEntry(f"{robot.name}: {OURS}", KineverseSearch(robot.scene()), _CURVED)
     yield SearchEntry(f"{robot.name}: {COAL}", CoalSearch(robot.scene()), _CURVED)
     if has_peer("mujoco"):

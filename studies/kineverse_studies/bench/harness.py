@@ -94,8 +94,6 @@ def check_equal(
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """Library or implementation that is measured."""
-
     name: str  # library and method
     sample: Callable[[], float]  # does the work and returns its cost in ``unit``
     results: Callable[[], Sequence[Array]] | None = None
@@ -449,8 +447,6 @@ VERSIONS = [
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Machine and software of a run."""
-
     tier: str
     compiler: CompilerInformation  # C compiler, with the vector unit and the number of cores
     processor: str  # names of processor, operating system and Python implementation, with versions

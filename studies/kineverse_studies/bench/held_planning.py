@@ -107,8 +107,6 @@ MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
 
 @dataclass
 class HeldResults:
-    """Attempts at a motion with holds."""
-
     name: str
     attempts: list[Attempt] = field(default_factory=list)
     residual: float = 0.0  # largest residual of the holds at points of the paths, and between them [m], [rad]

@@ -113,8 +113,6 @@ class IterativeSolver(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Search for joint positions that reach a target."""
-
     solved: bool  # true if a start led to the target within limits
     starts: int  # number of starts used
     iterations: int
@@ -166,7 +164,6 @@ _MORE = 10  # number of our targets per configuration, and of configurations per
 
 
 def measure_inverse_kinematics(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure CPU times from pose to joint positions, without building; and the share of solved poses."""
     one = Benchmark("inverse_kinematics", settings)
     installed = [*filter(one.has, ("pink", "mink"))]
     found: dict[tuple[str, str], tuple[Search, ...]] = {}

@@ -33,7 +33,6 @@ _TABLE = 147, 62
 
 
 def measure_call(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure interleaved calls at the same configurations."""
     robot = find_benchmark_robot(settings)
     configurations = robot.configurations(settings.configurations)
 
@@ -86,7 +85,6 @@ def _table_compile_times(times: int) -> list[float]:
 
 
 def _over(call: Callable[[Array], object], points: Sequence[Array]) -> Callable[[], float]:
-    """Return a sample of the time of a call at one of some points."""
 
     def run() -> None:
         for point in points:
@@ -130,7 +128,6 @@ def _call(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
 
 
 def measure_frames(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure the poses of all frames."""
     robot = find_benchmark_robot(settings)
     frames, configurations = list(robot.model.frames), robot.configurations(settings.configurations)
     evaluator = compile([robot.model.fk(f) for f in frames], robot.coordinates, wait=True).bind()
@@ -158,7 +155,6 @@ ONE_CORE, ALL_CORES, FRESH = (
 
 
 def measure_batch(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure batches, on one core unless the label says otherwise."""
     robot = find_benchmark_robot(settings)
     configurations = robot.configurations(settings.rows)
     points = robot.chain_columns(configurations)
@@ -209,7 +205,6 @@ CRANK, COUPLER, ROCKER, GROUND = 0.4, 1.1, 0.9, 1.0  # lengths of the links of a
 
 
 def measure_loop(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure the position and Jacobian of the coupler's end over full turns of the crank."""
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, settings.configurations)
     one = Benchmark("loop", settings)
     one.time([*_close_loop(angles), *one.peers("loop", ("casadi",), angles)])

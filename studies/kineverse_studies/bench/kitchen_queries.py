@@ -81,8 +81,6 @@ _STARTS = 4  # number of starts of inverse kinematics
 
 @dataclass(frozen=True, eq=False)
 class PlanningQuery:
-    """Start and goal of an arm at one place of the base."""
-
     start: Array  # configurations of the arm, shape (n,) [m], [rad]
     goal: Array
     state: State  # state of the model, with the arm at the start
@@ -90,8 +88,6 @@ class PlanningQuery:
 
 @dataclass(frozen=True, eq=False)
 class KitchenArm:
-    """Arm of a robot that stands in a kitchen."""
-
     name: str
     model: Model
     arm: KitchenRobotArm
@@ -221,11 +217,9 @@ class _QuerySearch:
                 return self.query(start, goal, base)
 
     def _check(self, base: Array, q: Array) -> bool:
-        """Return True for a configuration without contacts and with clearance of the kitchen."""
         return self._free(np.concatenate([base, q])) and len(self._near()) == 0
 
     def query(self, start: Array, goal: Array, base: Array) -> PlanningQuery:
-        """Return a query with the base at a place x, y [m] and angle [rad], shape (3,)."""
         coordinates = (*self._arm.base, *self._arm.symbols)
         here = dict(zip(coordinates, (*base.tolist(), *start.tolist()), strict=True))
         return PlanningQuery(start, goal, self._home | State(here))

@@ -189,7 +189,6 @@ _CHECKED = 10
 
 
 def measure_motion(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure the compiled objects, from arrays to arrays, and the plain methods, from states to states."""
     name, model = make_kitchen_model()
     count, random = settings.configurations, np.random.default_rng(0)
     q = random.uniform(-1, 1, (count, len(model.symbols)))
@@ -264,7 +263,6 @@ OURS, MSGPACK = "robot, written and read", "robot, written and read as msgpack"
 
 
 def measure_document(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure documents of a robot in a kitchen, with formats of peers, and of large models."""
     robot = find_benchmark_robot(settings)
     home = robot.model.copy()
     home.include("kitchen")
@@ -335,7 +333,6 @@ def replace_joint(robot: BenchmarkRobot) -> Contender:
 
 
 def _middle_joint(robot: BenchmarkRobot) -> tuple[str, Joint]:
-    """Return tag and operation of the middle joint of the chain."""
     name = robot.chain[len(robot.chain) // 2].path
     for tag in robot.model.history.tags:
         operation = robot.model.history.entry(tag).operation
@@ -351,7 +348,6 @@ def _shift_origin(origin: Pose, shift: float) -> Pose:
 
 
 def _edited_text(robot: BenchmarkRobot) -> str:
-    """Return the robot's file with the joint moved, without shapes."""
     name = _middle_joint(robot)[1].name
     root = ElementTree.fromstring(strip_shapes(robot.file))
     element = next(e for e in root.iterfind("joint") if e.get("name") == name)
@@ -364,7 +360,6 @@ def _edited_text(robot: BenchmarkRobot) -> str:
 
 
 def measure_edit(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure edits of a large model and of a robot."""
     robot = find_benchmark_robot(settings)
     large = make_large_model(settings.operations)
     one = Benchmark("edit", settings)

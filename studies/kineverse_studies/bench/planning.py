@@ -144,8 +144,6 @@ LEAST_SOLVED, MEDIAN, P99, FASTER = 98.0, 2e-3, 0.2, 100.0
 
 @dataclass
 class KitchenResults:
-    """Attempts at queries in kitchens."""
-
     ours: dict[str, list[Attempt]] = field(default_factory=dict)  # our attempts by robot and kitchen
     solvable: int = 0  # number of queries that we or OMPL solve
     sampled: list[tuple[Attempt, Attempt]] = field(default_factory=list)
@@ -285,7 +283,6 @@ FIRST, AGAIN = "planner from its file, spheres and compiling", "planner from the
 
 
 def measure_planning(settings: BenchmarkSettings, parts: Sequence[str] = PARTS) -> BenchmarkResult:
-    """Measure times of searches, and the shares of problems that are solved."""
     one = Benchmark("planning", settings)
     one.missing += [install_advice(peer) for peer in ("ompl", "vamp") if not has_peer(peer)]
     for robot in ROBOTS if "published" in parts else ():

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """Result of a planner for one problem."""
-
     found: bool  # true if a path was found
     seconds: float  # time of the search, without anything that is done once for a robot [s]
     # time with the judgement of the path by a scene [s]; the same for planners that do not judge
@@ -73,8 +71,6 @@ def attempt_first_path(planner: Planner, start: Array, goal: Array, seconds: flo
 
 @dataclass(frozen=True)
 class AttemptSummary:
-    """Times and success of a planner over problems."""
-
     name: str  # planner and problems
     attempts: Sequence[Attempt]
 
@@ -90,7 +86,6 @@ class AttemptSummary:
 
     @property
     def median(self) -> float:
-        """Median time of what was solved [s]."""
         return float(np.median(self.times()))
 
     @property
@@ -120,8 +115,6 @@ ROBOTS = ("panda", "fetch")  # robots with problems
 
 @dataclass(frozen=True, eq=False)
 class PublishedProblem:
-    """Start and goal of an arm among obstacles."""
-
     name: str  # name of the problem set, and number of the problem in it
     start: Array  # configurations, in the order of :attr:`ProblemSet.symbols` [m], [rad]
     goal: Array
@@ -249,7 +242,6 @@ class ConfigurationCheck:
         self._kept = np.array([s in place for s in symbols], dtype=bool)
 
     def __call__(self, q: Sequence[float] | Array) -> bool:
-        """Return True for a configuration without contacts of what the coordinates move."""
         self._values[self._columns] = np.asarray(q)[self._kept]
         self.scene.update(self._values)
         return len(self._query()) == 0

@@ -25,7 +25,6 @@ LOADED, EVALUATED = "kineverse, loaded", "kineverse, pose and Jacobian compiled"
 
 
 def measure_load(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure loading, each time in a fresh process."""
     robot, one = find_benchmark_robot(settings), Benchmark("load", settings)
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
         peers = [_load_with_peer(robot, *peer) for peer in _peer_files(one, robot, Path(folder))]
@@ -37,7 +36,6 @@ def measure_load(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def _peer_files(one: Benchmark, robot: BenchmarkRobot, folder: Path) -> Iterator[tuple[str, str]]:
-    """Yield the peers that are installed, with the robot's file for each."""
     if one.has("pinocchio"):
         yield "pinocchio", str(robot.file)
     if one.has("mujoco"):
@@ -83,7 +81,6 @@ def _results(robot: BenchmarkRobot, load: Callable[[], dict[str, Any]]) -> Calla
 
 
 def measure_import(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure imports, and count packages."""
     one = Benchmark("import", settings)
     peers = ("casadi", "pinocchio", "mujoco")
     one.time(map(_import, ["kineverse", *filter(one.has, peers)]), settings.processes)
@@ -126,7 +123,6 @@ def find_requirements(distribution: str) -> set[str]:
 
 
 def measure_memory(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure memory, each time in a fresh process."""
     if not os.path.exists("/proc/self/statm"):
         raise KineverseError("Benchmark 'memory' needs Linux, which reports the memory of a process.")
     robot, one = find_benchmark_robot(settings), Benchmark("memory", settings)

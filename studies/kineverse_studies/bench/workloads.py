@@ -71,7 +71,6 @@ class BenchmarkRobot:
         return np.ascontiguousarray(configurations[:, columns])
 
     def positions(self, configurations: Array) -> dict[str, Array]:
-        """Return the positions of all joints by name, mimic joints included."""
         columns = zip(self.coordinates, configurations.T, strict=True)
         known = {symbol.path: np.array(column) for symbol, column in columns}
 
@@ -139,7 +138,6 @@ def _check_chain(robot: BenchmarkRobot) -> None:
 
 
 def _mimic_joint(model: Model, frame: str) -> str | None:
-    """Return a mimic joint that moves the frame; None if there is none."""
     above = {a.child: (name, a) for name, a in model.articulations.items()}
     while frame != WORLD:
         if frame in above:

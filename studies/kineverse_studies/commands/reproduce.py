@@ -128,7 +128,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _save_figures(report: Report, requested: Path) -> list[Path]:
-    """Write the figure, and the further pictures beside it; return their paths."""
     paths = {requested: report.figure}
     for name, picture in report.pictures.items():
         paths[requested.with_name(f"{requested.stem}-{name}{requested.suffix}")] = picture

@@ -15,9 +15,17 @@ import numpy as np
 
 from kineverse.gallery.lockboxes import THESIS, draw_lockbox
 from kineverse.view.plots import Figure
-from kineverse_studies.execution import run_jobs
+from kineverse_studies.experiments.execution import run_jobs
 
-from .lockbox.unlocking_runs import FIGURE_SIZE, RULES, Rule, UnlockingRun, draw_boxes, run_unlocking
+from .lockbox.unlocking_runs import (
+    FIGURE_SIZE,
+    RULES,
+    Rule,
+    UnlockingRun,
+    draw_boxes,
+    make_thesis_table,
+    run_unlocking,
+)
 from .manipulation.skills import SettingOptions, check_data, find_robots, make_settings
 from .manipulation.trials import (
     QUALITY,
@@ -61,7 +69,7 @@ def run(progress: Progress, options: Options) -> Report:
         for robot in robots
         for thing in (QUICK_OBJECTS if options.quick else OBJECTS)
     ]
-    pushes = run_jobs(run_push, jobs, progress, "ablations", "push", options.processes)
+    pushes = run_jobs(run_push, jobs, progress, "ablations", "push", options)
     of_rule = len(jobs) // len(RULES)
     by_rule = {
         rule: [replace(trial, skill=name) for trial in pushes[k * of_rule : (k + 1) * of_rule]]
@@ -112,18 +120,11 @@ def make_ablation_report(
 
 
 def _thesis_table(runs: dict[Rule, UnlockingRun]) -> ReportTable:
-    rows = tuple(
-        (
-            RULES[rule],
-            "yes" if one.done else "no",
-            one.steps,
-            ", ".join(one.order),
-            f"{_microseconds(one.cpu):.3g}",
-        )
-        for rule, one in runs.items()
-    )
-    head = ("trends", "opened", "steps", "order of the bolts", "CPU of a step [µs]")
-    return ReportTable("The lockbox of the thesis: f, e, d, then b and c, then a", head, rows)
+    title = "The lockbox of the thesis: f, e, d, then b and c, then a"
+    table = make_thesis_table(title, "order of the bolts", runs)
+    cpu = (f"{1e3 * StepTimeStatistics.from_seconds(one.cpu).mean:.3g}" for one in runs.values())
+    rows = tuple((*row, cell) for row, cell in zip(table.rows, cpu, strict=True))
+    return ReportTable(title, (*table.head, "CPU of a step [µs]"), rows)
 
 
 def _box_table(runs: dict[tuple[Rule, int], list[UnlockingRun]]) -> ReportTable:
@@ -149,7 +150,3 @@ PUSH_COLUMNS = (
     *TIMES[1:],
     *QUALITY,
 )
-
-
-def _microseconds(cpu: Sequence[float]) -> float:
-    return 1e3 * StepTimeStatistics.from_seconds(cpu).mean

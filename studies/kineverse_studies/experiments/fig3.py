@@ -145,7 +145,6 @@ def _unlocking_bolt(bound: CompiledFunction, a: float) -> float:
 
 
 def _slopes(model: Model, coordinates: Array) -> Array:
-    """Return the length of the derivative of the upper edge's position by the coordinate."""
     q = model.symbol("garage/door")
     position = model.fk("garage/upper_edge")[:3, 3]
     derivative = compile(position.jacobian([q]), [q]).batch(coordinates[:, None])

@@ -14,9 +14,8 @@ the child. In the others the parent is exact. Errors are in the observer's axes:
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -28,11 +27,11 @@ from kineverse.estimation.identification.solver import solver
 from kineverse.estimation.identification.unknown_noise import UNKNOWN_NOISE
 from kineverse.lie import Array, exp_so3, quaternion, retract, transform, translation, unit_vector
 from kineverse.view.plots import Figure
-from kineverse_studies.execution import worker_pool
 
 from .estimation_grid.cramer_rao import Joint
+from .execution import run_jobs
 from .registry import Options, Progress
-from .report import Report, ReportTable
+from .report import Cell, Report, ReportTable, format_yes, make_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -56,8 +55,6 @@ MOVING = 0.6  # share of the cases with a moving observer and a parent that is m
 
 @dataclass(frozen=True, eq=False)
 class JointCase:
-    """Observations of a random joint."""
-
     joint: Joint  # true family
     position: float  # standard deviations of the errors [m], [rad]
     orientation: float
@@ -111,8 +108,7 @@ def _random_orthogonal(rng: np.random.Generator, axis: Array) -> Array:
 
 CASES = 1000
 
-# Number of cases that a process identifies at a time.
-_CHUNK = 10
+_CHUNK = 10  # number of cases that a process identifies at a time
 
 
 @dataclass(frozen=True)
@@ -132,8 +128,6 @@ SETTINGS = tuple(Setting(poses, stated) for poses in (True, False) for stated in
 
 @dataclass(frozen=True, eq=False)
 class TypeAnswer:
-    """Identified family of a case."""
-
     number: int
     true: str  # true and most probable family
     family: str
@@ -145,7 +139,6 @@ class TypeAnswer:
 
     @property
     def is_right(self) -> bool:
-        """True if the most probable family is the true one."""
         return self.family == self.true
 
     @property
@@ -159,6 +152,7 @@ def identify_case(number: int, setting: Setting) -> TypeAnswer:
     noise = pose_covariance(case.position, case.orientation) if setting.stated else None
     child: Array = case.child if setting.poses else case.child[:, :3, 3]
     found = identify(case.parent, child, noise=noise)
+    has_orientation = setting.poses or case.parent is not None
     return TypeAnswer(
         number=number,
         true=case.joint,
@@ -166,38 +160,27 @@ def identify_case(number: int, setting: Setting) -> TypeAnswer:
         probability=found.best.probability,
         is_ambiguous=found.is_ambiguous,
         count=len(child),
-        truth=_true_noise(case, setting),
+        truth=NoiseDeviations(case.position, case.orientation if has_orientation else np.nan),
         noise=found.noise,
     )
 
 
 def identify_cases(
-    count: int, progress: Progress, workers: int | None = None
+    count: int, progress: Progress, options: Options | None = None
 ) -> dict[Setting, list[TypeAnswer]]:
     """Identify the families of the first cases in all settings."""
-    workers = workers or os.cpu_count() or 1
     chunks = [range(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
-    if workers == 1:
-        found = [_identify_chunk(chunk) for chunk in progress(chunks, "joint-types", "chunk")]
-    else:
-        with worker_pool(workers) as pool:
-            jobs = [pool.submit(_identify_chunk, chunk) for chunk in chunks]
-            found = [job.result() for job in progress(jobs, "joint-types", "chunk")]
+    found = run_jobs(_identify_chunk, chunks, progress, "joint-types", "chunk", options)
     return {setting: [answer for chunk in found for answer in chunk[k]] for k, setting in enumerate(SETTINGS)}
 
 
-def _identify_chunk(numbers: Sequence[int]) -> list[list[TypeAnswer]]:
+def _identify_chunk(numbers: Sequence[int]) -> list[list[list[TypeAnswer]]]:
     solver.prepare(wait=True)
-    return [[identify_case(number, setting) for number in numbers] for setting in SETTINGS]
-
-
-def _true_noise(case: JointCase, setting: Setting) -> NoiseDeviations:
-    has_orientation = setting.poses or case.parent is not None
-    return NoiseDeviations(case.position, case.orientation if has_orientation else np.nan)
+    return [[[identify_case(number, setting) for number in numbers] for setting in SETTINGS]]
 
 
 Answers = Mapping[Setting, Sequence[TypeAnswer]]
-OPTIONS = ("quick",)
+OPTIONS = ("quick", "processes")
 QUICK_CASES = 30
 FIGURE_SIZE = (13.0, 5.0)
 TARGETS = {Setting(True, False): (0.92, 0.02), Setting(True, True): (0.98, 0.002)}
@@ -210,7 +193,7 @@ RATIOS = (0.0, 1 / 8, 1 / 2, 2.0, 8.0, math.inf)
 
 def run(progress: Progress, options: Options) -> Report:
     """Identify the cases; with the option ``quick`` a few of them."""
-    return report_answers(identify_cases(QUICK_CASES if options.quick else CASES, progress))
+    return report_answers(identify_cases(QUICK_CASES if options.quick else CASES, progress, options))
 
 
 def report_answers(answers: Answers) -> Report:
@@ -244,9 +227,7 @@ def report_answers(answers: Answers) -> Report:
                 "lever": LEVERS,
                 "moving": MOVING,
             },
-            "answers": {
-                setting.title: [_numbers(answer) for answer in some] for setting, some in answers.items()
-            },
+            "answers": {setting.title: list(map(_numbers, some)) for setting, some in answers.items()},
         },
         figure=Figure(lambda canvas: draw_answers(canvas, answers), FIGURE_SIZE),
     )
@@ -277,18 +258,15 @@ def _target_table(answers: Answers) -> ReportTable:
     rows = []
     for setting, some in answers.items():
         right, wrong = share_right(some), share_of_sure_errors(some)
-        least, most = TARGETS.get(setting, (None, None))
         sure = sum(answer.is_sure for answer in some) / len(some)
         asked, holds = "-", "-"
-        if least is not None and most is not None:
+        if setting in TARGETS:
+            least, most = TARGETS[setting]
             asked = f"{100 * least:g}, at most {100 * most:g}"
-            holds = "yes" if right >= least and wrong <= most else "no"
+            holds = format_yes(right >= least and wrong <= most)
         rows.append((setting.title, 100 * right, 100 * sure, 100 * wrong, asked, holds))
-    return ReportTable(
-        "Right types, sure answers and wrong sure answers",
-        ("given", "right [%]", "sure [%]", "sure and wrong [%]", "asked for", "holds"),
-        tuple(rows),
-    )
+    head = ("given", "right [%]", "sure [%]", "sure and wrong [%]", "asked for", "holds")
+    return ReportTable("Right types, sure answers and wrong sure answers", head, tuple(rows))
 
 
 def _binned_table(
@@ -315,32 +293,30 @@ def _noise_table(answers: Answers) -> ReportTable:
             if len(ratios):
                 quantiles = np.quantile(ratios, (0.05, 0.5, 0.95)).tolist()
                 rows.append((setting.title, name, *quantiles))
-    return ReportTable(
-        "Estimated noise over the true one",
-        ("given", "noise of", "5 % quantile", "median", "95 % quantile"),
-        tuple(rows),
-    )
+    head = ("given", "noise of", "5 % quantile", "median", "95 % quantile")
+    return ReportTable("Estimated noise over the true one", head, tuple(rows))
 
 
 def _error_table(answers: Answers) -> ReportTable:
-    rows = tuple(
-        (
-            setting.title,
-            float(answer.number),
-            answer.true,
-            answer.family,
-            f"{100 * answer.probability:.2f}",
-            float(answer.count),
-            1e3 * answer.truth.position,
-            math.degrees(answer.truth.orientation),
-        )
+    errors = [
+        (setting.title, answer)
         for setting, some in answers.items()
         if setting in TARGETS
         for answer in some
         if answer.is_sure and not answer.is_right
-    )
-    head = ("given", "case", "true", "answer", "probability [%]", "N", "noise [mm]", "noise [deg]")
-    return ReportTable("Wrong sure answers from poses", head, rows or (("-",) * len(head),))
+    ]
+    columns: dict[str, Callable[[tuple[str, TypeAnswer]], Cell]] = {
+        "given": lambda one: one[0],
+        "case": lambda one: float(one[1].number),
+        "true": lambda one: one[1].true,
+        "answer": lambda one: one[1].family,
+        "probability [%]": lambda one: f"{100 * one[1].probability:.2f}",
+        "N": lambda one: float(one[1].count),
+        "noise [mm]": lambda one: 1e3 * one[1].truth.position,
+        "noise [deg]": lambda one: math.degrees(one[1].truth.orientation),
+    }
+    found = make_table("Wrong sure answers from poses", errors, columns)
+    return found if found.rows else replace(found, rows=(("-",) * len(columns),))
 
 
 def draw_answers(canvas: Canvas, answers: Answers) -> None:
@@ -370,10 +346,6 @@ def _numbers(answer: TypeAnswer) -> dict[str, Any]:
         "probability": answer.probability,
         "sure": answer.is_sure,
         "count": answer.count,
-        "true_noise": _finite(answer.truth),
-        "noise": None if answer.noise is None else _finite(answer.noise),
+        "true_noise": answer.truth,
+        "noise": answer.noise,
     }
-
-
-def _finite(values: Sequence[float]) -> list[float | None]:
-    return [value if math.isfinite(value) else None for value in values]

@@ -20,7 +20,7 @@ from kineverse.manipulation.start_state import find_free_state
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse_studies.execution import run_jobs
+from kineverse_studies.experiments.execution import run_jobs
 
 from .manipulation.skills import (
     SettingOptions,
@@ -48,8 +48,6 @@ OPEN_SHARE = 0.98
 
 @dataclass(frozen=True)
 class KitchenJob:
-    """All objects of one kitchen, with one robot in one world."""
-
     kitchen: str  # name or path of its model, such as ``"kitchens/17"``
     robot: RobotSource
     setting: TrialSetting = field(default_factory=TrialSetting)  # world, noise and recordings
@@ -70,7 +68,7 @@ def run(progress: Progress, options: Options) -> Report:
         for setting in make_settings(options)
         for robot in robots
     ]
-    trials = run_jobs(run_kitchen, jobs, progress, "kitchens", "kitchen", options.processes)
+    trials = run_jobs(run_kitchen, jobs, progress, "kitchens", "kitchen", options)
     return report_trials(trials, names)
 
 

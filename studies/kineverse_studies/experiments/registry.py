@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import MappingProxyType
@@ -18,48 +19,27 @@ WORLDS, BOTH = ("kinematic", "mujoco"), "both"  # worlds of trials, and the opti
 
 @dataclass(frozen=True)
 class Options:
-    """Options of experiments; each takes some of these.
+    """Options of experiments; each takes some of these."""
 
-    Attributes
-    ----------
-    quick
-        True for a reduced experiment, in seconds.
-    data
-        Folder of recordings; None for the default.
-    model
-        Name or path of the model; None for the default.
-    seed
-        First seed.
-    count
-        Number of seeds, repetitions or the like; None for the default.
-    robot
-        Robots by name or path; empty for the default.
-    processes
-        Number of processes; None for the number of cores.
-    world
-        ``"kinematic"``, ``"mujoco"``, or ``"both"``.
-    noise
-        Noise of the sensors, as :meth:`kineverse.worlds.Sensors.parse` reads it; None to act on the truth.
-    record
-        Folder of recordings; None for none.
-    """
-
-    quick: bool = False
-    data: Path | None = None
-    model: str | None = None
-    seed: int = 0
-    count: int | None = None
-    robot: tuple[str, ...] = ()
-    processes: int | None = None
-    world: str = WORLDS[0]
-    noise: str | None = None
-    record: Path | None = None
+    quick: bool = False  # true for a reduced experiment, in seconds
+    data: Path | None = None  # folder of recordings or robots
+    model: str | None = None  # name or path of the model; None for the default
+    seed: int = 0  # first seed
+    count: int | None = None  # number of seeds, repetitions or the like; None for the default
+    robot: tuple[str, ...] = ()  # names or paths of robots; empty for the default
+    processes: int | None = None  # number of processes; None for the number of cores
+    world: str = WORLDS[0]  # ``"kinematic"``, ``"mujoco"``, or ``"both"``
+    noise: str | None = None  # as kineverse.worlds.Sensors.parse reads it; None to act on the truth
+    record: Path | None = None  # folder of recordings, a path of the computer on which a trial runs
+    executor: Executor | None = None  # where trials run, such as dask's client.get_executor()
 
     def check(self, name: str, supported: Sequence[str]) -> None:
         """Check that an experiment supports the options that are set."""
         given = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         for option in given:
-            if option not in supported:
+            if option == "executor" and "processes" not in supported:
+                raise InvalidValueError(f"The experiment '{name}' runs in one process, without an executor.")
+            if option not in supported and option != "executor":
                 takes = ", ".join(f"--{known}" for known in supported) or "none"
                 raise InvalidValueError(f"The experiment '{name}' takes no --{option}. It takes {takes}.")
         for option, least in (("seed", 0), ("count", 1), ("processes", 1)):

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ from kineverse.model.model import Model
 from kineverse.view.plots import Figure
 
 from .registry import Options, Progress
-from .report import Report, ReportTable
+from .report import Report, ReportTable, format_fixed, make_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -46,8 +46,6 @@ OPEN_ANGLE, HALF_SHUT_ANGLE = 1.3, 0.65  # angles of the open and of the half sh
 
 @dataclass(frozen=True)
 class StreamErrors:
-    """Errors of a stream of looks."""
-
     correlation: float = 0.95
     share: float = 0.7
     dropouts: float = 0.15  # fractions of markers that are missing, and that are somewhere else
@@ -57,8 +55,6 @@ class StreamErrors:
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Stream of looks at the markers of a door."""
-
     times: Array  # times of the looks (N,) [s]
     angles: Array  # true angles of the door (N,) [rad]
     poses: Array  # measured poses of the markers (N, 2, 4, 4)
@@ -72,7 +68,6 @@ class Stream:
         return np.asarray(speed > 1e-6)
 
     def look(self, k: int) -> dict[str, Array]:
-        """Return the poses of the seen markers, by name."""
         return {frame: self.poses[k, i] for i, frame in enumerate(FRAMES) if self.seen[k, i]}
 
 
@@ -166,8 +161,6 @@ _WRONG = 5.0
 
 @dataclass(frozen=True, eq=False)
 class TrackedStream:
-    """Estimates of the door in one stream."""
-
     stream: Stream
     angles: Array  # estimates and their variances (N,)
     variances: Array
@@ -192,8 +185,6 @@ class TrackedStream:
 
 @dataclass(frozen=True)
 class TrackingSummary:
-    """Results of a filter over all streams."""
-
     name: str
     moving: float  # root mean square error while the door moves, and at rest after the first second [rad]
     resting: float
@@ -299,15 +290,11 @@ TURNED = np.pi / 4  # angle of the door from which looks until an alarm are coun
 PERIOD = 60.0  # time after which the hand's motion repeats [s]
 WHITE = StreamErrors(correlation=0.0, share=0.0)  # errors without correlation, with dropouts and outliers
 
-# Time in which the hand shuts the door before its motion repeats [s].
-_SHUTTING = 3.5
-MakeStream: TypeAlias = Callable[[Model, np.random.Generator, float, StreamErrors | None], Stream]
+_SHUTTING = 3.5  # time in which the hand shuts the door before its motion repeats [s]
 
 
 @dataclass(frozen=True)
 class MonitoringRow:
-    """Results of the monitor on streams of one kind."""
-
     case: str  # description of the streams
     runs: int  # number of streams, and of looks in all of them until the alarms
     looks: int
@@ -317,15 +304,6 @@ class MonitoringRow:
     cpu: float  # mean CPU time of a look and its 99th percentile [ms]
     cpu_99: float
 
-    def __str__(self) -> str:
-        after = (
-            "" if np.isnan(self.median) else f", {self.median:.0f} looks after 45° (worst {self.worst:.0f})"
-        )
-        return (
-            f"{self.case}: alarms in {self.alarms} of {self.runs} streams ({self.looks} looks){after}; "
-            f"{self.cpu:.2f} ms a look (p99 {self.cpu_99:.2f})"
-        )
-
 
 def measure_monitoring(
     model: Model, seeds: int = 20, minutes: float = 6.0, displacements: tuple[float, ...] = (0.02, 0.01)
@@ -333,14 +311,14 @@ def measure_monitoring(
     """Run the monitor over streams of a door as modelled, and of doors with a displaced axis."""
     long, short = 60.0 * minutes, PERIOD
     rows = [
-        _measure("as modelled", model, seeds, long, _as_modelled, None),
-        _measure("as modelled, white noise", model, seeds, long / 6.0, _as_modelled, WHITE),
+        _measure("as modelled", model, seeds, long, None),
+        _measure("as modelled, white noise", model, seeds, long / 6.0, WHITE),
     ]
     for size in displacements:
         for where, errors in (("", None), (", white noise", WHITE)):
             case = f"axis {100.0 * size:.0f} cm off{where}"
-            rows.append(_measure(case, model, seeds, short, _displaced(size, True), errors))
-            rows.append(_measure(f"{case}, door too", model, seeds, short, _displaced(size, False), errors))
+            rows.append(_measure(case, model, seeds, short, errors, size))
+            rows.append(_measure(f"{case}, door too", model, seeds, short, errors, size, False))
     return rows
 
 
@@ -351,61 +329,63 @@ def repeated_motion(times: Array) -> Array:
     return np.asarray(hand_motion(within) * (1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)))
 
 
-def _as_modelled(
-    model: Model, random: np.random.Generator, duration: float, errors: StreamErrors | None
+def _simulate(
+    model: Model,
+    random: np.random.Generator,
+    duration: float,
+    errors: StreamErrors | None,
+    displacement: float,
+    same_when_shut: bool,
 ) -> Stream:
-    times = np.arange(round(duration * RATE)) / RATE
-    return simulate_stream(model, repeated_motion(times), random, errors)
-
-
-def _displaced(size: float, same_when_shut: bool) -> MakeStream:
-    """Return a maker of streams of a door with a displaced axis.
+    """Return a stream of a door whose axis is displaced [m].
 
     The shut door is at its modelled place if ``same_when_shut``; otherwise the door is displaced too.
     """
-
-    def make(
-        model: Model, random: np.random.Generator, duration: float, errors: StreamErrors | None
-    ) -> Stream:
-        stream = _as_modelled(model, random, duration, errors)
-        direction = random.uniform(0.0, 2.0 * np.pi)
-        offset = size * np.array([np.cos(direction), np.sin(direction), 0.0])
-        away = np.broadcast_to(offset, (len(stream.times), 3))
-        if same_when_shut:
-            # A rotation about a displaced axis is q ↦ R q + (1 - R) d.
-            away = away - rotation_z(stream.angles) @ offset
-        shut = model.fk(FRAMES[0])({DOOR: 0.0})
-        poses = stream.poses.copy()
-        poses[:, :, :3, 3] += (away @ shut[:3, :3].T)[:, None]
-        return replace(stream, poses=poses)
-
-    return make
+    times = np.arange(round(duration * RATE)) / RATE
+    stream = simulate_stream(model, repeated_motion(times), random, errors)
+    if not displacement:
+        return stream
+    direction = random.uniform(0.0, 2.0 * np.pi)
+    offset = displacement * np.array([np.cos(direction), np.sin(direction), 0.0])
+    away = np.broadcast_to(offset, (len(stream.times), 3))
+    if same_when_shut:
+        # A rotation about a displaced axis is q ↦ R q + (1 - R) d.
+        away = away - rotation_z(stream.angles) @ offset
+    shut = model.fk(FRAMES[0])({DOOR: 0.0})
+    poses = stream.poses.copy()
+    poses[:, :, :3, 3] += (away @ shut[:3, :3].T)[:, None]
+    return replace(stream, poses=poses)
 
 
 def _measure(
-    case: str, model: Model, seeds: int, duration: float, make: MakeStream, errors: StreamErrors | None
+    case: str,
+    model: Model,
+    seeds: int,
+    duration: float,
+    errors: StreamErrors | None,
+    displacement: float = 0.0,
+    same_when_shut: bool = True,
 ) -> MonitoringRow:
     delays: list[float] = []
     spent: list[float] = []
     for seed in range(seeds):
-        stream = make(model, np.random.default_rng(seed), duration, errors)
+        random = np.random.default_rng(seed)
+        stream = _simulate(model, random, duration, errors, displacement, same_when_shut)
         turned = int(np.argmax(stream.angles >= TURNED))
         monitor = PlausibilityMonitor(model, FRAMES, noise=pose_covariance(POSITION, ORIENTATION))
-        delay = np.inf
+        delays.append(np.inf)
         for k, at in enumerate(stream.times):
             look = stream.look(k)
             began = time.thread_time()
             alarm = monitor.update(look, at=at)
             spent.append(1e3 * (time.thread_time() - began))
             if alarm:
-                delay = float(k - turned)
+                delays[-1] = float(k - turned)
                 break
-        delays.append(delay)
     alarms = int(np.isfinite(delays).sum())
     median, worst = (float(np.median(delays)), float(np.max(delays))) if alarms else (np.nan, np.nan)
-    return MonitoringRow(
-        case, seeds, len(spent), alarms, median, worst, float(np.mean(spent)), float(np.percentile(spent, 99))
-    )
+    cpu = float(np.mean(spent)), float(np.percentile(spent, 99))
+    return MonitoringRow(case, seeds, len(spent), alarms, median, worst, *cpu)
 
 
 FIGURE_SIZE = (11.0, 8.0)
@@ -415,87 +395,46 @@ def make_report(tracked: Mapping[str, Sequence[TrackedStream]], monitored: Seque
     """Return the report of trackers by name, and of the monitor."""
     summaries = summarize_trackers(tracked)
     count = len(next(iter(tracked.values())))
+    table = make_table(
+        f"Tracking, {count} streams of a minute",
+        summaries,
+        {
+            "process": lambda s: s.name,
+            "RMSE moving [mrad]": lambda s: format_fixed(s.moving, 2, 1e3),
+            "RMSE at rest [mrad]": lambda s: format_fixed(s.resting, 2, 1e3),
+            "NEES": lambda s: format_fixed(s.nees),
+            "worst stream": lambda s: format_fixed(s.worst_nees),
+            "silently lost [s]": lambda s: format_fixed(s.silently_lost),
+            "lost [%]": lambda s: format_fixed(s.lost, 1, 100),
+            "update [ms CPU]": lambda s: format_fixed(s.mean_time, 2, 1e3),
+            "99 of 100 within": lambda s: format_fixed(s.high_time, 2, 1e3),
+        },
+    )
     return Report(
         name="stream",
         title=(
             f"A door that a hand moves, seen by two markers at 30 Hz: {1000 * POSITION:.0f} mm, "
             f"{math.degrees(ORIENTATION):.1f}°, correlated errors, dropouts, outliers"
         ),
-        tables=(_tracking_table(summaries, count), monitoring_table(monitored)),
-        numbers={
-            "tracking": [_numbers(asdict(summary)) for summary in summaries],
-            "monitoring": [_numbers(asdict(row)) for row in monitored],
-        },
+        tables=(table, monitoring_table(monitored)),
+        numbers={"tracking": summaries, "monitoring": monitored},
         figure=Figure(lambda canvas: draw_stream(canvas, tracked), FIGURE_SIZE),
     )
 
 
-def _numbers(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in values.items()
-    }
-
-
-def _tracking_table(summaries: Sequence[TrackingSummary], count: int) -> ReportTable:
-    return ReportTable(
-        f"Tracking, {count} streams of a minute",
-        (
-            "process",
-            "RMSE moving [mrad]",
-            "RMSE at rest [mrad]",
-            "NEES",
-            "worst stream",
-            "silently lost [s]",
-            "lost [%]",
-            "update [ms CPU]",
-            "99 of 100 within",
-        ),
-        tuple(
-            (
-                summary.name,
-                f"{1000 * summary.moving:.2f}",
-                f"{1000 * summary.resting:.2f}",
-                f"{summary.nees:.2f}",
-                f"{summary.worst_nees:.2f}",
-                f"{summary.silently_lost:.2f}",
-                f"{100 * summary.lost:.1f}",
-                _milliseconds(summary.mean_time),
-                _milliseconds(summary.high_time),
-            )
-            for summary in summaries
-        ),
-    )
-
-
-def _milliseconds(seconds: float) -> str:
-    return "-" if math.isnan(seconds) else f"{1000 * seconds:.2f}"
-
-
 def monitoring_table(rows: Sequence[MonitoringRow]) -> ReportTable:
-    return ReportTable(
+    return make_table(
         "Monitor of the model's plausibility",
-        (
-            "door",
-            "streams",
-            "alarms",
-            "looks from 45° to the alarm",
-            "worst",
-            "look [ms CPU]",
-            "99 of 100 within",
-        ),
-        tuple(
-            (
-                row.case,
-                row.runs,
-                row.alarms,
-                "-" if math.isnan(row.median) else f"{row.median:.0f}",
-                "-" if math.isnan(row.worst) else f"{row.worst:.0f}",
-                f"{row.cpu:.2f}",
-                f"{row.cpu_99:.2f}",
-            )
-            for row in rows
-        ),
+        rows,
+        {
+            "door": lambda row: row.case,
+            "streams": lambda row: row.runs,
+            "alarms": lambda row: row.alarms,
+            "looks from 45° to the alarm": lambda row: format_fixed(row.median, 0),
+            "worst": lambda row: format_fixed(row.worst, 0),
+            "look [ms CPU]": lambda row: format_fixed(row.cpu),
+            "99 of 100 within": lambda row: format_fixed(row.cpu_99),
+        },
     )
 
 

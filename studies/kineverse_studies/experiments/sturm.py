@@ -1,4 +1,10 @@
-"""Experiment ``sturm``: classification of published recordings of doors and drawers."""
+"""``sturm``: classification of published recordings of doors and drawers.
+
+The recordings of Sturm, Stachniss and Burgard (2011) contain handles and markers of doors and drawers,
+moved by hand or by a robot. They are not part of this package. Folders and files are named as in
+``tum-vision/articulation``. Each is also identified by all of its poses, as ``kineverse fit`` does, with
+noise that is estimated, or stated rightly or wrongly.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +32,13 @@ from kineverse.lie import Array
 from kineverse.view.plots import Figure, FitProjection, draw_axial_view, draw_side_view
 
 from .registry import Options, Progress
-from .report import Report, ReportTable
+from .report import Report, ReportTable, format_yes, make_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
 Label = Literal["revolute", "prismatic"]
-FOLDER = "sturm_tracks"
 SOURCE = "https://github.com/tum-vision/articulation"
 LABELS: Mapping[str, Label] = MappingProxyType(
     {
@@ -73,8 +78,6 @@ THINNED = 20
 
 @dataclass(frozen=True, eq=False)
 class LabelledRecording:
-    """Recording with its label."""
-
     name: str  # path of the file in its folder, without suffix
     label: Label  # true joint family
     poses: Array  # (N, 4, 4) of a marker, or positions (N, 3) of a handle, in the camera's frame [m]
@@ -99,15 +102,16 @@ def read_labelled_recordings(folder: Path | None) -> Iterator[LabelledRecording]
 
 def read_labelled_pairs(folder: Path | None) -> Iterator[tuple[str, Label, RecordedPair]]:
     """Return names, labels and all poses of the recordings in a folder, sorted by name."""
-    place = Path(FOLDER) if folder is None else folder
-    found = sorted((file, label) for pattern, label in LABELS.items() for file in place.glob(pattern))
-    if not found:
-        what = "none of them is there" if place.is_dir() else "there is no such folder"
+    patterns = LABELS.items() if folder is not None else ()
+    found = sorted((file, label) for pattern, label in patterns for file in (folder or Path()).glob(pattern))
+    if folder is None or not found:
+        what = "none of them is there" if folder and folder.is_dir() else "there is no such folder"
+        where = "" if folder is None else f"{folder}: {what}. "
         raise FormatError(
-            f"{place}: {what}. This experiment is about recordings of doors and drawers, cabinet_one/001.log "
+            f"{where}This experiment is about recordings of doors and drawers, cabinet_one/001.log "
             f"and so on, from {SOURCE}. Say where they are: --data FOLDER."
         )
-    return (_read_labelled(file, file.relative_to(place), label) for file, label in found)
+    return (_read_labelled(file, file.relative_to(folder), label) for file, label in found)
 
 
 def _read_labelled(file: Path, name: Path, label: Label) -> tuple[str, Label, RecordedPair]:
@@ -130,8 +134,6 @@ STATEMENTS: Mapping[str, str] = MappingProxyType(
 
 @dataclass(frozen=True)
 class StatementAnswer:
-    """Answer for a recording under a statement of the noise."""
-
     name: str  # name and label of the recording
     label: Label
     statement: str  # one of :data:`STATEMENTS`
@@ -167,11 +169,11 @@ def answer_statements(name: str, label: Label, pair: RecordedPair) -> list[State
 
 def statement_table(answers: Sequence[StatementAnswer]) -> ReportTable:
     """Return the table with the number of right, wrong and ambiguous answers for each statement."""
-    return ReportTable(
-        "All poses of each recording, as kineverse fit takes them",
-        ("noise", "right", "sure and wrong", "cannot tell"),
-        tuple((STATEMENTS[name], *map(float, counts)) for name, counts in _counts(answers).items()),
+    rows: tuple[tuple[float | str, ...], ...] = tuple(
+        (STATEMENTS[name], *(float(n) for n in counts)) for name, counts in _counts(answers).items()
     )
+    head = ("noise", "right", "sure and wrong", "cannot tell")
+    return ReportTable("All poses of each recording, as kineverse fit takes them", head, rows)
 
 
 def statement_numbers(answers: Sequence[StatementAnswer]) -> dict[str, Any]:
@@ -203,19 +205,15 @@ def _counts(answers: Sequence[StatementAnswer]) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True, eq=False)
 class Classification:
-    """Identification result of a recording."""
-
     recording: LabelledRecording  # recording with its label
     result: IdentificationResult  # identification result with the probabilities of all families
 
     @property
     def predicted(self) -> str:
-        """Most probable family."""
         return self.result.best.family
 
     @property
     def is_correct(self) -> bool:
-        """True if the most probable family is the label."""
         return self.predicted == self.recording.label
 
 
@@ -309,20 +307,22 @@ def report_recordings(
         name="sturm",
         title=f"Recorded doors and drawers ({SOURCE}): {right} of {len(classified)} taken for what they are",
         tables=(
-            ReportTable(
+            make_table(
                 "The recordings",
-                (
-                    "recording",
-                    "N",
-                    "shows",
-                    "taken for",
-                    "probability",
-                    "radius [m]",
-                    "travel",
-                    "rms [mm]",
-                    "right",
-                ),
-                tuple(_recording_row(j) for j in classified),
+                classified,
+                {
+                    "recording": lambda j: j.recording.name,
+                    "N": lambda j: float(len(j.recording.poses)),
+                    "shows": lambda j: LABEL_NAMES[j.recording.label],
+                    "taken for": lambda j: j.predicted,
+                    "probability": lambda j: j.result.best.probability,
+                    "radius [m]": lambda j: r if math.isfinite(r := axis_distance(j.result.best)) else "-",
+                    "travel": lambda j: format_travel(j.result.best),
+                    "rms [mm]": lambda j: 1e3 * j.result.best.rms[0],
+                    "right": lambda j: (
+                        ("yes" if j.is_correct else "NO") + (", cannot tell" if j.result.is_ambiguous else "")
+                    ),
+                },
             ),
             ReportTable(
                 "What is asked for, and what came out",
@@ -332,17 +332,20 @@ def report_recordings(
                         "taken for what they are",
                         share,
                         f">= {LEAST_RIGHT:g}",
-                        "yes" if share >= LEAST_RIGHT else "no",
+                        format_yes(share >= LEAST_RIGHT),
                     ),
                 ),
             ),
-            ReportTable(
+            make_table(
                 "Missed",
-                ("recording", "shows", "all families, the most probable first"),
-                tuple(
-                    (j.recording.name, LABEL_NAMES[j.recording.label], _format_families(j.result))
-                    for j in misclassified
-                ),
+                misclassified,
+                {
+                    "recording": lambda j: j.recording.name,
+                    "shows": lambda j: LABEL_NAMES[j.recording.label],
+                    "all families, the most probable first": lambda j: ", ".join(
+                        f"{fit.family} {fit.probability:.2g}" for fit in j.result.fits
+                    ),
+                },
             ),
             *([statement_table(answers)] if answers else []),
         ),
@@ -381,29 +384,8 @@ def format_travel(fit: Fit) -> str:
     )
 
 
-def _recording_row(item: Classification) -> tuple[float | str, ...]:
-    best, recording = item.result.best, item.recording
-    radius = axis_distance(best)
-    return (
-        recording.name,
-        float(len(recording.poses)),
-        LABEL_NAMES[recording.label],
-        item.predicted,
-        best.probability,
-        radius if math.isfinite(radius) else "-",
-        format_travel(best),
-        1e3 * best.rms[0],
-        ("yes" if item.is_correct else "NO") + (", cannot tell" if item.result.is_ambiguous else ""),
-    )
-
-
-def _format_families(result: IdentificationResult) -> str:
-    return ", ".join(f"{fit.family} {fit.probability:.2g}" for fit in result.fits)
-
-
 def _numbers(item: Classification) -> dict[str, Any]:
     best, recording = item.result.best, item.recording
-    radius = axis_distance(best)
     return {
         "name": recording.name,
         "count": len(recording.poses),
@@ -412,7 +394,7 @@ def _numbers(item: Classification) -> dict[str, Any]:
         "right": item.is_correct,
         "told": not item.result.is_ambiguous,
         "probabilities": {fit.family: fit.probability for fit in item.result.fits},
-        "radius": radius if math.isfinite(radius) else None,
-        "ranges": best.range.tolist(),
-        "rms": list(best.rms),
+        "radius": axis_distance(best),
+        "ranges": best.range,
+        "rms": best.rms,
     }

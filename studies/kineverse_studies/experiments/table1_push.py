@@ -27,9 +27,9 @@ from kineverse.spatial import rotation_z, translation
 from kineverse.state import State
 from kineverse.view.plots import Figure
 from kineverse.worlds.judge import CONTACT_GAP
-from kineverse_studies.execution import run_jobs
+from kineverse_studies.experiments.execution import run_jobs
 
-from .manipulation.film import FilmRow, choose_moments, find_telling_moment, make_film, make_push_picture
+from .manipulation.film import find_telling_moment, make_film, make_push_picture, make_row
 from .manipulation.skills import (
     SettingOptions,
     TrialCase,
@@ -45,7 +45,6 @@ from .manipulation.trials import (
     Column,
     StepTimeStatistics,
     Trial,
-    as_json,
     group_trials,
     make_group_table,
     make_trial_numbers,
@@ -92,8 +91,6 @@ OBJECTS = (*_COORDINATES, FOLDING_DOOR)  # names of the objects
 
 @dataclass(frozen=True, eq=False)
 class PushSetup:
-    """Robot before an open object."""
-
     kitchen: str
     model: Model  # model of robot and furniture
     what: str
@@ -147,25 +144,15 @@ def make_push_pictures(trials: Sequence[Trial]) -> dict[str, Figure]:
         telling = [(*find_telling_moment(t.film), robot) for (robot, of), t in films.items() if of == thing]
         _, moment, robot = max(telling, key=lambda found: found[0], default=(0.0, None, ""))
         if moment is not None:
-            panels.append(
-                (f"{robot} at the {thing}, {moment.time:.1f} s", partial(_load, robot, thing), moment)
-            )
+            title = f"{robot} at the {thing}, {moment.time:.1f} s"
+            panels.append((title, partial(_load, robot, thing), moment))
     if panels:
         found["vectors"] = make_push_picture(panels)
     rows = []
     for robot in SHIPPED:
-        if (robot, FILMED[0]) in films:
-            trial = films[robot, FILMED[0]]
-            chosen = choose_moments(trial.film, _PICTURES)
-            rows.append(
-                FilmRow(
-                    robot,
-                    partial(_load, robot, FILMED[0]),
-                    [m.values for m in chosen],
-                    [f"{m.time:.1f} s" for m in chosen],
-                    (f"{SHIPPED[robot].prefix}/", trial.what),
-                )
-            )
+        if (trial := films.get((robot, FILMED[0]))) is not None:
+            shown, load = (f"{SHIPPED[robot].prefix}/", trial.what), partial(_load, robot, FILMED[0])
+            rows.append(make_row(robot, load, trial.film, _PICTURES, "{0.time:.1f} s", shown))
     if rows:
         found["fridge"] = make_film(rows)
     return found
@@ -189,15 +176,10 @@ def make_push_report(trials: Sequence[Trial], seed: int) -> Report:
     by = ("case", "skill")
     groups = group_trials(trials, *by, *(c.key for c in ROW)).values()
     columns = (*ROW[:3], *OBJECT_COLUMNS, *PAPER_COLUMNS)
-    own = [dict(zip(by, (own[0].case, own[0].skill), strict=True)) for own in groups]
-    numbers = {
-        "seed": seed,
-        "pushes": [
-            one | {c.key: as_json(c.of(group)) for c in columns}
-            for one, group in zip(own, groups, strict=True)
-        ],
-        **make_trial_numbers(trials),
-    }
+    pushes = [
+        {"case": own[0].case, "skill": own[0].skill, **{c.key: c.of(own) for c in columns}} for own in groups
+    ]
+    numbers = {"seed": seed, "pushes": pushes, **make_trial_numbers(trials)}
     more = (
         make_group_table("Starts and bars", trials, (*ROW[:3], *OBJECT_COLUMNS), by),
         make_group_table("Control steps beside the papers [ms]", trials, (*ROW[:3], *PAPER_COLUMNS), by),
@@ -291,8 +273,6 @@ QUICK_OBJECTS = ("fridge door", "sink trash drawer")
 
 @dataclass(frozen=True)
 class PushJob:
-    """Push of one object by one robot."""
-
     robot: RobotSource
     kitchen: str  # name of the kitchen, and the folder of the authors' files
     data: Path | None
@@ -315,7 +295,7 @@ def run(progress: Progress, options: Options) -> Report:
         for paper in PERIODS
         if not options.quick or (thing in QUICK_OBJECTS and paper == "2022")
     ]
-    trials = run_jobs(run_push, jobs, progress, "table1-push", "push", options.processes)
+    trials = run_jobs(run_push, jobs, progress, "table1-push", "push", options)
     return make_push_report(trials, options.seed)
 
 

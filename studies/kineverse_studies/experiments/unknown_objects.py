@@ -16,7 +16,7 @@ from kineverse.manipulation.unknown_objects import forget_joint
 from kineverse.model.model import Model
 from kineverse.spatial import translation
 from kineverse.worlds import Sensors
-from kineverse_studies.execution import run_jobs
+from kineverse_studies.experiments.execution import run_jobs
 
 from .manipulation.skills import (
     DT,
@@ -70,8 +70,6 @@ OBJECTS = {
 
 @dataclass(frozen=True)
 class UnknownObjectJob:
-    """Opening of one object by one robot with one seed."""
-
     robot: RobotSource
     thing: str
     setting: TrialSetting
@@ -92,7 +90,7 @@ def run(progress: Progress, options: Options) -> Report:
         for thing in OBJECTS
         for seed in range(options.seed, options.seed + count)
     ]
-    trials = run_jobs(open_one, jobs, progress, "unknown-objects", "opening", options.processes)
+    trials = run_jobs(open_one, jobs, progress, "unknown-objects", "opening", options)
     return report_openings(trials, options.seed, count)
 
 

@@ -164,7 +164,7 @@ def test_consistency_statistics_of_known_errors(kitchen):
     assert consistent.states == (~near).sum() < truth.size
     overconfident = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound / 9)])
     assert overconfident.nees == pytest.approx(9 * consistent.nees)
-    assert "nis" not in overconfident.as_json()
+    assert "nis" not in overconfident.as_data()
 
 
 def test_lost_runs_are_counted_and_excluded():

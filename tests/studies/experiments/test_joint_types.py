@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kineverse.lie import inverse, rotation_angle
+from kineverse_studies.experiments import Options
 from kineverse_studies.experiments.joint_types import (
     COUNTS,
     LEVERS,
@@ -17,7 +18,7 @@ from kineverse_studies.experiments.joint_types import (
     SETTINGS,
     draw_case,
     identify_cases,
-    report,
+    report_answers,
 )
 
 
@@ -48,6 +49,6 @@ def test_relative_poses_are_those_of_the_joint_up_to_the_noise() -> None:
 
 
 def test_the_report_of_a_few_cases_has_all_settings() -> None:
-    found = report.report_answers(identify_cases(3, lambda items, what, unit: items, workers=1))
+    found = report_answers(identify_cases(3, lambda items, what, unit: items, Options(processes=1)))
     assert len(found.tables[0].rows) == len(SETTINGS)
     assert len(json.loads(json.dumps(found.numbers))["answers"][SETTINGS[0].title]) == 3

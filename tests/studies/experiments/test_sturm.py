@@ -115,7 +115,7 @@ def test_missing_recordings_are_an_error_with_their_place(tmp_path, monkeypatch)
     with pytest.raises(FormatError, match="none of them is there"):
         read_labelled_recordings(tmp_path)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FormatError, match="sturm_tracks: there is no such folder"):
+    with pytest.raises(FormatError, match=r"^This experiment is about .*Say where they are: --data"):
         reproduce("sturm")
 
 

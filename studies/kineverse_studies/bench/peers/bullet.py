@@ -53,13 +53,11 @@ class BulletSearch:
         )
 
     def query(self) -> object:
-        """Search for pairs within the radius."""
         closest_points, arm, client = self._bullet.getClosestPoints, self._arm, self._client
         self.results = [closest_points(arm, body, RADIUS, physicsClientId=client) for body in self._bodies]
         return self.results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search, with distances [m]."""
         for contact in itertools.chain(*self.results):
             yield f"link{contact[3]}", f"box{self._bodies[contact[2]] + contact[4]}", contact[8]
 
@@ -99,7 +97,6 @@ def _create_body(
     axes: list[list[int]] | None,
     client: int,
 ) -> int:
-    """Create a chain of revolute links, or static links if there are no axes."""
     count, nothing, upright = len(shapes), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
     fixed, turning = pybullet.JOINT_FIXED, pybullet.JOINT_REVOLUTE
     return int(
@@ -144,7 +141,6 @@ class BulletRobotSearch:
         self.results: list[tuple[int, int, Any]] = []
 
     def update(self, angles: Array) -> None:
-        """Set the state of the robot."""
         poses, place = self._room.update(angles), self._bullet.resetBasePositionAndOrientation
         for body, at, turn in zip(
             self._robot, poses[:, :, 3].tolist(), _xyzw_quaternions(poses), strict=True
@@ -152,7 +148,6 @@ class BulletRobotSearch:
             place(body, at, turn, physicsClientId=self._client)
 
     def query(self) -> object:
-        """Search for pairs within the radius."""
         closest_points, client = self._bullet.getClosestPoints, self._client
         self.results = [
             (index, first, closest_points(body, other, RADIUS, physicsClientId=client))
@@ -162,7 +157,6 @@ class BulletRobotSearch:
         return self.results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search, with distances [m]."""
         names, others = self._room.names, self._room.others
         for index, first, contacts in self.results:
             for contact in contacts:

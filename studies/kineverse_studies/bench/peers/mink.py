@@ -62,8 +62,6 @@ class MinkRobot:
 
 @dataclass
 class MinkLoop:
-    """Control loop of mink."""
-
     robot: MinkRobot
     period: float  # control period [s]
     tasks: list[Any]
@@ -85,12 +83,10 @@ class MinkLoop:
         self._q = self.robot.start
 
     def aim(self, time: float) -> None:
-        """Move the targets to a time [s]."""
         self.move(time)
         self._kept = self.constraints(time)
 
     def step(self) -> None:
-        """Update the configuration and solve."""
         configuration = self.robot.configuration
         configuration.update(self._q)
         self._velocity = mink.solve_ik(
@@ -119,7 +115,6 @@ def make_loop(name: str, workload: ControlWorkload) -> MinkLoop:
 
 
 def _plain(workload: ControlWorkload) -> Any:
-    """Return the model without masses, because MuJoCo refuses some that other libraries read."""
     root = remove_masses(ElementTree.fromstring(workload.urdf()))
     return mujoco.MjModel.from_xml_string(add_mujoco_options(root))
 
@@ -150,7 +145,6 @@ def _with_table(workload: ControlWorkload) -> Any:
 
 
 def _with_loops(workload: ControlWorkload) -> Any:
-    """Return the model by way of MJCF, because URDF has no closed loops."""
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
         file = Path(folder, "robot.xml")
         workload.robot().save(file)
@@ -370,7 +364,6 @@ class MinkReaching:
         self._task.set_target(mink.SE3.from_matrix(target))
 
     def start(self, q: Array) -> None:
-        """Set the joint positions."""
         positions = self._configuration.q
         positions[self._columns] = q
         self._configuration.update(positions)
@@ -383,7 +376,6 @@ class MinkReaching:
         return float(np.abs(step).max())
 
     def errors(self) -> tuple[float, float]:
-        """Return the errors of position and orientation."""
         error = self._task.compute_error(self._configuration)
         return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
 

@@ -176,19 +176,16 @@ class MujocoSearch:
         self.results: Any = None
 
     def update(self, angles: Array) -> None:
-        """Set the state of the moving bodies."""
         self.data.qpos[:] = angles
         mujoco.mj_kinematics(self.model, self.data)
 
     def query(self) -> object:
-        """Search for pairs within the radius."""
         mujoco.mj_collision(self.model, self.data)
         contact = self.data.contact
         self.results = contact.geom, contact.dist, contact.pos, contact.frame
         return self.results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search, with distances [m]."""
         for (a, b), distance in zip(self.results[0].tolist(), self.results[1].tolist(), strict=True):
             yield self.names[a], self.names[b], distance
 
@@ -203,7 +200,6 @@ class MujocoPairSearch(MujocoSearch):
         self._radii = self.model.geom_rbound.copy()
 
     def query(self) -> object:
-        """Search for pairs within the radius."""
         at, links, boxes = self.data.geom_xpos, self._links, self._boxes
         apart = at[links, None] - at[boxes]
         reach = self._radii[links, None] + self._radii[boxes] + RADIUS
@@ -219,7 +215,6 @@ class MujocoPairSearch(MujocoSearch):
         return results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search, with distances [m]."""
         return ((self.names[i], self.names[j], distance) for i, j, distance, _ in self.results)
 
 
@@ -284,14 +279,12 @@ class MujocoRobotSearch(MujocoSearch):
         self.names = [room.names[int(name)] for name in self.names]
 
     def update(self, angles: Array) -> None:
-        """Set the state of the robot."""
         poses = self._room.update(angles)
         self.data.qpos.reshape(-1, 7)[:] = np.hstack([poses[:, :, 3], to_wxyz(poses)])
         mujoco.mj_kinematics(self.model, self.data)
 
 
 def _mjcf_geom(number: int, solid: Solid) -> tuple[str, str]:
-    """Return the asset and the geom attributes of an object in MJCF."""
     shape, name = solid.surface, f'name="{number}"'
     if isinstance(shape, Sphere):
         return "", f'{name} type="sphere" size="{shape.radius!r}"'

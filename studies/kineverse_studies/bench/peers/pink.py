@@ -64,8 +64,6 @@ class PinkRobot:
 
 @dataclass
 class PinkLoop:
-    """Control loop of pink."""
-
     robot: PinkRobot
     period: float  # control period [s]
     tasks: list[Any]
@@ -83,11 +81,9 @@ class PinkLoop:
         self._q = self.robot.start
 
     def aim(self, time: float) -> None:
-        """Move the targets to a time [s]."""
         self.move(time)
 
     def step(self) -> None:
-        """Update the configuration and solve."""
         configuration = self.robot.configuration
         configuration.update(self._q)
         self._velocity = pink.solve_ik(configuration, self.tasks, self.period, solver=SOLVER, **self.options)
@@ -211,7 +207,6 @@ class PinkTargetLoop(PinkLoop):
         """Stay at the solution."""
 
     def step(self) -> None:
-        """Iterate until the target is reached."""
         self.reset()
         (task,) = self.tasks
         for _ in range(1000):
@@ -308,7 +303,6 @@ class PinkReaching:
         self._task.set_target(pin.SE3(target))
 
     def start(self, q: Array) -> None:
-        """Set the joint positions."""
         self._configuration.update(self._arm.to_pinocchio(q))
 
     def iterate(self) -> float:
@@ -325,7 +319,6 @@ class PinkReaching:
         return float(np.abs(step).max())
 
     def errors(self) -> tuple[float, float]:
-        """Return the errors of position and orientation."""
         error = self._task.compute_error(self._configuration)
         return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
 
@@ -351,7 +344,6 @@ class PinocchioReaching:
         self._target = pin.SE3(target)
 
     def start(self, q: Array) -> None:
-        """Set the joint positions."""
         self._q = self._arm.to_pinocchio(q)
         self._look()
 
@@ -365,11 +357,9 @@ class PinocchioReaching:
         return float(np.abs(step).max())
 
     def errors(self) -> tuple[float, float]:
-        """Return the errors of position and orientation."""
         return float(np.linalg.norm(self._error[:3])), float(np.linalg.norm(self._error[3:]))
 
     def positions(self) -> Array:
-        """Return the joint positions, those of revolute joints within π of the middle of the limits."""
         q, middle = self._arm.from_pinocchio(self._q), 0.5 * (self._problem.lower + self._problem.upper)
         turns = np.round((q - middle) / (2.0 * np.pi))
         return np.array(q - 2.0 * np.pi * turns * self._revolute)

@@ -1,14 +1,16 @@
-"""Results of the estimation grid, their comparison with the bounds, and the targets."""
+"""``estimation-grid``: identified hinges and sliders over noise, number and range of observations.
+
+Each fit is compared with the Cramér-Rao bound of its own sample, see :mod:`.cramer_rao`, and the most
+probable family with the true one.
+"""
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Hashable, Iterable, Sequence
-from concurrent.futures import Future
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +20,10 @@ from kineverse.estimation import identify, pose_covariance
 from kineverse.estimation.identification.result import Fit
 from kineverse.lie import Array
 from kineverse.view.plots import Figure
-from kineverse_studies.execution import worker_pool
+from kineverse_studies.experiments.execution import run_jobs
 from kineverse_studies.experiments.registry import Options, Progress
-from kineverse_studies.experiments.report import Report, ReportTable
+from kineverse_studies.experiments.report import Cell as TableCell
+from kineverse_studies.experiments.report import Report, ReportTable, format_yes, make_table
 
 from .cramer_rao import (
     LEVER,
@@ -49,8 +52,6 @@ FAR_OFF = 6.0
 
 @dataclass(frozen=True, eq=False)
 class CellResult:
-    """Results of the samples of a cell."""
-
     cell: Cell
     degrees: Array
     metres: Array
@@ -112,8 +113,6 @@ class ErrorRatios:
 
 @dataclass(frozen=True)
 class GridSummary:
-    """Summary of several cells."""
-
     cells: int  # numbers of cells and fits
     fits: int
     bound: ErrorRatios  # ratios of errors to the Cramér-Rao bound and to the attainable bound
@@ -196,21 +195,18 @@ def make_quick_grid() -> list[Cell]:
 
 
 def fit_all(
-    cells: Sequence[Cell], samples: int, progress: Progress, workers: int | None = None
+    cells: Sequence[Cell], samples: int, progress: Progress, options: Options | None = None
 ) -> list[CellResult]:
     """Fit samples of each cell and return the results in the same order."""
-    workers = workers or os.cpu_count() or 1
-    if workers == 1:
-        return [fit_cell(cell, samples) for cell in progress(cells, "estimation-grid", "cell")]
-    # Spawned processes, because a fork during a background compilation may hang. Long cells first, so that
-    # all processes end at about the same time.
+    # Long cells first, so that all processes end at about the same time.
     order = sorted(range(len(cells)), key=lambda k: -cells[k].count)
-    with worker_pool(workers) as pool:
-        jobs: list[tuple[int, Future[CellResult]]] = [
-            (k, pool.submit(fit_cell, cells[k], samples)) for k in order
-        ]
-        done = {k: job.result() for k, job in progress(jobs, "estimation-grid", "cell")}
-    return [done[k] for k in range(len(cells))]
+    jobs = [(cells[k], samples) for k in order]
+    found = run_jobs(_fit_one, jobs, progress, "estimation-grid", "cell", options)
+    return [result for _, result in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
+
+
+def _fit_one(job: tuple[Cell, int]) -> list[CellResult]:
+    return [fit_cell(*job)]
 
 
 def fit_cell(cell: Cell, count: int) -> CellResult:
@@ -271,7 +267,6 @@ def _metres(fit: Fit | None, samples: JointSamples, k: int) -> float:
 
 
 def _spread(limit: Bound) -> float:
-    """Return the relative variance of the sum of squared angles under the bound."""
     squares = np.trace(limit.direction @ limit.direction, axis1=1, axis2=2).sum()
     return float(2.0 * squares / np.trace(limit.direction, axis1=1, axis2=2).sum() ** 2)
 
@@ -331,164 +326,112 @@ def _scatter(axes: Axes, results: Sequence[CellResult], across: Sequence[float],
 OPTIONS = ("quick", "count", "processes")
 QUICK_SAMPLES = 10
 WORST = 10
-Key = TypeVar("Key", bound=Hashable)
-Cells = tuple[float | str, ...]
 
 
 def run(progress: Progress, options: Options) -> Report:
     """Fit the grid; ``quick`` takes a few cells and fewer samples, ``count`` so many samples of each cell."""
     cells, samples = (make_quick_grid(), QUICK_SAMPLES) if options.quick else (make_grid(), SAMPLES)
-    return report_grid(fit_all(cells, options.count or samples, progress, options.processes))
+    return report_grid(fit_all(cells, options.count or samples, progress, options))
 
 
 def report_grid(results: Sequence[CellResult]) -> Report:
     total = summarize_cells(results)
+    near = sorted((r for r in results if r.attainable < NEAR), key=lambda r: -r.attained)[:WORST]
     return Report(
         name="estimation-grid",
         title=f"Hinges and sliders from noisy poses: {total.fits} fits in {total.cells} cells",
         tables=(
-            _target_rows(total),
-            _by_noise(results),
-            _by_range(results),
-            _by_count(results),
-            _worst(results),
+            _target_table(total),
+            _grouped_table(
+                f"By noise of both poses; errors where what they are held against is below {NEAR:g} deg",
+                results,
+                {
+                    "joint": lambda cell: cell.joint,
+                    "noise [mm]": lambda cell: 1e3 * cell.position,
+                    "noise [deg]": lambda cell: math.degrees(cell.orientation),
+                },
+            ),
+            _grouped_table(
+                "By range of the motion",
+                results,
+                {"joint": lambda cell: cell.joint, "range": format_joint_range},
+            ),
+            _grouped_table(
+                "By number of observations",
+                results,
+                {"joint": lambda cell: cell.joint, "N": lambda cell: float(cell.count)},
+            ),
+            make_table(
+                f"The cells farthest above what can be attained, where that is below {NEAR:g} deg",
+                near,
+                {
+                    "joint": lambda r: r.cell.joint,
+                    "noise [mm]": lambda r: 1e3 * r.cell.position,
+                    "noise [deg]": lambda r: math.degrees(r.cell.orientation),
+                    "N": lambda r: float(r.cell.count),
+                    "range": lambda r: format_joint_range(r.cell),
+                    "bound [deg]": lambda r: r.bound,
+                    "attainable": lambda r: r.attainable,
+                    "RMS [deg]": lambda r: rms(r.degrees),
+                    "right": lambda r: float(r.right.mean()),
+                },
+            ),
         ),
         numbers={
             "seed": SEED,
             "geometry": {"parent_to_axis": TO_AXIS, "axis_to_child": LEVER},
             "bars": {"near_deg": NEAR, "telling_deg": TELLING, "ratio": MOST_OVER, "right": LEAST_RIGHT},
-            "summary": _to_json(asdict(total)),
+            "summary": total,
             "cells": [_numbers(result) for result in results],
         },
         figure=Figure(lambda canvas: draw_grid(canvas, results), FIGURE_SIZE),
     )
 
 
-def _target_rows(total: GridSummary) -> ReportTable:
-    by_chance = total.over_by_chance
-    chance = f"{by_chance:.1f} by chance"
-    return ReportTable(
-        "What is asked for, and what came out",
-        ("", "measured", "asked for", "holds"),
-        (
-            *_error_rows("the Cramér-Rao bound", total.bound),
-            *_error_rows("what can be attained", total.attainable),
-            (
-                f"cells over {MOST_OVER:g} of what can be attained",
-                float(total.attainable.over),
-                chance,
-                _format_met(total.attainable.over <= by_chance + 3.0 * math.sqrt(by_chance)),
-            ),
-            ("divergences", float(total.diverged), "0", _format_met(total.diverged == 0)),
-            _correct_rows("right type, the Cramér-Rao bound", total.right),
-            _correct_rows("right type, what can be attained", total.right_attainable),
-            (f'told rather than "cannot tell", the bound below {TELLING:g} deg', _dash(total.told), "-", "-"),
-            ("told, and wrong, anywhere", float(total.told_wrong), "-", "-"),
-        ),
-    )
+def _target_table(total: GridSummary) -> ReportTable:
+    rows: list[tuple[TableCell, ...]] = []
+    held = {"the Cramér-Rao bound": total.bound, "what can be attained": total.attainable}
+    for what, ratios in held.items():
+        for part, ratio in (("direction", ratios.direction), ("place", ratios.place)):
+            name = f"RMS of the {part} over {what}, that below {NEAR:g} deg"
+            rows.append((name, _dash(ratio), f"<= {MOST_OVER:g}", format_yes(ratio <= MOST_OVER)))
+    chance, over = total.over_by_chance, total.attainable.over
+    few = f"{chance:.1f} by chance", format_yes(over <= chance + 3.0 * math.sqrt(chance))
+    rows.append((f"cells over {MOST_OVER:g} of what can be attained", float(over), *few))
+    rows.append(("divergences", float(total.diverged), "0", format_yes(total.diverged == 0)))
+    for what, share in zip(held, (total.right, total.right_attainable), strict=True):
+        name = f"right type, {what} below {TELLING:g} deg"
+        rows.append((name, _dash(share), f">= {LEAST_RIGHT:g}", format_yes(share >= LEAST_RIGHT)))
+    name = f'told rather than "cannot tell", the bound below {TELLING:g} deg'
+    rows.append((name, _dash(total.told), "-", "-"))
+    rows.append(("told, and wrong, anywhere", float(total.told_wrong), "-", "-"))
+    head = ("", "measured", "asked for", "holds")
+    return ReportTable("What is asked for, and what came out", head, tuple(rows))
 
 
-def _error_rows(what: str, ratios: ErrorRatios) -> tuple[Cells, ...]:
-    asked = f"<= {MOST_OVER:g}"
-    return tuple(
-        (
-            f"RMS of the {part} over {what}, that below {NEAR:g} deg",
-            _dash(ratio),
-            asked,
-            _format_met(ratio <= MOST_OVER),
-        )
-        for part, ratio in (("direction", ratios.direction), ("place", ratios.place))
-    )
-
-
-def _correct_rows(what: str, part: float) -> Cells:
-    return (
-        f"{what} below {TELLING:g} deg",
-        _dash(part),
-        f">= {LEAST_RIGHT:g}",
-        _format_met(part >= LEAST_RIGHT),
-    )
-
-
-_HEAD = ("fits", "RMS/bound", "RMS/attainable", "place/attainable", "right", "told", "diverged")
-
-
-def _by_noise(results: Sequence[CellResult]) -> ReportTable:
-    return ReportTable(
-        f"By noise of both poses; errors where what they are held against is below {NEAR:g} deg",
-        ("joint", "noise [mm]", "noise [deg]", *_HEAD),
-        tuple(
-            (joint, 1e3 * position, math.degrees(orientation), *_cells(chosen))
-            for (joint, position, orientation), chosen in _group_results(
-                results, lambda cell: (cell.joint, cell.position, cell.orientation)
-            )
-        ),
-    )
-
-
-def _by_range(results: Sequence[CellResult]) -> ReportTable:
-    groups = _group_results(results, lambda cell: (cell.joint, cell.range))
-    rows = tuple(
-        (joint, format_joint_range(joint, reach), *_cells(chosen)) for (joint, reach), chosen in groups
-    )
-    return ReportTable("By range of the motion", ("joint", "range", *_HEAD), rows)
-
-
-def _by_count(results: Sequence[CellResult]) -> ReportTable:
-    groups = _group_results(results, lambda cell: (cell.joint, cell.count))
-    rows = tuple((joint, float(count), *_cells(chosen)) for (joint, count), chosen in groups)
-    return ReportTable("By number of observations", ("joint", "N", *_HEAD), rows)
-
-
-def _cells(results: Sequence[CellResult]) -> Cells:
-    part = summarize_cells(results)
-    numbers = (part.bound.direction, part.attainable.direction, part.attainable.place, part.right, part.told)
-    return (float(part.fits), *map(_dash, numbers), float(part.diverged))
-
-
-def _worst(results: Sequence[CellResult]) -> ReportTable:
-    near = sorted((r for r in results if r.attainable < NEAR), key=lambda r: -r.attained)[:WORST]
-    return ReportTable(
-        f"The cells farthest above what can be attained, where that is below {NEAR:g} deg",
-        (
-            "joint",
-            "noise [mm]",
-            "noise [deg]",
-            "N",
-            "range",
-            "bound [deg]",
-            "attainable",
-            "RMS [deg]",
-            "right",
-        ),
-        tuple(
-            (
-                r.cell.joint,
-                1e3 * r.cell.position,
-                math.degrees(r.cell.orientation),
-                float(r.cell.count),
-                format_joint_range(r.cell.joint, r.cell.range),
-                r.bound,
-                r.attainable,
-                rms(r.degrees),
-                float(r.right.mean()),
-            )
-            for r in near
-        ),
-    )
-
-
-def format_joint_range(joint: str, reach: float) -> str:
-    return f"{math.degrees(reach):.0f} deg" if joint == "revolute" else f"{100 * reach:.0f} cm"
-
-
-def _group_results(
-    results: Iterable[CellResult], key: Callable[[Cell], Key]
-) -> Iterable[tuple[Key, list[CellResult]]]:
-    groups: dict[Key, list[CellResult]] = {}
+def _grouped_table(
+    title: str, results: Sequence[CellResult], by: Mapping[str, Callable[[Cell], TableCell]]
+) -> ReportTable:
+    """Return a table with a row for each group of cells that agree in some columns."""
+    groups: dict[tuple[TableCell, ...], list[CellResult]] = {}
     for result in results:
-        groups.setdefault(key(result.cell), []).append(result)
-    return groups.items()
+        groups.setdefault(tuple(of(result.cell) for of in by.values()), []).append(result)
+    columns: dict[str, Callable[[GridSummary], TableCell]] = {
+        "fits": lambda part: float(part.fits),
+        "RMS/bound": lambda part: _dash(part.bound.direction),
+        "RMS/attainable": lambda part: _dash(part.attainable.direction),
+        "place/attainable": lambda part: _dash(part.attainable.place),
+        "right": lambda part: _dash(part.right),
+        "told": lambda part: _dash(part.told),
+        "diverged": lambda part: float(part.diverged),
+    }
+    summaries = make_table(title, map(summarize_cells, groups.values()), columns)
+    rows = tuple((*key, *row) for key, row in zip(groups, summaries.rows, strict=True))
+    return ReportTable(title, (*by, *summaries.head), rows)
+
+
+def format_joint_range(cell: Cell) -> str:
+    return f"{math.degrees(cell.range):.0f} deg" if cell.joint == "revolute" else f"{100 * cell.range:.0f} cm"
 
 
 def _numbers(result: CellResult) -> dict[str, Any]:
@@ -502,29 +445,18 @@ def _numbers(result: CellResult) -> dict[str, Any]:
         "samples": len(result.degrees),
         "bound_deg": result.bound,
         "attainable_deg": result.attainable,
-        "rms_deg": _to_json(rms(result.degrees)),
-        "bound_m": _to_json(rms(result.bound_metres)),
-        "attainable_m": _to_json(rms(result.attainable_metres)),
-        "rms_m": _to_json(rms(result.metres)),
+        "rms_deg": rms(result.degrees),
+        "bound_m": rms(result.bound_metres),
+        "attainable_m": rms(result.attainable_metres),
+        "rms_m": rms(result.metres),
         "above_by_chance": result.by_chance,
-        "right": float(result.right.mean()),
-        "told": float(result.told.mean()),
-        "told_wrong": int((result.told & ~result.right).sum()),
+        "right": result.right.mean(),
+        "told": result.told.mean(),
+        "told_wrong": (result.told & ~result.right).sum(),
         "taken_for": {name: result.called.count(name) for name in sorted(set(result.called))},
         "diverged": result.diverged,
     }
 
 
-def _to_json(value: Any) -> Any:
-    """Convert a value for JSON, with null for numbers that are not finite."""
-    if isinstance(value, dict):
-        return {name: _to_json(inner) for name, inner in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _dash(value: float) -> float | str:
+def _dash(value: float) -> TableCell:
     return value if math.isfinite(value) else "-"
-
-
-def _format_met(does: bool) -> str:
-    return "yes" if does else "no"

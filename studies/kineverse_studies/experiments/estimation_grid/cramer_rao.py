@@ -41,8 +41,6 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class JointSamples:
-    """Random recordings of one cell, with the true joints."""
-
     cell: Cell
     axis: Array  # unit vectors of the axes in the parent's frame, (S, 3)
     point: Array

@@ -8,8 +8,8 @@ Gaussian noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,13 +17,14 @@ import numpy as np
 from kineverse.formats import load
 from kineverse.view.plots import Figure
 from kineverse_studies.experiments.registry import Options, Progress
-from kineverse_studies.experiments.report import Report, ReportTable
+from kineverse_studies.experiments.report import Report, ReportTable, format_fixed, make_table
 
 from .accuracy import (
     FILTERS,
     INTERIOR_DEVIATIONS,
     REPORTED_MAX,
     REPORTED_MEAN,
+    CoordinateErrors,
     Errors,
     FilterConsistency,
     MechanismErrors,
@@ -57,7 +58,7 @@ class Fig4Results:
     scene: ObservedModel
     seeds: tuple[int, ...]  # seeds, and number of configurations of each
     configurations: int
-    errors: tuple[Errors, ...]  # see :mod:`.accuracy`, :mod:`.consistency`, :mod:`.mechanisms`
+    errors: tuple[Errors, ...]
     variants: Mapping[str, list[float]]
     by_size: list[tuple[int, dict[str, Duration]]]
     by_noise: list[tuple[PoseNoise, dict[str, Duration]]]
@@ -65,75 +66,49 @@ class Fig4Results:
     mechanisms: list[MechanismErrors]
 
     def numbers(self) -> dict[str, Any]:
-        """Return the results as JSON data, by filter, with null for NaN."""
+        """Return the results by filter."""
+        reported = zip(self.errors, REPORTED_MEAN, REPORTED_MAX, strict=True)
         return {
             "model": self.model,
             "degrees_of_freedom": len(self.scene.symbols),
             "symbols": [str(s) for s in self.scene.symbols],
-            "seeds": list(self.seeds),
+            "seeds": self.seeds,
             "configurations": self.configurations,
             "observations": OBSERVATIONS,
             "errors": [
-                {
-                    **_noise_to_json(errors.noise),
-                    **{
-                        filter_name: {**errors.summary(filter_name), "nees": errors.nees[filter_name]}
-                        for filter_name in FILTERS
-                    },
-                    "reported_mean": mean,
-                    "reported_max": largest,
-                }
-                for errors, mean, largest in zip(self.errors, REPORTED_MEAN, REPORTED_MAX, strict=True)
+                _by_noise(
+                    errors.noise,
+                    {name: errors.summary(name) | {"nees": errors.nees[name]} for name in FILTERS},
+                )
+                | {"reported_mean": mean, "reported_max": largest}
+                for errors, mean, largest in reported
             ],
             "by_degrees_of_freedom": [
-                {
-                    "degrees_of_freedom": dof,
-                    **{
-                        filter_name: self._at_size(dof, times[filter_name], filter_name)
-                        for filter_name in FILTERS
-                    },
+                {"degrees_of_freedom": dof}
+                | {
+                    name: {
+                        "errors": [e.summary(name, slice(dof)) for e in self.errors],
+                        "milliseconds": times[name],
+                    }
+                    for name in FILTERS
                 }
                 for dof, times in self.by_size
             ],
-            "milliseconds_by_noise": [
-                {
-                    **_noise_to_json(noise),
-                    **{filter_name: asdict(times[filter_name]) for filter_name in FILTERS},
-                }
-                for noise, times in self.by_noise
-            ],
-            "variants": dict(self.variants),
+            "milliseconds_by_noise": [_by_noise(noise, times) for noise, times in self.by_noise],
+            "variants": self.variants,
             "consistency": [
-                {
-                    **_noise_to_json(noise),
-                    **{filter_name: c.as_json() for filter_name, c in by_filter.items()},
-                }
+                _by_noise(noise, {name: c.as_data() for name, c in by_filter.items()})
                 for noise, by_filter in self.consistency.items()
             ],
             "mechanisms": [
-                {
-                    "mechanism": f.mechanism,
-                    **_noise_to_json(f.noise),
-                    **{
-                        filter_name: _without_nan(asdict(f.by_filter[filter_name])) for filter_name in FILTERS
-                    },
-                }
-                for f in self.mechanisms
+                {"mechanism": one.mechanism} | _by_noise(one.noise, one.by_filter) for one in self.mechanisms
             ],
             "paper": {"milliseconds_below": REPORTED},
         }
 
-    def _at_size(self, dof: int, time: Duration, filter_name: str) -> dict[str, Any]:
-        errors = [e.summary(filter_name, slice(dof)) for e in self.errors]
-        return {"errors": errors, "milliseconds": asdict(time)}
 
-
-def _noise_to_json(noise: PoseNoise) -> dict[str, float]:
-    return {"position": noise.position, "orientation": noise.orientation}
-
-
-def _without_nan(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {key: None if math.isnan(value) else value for key, value in values.items()}
+def _by_noise(noise: PoseNoise, by_filter: Mapping[str, Any]) -> dict[str, Any]:
+    return {"position": noise.position, "orientation": noise.orientation, **by_filter}
 
 
 FILTER_NAMES = {"published": "papers' filter", "proper": "Tracker"}
@@ -143,165 +118,131 @@ _KINDS = (("shifting", 1e3), ("turning", 180 / math.pi))
 
 def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
     """Return all tables, first the one of published values."""
-    return (
-        _table_of_reported(results),
-        _table_by_noise(results),
-        _table_by_kind(results),
-        _table_by_size(results),
-        _table_of_variants(results),
-        _table_of_consistency(results),
-        _table_of_mechanisms(results),
-    )
-
-
-def _table_of_reported(results: Fig4Results) -> ReportTable:
-    rows = []
-    for errors, mean, largest in zip(results.errors, REPORTED_MEAN, REPORTED_MAX, strict=True):
-        found = errors.summary("published")
-        off = f"{100 * (found['mean'] / mean - 1):+.1f} %"
-        maxima = f"{min(found['maxima']):.3f} … {max(found['maxima']):.3f}"
-        rows.append(
-            (
-                str(errors.noise),
-                _format_fixed(found["mean"]),
-                _format_fixed(mean),
-                off,
-                maxima,
-                f"{largest:.3f}",
-            )
-        )
-    return ReportTable(
-        f"The papers' filter: |q̂ - q| after {OBSERVATIONS} observations, m and rad together like the papers "
-        f"(configurations: {results.configurations}, seeds: {len(results.seeds)})",
-        ("noise", "mean", "authors' code", "off by", "max, by seed", "authors' code, one run"),
-        tuple(rows),
-    )
-
-
-def _table_by_noise(results: Fig4Results) -> ReportTable:
-    rows = []
-    for errors, (_, times) in zip(results.errors, results.by_noise, strict=True):
-        for filter_name in FILTERS:
-            found = errors.summary(filter_name)
-            values = (_format_fixed(found[key]) for key in ("mean", "sd", "max"))
-            nees = f"{errors.nees[filter_name]:.2f}"
-            rows.append(
-                (str(errors.noise), FILTER_NAMES[filter_name], *values, nees, *_format_ms(times[filter_name]))
-            )
-    return ReportTable(
-        "Errors against noise, and the processor time of one prediction and update",
-        ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "its sd", "its median"),
-        tuple(rows),
-    )
-
-
-def _table_by_kind(results: Fig4Results) -> ReportTable:
+    strongest = results.errors[-1]
     turning = results.scene.turning
     kinds = [(~turning, 1e3), (turning, 180 / math.pi)]
-    rows = []
-    for errors in results.errors:
-        cells = [
-            f"{unit * errors.rms(filter_name, where):.2f}" if where.any() else "-"
-            for where, unit in kinds
-            for filter_name in FILTERS
-        ]
-        rows.append((str(errors.noise), *cells))
-    titles = (
-        f"{what}: {FILTER_NAMES[filter_name]}"
-        for what in ("shifts [mm]", "turns [deg]")
-        for filter_name in FILTERS
+    names = [FILTER_NAMES[name] for name in FILTERS]
+    reported = zip(results.errors, REPORTED_MEAN, REPORTED_MAX, strict=True)
+    means = {
+        dof: [strongest.summary(name, slice(dof))["mean"] for name in FILTERS] for dof, _ in results.by_size
+    }
+    return (
+        ReportTable(
+            f"The papers' filter: |q̂ - q| after {OBSERVATIONS} observations, m and rad together like the "
+            f"papers (configurations: {results.configurations}, seeds: {len(results.seeds)})",
+            ("noise", "mean", "authors' code", "off by", "max, by seed", "authors' code, one run"),
+            tuple(_reported_row(*row) for row in reported),
+        ),
+        ReportTable(
+            "Errors against noise, and the processor time of one prediction and update",
+            ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "its sd", "its median"),
+            tuple(
+                (
+                    str(errors.noise),
+                    FILTER_NAMES[name],
+                    *(format_fixed(errors.summary(name)[key], 4) for key in ("mean", "sd", "max")),
+                    format_fixed(errors.nees[name]),
+                    *_format_ms(times[name]),
+                )
+                for errors, (_, times) in zip(results.errors, results.by_noise, strict=True)
+                for name in FILTERS
+            ),
+        ),
+        ReportTable(
+            "Root mean square errors of what shifts and what turns",
+            ("noise", *(f"{what}: {name}" for what in ("shifts [mm]", "turns [deg]") for name in names)),
+            tuple(
+                (
+                    str(errors.noise),
+                    *(
+                        format_fixed(errors.rms(name, where), 2, unit) if where.any() else "-"
+                        for where, unit in kinds
+                        for name in FILTERS
+                    ),
+                )
+                for errors in results.errors
+            ),
+        ),
+        ReportTable(
+            f"Against degrees of freedom, at {strongest.noise}; the papers stay below {REPORTED:g} ms",
+            (
+                "DoF",
+                *(f"{name}: mean error" for name in names),
+                *(title for name in names for title in (f"{name} [ms]", "sd", "median")),
+            ),
+            tuple(
+                (
+                    str(dof),
+                    *(format_fixed(mean, 4) for mean in means[dof]),
+                    *(cell for name in FILTERS for cell in _format_ms(times[name])),
+                )
+                for dof, times in results.by_size
+            ),
+        ),
+        ReportTable(
+            "What the mean errors of the papers' filter depend on",
+            ("variant", *(str(errors.noise) for errors in results.errors)),
+            tuple((name, *(format_fixed(mean, 4) for mean in row)) for name, row in results.variants.items()),
+        ),
+        _consistency_table(results),
+        _mechanism_table(results),
     )
-    return ReportTable(
-        "Root mean square errors of what shifts and what turns", ("noise", *titles), tuple(rows)
+
+
+def _reported_row(errors: Errors, mean: float, largest: float) -> tuple[str, ...]:
+    found = errors.summary("published")
+    maxima = f"{min(found['maxima']):.3f} … {max(found['maxima']):.3f}"
+    off = f"{100 * (found['mean'] / mean - 1):+.1f} %"
+    return (
+        str(errors.noise),
+        format_fixed(found["mean"], 4),
+        format_fixed(mean, 4),
+        off,
+        maxima,
+        f"{largest:.3f}",
     )
 
 
-def _table_by_size(results: Fig4Results) -> ReportTable:
-    strongest = results.errors[-1]
-    rows = []
-    for dof, times in results.by_size:
-        means = (_format_fixed(strongest.summary(filter_name, slice(dof))["mean"]) for filter_name in FILTERS)
-        rows.append(
-            (str(dof), *means, *(cell for filter_name in FILTERS for cell in _format_ms(times[filter_name])))
-        )
-    titles = (
-        title for filter_name in FILTERS for title in (f"{FILTER_NAMES[filter_name]} [ms]", "sd", "median")
-    )
-    return ReportTable(
-        f"Against degrees of freedom, at {strongest.noise}; the papers stay below {REPORTED:g} ms",
-        ("DoF", *(f"{FILTER_NAMES[filter_name]}: mean error" for filter_name in FILTERS), *titles),
-        tuple(rows),
-    )
+def _consistency_table(results: Fig4Results) -> ReportTable:
+    def of_kind(found: FilterConsistency, kind: str, unit: float) -> str:
+        return f"{unit * found.rms[kind]:.2f}, {unit * found.bound[kind]:.2f}" if kind in found.rms else "-"
 
-
-def _table_of_variants(results: Fig4Results) -> ReportTable:
-    return ReportTable(
-        "What the mean errors of the papers' filter depend on",
-        ("variant", *(str(errors.noise) for errors in results.errors)),
-        tuple((name, *map(_format_fixed, means)) for name, means in results.variants.items()),
-    )
-
-
-def _table_of_consistency(results: Fig4Results) -> ReportTable:
-    return ReportTable(
+    columns: dict[str, Callable[[tuple[PoseNoise, str, FilterConsistency]], str]] = {
+        "noise": lambda one: str(one[0]),
+        "filter": lambda one: FILTER_NAMES[one[1]],
+        "NEES": lambda one: format_fixed(one[2].nees_inside, 3),
+        "NEES, all": lambda one: format_fixed(one[2].nees, 3),
+        "NIS": lambda one: format_fixed(one[2].nis, 4),
+        "band": lambda one: "-" if math.isnan(one[2].nis) else "{:.4f} … {:.4f}".format(*one[2].nis_band),
+        "RMSE/bound": lambda one: format_fixed(one[2].over_bound, 3),
+        "shifts: RMSE, bound [mm]": lambda one: of_kind(one[2], *_KINDS[0]),
+        "turns: RMSE, bound [deg]": lambda one: of_kind(one[2], *_KINDS[1]),
+    }
+    title = (
         "Gaussian noise on each axis: NEES per state (1 is right) of truths "
         f"{INTERIOR_DEVIATIONS:g}σ inside the limits and of all, NIS and its 95 % band, "
-        "and errors over the Cramér-Rao bound",
-        (
-            "noise",
-            "filter",
-            "NEES",
-            "NEES, all",
-            "NIS",
-            "band",
-            "RMSE/bound",
-            "shifts: RMSE, bound [mm]",
-            "turns: RMSE, bound [deg]",
-        ),
-        tuple(
-            (str(noise), FILTER_NAMES[filter_name], *_consistency_row(found))
-            for noise, by_filter in results.consistency.items()
-            for filter_name, found in by_filter.items()
-        ),
+        "and errors over the Cramér-Rao bound"
     )
-
-
-def _consistency_row(found: FilterConsistency) -> tuple[str, ...]:
-    counted = not math.isnan(found.nis)
-    return (
-        f"{found.nees_inside:.3f}",
-        f"{found.nees:.3f}",
-        f"{found.nis:.4f}" if counted else "-",
-        "{:.4f} … {:.4f}".format(*found.nis_band) if counted else "-",
-        f"{found.over_bound:.3f}",
-        *(
-            f"{unit * found.rms[kind]:.2f}, {unit * found.bound[kind]:.2f}" if kind in found.rms else "-"
-            for kind, unit in _KINDS
-        ),
+    items = (
+        (noise, name, one) for noise, found in results.consistency.items() for name, one in found.items()
     )
+    return make_table(title, items, columns)
 
 
-def _table_of_mechanisms(results: Fig4Results) -> ReportTable:
-    rows = []
-    for mechanism in results.mechanisms:
-        for filter_name in FILTERS:
-            found = mechanism.by_filter[filter_name]
-            values = (
-                _format_fixed(found.mean),
-                _format_fixed(found.max),
-                f"{found.nees:.2f}",
-                f"{found.lost_percent:.0f}",
-            )
-            rows.append((mechanism.mechanism, str(mechanism.noise), FILTER_NAMES[filter_name], *values))
-    return ReportTable(
-        "Mechanisms that are no joints: |q̂ - q| [rad], [m]; lost: a step to where the model has no value",
-        ("mechanism", "noise", "filter", "mean", "max", "NEES", "lost [%]"),
-        tuple(rows),
+def _mechanism_table(results: Fig4Results) -> ReportTable:
+    columns: dict[str, Callable[[tuple[MechanismErrors, str, CoordinateErrors]], str]] = {
+        "mechanism": lambda one: one[0].mechanism,
+        "noise": lambda one: str(one[0].noise),
+        "filter": lambda one: FILTER_NAMES[one[1]],
+        "mean": lambda one: format_fixed(one[2].mean, 4),
+        "max": lambda one: format_fixed(one[2].max, 4),
+        "NEES": lambda one: f"{one[2].nees:.2f}",
+        "lost [%]": lambda one: f"{one[2].lost_percent:.0f}",
+    }
+    title = "Mechanisms that are no joints: |q̂ - q| [rad], [m]; lost: a step to where the model has no value"
+    return make_table(
+        title, ((one, name, one.by_filter[name]) for one in results.mechanisms for name in FILTERS), columns
     )
-
-
-def _format_fixed(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.4f}"
 
 
 def _format_ms(duration: Duration) -> tuple[str, ...]:
@@ -315,94 +256,42 @@ _COLORS = {"published": "tab:orange", "proper": "tab:blue"}
 def draw_results(canvas: Canvas, results: Fig4Results) -> None:
     """Draw the results on an empty figure."""
     (noise, size), (time, consistency) = canvas.subplots(2, 2)
-    _plot_errors_by_noise(noise, results)
-    _plot_errors_by_size(size, results)
-    _plot_times(time, results)
-    _plot_consistency(consistency, results)
-
-
-def _plot_errors_by_noise(axes: Any, results: Fig4Results) -> None:
     places = np.arange(len(results.errors))
-    for filter_name in FILTERS:
-        found = [errors.summary(filter_name) for errors in results.errors]
+    sizes = [dof for dof, _ in results.by_size]
+    gaussian = np.arange(len(results.consistency))
+    for name in FILTERS:
+        label, color = FILTER_NAMES[name], _COLORS[name]
+        found = [errors.summary(name) for errors in results.errors]
         for key, style in (("max", "^"), ("mean", "o-"), ("sd", ":")):
-            axes.plot(
-                places,
-                [f[key] for f in found],
-                style,
-                color=_COLORS[filter_name],
-                label=f"{FILTER_NAMES[filter_name]}: {key}",
-            )
-    axes.plot(places, REPORTED_MAX, "k+", label="authors' code: max of one run")
-    axes.plot(places, REPORTED_MEAN, "kx", label="authors' code: mean")
-    axes.set(title="error against noise", ylabel="|q̂ - q| [m], [rad]", yscale="log")
-    axes.set_ylim(bottom=1.5e-3)
-    axes.set_xticks(places, [str(errors.noise) for errors in results.errors])
-    axes.legend(fontsize="small", ncols=2)
-
-
-def _plot_errors_by_size(axes: Any, results: Fig4Results) -> None:
-    sizes = [dof for dof, _ in results.by_size]
-    for filter_name in FILTERS:
+            noise.plot(places, [f[key] for f in found], style, color=color, label=f"{label}: {key}")
         for errors, style in zip(results.errors[::3], ("-", "--"), strict=True):
-            means = [errors.summary(filter_name, slice(dof))["mean"] for dof in sizes]
-            axes.plot(
-                sizes,
-                means,
-                style,
-                color=_COLORS[filter_name],
-                label=f"{FILTER_NAMES[filter_name]}, {errors.noise}",
-            )
-    axes.set(title="mean error against degrees of freedom", xlabel="degrees of freedom")
-    axes.set(ylabel="|q̂ - q| [m], [rad]")
-    axes.set_ylim(bottom=0)
-    axes.legend(fontsize="small", loc="upper left")
-
-
-def _plot_times(axes: Any, results: Fig4Results) -> None:
-    sizes = [dof for dof, _ in results.by_size]
-    for filter_name in FILTERS:
-        times = [by_filter[filter_name] for _, by_filter in results.by_size]
+            means = [errors.summary(name, slice(dof))["mean"] for dof in sizes]
+            size.plot(sizes, means, style, color=color, label=f"{label}, {errors.noise}")
         for key, style in (("mean", "o-"), ("sd", ":"), ("median", "--")):
-            values = [getattr(time, key) for time in times]
-            axes.plot(
-                sizes,
-                values,
-                style,
-                color=_COLORS[filter_name],
-                markersize=4,
-                label=f"{FILTER_NAMES[filter_name]}: {key}",
-            )
-    axes.axhline(REPORTED, color="0.6", label="the papers stay below")
-    axes.set(
-        title="time of one prediction and update", xlabel="degrees of freedom", ylabel="[ms]", yscale="log"
-    )
-    axes.legend(fontsize="small", ncols=2)
-
-
-def _plot_consistency(axes: Any, results: Fig4Results) -> None:
-    places = np.arange(len(results.consistency))
-    for filter_name in FILTERS:
-        found = [by_filter[filter_name] for by_filter in results.consistency.values()]
-        nees, ratio = [c.nees_inside for c in found], [c.over_bound for c in found]
-        axes.plot(
-            places,
-            nees,
-            "o-",
-            color=_COLORS[filter_name],
-            label=f"{FILTER_NAMES[filter_name]}: NEES per state",
-        )
-        axes.plot(
-            places,
-            ratio,
-            "s--",
-            color=_COLORS[filter_name],
-            label=f"{FILTER_NAMES[filter_name]}: RMSE over Cramér-Rao",
-        )
-    axes.axhspan(0.9, 1.1, color="0.9", zorder=0)
-    axes.set(title="consistency, Gaussian noise on each axis: 1 is right", yscale="log")
-    axes.set_xticks(places, [str(noise) for noise in results.consistency])
-    axes.legend(fontsize="small")
+            values = [getattr(by_filter[name], key) for _, by_filter in results.by_size]
+            time.plot(sizes, values, style, color=color, markersize=4, label=f"{label}: {key}")
+        statistics = [by_filter[name] for by_filter in results.consistency.values()]
+        nees, ratio = [c.nees_inside for c in statistics], [c.over_bound for c in statistics]
+        consistency.plot(gaussian, nees, "o-", color=color, label=f"{label}: NEES per state")
+        consistency.plot(gaussian, ratio, "s--", color=color, label=f"{label}: RMSE over Cramér-Rao")
+    noise.plot(places, REPORTED_MAX, "k+", label="authors' code: max of one run")
+    noise.plot(places, REPORTED_MEAN, "kx", label="authors' code: mean")
+    noise.set(title="error against noise", ylabel="|q̂ - q| [m], [rad]", yscale="log")
+    noise.set_ylim(bottom=1.5e-3)
+    noise.set_xticks(places, [str(errors.noise) for errors in results.errors])
+    noise.legend(fontsize="small", ncols=2)
+    size.set(title="mean error against degrees of freedom", xlabel="degrees of freedom")
+    size.set(ylabel="|q̂ - q| [m], [rad]")
+    size.set_ylim(bottom=0)
+    size.legend(fontsize="small", loc="upper left")
+    time.axhline(REPORTED, color="0.6", label="the papers stay below")
+    time.set(title="time of one prediction and update", ylabel="[ms]", yscale="log")
+    time.set(xlabel="degrees of freedom")
+    time.legend(fontsize="small", ncols=2)
+    consistency.axhspan(0.9, 1.1, color="0.9", zorder=0)
+    consistency.set(title="consistency, Gaussian noise on each axis: 1 is right", yscale="log")
+    consistency.set_xticks(gaussian, list(map(str, results.consistency)))
+    consistency.legend(fontsize="small")
 
 
 OPTIONS = ("quick", "model")

@@ -35,10 +35,10 @@ from .protocol import (
     ObservedModel,
     PoseNoise,
     add_gaussian_noise,
-    add_published_noise,
     make_observed_model,
     run_proper,
     run_published,
+    simulate_observations,
 )
 
 FILTERS = ("published", "proper")  # names of the papers' filter and of kineverse.estimation.Tracker
@@ -49,14 +49,11 @@ REPORTED_MAX = (0.065, 0.115, 0.156, 0.247)  # largest errors of one of these ru
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors |q̂ - q| at one level of noise."""
-
     noise: PoseNoise
     by_filter: dict[str, Array]  # errors of all coordinates by filter, (seeds, C, n) [m] or [rad]
     nees: dict[str, float]  # mean of (q̂ - q)²/σ² over all states by filter; 1 for a consistent filter
 
     def summary(self, filter_name: str, coordinates: Any = slice(None)) -> dict[str, Any]:
-        """Return mean, standard deviation and maximum of errors, and means and maxima by seed."""
         errors = self.by_filter[filter_name][:, :, coordinates]
         return {
             "mean": float(errors.mean()),
@@ -73,8 +70,6 @@ class Errors:
 
 @dataclass(frozen=True)
 class Variant:
-    """Variant of the published filter or of the noise."""
-
     name: str
     steps: int = 10
     spread: float = 0.5
@@ -95,27 +90,26 @@ def measure_errors(
 ) -> tuple[Errors, ...]:
     """Return the errors of both filters for equal observations, at the papers' levels of noise."""
     jobs = [(noise, seed) for noise in LEVELS for seed in seeds]
-    errors: dict[PoseNoise, dict[str, list[tuple[Array, Array]]]] = {
-        level: {filter_name: [] for filter_name in FILTERS} for level in LEVELS
+    errors: dict[PoseNoise, dict[str, list[Array]]] = {
+        noise: {name: [] for name in FILTERS} for noise in LEVELS
+    }
+    nees: dict[PoseNoise, dict[str, list[Array]]] = {
+        noise: {name: [] for name in FILTERS} for noise in LEVELS
     }
     for noise, seed in progress(jobs, "fig4: errors", "run"):
         truth, observations, training = simulate_observations(scene, noise, seed, configurations)
-        for filter_name, run in (
-            ("published", run_published(scene, observations, training)),
-            ("proper", run_proper(scene, observations, noise.on_axes)),
-        ):
+        runs = (run_published(scene, observations, training), run_proper(scene, observations, noise.on_axes))
+        for name, run in zip(FILTERS, runs, strict=True):
             error = np.abs(run.q - truth)
-            errors[noise][filter_name].append((error, error**2 / run.variance))
+            errors[noise][name].append(error)
+            nees[noise][name].append(error**2 / run.variance)
     return tuple(
         Errors(
             noise,
-            {filter_name: np.stack([error for error, _ in runs]) for filter_name, runs in by_filter.items()},
-            {
-                filter_name: float(np.mean([nees for _, nees in runs]))
-                for filter_name, runs in by_filter.items()
-            },
+            {name: np.stack(found) for name, found in errors[noise].items()},
+            {name: float(np.mean(found)) for name, found in nees[noise].items()},
         )
-        for noise, by_filter in errors.items()
+        for noise in LEVELS
     )
 
 
@@ -143,23 +137,6 @@ def measure_variants(
     return mean_errors
 
 
-def simulate_observations(
-    scene: ObservedModel,
-    noise: PoseNoise,
-    seed: int,
-    configurations: int,
-    directions: Directions = "published",
-) -> tuple[Array, Array, Array]:
-    """Return true states (C, n), observations (25, C, m, 4, 4), and others to learn R (400, m, 4, 4)."""
-    rng = np.random.default_rng([seed, LEVELS.index(noise)])
-    static_poses = scene.poses(scene.configurations(rng, 1))
-    training = add_published_noise(np.repeat(static_poses, TRAINING, axis=0), noise, rng, directions)
-    truth = scene.configurations(rng, configurations)
-    true_poses = scene.poses(truth)
-    observations = [add_published_noise(true_poses, noise, rng, directions) for _ in range(OBSERVATIONS)]
-    return truth, np.stack(observations), training
-
-
 GAUSSIAN_LEVELS = (
     PoseNoise(0.01, math.radians(1.0)),
     PoseNoise(0.05, math.radians(5.0)),
@@ -173,8 +150,6 @@ _STEP = 1e-5
 
 @dataclass(frozen=True)
 class FilterConsistency:
-    """Statistics of a filter at one level of noise."""
-
     # mean of (q̂ - q)²/σ² over interior states and over all states; 1 for a consistent filter
     nees_inside: float
     nees: float
@@ -186,8 +161,7 @@ class FilterConsistency:
     bound: dict[str, float]
     states: int  # number of interior states
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the statistics as JSON data."""
+    def as_data(self) -> dict[str, Any]:
         numbers: dict[str, Any] = {
             "nees_inside": self.nees_inside,
             "nees_all": self.nees,
@@ -196,9 +170,7 @@ class FilterConsistency:
             "cramer_rao": self.bound,
             "states_inside": self.states,
         }
-        if not math.isnan(self.nis):
-            numbers |= {"nis": self.nis, "nis_band": list(self.nis_band)}
-        return numbers
+        return numbers if math.isnan(self.nis) else numbers | {"nis": self.nis, "nis_band": self.nis_band}
 
 
 def measure_consistency(
@@ -210,25 +182,27 @@ def measure_consistency(
         truths, runs = [], []
         for seed in seeds:
             rng = np.random.default_rng([seed, GAUSSIAN_LEVELS.index(noise), 1])
-            static_poses = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
-            truth = scene.configurations(rng, configurations)
-            true_poses = scene.poses(truth)
-            observations = np.stack([add_gaussian_noise(true_poses, noise, rng) for _ in range(OBSERVATIONS)])
+            truth, observations, training = _simulate_gaussian(scene, noise, rng, configurations)
             truths.append(truth)
-            training = add_gaussian_noise(static_poses, noise, rng)
-            runs.append(
-                {
-                    "published": run_published(scene, observations, training),
-                    "proper": run_proper(scene, observations, noise),
-                }
-            )
+            published = run_published(scene, observations, training)
+            runs.append((published, run_proper(scene, observations, noise)))
         truth = np.concatenate(truths)
         bound = cramer_rao(scene, truth, noise)
         statistics[noise] = {
-            filter_name: _evaluate_consistency(scene, truth, bound, [run[filter_name] for run in runs])
-            for filter_name in runs[0]
+            name: _evaluate_consistency(scene, truth, bound, list(own))
+            for name, own in zip(FILTERS, zip(*runs, strict=True), strict=True)
         }
     return statistics
+
+
+def _simulate_gaussian(
+    scene: ObservedModel, noise: PoseNoise, rng: np.random.Generator, configurations: int
+) -> tuple[Array, Array, Array]:
+    static_poses = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
+    truth = scene.configurations(rng, configurations)
+    true_poses = scene.poses(truth)
+    observations = np.stack([add_gaussian_noise(true_poses, noise, rng) for _ in range(OBSERVATIONS)])
+    return truth, observations, add_gaussian_noise(static_poses, noise, rng)
 
 
 def cramer_rao(scene: ObservedModel, q: Array, noise: PoseNoise, observations: int = OBSERVATIONS) -> Array:
@@ -295,8 +269,6 @@ MECHANISMS: dict[str, tuple[Operation, str]] = {
 
 @dataclass(frozen=True)
 class CoordinateErrors:
-    """Error of a filter in one coordinate."""
-
     # mean and maximum of |q̂ - q| [rad] or [m] over the configurations not lost; NaN if all are lost
     mean: float
     max: float
@@ -306,8 +278,6 @@ class CoordinateErrors:
 
 @dataclass(frozen=True)
 class MechanismErrors:
-    """Errors of both filters for a mechanism at one level of noise."""
-
     mechanism: str
     noise: PoseNoise
     by_filter: dict[str, CoordinateErrors]
@@ -330,21 +300,13 @@ def _track_mechanism(name: str, noise: PoseNoise, configurations: int) -> Mechan
     scene = make_observed_model(model)
     column = [str(s) for s in scene.symbols].index(coordinate)
     rng = np.random.default_rng([list(MECHANISMS).index(name), GAUSSIAN_LEVELS.index(noise)])
-    static_poses = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
-    truth = scene.configurations(rng, configurations)
-    true_poses = scene.poses(truth)
-    observations = np.stack([add_gaussian_noise(true_poses, noise, rng) for _ in range(OBSERVATIONS)])
+    truth, observations, training = _simulate_gaussian(scene, noise, rng, configurations)
     runs = {
-        "published": _run_published_sequentially(
-            scene, observations, add_gaussian_noise(static_poses, noise, rng)
-        ),
+        "published": _run_published_sequentially(scene, observations, training),
         "proper": run_proper(scene, observations, noise),
     }
-    return MechanismErrors(
-        name,
-        noise,
-        {filter_name: _coordinate_errors(run, truth, column) for filter_name, run in runs.items()},
-    )
+    errors = {name: _coordinate_errors(run, truth, column) for name, run in runs.items()}
+    return MechanismErrors(name, noise, errors)
 
 
 def _coordinate_errors(run: FilterRun, truth: Array, column: int) -> CoordinateErrors:

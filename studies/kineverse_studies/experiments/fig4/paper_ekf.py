@@ -62,7 +62,6 @@ class PaperEkf:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the estimate to the start; R stays."""
         lower, upper = self.limits.T
         self.q = np.broadcast_to((lower + upper) / 2, (*self._lead, len(self.symbols))).copy()
         for group in self._groups:
@@ -92,7 +91,6 @@ class PaperEkf:
             self.q[..., by_name[str(symbol)]] += dt * speed
 
     def update(self, poses: npt.ArrayLike) -> Array:
-        """Update with an observation and return the estimate."""
         z = self._observed_entries(poses, self._lead)
         q, covariances = self._kalman_update(z) if self._started else self._gradient_steps(z)
         if not np.isfinite(q).all():

@@ -22,7 +22,6 @@ from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 from kineverse_studies.experiments.registry import Progress
 
-from .accuracy import simulate_observations
 from .paper_ekf import SPREAD, STEPS, PaperEkf
 
 Generator: TypeAlias = np.random.Generator
@@ -149,10 +148,25 @@ def _directions(rng: Generator, lead: tuple[int, ...], how: Directions) -> Array
     return np.stack([np.cos(around) * across, np.sin(around) * across, up], axis=-1)
 
 
+def simulate_observations(
+    scene: ObservedModel,
+    noise: PoseNoise,
+    seed: int,
+    configurations: int,
+    directions: Directions = "published",
+) -> tuple[Array, Array, Array]:
+    """Return true states (C, n), observations (25, C, m, 4, 4), and others to learn R (400, m, 4, 4)."""
+    rng = np.random.default_rng([seed, LEVELS.index(noise)])
+    static_poses = scene.poses(scene.configurations(rng, 1))
+    training = add_published_noise(np.repeat(static_poses, TRAINING, axis=0), noise, rng, directions)
+    truth = scene.configurations(rng, configurations)
+    true_poses = scene.poses(truth)
+    observations = [add_published_noise(true_poses, noise, rng, directions) for _ in range(OBSERVATIONS)]
+    return truth, np.stack(observations), training
+
+
 @dataclass(frozen=True)
 class FilterRun:
-    """Final estimates of a filter for C configurations."""
-
     q: Array  # estimates, and their variances according to the filter, (C, n)
     variance: Array
     nis: float = 0.0

@@ -28,20 +28,27 @@ from kineverse.manipulation import PartMover, Session, execute_unlocking, explor
 from kineverse.reasoning import interlocks, plan_unlocking, plan_violations
 from kineverse.view.plots import Figure
 from kineverse.worlds import MechanismWorld, Recorder
-from kineverse_studies.execution import run_jobs
+from kineverse_studies.experiments.execution import run_jobs
 from kineverse_studies.experiments.manipulation.skills import make_record_folder
 from kineverse_studies.experiments.registry import Options, Progress
-from kineverse_studies.experiments.report import Report, ReportTable
+from kineverse_studies.experiments.report import Report, ReportTable, make_table
 
 from .unknown_locks import (
     UnknownLockResult,
     can_be_opened,
     list_unknown_jobs,
-    list_unknown_numbers,
     make_unknown_table,
     run_unknown,
 )
-from .unlocking_runs import FIGURE_SIZE, LOCK_RULES, Rule, UnlockingRun, draw_boxes, run_unlocking
+from .unlocking_runs import (
+    FIGURE_SIZE,
+    LOCK_RULES,
+    Rule,
+    UnlockingRun,
+    draw_boxes,
+    make_thesis_table,
+    run_unlocking,
+)
 
 _DT = 0.05
 
@@ -87,8 +94,6 @@ KINDS: dict[Kind, str] = {
 
 @dataclass(frozen=True, slots=True)
 class ExplorerJob:
-    """Random box that a controller opens."""
-
     parts: int
     seed: int
     negated: float
@@ -106,8 +111,6 @@ class ExplorerResult:
 
 @dataclass(frozen=True, slots=True)
 class PlannerJob:
-    """Box for which a plan is made."""
-
     kind: Kind
     parts: int
     seed: int
@@ -115,8 +118,6 @@ class PlannerJob:
 
 @dataclass(frozen=True, slots=True)
 class PlannerResult:
-    """Plan of a box."""
-
     job: PlannerJob
     verdict: str  # verdict, and number of moves
     moves: int
@@ -131,30 +132,12 @@ def run(progress: Progress, options: Options) -> Report:
     if options.record is not None:
         record_thesis_box(options.record)
     thesis = {rule: run_unlocking(THESIS, rule) for rule in LOCK_RULES}
-    explored = run_jobs(
-        run_explorer,
-        list_explorer_jobs(count, options.seed, options.quick),
-        progress,
-        "lockbox",
-        "box",
-        options.processes,
-    )
-    planned = run_jobs(
-        run_planner,
-        list_planner_jobs(count, options.seed, options.quick),
-        progress,
-        "lockbox",
-        "plan",
-        options.processes,
-    )
-    unknown = run_jobs(
-        run_unknown,
-        list_unknown_jobs(count, options.seed),
-        progress,
-        "lockbox",
-        "exploration",
-        options.processes,
-    )
+    explorer_jobs = list_explorer_jobs(count, options.seed, options.quick)
+    planner_jobs = list_planner_jobs(count, options.seed, options.quick)
+    explored = run_jobs(run_explorer, explorer_jobs, progress, "lockbox", "box", options)
+    planned = run_jobs(run_planner, planner_jobs, progress, "lockbox", "plan", options)
+    unknown_jobs = list_unknown_jobs(count, options.seed)
+    unknown = run_jobs(run_unknown, unknown_jobs, progress, "lockbox", "exploration", options)
     return make_lockbox_report(thesis, explored, planned, unknown, options.seed)
 
 
@@ -258,13 +241,22 @@ def make_lockbox_report(
             }
             for kind, own in plans.items()
         ],
-        "unknown locks": list_unknown_numbers(unknown),
+        "unknown locks": [
+            {
+                "boxes": r.job.kind,
+                "seed": r.job.seed,
+                "tries": r.tries,
+                "depth": r.depth,
+                "breadth": r.breadth,
+            }
+            for r in unknown
+        ],
     }
     return Report(
         "lockbox",
         "Lockboxes opened by trends, plans of their opening, and unknown locks",
         (
-            _thesis_table(thesis),
+            make_thesis_table("The lockbox of the thesis", "order of the parts", thesis),
             make_explorer_table(groups),
             make_planner_table(plans),
             make_unknown_table(unknown),
@@ -274,14 +266,6 @@ def make_lockbox_report(
     )
 
 
-def _thesis_table(runs: dict[Rule, UnlockingRun]) -> ReportTable:
-    rows = tuple(
-        (LOCK_RULES[rule], "yes" if one.done else "no", one.steps, ", ".join(one.order))
-        for rule, one in runs.items()
-    )
-    return ReportTable("The lockbox of the thesis", ("trends", "opened", "steps", "order of the parts"), rows)
-
-
 def make_explorer_table(groups: dict[tuple[Rule, bool], list[ExplorerResult]]) -> ReportTable:
     """Return the table of boxes that a controller opens, by rule of trends and whether locks are negated."""
     rows: list[tuple[float | str, ...]] = []
@@ -289,16 +273,9 @@ def make_explorer_table(groups: dict[tuple[Rule, bool], list[ExplorerResult]]) -
         solvable = [r for r in own if r.solvable]
         steps = [r.run.steps for r in solvable if r.run.done]
         cpu = [1e6 * t for r in solvable for t in r.run.cpu]
-        rows.append(
-            (
-                LOCK_RULES[rule],
-                "&, |, ~" if negated else "&, |",
-                _format_parts(r.job.parts for r in own),
-                f"{len(steps)} of {len(solvable)}",
-                f"{np.median(steps):.0f}" if steps else "",
-                f"{np.median(cpu):.0f}" if cpu else "",
-            )
-        )
+        parts, opened = _format_parts(r.job.parts for r in own), f"{len(steps)} of {len(solvable)}"
+        medians = (f"{np.median(values):.0f}" if values else "" for values in (steps, cpu))
+        rows.append((LOCK_RULES[rule], "&, |, ~" if negated else "&, |", parts, opened, *medians))
     head = ("trends", "locks", "parts", "opened", "steps (median)", "CPU of a step [µs]")
     return ReportTable("Random boxes that can be opened", head, tuple(rows))
 
@@ -309,33 +286,22 @@ def _format_parts(parts: Iterable[int]) -> str:
 
 
 def make_planner_table(plans: dict[Kind, list[PlannerResult]]) -> ReportTable:
-    rows: list[tuple[float | str, ...]] = []
-    for kind, own in plans.items():
-        counts = [sum(p.verdict == v for p in own) for v in ("found", "refuted", "undecided")]
-        times = sorted(1e3 * p.planning for p in own)
-        reading = sorted(1e3 * p.reading for p in own)
-        rows.append(
-            (
-                KINDS[kind],
-                _format_parts(p.job.parts for p in own),
-                *counts,
-                sum(p.wrong for p in own),
-                max(p.moves for p in own),
-                f"{np.median(times):.3g}",
-                f"{times[-1]:.3g}",
-                f"{np.median(reading):.3g}",
-            )
-        )
-    head = (
-        "boxes",
-        "parts",
-        "found",
-        "refuted",
-        "undecided",
-        "wrong",
-        "moves (most)",
-        "planning [ms]",
-        "(longest)",
-        "reading locks [ms]",
+    def times(own: list[PlannerResult]) -> list[float]:
+        return [1e3 * p.planning for p in own]
+
+    return make_table(
+        "Plans, checked by constraints and exhaustive search",
+        plans.items(),
+        {
+            "boxes": lambda pair: KINDS[pair[0]],
+            "parts": lambda pair: _format_parts(p.job.parts for p in pair[1]),
+            "found": lambda pair: sum(p.verdict == "found" for p in pair[1]),
+            "refuted": lambda pair: sum(p.verdict == "refuted" for p in pair[1]),
+            "undecided": lambda pair: sum(p.verdict == "undecided" for p in pair[1]),
+            "wrong": lambda pair: sum(p.wrong for p in pair[1]),
+            "moves (most)": lambda pair: max(p.moves for p in pair[1]),
+            "planning [ms]": lambda pair: f"{np.median(times(pair[1])):.3g}",
+            "(longest)": lambda pair: f"{max(times(pair[1])):.3g}",
+            "reading locks [ms]": lambda pair: f"{np.median([1e3 * p.reading for p in pair[1]]):.3g}",
+        },
     )
-    return ReportTable("Plans, checked by constraints and exhaustive search", head, tuple(rows))

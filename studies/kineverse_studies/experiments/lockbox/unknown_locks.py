@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -47,7 +47,6 @@ def can_be_opened(box: Lockbox) -> bool:
 
 
 def _places(box: Lockbox, name: str) -> list[float]:
-    """Return a position between each two thresholds of a part, and its limits."""
     conditions = (c for part in box.parts.values() for group in part.groups for c in group)
     cuts = sorted({c.threshold for c in conditions if c.part == name})
     return [0.0, *((a + b) / 2 for a, b in pairwise(cuts)), box.parts[name].upper]
@@ -119,7 +118,6 @@ def _flip(combination: Combination, k: int) -> Combination:
 
 
 def _find_ways(start: Combination, moves: dict[Combination, list[int]]) -> dict[Combination, list[int]]:
-    """Return the fewest known moves to each combination that they lead to, nearest first."""
     ways: dict[Combination, list[int]] = {start: []}
     waiting = deque([start])
     while waiting:
@@ -162,8 +160,6 @@ UNKNOWN_KINDS: dict[UnknownKind, str] = {
 
 @dataclass(frozen=True, slots=True)
 class UnknownLockJob:
-    """Box whose locks are unknown."""
-
     kind: UnknownKind
     seed: int
 
@@ -209,26 +205,11 @@ def make_unknown_table(results: Sequence[UnknownLockResult]) -> ReportTable:
     for kind, name in UNKNOWN_KINDS.items():
         own = [r for r in results if r.job.kind == kind]
         tries = [r.tries for r in own if r.tries is not None]
-        rows.append(
-            (
-                name,
-                f"{len(tries)} of {len(own)}",
-                _mean(tries),
-                max(tries, default=""),
-                _mean([r.depth for r in own]),
-                _mean([r.breadth for r in own]),
-            )
-        )
+        most = max(tries, default="")
+        systematic = _mean([r.depth for r in own]), _mean([r.breadth for r in own])
+        rows.append((name, f"{len(tries)} of {len(own)}", _mean(tries), most, *systematic))
     head = ("boxes", "opened", "tries (mean)", "(most)", "systematic, depth first", "breadth first")
     return ReportTable(f"Unknown locks, {_PARTS} parts", head, tuple(rows))
-
-
-def list_unknown_numbers(results: Sequence[UnknownLockResult]) -> list[dict[str, Any]]:
-    """Return the results as data for JSON."""
-    return [
-        {"boxes": r.job.kind, "seed": r.job.seed, "tries": r.tries, "depth": r.depth, "breadth": r.breadth}
-        for r in results
-    ]
 
 
 def _mean(tries: Sequence[int | None]) -> str:

@@ -15,6 +15,7 @@ from kineverse.control import Controller, unlock
 from kineverse.gallery.lockboxes import Lockbox, make_lockbox_model
 from kineverse.symbols import position
 from kineverse.worlds import Recorder
+from kineverse_studies.experiments.report import ReportTable, format_yes, make_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -34,15 +35,12 @@ _BEGUN = 0.1
 
 @dataclass(frozen=True, slots=True)
 class UnlockingRun:
-    """Opening of a box."""
-
     done: bool  # whether the goal was reached, and the number of steps
     steps: int
     order: tuple[str, ...]
     cpu: tuple[float, ...]  # CPU times of the steps [s]
 
     def as_data(self) -> dict[str, Any]:
-        """Return the run as data for JSON, without its times."""
         return {"done": self.done, "steps": self.steps, "order": list(self.order)}
 
 
@@ -103,3 +101,17 @@ def draw_boxes(canvas: Canvas, boxes: Mapping[tuple[Rule, int], Sequence[Unlocki
         axes.set_ylim(-0.02, 1.02)
     panels[0].set_ylabel("share opened")
     panels[0].legend(loc="center right", frameon=False)
+
+
+def make_thesis_table(title: str, order: str, runs: Mapping[Rule, UnlockingRun]) -> ReportTable:
+    """Return the table of the box of the thesis, with a title of the column of the order."""
+    return make_table(
+        title,
+        runs.items(),
+        {
+            "trends": lambda pair: LOCK_RULES[pair[0]],
+            "opened": lambda pair: format_yes(pair[1].done),
+            "steps": lambda pair: pair[1].steps,
+            order: lambda pair: ", ".join(pair[1].order),
+        },
+    )

@@ -34,8 +34,6 @@ _NEAREST = 0.035  # distance within which a push has nearest points [m]
 
 @dataclass(frozen=True, eq=False)
 class FilmRow:
-    """Row of pictures of one model."""
-
     title: str
     load: Callable[[], Model]  # function that returns the model; it is called when the row is drawn
     states: Sequence[Mapping[str, float]]  # values by name, one mapping for each picture
@@ -66,17 +64,22 @@ def make_film(rows: Sequence[FilmRow], size: tuple[int, int] = (420, 420)) -> Fi
     return Figure(draw, (count * size[0] * scale + 0.3, len(rows) * (size[1] * scale + 0.25)))
 
 
-def choose_moments(film: Sequence[Moment], count: int) -> list[Moment]:
-    """Return moments of a film, evenly in time, with the first and the last one."""
-    if not film:
-        return []
-    return [film[k] for k in np.linspace(0, len(film) - 1, count).round().astype(int).tolist()]
+def make_row(
+    title: str,
+    load: Callable[[], Model],
+    film: Sequence[Moment],
+    count: int,
+    label: str,
+    shown: tuple[str, ...],
+) -> FilmRow:
+    """Return a row of moments of a film, evenly in time; the label is a format of a moment."""
+    numbers = np.linspace(0, len(film) - 1, count).round().astype(int).tolist() if film else []
+    chosen = [film[k] for k in numbers]
+    return FilmRow(title, load, [m.values for m in chosen], [label.format(m) for m in chosen], shown)
 
 
 @dataclass(frozen=True, eq=False)
 class RowView:
-    """Things that a camera has to see."""
-
     scenes: Sequence[TriangleSoup]  # all bodies at some times
     wanted: npt.NDArray[np.bool_]  # which parts have to be seen (N,)
     points: Array  # points that have to be in view (M, 3) [m]
@@ -199,7 +202,6 @@ def _length(vector: tuple[Array, Array]) -> float:
 def _find_close_camera(
     model: Model, moment: Moment, points: Array, parts: Sequence[Drawable], aspect: float
 ) -> Camera:
-    """Return the camera near some points that sees most of some parts."""
     items = [*collect_drawables(model), *parts]
     wanted = np.arange(len(items)) >= len(items) - len(parts)
     middle = points.mean(axis=0)

@@ -9,16 +9,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
-from types import TracebackType
 from typing import Any
 
 from kineverse.errors import FormatError, InvalidValueError, KineverseError
+from kineverse.geometry import Scene
 from kineverse.grasping import find_gripper, find_handle
 from kineverse.manipulation import Belief, Outcome, Session, TrackedBelief, TrueBelief, open_object
+from kineverse.manipulation.pushing import Pushing, push
 from kineverse.manipulation.pushing.nearest_pair import PushView
-from kineverse.manipulation.pushing.push_controller import Pushing
-from kineverse.manipulation.pushing.trials import try_push
+from kineverse.manipulation.pushing.push_placement import find_push_start
 from kineverse.manipulation.robot_sources import SHIPPED, RobotSource, find_robot
+from kineverse.manipulation.skill_arguments import find_object_coordinate
 from kineverse.model.model import Model
 from kineverse.state import State, StateLike
 from kineverse.worlds import Judge, KinematicWorld, MujocoWorld, Recorder, Sensors, World
@@ -51,14 +52,12 @@ def check_data(data: Path | None) -> Path | None:
 
 
 def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[RobotSource, ...]:
+    """Return robots by name, by default those that ship, and the authors' in a folder."""
     known = dict(SHIPPED)
-    if data is not None:
-        for name, (like, file, hand) in _AUTHORS.items():
-            if (data / file).is_file():
-                ours = SHIPPED[like]
-                known[name] = RobotSource(
-                    name, like, str(data / file), hand, ours.push_link, ours.start, ours.omni
-                )
+    for name, (like, file, hand) in _AUTHORS.items() if data is not None else ():
+        source = (data or Path()) / file
+        if source.is_file():
+            known[name] = replace(SHIPPED[like], name=name, source=str(source), hand=hand)
     return tuple(find_robot(name, known) for name in tuple(names) or known)
 
 
@@ -111,14 +110,14 @@ def make_settings(options: Options) -> tuple[TrialSetting, ...]:
     return tuple(TrialSetting(world, noise, options.record) for world in worlds)
 
 
-class TrialWatch:
+class TrialWatch(ExitStack):
     """Session of a trial that is recorded and filmed, where that is wanted; a context."""
 
     def __init__(
         self, setting: TrialSetting, model: Model, about: Mapping[str, str], *, film: bool = False
     ) -> None:
+        super().__init__()
         self._setting, self._model, self._about, self._film = setting, model, about, film
-        self._stack = ExitStack()
         self._recorder: Recorder | None = None
         self._watchers: tuple[Callable[[Session], object], ...] = ()
         self.session: Session | None = None
@@ -130,13 +129,8 @@ class TrialWatch:
         if self._setting.record is not None:
             name = "-".join(re.sub(r"[^\w]+", "_", word).strip("_") for word in self._about.values())
             recorder = Recorder(self._setting.record / f"{name}.mcap", self._model, self._about)
-            self._recorder = self._stack.enter_context(recorder)
+            self._recorder = self.enter_context(recorder)
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.close()
 
     def open_session(self, world: World, dt: float, *watchers: Callable[[Session], object]) -> Session:
         self._watchers, self.view = watchers, None
@@ -182,14 +176,13 @@ def list_series(commands: Iterable[tuple[float, Mapping[str, float]]]) -> dict[s
 
 
 DT = 0.02  # control period [s]
+_SAMPLES = 200  # of the base placement
 _PLANS = ("plan", "place", "placement")
 """Computations that are no control steps, by the first word of their names in a session."""
 
 
 @dataclass(frozen=True)
 class TrialCase:
-    """One robot at one object, in one setting."""
-
     case: str  # kitchen, or name of the set-up
     robot: RobotSource
     what: str  # coordinate of the object
@@ -272,6 +265,40 @@ def open_then_close(
     return trials
 
 
+def try_push(
+    pushing: Pushing,
+    world: World,
+    start: State,
+    open_session: Callable[[], Session],
+    *,
+    seconds: float = 24.0,
+    seed: int = 0,
+    place: bool = True,
+    on_step: Callable[[Pushing], object] | None = None,
+) -> tuple[Outcome, int, str]:
+    """Push from a start; if that fails, from one that base placement finds.
+
+    Return the outcome, the number of samples of the placement, 0 without any, and why the first push failed.
+    """
+
+    def attempt(state: State) -> Outcome:
+        world.reset(state)
+        return push(
+            open_session(),
+            pushing.coordinate,
+            seconds=seconds,
+            pushing=pushing,
+            plan=not place,
+            on_step=on_step,
+        )
+
+    outcome = attempt(start)
+    if outcome or not place:
+        return outcome, 0, ""
+    found = find_push_start(pushing, start, samples=_SAMPLES, seed=seed)
+    return attempt(found.state) if found.state is not None else outcome, found.samples, outcome.reason
+
+
 def run_push_trial(
     case: TrialCase,
     model: Model,
@@ -286,20 +313,21 @@ def run_push_trial(
     """Return the trial of a push in a world: from a start, or from one that base placement finds."""
 
     def act(watch: TrialWatch) -> Outcome:
-        judge = PushJudge(model, world, case.what, watch)
-        found = try_push(
+        bodies = find_gripper(model, world.robot).bodies
+        coordinate = find_object_coordinate(world, case.what)
+        pushing = Pushing(model, coordinate, bodies, start, target=0.0, robot=world.robot, dt=dt, logic=logic)
+        judge = PushJudge(pushing, world, watch)
+        outcome, placed, first = try_push(
+            pushing,
             world,
             start,
-            case.what,
-            dt=dt,
-            steps=steps,
+            lambda: watch.open_session(world, dt, judge),
+            seconds=steps * dt,
             seed=case.seed,
-            logic=logic,
-            open_session=lambda world, look: watch.open_session(world, dt, look, judge),
             on_step=judge.watch_controller,
         )
-        own = {"placed": found.placed, "first": found.first, "pressed": found.pressed}
-        return replace(found.outcome, measures={**found.outcome.measures, **judge.measures, **own})
+        more = {"placed": placed, "first": first, **judge.measures}
+        return replace(outcome, measures={**outcome.measures, **more})
 
     return case.run(skill, model, act)
 
@@ -307,29 +335,35 @@ def run_push_trial(
 class PushJudge:
     """Judge of a push, which is called after each step of its session."""
 
-    def __init__(self, model: Model, world: World, what: str, watch: TrialWatch) -> None:
+    def __init__(self, pushing: Pushing, world: World, watch: TrialWatch) -> None:
+        model = world.model
         try:
-            handle = find_handle(model, what).frame
+            handle = find_handle(model, pushing.coordinate).frame
         except KineverseError:
             handle = None
-        gripper = find_gripper(model, world.robot)
-        self._judge = Judge(model, world.robot, gripper, handle)
-        self._watch, self._pushing, self._force = watch, False, 0.0
+        self._judge = Judge(model, world.robot, find_gripper(model, world.robot), handle)
+        self._scene = Scene(model, rules=(*pushing.overlapping, *pushing.rules), leave_out=pushing.leave_out)
+        self._pair = self._scene.watch(pushing.pusher, pushing.object_bodies, radius=0.0)
+        self._watch, self._touching = watch, False
+        self._force = self._pressed = 0.0
         self._session: Session | None = None
 
     def watch_controller(self, pushing: Pushing) -> None:
         """Note whether the controller pushes, and what it sees."""
-        self._pushing, self._watch.view = pushing.touching, pushing.view
+        self._touching, self._watch.view = pushing.touching, pushing.view
 
     def __call__(self, session: Session) -> None:
         if session is not self._session:
-            self._session, self._pushing, self._force = session, False, 0.0
+            self._session, self._touching, self._force, self._pressed = session, False, 0.0, 0.0
             self._judge.reset()
         world = session.world
-        self._judge.update(world.state, session.commands, held=world.held, pushing=self._pushing)
+        self._judge.update(world.state, session.commands, held=world.held, pushing=self._touching)
         self._force = max(self._force, getattr(world, "peak_force", math.nan))
+        self._scene.update(world.state)
+        if len(found := self._pair()):
+            self._pressed = max(self._pressed, -float(found.distances[0]))
 
     @property
     def measures(self) -> dict[str, Any]:
-        """Measures of the judge; ``peak_force`` [N] in a world that has it."""
-        return {**self._judge.measures, "peak_force": self._force or math.nan}
+        """Measures of the judge, ``peak_force`` [N] in a world that has it, and ``pressed``, a depth [m]."""
+        return {**self._judge.measures, "peak_force": self._force or math.nan, "pressed": self._pressed}

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
 from kineverse.manipulation.outcome import Outcome
 from kineverse.view.plots import Figure
-from kineverse_studies.experiments.report import ReportTable
+from kineverse_studies.experiments.report import ReportTable, as_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -33,8 +33,6 @@ _PATTERNS: Mapping[Failure, str] = {
 
 @dataclass(frozen=True, slots=True)
 class StepTimeStatistics:
-    """CPU and wall times of control steps [ms]."""
-
     count: int = 0
     mean: float = math.nan
     deviation: float = math.nan
@@ -62,8 +60,6 @@ class StepTimeStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One time of a trial."""
-
     time: float  # time in the world [s]
     phase: str
     values: Mapping[str, float]  # true values of all coordinates by name
@@ -73,8 +69,6 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One skill of one robot at one object."""
-
     case: str  # kitchen, or name of the set-up
     robot: str  # names of the robot, the coordinate and the skill
     what: str
@@ -100,10 +94,11 @@ class Trial:
         return self.failure == "reach" and self.measures.get("placements", 0) >= PLACEMENTS
 
     def as_data(self) -> dict[str, Any]:
-        """Return the trial as JSON data."""
         data = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NO_DATA}
-        step_ms = asdict(StepTimeStatistics.from_seconds(self.cpu, self.wall))
-        return {key: as_json(value) for key, value in {**data, "step_ms": step_ms}.items()}
+        found: dict[str, Any] = as_json(
+            {**data, "step_ms": StepTimeStatistics.from_seconds(self.cpu, self.wall)}
+        )
+        return found
 
 
 def find_failure(outcome: Outcome) -> Failure:
@@ -147,35 +142,14 @@ def group_trials(trials: Iterable[Trial], *names: str) -> dict[tuple[Any, ...], 
     return found
 
 
-def as_json(value: Any) -> Any:
-    """Return a value as JSON data: numbers that are not finite are null, what is no data is its text."""
-    if isinstance(value, Mapping):
-        return {str(key): as_json(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [as_json(entry) for entry in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value if value is None or isinstance(value, str) else str(value)
-
-
-Cell = float | str
-
-
 @dataclass(frozen=True)
 class Column:
-    """Column of a table."""
-
     key: str  # name in JSON data
     title: str  # title with the unit
     of: Callable[[Sequence[Trial]], Any]  # function from the trials of a row to the value
     digits: int = 3  # significant digits of numbers that are printed
 
     def cell(self, trials: Sequence[Trial]) -> str:
-        """Return the printed value; empty for NaN."""
         value = self.of(trials)
         if isinstance(value, str):
             return value

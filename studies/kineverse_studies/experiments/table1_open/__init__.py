@@ -20,8 +20,8 @@ from kineverse.formats import load
 from kineverse.manipulation.robot_sources import SHIPPED, RobotSource
 from kineverse.model.model import Model
 from kineverse.view.plots import Figure
-from kineverse_studies.execution import run_jobs
-from kineverse_studies.experiments.manipulation.film import FilmRow, choose_moments, make_film
+from kineverse_studies.experiments.execution import run_jobs
+from kineverse_studies.experiments.manipulation.film import FilmRow, make_film, make_row
 from kineverse_studies.experiments.manipulation.skills import (
     SettingOptions,
     TrialCase,
@@ -38,7 +38,6 @@ from kineverse_studies.experiments.manipulation.trials import (
     Failure,
     StepTimeStatistics,
     Trial,
-    as_json,
     group_trials,
     make_trial_numbers,
     make_trial_tables,
@@ -95,14 +94,9 @@ def _object_row(name: str) -> FilmRow:
 
 
 def _robot_row(trial: Trial) -> FilmRow:
-    chosen = choose_moments(trial.film, _PICTURES)
-    return FilmRow(
-        f"{trial.robot}, {trial.world} world",
-        partial(_load, trial.robot, trial.case),
-        [m.values for m in chosen],
-        [f"{m.time:.1f} s, {m.phase}" for m in chosen],
-        (f"{SHIPPED[trial.robot].prefix}/", f"{OBJECT}/"),
-    )
+    title, load_model = f"{trial.robot}, {trial.world} world", partial(_load, trial.robot, trial.case)
+    shown = f"{SHIPPED[trial.robot].prefix}/", f"{OBJECT}/"
+    return make_row(title, load_model, trial.film, _PICTURES, "{0.time:.1f} s, {0.phase}", shown)
 
 
 def _load(robot: str, thing: str) -> Model:
@@ -125,7 +119,7 @@ def make_opening_report(trials: Sequence[Trial], starts: int, seed: int) -> Repo
     numbers = {
         "seed": seed,
         "starts": starts,
-        "programs": [{c.key: as_json(c.of(own)) for c in PROGRAM_COLUMNS} for own in groups],
+        "programs": [{c.key: c.of(own) for c in PROGRAM_COLUMNS} for own in groups],
         "skill": make_trial_numbers(skill),
     }
     tables = (
@@ -166,14 +160,14 @@ PROGRAM_COLUMNS = (
     *(column for column in TIMES if column.key in ("cpu_mean_ms", "cpu_p99_ms", "cpu_worst_ms")),
     Column("rate_hz", "slowest [Hz]", lambda trials: 1e3 / step_times(trials).worst),
     Column("programs_a_step", "programs a step", _programs_a_step),
-    Column("grasp_error_mm", "grasp error [mm]", lambda trials: worst("grasp_error", 1e3)(_done(trials))),
+    Column(
+        "grasp_error_mm",
+        "grasp error [mm]",
+        lambda trials: worst("grasp_error", 1e3)([t for t in trials if t.done]),
+    ),
     Column("limit_violation", "limits violated", worst("limit_violation")),
 )
 """Columns of the programs alone; the grasp error is that of the runs that opened the object."""
-
-
-def _done(trials: Sequence[Trial]) -> list[Trial]:
-    return [t for t in trials if t.done]
 
 
 def _object_table(groups: Sequence[Sequence[Trial]]) -> ReportTable:
@@ -191,7 +185,6 @@ def _object_table(groups: Sequence[Sequence[Trial]]) -> ReportTable:
 
 
 def _draw(canvas: Canvas, groups: Sequence[Sequence[Trial]]) -> None:
-    """Draw the solver's times of a control step, by robot and program."""
     axes = canvas.add_subplot()
     times: list[Any] = [
         [1e3 * t for trial in own for t in trial.series["solve"]] or [math.nan] for own in groups
@@ -209,8 +202,6 @@ _COMPILED = 30.0  # longest wait for compiled code [s]; times are those of compi
 
 @dataclass(frozen=True)
 class OpeningJob:
-    """Openings of one object by one robot."""
-
     robot: RobotSource
     thing: str
     starts: int
@@ -224,7 +215,7 @@ def run(progress: Progress, options: Options) -> Report:
     settings = make_settings(options)
     robots = find_robots(options.robot, check_data(options.data))
     jobs = [OpeningJob(robot, thing, starts, options.seed, settings) for robot in robots for thing in OBJECTS]
-    trials = run_jobs(run_openings, jobs, progress, "table1-open", "object", options.processes)
+    trials = run_jobs(run_openings, jobs, progress, "table1-open", "object", options)
     return make_opening_report(trials, starts, options.seed)
 
 

@@ -38,8 +38,6 @@ _AREA = {"x": (-0.4, 0.5), "y": (-0.8, 0.4), "angle": (-0.8, 0.8)}
 
 @dataclass(frozen=True)
 class GraspedObject:
-    """Object that is opened by its handle."""
-
     name: str
     source: str
     coordinate: str  # coordinate that is opened, without the prefix
@@ -65,8 +63,6 @@ OBJECTS: Mapping[str, GraspedObject] = MappingProxyType(
 
 @dataclass(frozen=True, eq=False)
 class OpeningSetup:
-    """Robot before an object."""
-
     robot: RobotSource
     thing: GraspedObject  # the robot, and the object
     model: Model
@@ -147,8 +143,6 @@ LOST = 0.01  # grasp error from which the handle counts as lost [m]
 
 @dataclass(slots=True)
 class ProgramRun:
-    """Opening of an object by a program."""
-
     done: bool = False
     value: float = 0.0
     steps: int = 0
@@ -195,7 +189,6 @@ class LeaderFollower:
         return self._leader, self._follower
 
     def step(self, state: State) -> tuple[State, float, int]:
-        """Return the next state, the time of the solver [s] and the number of programs solved."""
         lead = self._leader.step(state)
         solve, count = lead.times.solve, 1
         led = self._model.integrate(state, lead.speeds, DT)
@@ -235,7 +228,6 @@ class OneProgram:
         return (self._controller,)
 
     def step(self, state: State) -> tuple[State, float, int]:
-        """Return the next state, the time of the solver [s] and the number of programs solved."""
         command = self._controller.step(state)
         return self._model.integrate(state, command.speeds, DT), command.times.solve, 1
 
