@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from time import thread_time_ns
-from types import MappingProxyType
 
 import numpy as np
 
@@ -173,23 +172,21 @@ class TimedLoop:
 OPENING = "opening"  # name of the workload among those of peers
 DOOR, GRASP = "kitchen/fridge_door", "grasp"
 """Joint of the door, and the frame on its handle that a gripper holds."""
-
-GRIPPERS: Mapping[str, str] = MappingProxyType(
-    {"pr2": "pr2/r_gripper_tool_frame", "fetch": "fetch/gripper_link", "hsr": "hsr/hand_palm_link"}
-)
+GRIPPERS: Mapping[str, str] = {
+    "pr2": "pr2/r_gripper_tool_frame",
+    "fetch": "fetch/gripper_link",
+    "hsr": "hsr/hand_palm_link",
+}
 """Frames of grippers by robot."""
-
 _FINGERS = {"pr2": "pr2/r_gripper*", "fetch": "fetch/*gripper*", "hsr": "hsr/hand*"}
 DOOR_GAIN, OPEN = 1.0, 1.5
 """Gain of the door's opening [1/s], and the angle [rad] from which the door counts as open."""
-
 PERIOD, STEPS = 0.02, 250  # control period [s], and number of steps of an opening
 CONTACTS, MARGIN, RADIUS = 24, 0.005, 0.15
 """Number of contact slots, the distance that pairs keep and the one from which they count [m].
 
 Within this radius there are more pairs than slots, nearly all of the time.
 """
-
 _STARTS, _SEEDS = 64, 20
 
 
@@ -260,7 +257,7 @@ def peer_workload(opening: Opening, start: State, kept: Iterable[str] | None = N
             if joint.kind != "fixed" and names.isdisjoint(symbol.path for symbol in joint.coordinates):
                 held.append(name)
         positions = {path: value for path, value in positions.items() if path in names}
-    return ControlWorkload("", lambda: opening.model, positions, tuple(held), period=PERIOD, steps=STEPS)
+    return ControlWorkload(lambda: opening.model, positions, tuple(held), period=PERIOD, steps=STEPS)
 
 
 COMPARED = "pr2"  # robot of the peers

@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType, ModuleType
+from types import ModuleType
 
 import kineverse
 from kineverse._extras import checkout
@@ -24,24 +24,21 @@ class Example:
     task: str | None = None  # name of our task whose error counts; by default the first
 
 
-EXAMPLES: Mapping[str, Example] = MappingProxyType(
-    {
-        "arm_ur5": Example("pink", 29),
-        "arm_ur3_velocity_smoothing": Example("pink", 38),
-        "flying_dual_arm_ur3": Example("pink", 96),
-        "humanoid_g1_com": Example("pink", 57),
-        "go2_squat": Example("pink", 73, "foot FL"),
-        "inverse_kinematics_ur10": Example("pink", 50),
-        "arm_panda_dof_freezing": Example("mink", 57),
-        "humanoid_g1_teleop": Example("mink", 85, "left hand"),
-        "biped_cassie": Example("mink", 50),
-        "arm_hand_xarm": Example("mink", 98),
-        "arm_ur5_wrist_cam_lookat": Example("mink", 58),
-        "mobile_tiago": Example("mink", 80),
-    }
-)
+EXAMPLES: Mapping[str, Example] = {
+    "arm_ur5": Example("pink", 29),
+    "arm_ur3_velocity_smoothing": Example("pink", 38),
+    "flying_dual_arm_ur3": Example("pink", 96),
+    "humanoid_g1_com": Example("pink", 57),
+    "go2_squat": Example("pink", 73, "foot FL"),
+    "inverse_kinematics_ur10": Example("pink", 50),
+    "arm_panda_dof_freezing": Example("mink", 57),
+    "humanoid_g1_teleop": Example("mink", 85, "left hand"),
+    "biped_cassie": Example("mink", 50),
+    "arm_hand_xarm": Example("mink", 98),
+    "arm_ur5_wrist_cam_lookat": Example("mink", 58),
+    "mobile_tiago": Example("mink", 80),
+}
 """Examples by name, which is that of the workload and of the file."""
-
 _STEPS = 10  # steps of a motion for each of the settings
 
 

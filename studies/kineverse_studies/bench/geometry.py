@@ -282,10 +282,8 @@ SEARCH, PAIRS, BULLET = "mujoco, mj_collision", "mujoco, mj_geomDistance and num
 UPDATE, QUERY = "update", "query"
 _EXACT, _CURVED, _MARGINS = 1e-6, 1e-4, 3e-3
 """Tolerances of distances [m]: polytopes and capsules; all shapes of a robot; Bullet, which adds margins."""
-
 _NEAR, _WHOLE = 0.06, " without rules, within .06 m"
 """Radius [m] of the query without rules, whose results are mostly pairs of the robot's own links."""
-
 _WATCHED = " without rules, within .05 m, what the arm's speeds move"
 _WATCH_RADIUS = 0.05  # radius [m] of the query of a controller, about the pairs that it can move
 _CHECKED = 20

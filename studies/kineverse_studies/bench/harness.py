@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from time import perf_counter
-from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -191,11 +190,13 @@ class Benchmark:
         return BenchmarkResult(self.name, work, measurements, tuple(self.comparisons), missing)
 
 
-DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
-    {"pinocchio": "pin", "pink": "pin-pink", "ripl_articulation": "ripl-articulation", "vamp": "vamp-planner"}
-)
+DISTRIBUTIONS: Mapping[str, str] = {
+    "pinocchio": "pin",
+    "pink": "pin-pink",
+    "ripl_articulation": "ripl-articulation",
+    "vamp": "vamp-planner",
+}
 """Distributions of modules with another name."""
-
 PEERS_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink", "ompl")
 """Modules that the extra ``peers`` installs."""
 
@@ -353,29 +354,26 @@ def bound_median(measurement: Measurement, limit: float) -> Comparison:
     return Comparison(measurement.name, measurement.median, measurement.unit, Bar(limit, at_least=False))
 
 
-BENCHMARKS: Mapping[str, str] = MappingProxyType(
-    {
-        "load": "a robot's file to its first pose and Jacobian, in a fresh process",
-        "call": "pose and Jacobian of one frame at one configuration",
-        "frames": "the poses of all frames at one configuration",
-        "batch": "pose and Jacobian at 100 000 configurations",
-        "loop": "a closed loop and its derivative at one configuration",
-        "motion": "coordinates after a step, and constraints: a robot in a kitchen, as a control loop asks",
-        "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
-        "inverse_kinematics": "joint positions for poses of five arms, with restarts",
-        "tracking": "a kitchen's coordinates from noisy poses of its doors and drawers",
-        "identification": "the joint between two parts, from twenty poses of both and from one more",
-        "control": "a controller's step, a robot that opens a fridge; beside pink and mink",
-        "planning": "paths without collisions: published problems, robots in kitchens, held doors",
-        "examples": "published examples of pink and mink, beside the same ones of this library",
-        "import": "importing the library, and how many packages that takes",
-        "memory": "the memory of a loaded robot",
-        "document": "a robot in a kitchen, written down and read again; models of up to a million nodes",
-        "edit": "models of 10 000 operations, and a robot with one joint replaced",
-    }
-)
+BENCHMARKS: Mapping[str, str] = {
+    "load": "a robot's file to its first pose and Jacobian, in a fresh process",
+    "call": "pose and Jacobian of one frame at one configuration",
+    "frames": "the poses of all frames at one configuration",
+    "batch": "pose and Jacobian at 100 000 configurations",
+    "loop": "a closed loop and its derivative at one configuration",
+    "motion": "coordinates after a step, and constraints: a robot in a kitchen, as a control loop asks",
+    "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
+    "inverse_kinematics": "joint positions for poses of five arms, with restarts",
+    "tracking": "a kitchen's coordinates from noisy poses of its doors and drawers",
+    "identification": "the joint between two parts, from twenty poses of both and from one more",
+    "control": "a controller's step, a robot that opens a fridge; beside pink and mink",
+    "planning": "paths without collisions: published problems, robots in kitchens, held doors",
+    "examples": "published examples of pink and mink, beside the same ones of this library",
+    "import": "importing the library, and how many packages that takes",
+    "memory": "the memory of a loaded robot",
+    "document": "a robot in a kitchen, written down and read again; models of up to a million nodes",
+    "edit": "models of 10 000 operations, and a robot with one joint replaced",
+}
 """Benchmarks in the order of running; each is a function ``measure_NAME`` of a module of this package."""
-
 _MODULES = {
     "kinematics": ("call", "frames", "batch", "loop"),
     "processes": ("load", "import", "memory"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 
@@ -26,11 +25,9 @@ SECONDS, SOON = 10.0, 0.1  # largest time of a search, and the time in which nea
 MEDIAN, LEAST_SOON, RESIDUAL = 1e-3, 95.0, 1e-5
 """Targets: median time of the search at the fridge, with its path shortened, polished and certified [s],
 share solved soon of what is solved [%], residual of holds [m], [rad]."""
-
 STARTS = 5  # number of starts at each place of the base, each with a goal of its own
 _TRIES, _PATIENCE = 300, 0.2
 """Largest number of places of the base, and time of the search for grasps at each [s]."""
-
 _BETWEEN = (0.25, 0.5, 0.75)  # fractions of edges at which residuals are measured as well
 
 
@@ -61,47 +58,31 @@ class HeldMotion:
         return model
 
 
-MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
-    {
-        "fridge held by an arm": HeldMotion(
-            "fetch",
-            "kitchen/fridge_door",
-            0.03,
-            1.2,
-            {"fetch/gripper_link": (0.04, 0.0, 0.0, np.pi / 2, 0.0, np.pi)},
-            "kitchen/fridge_door_handle",
-            (
-                "fetch/torso*",
-                "fetch/shoulder*",
-                "fetch/upper*",
-                "fetch/elbow*",
-                "fetch/forearm*",
-                "fetch/wrist*",
-            ),
-            ((0.1, -1.9, -0.6), (0.7, -1.0, 0.6)),
-        ),
-        "drawer held by two arms": HeldMotion(
-            "pr2",
-            "kitchen/island_middle_upper_drawer",
-            0.02,
-            0.3,
-            {
-                "pr2/l_gripper_palm_link": (0.22, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
-                "pr2/r_gripper_palm_link": (0.22, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
-            },
-            "kitchen/island_middle_upper_drawer_handle",
-            (
-                "pr2/torso*",
-                "pr2/*_shoulder*",
-                "pr2/*_upper*",
-                "pr2/*_elbow*",
-                "pr2/*_forearm*",
-                "pr2/*_wrist*",
-            ),
-            ((-0.3, -0.2, np.pi - 0.3), (0.1, 0.2, np.pi + 0.3)),
-        ),
-    }
-)
+MOTIONS: Mapping[str, HeldMotion] = {
+    "fridge held by an arm": HeldMotion(
+        "fetch",
+        "kitchen/fridge_door",
+        0.03,
+        1.2,
+        {"fetch/gripper_link": (0.04, 0.0, 0.0, np.pi / 2, 0.0, np.pi)},
+        "kitchen/fridge_door_handle",
+        ("fetch/torso*", "fetch/shoulder*", "fetch/upper*", "fetch/elbow*", "fetch/forearm*", "fetch/wrist*"),
+        ((0.1, -1.9, -0.6), (0.7, -1.0, 0.6)),
+    ),
+    "drawer held by two arms": HeldMotion(
+        "pr2",
+        "kitchen/island_middle_upper_drawer",
+        0.02,
+        0.3,
+        {
+            "pr2/l_gripper_palm_link": (0.22, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
+            "pr2/r_gripper_palm_link": (0.22, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
+        },
+        "kitchen/island_middle_upper_drawer_handle",
+        ("pr2/torso*", "pr2/*_shoulder*", "pr2/*_upper*", "pr2/*_elbow*", "pr2/*_forearm*", "pr2/*_wrist*"),
+        ((-0.3, -0.2, np.pi - 0.3), (0.1, 0.2, np.pi + 0.3)),
+    ),
+}
 """Motions by name."""
 
 

@@ -6,8 +6,7 @@ import importlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from time import thread_time_ns
-from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,17 +23,14 @@ from .harness import Benchmark, BenchmarkResult, BenchmarkSettings, install_advi
 
 POSITION_TOLERANCE, ANGLE_TOLERANCE, LIMIT_TOLERANCE = 1e-4, 1e-3, 1e-6
 """Largest errors of a solution [m], [rad], and beyond limits [m], [rad]."""
-
 STARTS, BUDGET = 20, 0.01  # number of starts of a target, and CPU time [s]
-ARMS: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),
-        "ur5": ("ur_description/urdf/ur5_robot.urdf", "ee_link"),
-        "tiago": ("tiago_description/robots/tiago_no_hand.urdf", "wrist_ft_tool_link"),
-        "pr2": ("pr2_description/robots/pr2.urdf", "r_gripper_tool_frame"),
-        "fetch": ("fetch_description/robots/fetch.urdf", "gripper_link"),
-    }
-)
+ARMS: Mapping[str, tuple[str, str]] = {
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "ee_link"),
+    "tiago": ("tiago_description/robots/tiago_no_hand.urdf", "wrist_ft_tool_link"),
+    "pr2": ("pr2_description/robots/pr2.urdf", "r_gripper_tool_frame"),
+    "fetch": ("fetch_description/robots/fetch.urdf", "gripper_link"),
+}
 """Files and frames of arms by name."""
 
 
@@ -111,6 +107,27 @@ class IterativeSolver(Protocol):
         """Return the joint positions."""
 
 
+class TaskReaching:
+    """Full Gauss-Newton steps of pink or mink within limits of positions, an :class:`.IterativeSolver`."""
+
+    iterations = 25
+    configuration: Any
+    task: Any
+
+    def solve(self) -> Array:
+        """Return the step at the present configuration."""
+        raise NotImplementedError
+
+    def iterate(self) -> float:
+        step = self.solve()
+        self.configuration.integrate_inplace(step, 1.0)
+        return float(np.abs(step).max())
+
+    def errors(self) -> tuple[float, float]:
+        error = self.task.compute_error(self.configuration)
+        return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+
+
 @dataclass(frozen=True, slots=True)
 class Search:
     solved: bool  # true if a start led to the target within limits
@@ -158,7 +175,6 @@ PEERS = {
     "pinocchio's example": ("pink", "PinocchioReaching"),
 }
 """Module and class of each peer; the example's loop is in the module of pink."""
-
 LEAST_SOLVED = 99.0  # target share of solved poses [%]
 _MORE = 10  # number of our targets per configuration, and of configurations per target of a peer
 

@@ -6,7 +6,6 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 
@@ -37,44 +36,38 @@ class KitchenRobotArm:
     without: tuple[str, ...] = ()  # bodies that cannot be used, as their meshes are missing
 
 
-ARMS: Mapping[str, KitchenRobotArm] = MappingProxyType(
-    {
-        "pr2": KitchenRobotArm("pr2_description/robots/pr2.urdf", "r_gripper_tool_frame"),
-        "hsr": KitchenRobotArm(
-            "hsrb_description/robots/hsrb.urdf",
-            "hand_palm_link",
-            (0.0, 0.0, 1.0),
-            0.08,
-            ("head_l_stereo_camera_link", "head_r_stereo_camera_link"),
-        ),
-        "fetch": KitchenRobotArm("fetch_description/robots/fetch.urdf", "gripper_link"),
-        "pr2 (shipped)": KitchenRobotArm("pr2", "r_gripper_tool_frame"),
-        "hsr (shipped)": KitchenRobotArm("hsr", "hand_palm_link", (0.0, 0.0, 1.0), 0.08),
-        "fetch (shipped)": KitchenRobotArm("fetch", "gripper_link"),
-    }
-)
+ARMS: Mapping[str, KitchenRobotArm] = {
+    "pr2": KitchenRobotArm("pr2_description/robots/pr2.urdf", "r_gripper_tool_frame"),
+    "hsr": KitchenRobotArm(
+        "hsrb_description/robots/hsrb.urdf",
+        "hand_palm_link",
+        (0.0, 0.0, 1.0),
+        0.08,
+        ("head_l_stereo_camera_link", "head_r_stereo_camera_link"),
+    ),
+    "fetch": KitchenRobotArm("fetch_description/robots/fetch.urdf", "gripper_link"),
+    "pr2 (shipped)": KitchenRobotArm("pr2", "r_gripper_tool_frame"),
+    "hsr (shipped)": KitchenRobotArm("hsr", "hand_palm_link", (0.0, 0.0, 1.0), 0.08),
+    "fetch (shipped)": KitchenRobotArm("fetch", "gripper_link"),
+}
 """Robots by name: those of the model path, and those that ship."""
-
-KITCHENS: Mapping[str, str] = MappingProxyType(
-    {"iai_kitchen": "iai_kitchen/urdf_obj/kitchen.urdf", "kitchen (shipped)": "kitchen"}
-)
+KITCHENS: Mapping[str, str] = {
+    "iai_kitchen": "iai_kitchen/urdf_obj/kitchen.urdf",
+    "kitchen (shipped)": "kitchen",
+}
 """Kitchens by name."""
-
-FRIDGE_OPEN: Mapping[str, float] = MappingProxyType({f"{KITCHEN}/fridge_door": 1.4})
+FRIDGE_OPEN: Mapping[str, float] = {f"{KITCHEN}/fridge_door": 1.4}
 """Position of the door of the shipped fridge for the queries there [rad]."""
-
 FRIDGE_BASE = np.array([0.45, -1.5, 0.0])  # place of the base there: x, y [m] and angle [rad]
 BESIDE_FRIDGE = np.array([[0.9, -1.2, 0.5], [1.1, -0.9, 1.3]])
 INSIDE_FRIDGE = np.array([[1.3, -1.8, 0.8], [1.5, -1.4, 1.5]])
 """Corners of the boxes of points that the hand points at: starts and goals [m]."""
-
 OFFSET = 0.06, 0.12  # range of the distance of the fingertips from the handle [m]
 CLEARANCE = 0.005  # least distance of the robot from the kitchen at starts and goals [m]
 _CONE = 0.5  # least cosine of the angle between the direction of approach and that to the handle
 _SAMPLES, _HEIGHT, _NEAR = 20_000, 0.03, 0.2
 """Number of random configurations from which poses of the hand are taken, and how far in height, and in all
 directions, they may be off the handle [m]. Those of the goal are then brought to it by inverse kinematics."""
-
 _STATES = 200  # number of random states at which pairs of the robot touch that always do
 _STARTS = 4  # number of starts of inverse kinematics
 
@@ -180,7 +173,7 @@ def _include_robot(edit: Edit, arm: KitchenRobotArm) -> None:
 class _QuerySearch:
     """Search for configurations of an arm at handles, without collisions."""
 
-    def __init__(self, arm: KitchenArm, state: Mapping[str, float] = MappingProxyType({})) -> None:
+    def __init__(self, arm: KitchenArm, state: Mapping[str, float] = {}) -> None:
         self._arm = arm
         model = arm.model
         hand = model.fk(arm.tool)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from statistics import median
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -47,7 +46,6 @@ from .planning_problems import (
 
 OURS, SEARCH, VAMP = "kineverse", "kineverse, first path", "vamp"
 """Contenders: our planner, which shortens, certifies and judges; its search alone, as VAMP's clock; VAMP."""
-
 PUBLISHED_SECONDS = 1.0  # largest time of our search for one problem [s]
 SLOWER, FEWER = 2.0, -3.0  # targets: largest ratio of times, and least difference of the shares solved [%]
 
@@ -61,13 +59,11 @@ class PublishedFigures:
     solved: float  # share of attempts that found a path [%]
 
 
-FIGURES: Mapping[str, PublishedFigures] = MappingProxyType(
-    {
-        "panda": PublishedFigures(56e-6, 146e-6, 100.0),
-        # 5 of the 280 problems are invalid, and 41 of the other 1375 attempts failed.
-        "fetch": PublishedFigures(683e-6, 4.009e-3, 100.0 * 1334 / 1400),
-    }
-)
+FIGURES: Mapping[str, PublishedFigures] = {
+    "panda": PublishedFigures(56e-6, 146e-6, 100.0),
+    # 5 of the 280 problems are invalid, and 41 of the other 1375 attempts failed.
+    "fetch": PublishedFigures(683e-6, 4.009e-3, 100.0 * 1334 / 1400),
+}
 """Figures of VAMP by robot."""
 
 
@@ -137,7 +133,6 @@ SAMPLED = 50  # one of so many queries is also attempted by OMPL if ours is solv
 FRIDGE = ("fetch (shipped)", "kitchen (shipped)")  # robot and kitchen of the problems at the fridge
 PROBLEMS = {"easy": 15, "middle": 12, "hard": 18}
 """Numbers of the queries at the open fridge by the time that OMPL takes for them."""
-
 LEAST_SOLVED, MEDIAN, P99, FASTER = 98.0, 2e-3, 0.2, 100.0
 """Targets: share of solvable queries that are solved [%], times [s], and how many times as fast as OMPL."""
 
@@ -277,7 +272,6 @@ PARTS = ("published", "fridge", "kitchens", "held", "build")  # parts of the ben
 SEEDS = 5  # number of attempts at each published problem
 BUILT = ("pr2", "pr2 (shipped)")
 """Robots whose planner is built in a fresh process, in the shipped kitchen: the first that is there."""
-
 _AGAIN = 5  # number of times that it is built from the cache, of which the median counts
 FIRST, AGAIN = "planner from its file, spheres and compiling", "planner from the cache"
 

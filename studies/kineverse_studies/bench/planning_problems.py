@@ -220,7 +220,6 @@ def _read_problem(
 
 CHECKS_PER_RADIAN = 32.0
 """Configurations that planners check over a motion of length 1 of all coordinates [1/rad], [1/m]."""
-
 FINER = 20.0  # factor by which a returned path is sampled finer than that
 
 

@@ -24,7 +24,6 @@ from .harness import BenchmarkSettings
 
 PR2 = ("pr2_description/robots/pr2.urdf", "pr2_description/urdf/pr2.urdf", "pr2")
 """A real PR2 from the model path or from example-robot-data, else the one that ships."""
-
 GRIPPER = "r_gripper_tool_frame"
 _ONE_COORDINATE = ("fixed", "revolute", "continuous", "prismatic")
 
@@ -93,7 +92,7 @@ class BenchmarkRobot:
 
 def find_benchmark_robot(settings: BenchmarkSettings) -> BenchmarkRobot:
     """Return the requested robot, else the first PR2 that is found."""
-    file = _robot_file(settings.robot)
+    file = locate_model(settings.robot or _first_found(PR2)).path
     if file.suffix != ".urdf":
         raise InvalidValueError(f"Peers read URDF, and {str(file)!r} is none; give another --robot.")
     model = load(file, prefix="")
@@ -105,17 +104,6 @@ def find_benchmark_robot(settings: BenchmarkSettings) -> BenchmarkRobot:
     robot = BenchmarkRobot(file, model, settings.frame or _default_frame(model))
     _check_chain(robot)
     return robot
-
-
-def _robot_file(name: str | None) -> Path:
-    if name is not None:
-        return locate_model(name).path
-    for candidate in PR2[:-1]:
-        try:
-            return locate_model(candidate).path
-        except UnknownNameError:
-            continue
-    return locate_model(PR2[-1]).path
 
 
 def _default_frame(model: Model) -> str:
@@ -166,7 +154,6 @@ KITCHENS = {"iai_kitchen/urdf_obj/kitchen.urdf": (0.3, 1.5), "kitchen": (0.2, 0.
 """Kitchen with meshes from the model path, else the shipped one, with the robot's position [m].
 
 The robot stands close to the counters, so that many bodies are near and few are in contact."""
-
 _WALK_STEP, _WALK_RANGE = 0.003, 0.3
 
 
@@ -218,20 +205,14 @@ def _on_omni_base(robot: str, kitchen: str) -> Model:
         edit.include(kitchen, "kitchen")
         edit.include(robot, "robot")
         edit.apply(OmniBase(name="base", parent=WORLD, child="base"))
-        root = next(name for name, frame in model.frames.items() if _is_root(name, frame.parent))
-        edit.attach(root, "base", np.eye(4))
+        loose = (name for name, frame in model.frames.items() if frame.parent == WORLD)
+        edit.attach(next(name for name in loose if name.startswith("robot/")), "base", np.eye(4))
     return model
 
 
 def _make_scene(model: Model) -> Scene:
-    apart = (
-        Rule(f"{name}/*", f"{name}/*", why="only the robot in the kitchen") for name in ("robot", "kitchen")
-    )
-    return Scene(model, rules=apart)
-
-
-def _is_root(name: str, parent: str) -> bool:
-    return parent == WORLD and name.startswith("robot/")
+    why = "only the robot in the kitchen"
+    return Scene(model, rules=[Rule(f"{name}/*", f"{name}/*", why=why) for name in ("robot", "kitchen")])
 
 
 def _first_found(names: tuple[str, ...]) -> str:

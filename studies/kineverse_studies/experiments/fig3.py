@@ -32,7 +32,6 @@ OPTIONS = ()
 LENGTH = 2.0
 PARTS = {"A": 0.0, "25 %": 0.25, "50 %": 0.5, "75 %": 0.75, "B": 1.0}
 """Points along the door by name, from the lower edge A to the upper edge B, as fractions of its length."""
-
 _OPENINGS = np.linspace(0.0, LENGTH, 20)
 _HANDLE = np.linspace(0.0, 0.6, 50)
 _LOCK_AT = (1.0, 2.0)

@@ -41,13 +41,11 @@ COUNTS = (6, 120)  # least and largest number of observations, log-uniform
 POSITIONS = (0.0007, 0.04)
 ORIENTATIONS = (math.radians(0.25), math.radians(7.0))
 """Standard deviations of each component of the errors [m], [rad], log-uniform and independent."""
-
 RANGES: dict[Joint, tuple[float, float]] = {
     "revolute": (math.radians(12.0), math.radians(130.0)),
     "prismatic": (0.04, 0.6),
 }
 """Ranges [rad], [m], uniform."""
-
 BETA = (0.7, 0.9)  # parameters of the Beta distribution of the joint values over the range
 LEVERS = (0.08, 0.9)  # distances of the child's origin from the axis of a hinge [m], uniform
 MOVING = 0.6  # share of the cases with a moving observer and a parent that is measured with noise, too
@@ -107,7 +105,6 @@ def _random_orthogonal(rng: np.random.Generator, axis: Array) -> Array:
 
 
 CASES = 1000
-
 _CHUNK = 10  # number of cases that a process identifies at a time
 
 
@@ -185,7 +182,6 @@ QUICK_CASES = 30
 FIGURE_SIZE = (13.0, 5.0)
 TARGETS = {Setting(True, False): (0.92, 0.02), Setting(True, True): (0.98, 0.002)}
 """Least share of right answers, and largest share of wrong sure ones, of the settings that have a target."""
-
 PROBABILITIES = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
 RATIOS = (0.0, 1 / 8, 1 / 2, 2.0, 8.0, math.inf)
 """Bins of probabilities, and of ratios of position to orientation noise, relative to 5 mm : 1°."""

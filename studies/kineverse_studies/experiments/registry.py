@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
@@ -51,36 +50,30 @@ class Options:
 
 
 Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]
-EXPERIMENTS: Mapping[str, str] = MappingProxyType(
-    {
-        "fig3": "the garage door and its lock (2022 paper, Fig. 3 and Eqs. 11-13)",
-        "fig4": "a kitchen tracked from poses of its parts (2022 paper, Fig. 4; 2020 paper, IV-A)",
-        "sturm": "hinges and sliders learned from recordings of doors and drawers (--data FOLDER)",
-        "stream": "a door that a hand opens, tracked and monitored at 30 Hz with correlated errors",
-        "joint-types": "types of random hinges and sliders, with and without stated noise",
-        "kitchens": "generated kitchens, of which robots open and close all (--seed N --count 50)",
-        "table1-open": "grasped objects are opened, also by the papers' two programs (2022 paper, Table I)",
-        "table1-push": "twelve objects of a kitchen are pushed shut (both papers, Table I)",
-        "unknown-objects": "a door and a drawer whose joints nobody described are opened (--count 10)",
-        "lockbox": "parts that lock each other, opened by trends and by plans (thesis behind the 2020 paper)",
-        "ablations": "pushes and locks without augmented gradients, and with each rule of trends",
-        "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
-    }
-)
+EXPERIMENTS: Mapping[str, str] = {
+    "fig3": "the garage door and its lock (2022 paper, Fig. 3 and Eqs. 11-13)",
+    "fig4": "a kitchen tracked from poses of its parts (2022 paper, Fig. 4; 2020 paper, IV-A)",
+    "sturm": "hinges and sliders learned from recordings of doors and drawers (--data FOLDER)",
+    "stream": "a door that a hand opens, tracked and monitored at 30 Hz with correlated errors",
+    "joint-types": "types of random hinges and sliders, with and without stated noise",
+    "kitchens": "generated kitchens, of which robots open and close all (--seed N --count 50)",
+    "table1-open": "grasped objects are opened, also by the papers' two programs (2022 paper, Table I)",
+    "table1-push": "twelve objects of a kitchen are pushed shut (both papers, Table I)",
+    "unknown-objects": "a door and a drawer whose joints nobody described are opened (--count 10)",
+    "lockbox": "parts that lock each other, opened by trends and by plans (thesis behind the 2020 paper)",
+    "ablations": "pushes and locks without augmented gradients, and with each rule of trends",
+    "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
+}
 """Descriptions of experiments by name; the names are modules of this package, with dashes for underscores."""
-
-REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "ablations": ("control", "geometry"),
-        "kitchens": ("control", "geometry"),
-        "lockbox": ("control",),
-        "table1-open": ("control", "geometry"),
-        "table1-push": ("control", "geometry"),
-        "unknown-objects": ("control", "geometry"),
-    }
-)
+REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = {
+    "ablations": ("control", "geometry"),
+    "kitchens": ("control", "geometry"),
+    "lockbox": ("control",),
+    "table1-open": ("control", "geometry"),
+    "table1-push": ("control", "geometry"),
+    "unknown-objects": ("control", "geometry"),
+}
 """Extras without which an experiment cannot run."""
-
 PLANNED = ("kitchens", "table1-open", "unknown-objects")
 """Experiments with a planner, which needs a C compiler."""
 

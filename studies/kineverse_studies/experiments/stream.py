@@ -33,14 +33,11 @@ if TYPE_CHECKING:
 DOOR = "kitchen/fridge_door"
 FRAMES = (DOOR, "kitchen/fridge_door_handle")
 """Coordinate of the door, and the two frames on it that carry markers."""
-
 RATE = 30.0  # looks per second
 POSITION, ORIENTATION = 0.004, math.radians(1.5)
 """Standard deviations of each coordinate of a marker [m] and about each axis [rad]."""
-
 OPENED, HALF_SHUT, MOVING_TIME = 10.0, 34.0, 3.5
 """Times at which a hand begins to open and to half shut the door, and the duration of each motion [s]."""
-
 OPEN_ANGLE, HALF_SHUT_ANGLE = 1.3, 0.65  # angles of the open and of the half shut door [rad]
 
 
@@ -153,7 +150,6 @@ def run_gated_filter(stream: Stream, markers: Markers, acceleration: float) -> t
 DURATION = 60.0  # length of a stream [s]
 ACCELERATIONS = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Noise of the textbook filter [rad²/s³]; that with the least error while moving counts."""
-
 PROCESSES: tuple[Process, ...] = ("position", "velocity")
 _SETTLED = 1.0
 _WRONG = 5.0
@@ -289,7 +285,6 @@ def summarize_trackers(results: Mapping[str, Sequence[TrackedStream]]) -> list[T
 TURNED = np.pi / 4  # angle of the door from which looks until an alarm are counted [rad]
 PERIOD = 60.0  # time after which the hand's motion repeats [s]
 WHITE = StreamErrors(correlation=0.0, share=0.0)  # errors without correlation, with dropouts and outliers
-
 _SHUTTING = 3.5  # time in which the hand shuts the door before its motion repeats [s]
 
 

@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -40,38 +39,33 @@ if TYPE_CHECKING:
 
 Label = Literal["revolute", "prismatic"]
 SOURCE = "https://github.com/tum-vision/articulation"
-LABELS: Mapping[str, Label] = MappingProxyType(
-    {
-        "cabinet_one/*.log": "revolute",
-        "drawer_one/*.log": "prismatic",
-        "kitchen_6d/M2U00389.log": "revolute",
-        "kitchen_6d/M2U00390.log": "revolute",
-        "kitchen_6d/M2U00391.log": "revolute",
-        "kitchen_6d/M2U00393.log": "revolute",
-        "kitchen_6d/M2U00394.log": "prismatic",
-        "kitchen_6d/M2U00395.log": "prismatic",
-        "kitchen_6d/M2U00406.log": "revolute",
-        "kitchen_6d/M2U00411.log": "revolute",
-        "mechanisms_iros_2010/dishwasher/*.log": "revolute",
-        "mechanisms_iros_2010/drawer/*.log": "prismatic",
-        "mechanisms_iros_2010/left_door/*.log": "revolute",
-        "mechanisms_iros_2010/right_door/*.log": "revolute",
-        "microwave/*.log": "revolute",
-        "models_data/door.txt": "revolute",
-    }
-)
+LABELS: Mapping[str, Label] = {
+    "cabinet_one/*.log": "revolute",
+    "drawer_one/*.log": "prismatic",
+    "kitchen_6d/M2U00389.log": "revolute",
+    "kitchen_6d/M2U00390.log": "revolute",
+    "kitchen_6d/M2U00391.log": "revolute",
+    "kitchen_6d/M2U00393.log": "revolute",
+    "kitchen_6d/M2U00394.log": "prismatic",
+    "kitchen_6d/M2U00395.log": "prismatic",
+    "kitchen_6d/M2U00406.log": "revolute",
+    "kitchen_6d/M2U00411.log": "revolute",
+    "mechanisms_iros_2010/dishwasher/*.log": "revolute",
+    "mechanisms_iros_2010/drawer/*.log": "prismatic",
+    "mechanisms_iros_2010/left_door/*.log": "revolute",
+    "mechanisms_iros_2010/right_door/*.log": "revolute",
+    "microwave/*.log": "revolute",
+    "models_data/door.txt": "revolute",
+}
 """Label of each file, derived from the names of the objects."""
-
-COLUMNS: Mapping[str, str] = MappingProxyType({"models_data/door.txt": "x,y,z,qx,qy,qz,qw,-,-"})
+COLUMNS: Mapping[str, str] = {"models_data/door.txt": "x,y,z,qx,qy,qz,qw,-,-"}
 """Columns of files that have more than those of a pose."""
-
 POSITION, ORIENTATION = 0.01, math.radians(5.0)
 """Standard deviations of the deviation from an ideal joint, of each coordinate [m] and about each axis [rad].
 
 They are larger than the sensor noise of a millimetre or less: hands slip, handles and hinges yield, and
 planar markers have systematic orientation errors.
 """
-
 THINNED = 20
 """Number of poses used of each recording, evenly over time, because errors of neighbours are correlated."""
 
@@ -120,15 +114,13 @@ def _read_labelled(file: Path, name: Path, label: Label) -> tuple[str, Label, Re
 
 
 GUESS = (0.005, math.radians(1.0))  # guessed noise of positions [m] and orientations [rad]
-STATEMENTS: Mapping[str, str] = MappingProxyType(
-    {
-        "estimated": "estimated",
-        "residuals": "stated, as large as the residuals of the labelled joint",
-        "guess": "stated, 5 mm and 1 deg for all",
-        "half": "stated, half of the residuals",
-        "twice": "stated, twice the residuals",
-    }
-)
+STATEMENTS: Mapping[str, str] = {
+    "estimated": "estimated",
+    "residuals": "stated, as large as the residuals of the labelled joint",
+    "guess": "stated, 5 mm and 1 deg for all",
+    "half": "stated, half of the residuals",
+    "twice": "stated, twice the residuals",
+}
 """Statements of the noise by name."""
 
 

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -64,28 +63,20 @@ _FILES = {SHIPPED_KITCHEN: "kitchen", AUTHORS_KITCHEN: "iai_kitchen/iai_kitchen/
 _PLACE = Pose.from_matrix(translation(1.0, 0.0, 0.7) @ rotation_z(0.57))
 
 # Name of each object: coordinate in the shipped kitchen, and in the authors'.
-_COORDINATES: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "fridge door": ("fridge_door", "iai_fridge_door_joint"),
-        "oven door": ("oven_door", "oven_area_oven_door_joint"),
-        "dishwasher door": ("dishwasher_door", "sink_area_dish_washer_door_joint"),
-        "fridge lower drawer": ("fridge_lower_drawer", "fridge_area_lower_drawer_main_joint"),
-        "oven left drawer": ("oven_left_drawer", "oven_area_area_left_drawer_main_joint"),
-        "oven middle lower drawer": (
-            "oven_middle_lower_drawer",
-            "oven_area_area_middle_lower_drawer_main_joint",
-        ),
-        "oven middle upper drawer": (
-            "oven_middle_upper_drawer",
-            "oven_area_area_middle_upper_drawer_main_joint",
-        ),
-        "oven right drawer": ("oven_right_drawer", "oven_area_area_right_drawer_main_joint"),
-        "sink left bottom drawer": ("sink_left_bottom_drawer", "sink_area_left_bottom_drawer_main_joint"),
-        "sink left middle drawer": ("sink_left_middle_drawer", "sink_area_left_middle_drawer_main_joint"),
-        "sink left upper drawer": ("sink_left_upper_drawer", "sink_area_left_upper_drawer_main_joint"),
-        "sink trash drawer": ("sink_trash_drawer", "sink_area_trash_drawer_main_joint"),
-    }
-)
+_COORDINATES: Mapping[str, tuple[str, str]] = {
+    "fridge door": ("fridge_door", "iai_fridge_door_joint"),
+    "oven door": ("oven_door", "oven_area_oven_door_joint"),
+    "dishwasher door": ("dishwasher_door", "sink_area_dish_washer_door_joint"),
+    "fridge lower drawer": ("fridge_lower_drawer", "fridge_area_lower_drawer_main_joint"),
+    "oven left drawer": ("oven_left_drawer", "oven_area_area_left_drawer_main_joint"),
+    "oven middle lower drawer": ("oven_middle_lower_drawer", "oven_area_area_middle_lower_drawer_main_joint"),
+    "oven middle upper drawer": ("oven_middle_upper_drawer", "oven_area_area_middle_upper_drawer_main_joint"),
+    "oven right drawer": ("oven_right_drawer", "oven_area_area_right_drawer_main_joint"),
+    "sink left bottom drawer": ("sink_left_bottom_drawer", "sink_area_left_bottom_drawer_main_joint"),
+    "sink left middle drawer": ("sink_left_middle_drawer", "sink_area_left_middle_drawer_main_joint"),
+    "sink left upper drawer": ("sink_left_upper_drawer", "sink_area_left_upper_drawer_main_joint"),
+    "sink trash drawer": ("sink_trash_drawer", "sink_area_trash_drawer_main_joint"),
+}
 OBJECTS = (*_COORDINATES, FOLDING_DOOR)  # names of the objects
 
 
@@ -167,7 +158,6 @@ PUBLISHED = {
     "2020": {"hsr": (2.2, 0.08), "fetch": (4.8, 0.09), "pr2": (3.2, 0.06)},
 }
 """Mean time of a control step and its deviation over the objects, Table I of each paper [ms]."""
-
 PENETRATION, LIMITS, LOSSES = 5e-4, 1e-6, 1
 """Bars: deepest penetration [m], largest violation of limits, and contact losses of one run."""
 

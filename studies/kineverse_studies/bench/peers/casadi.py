@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -63,22 +62,20 @@ class BoundMap:
 
 
 CHUNK_SIZE = 1024  # number of points of a chunk: columns stay in the cache, and numpy's overhead is small
-NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = MappingProxyType(
-    {
-        ca.OP_ADD: np.add,
-        ca.OP_SUB: np.subtract,
-        ca.OP_MUL: np.multiply,
-        ca.OP_DIV: np.divide,
-        ca.OP_NEG: np.negative,
-        ca.OP_INV: np.reciprocal,
-        ca.OP_SQ: np.square,
-        ca.OP_TWICE: lambda x, out: np.multiply(x, 2.0, out=out),
-        ca.OP_SQRT: np.sqrt,
-        ca.OP_SIN: np.sin,
-        ca.OP_COS: np.cos,
-        ca.OP_ASSIGN: lambda x, out: np.copyto(out, x),
-    }
-)
+NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = {
+    ca.OP_ADD: np.add,
+    ca.OP_SUB: np.subtract,
+    ca.OP_MUL: np.multiply,
+    ca.OP_DIV: np.divide,
+    ca.OP_NEG: np.negative,
+    ca.OP_INV: np.reciprocal,
+    ca.OP_SQ: np.square,
+    ca.OP_TWICE: lambda x, out: np.multiply(x, 2.0, out=out),
+    ca.OP_SQRT: np.sqrt,
+    ca.OP_SIN: np.sin,
+    ca.OP_COS: np.cos,
+    ca.OP_ASSIGN: lambda x, out: np.copyto(out, x),
+}
 """Numpy functions of CasADi's operations, as far as joints with one coordinate need them."""
 
 

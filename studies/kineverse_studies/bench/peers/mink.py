@@ -20,12 +20,12 @@ from kineverse_studies.bench.control_workloads import (
     FINGERS,
     HAND_SPHERES,
     HANDS,
-    ROOT,
     TABLE_CENTRE,
     TABLE_SIZE,
     THIGH_SPHERES,
     CollisionSphere,
     ControlWorkload,
+    PeerLoop,
     drive,
     figure_eight,
     grasp,
@@ -34,8 +34,9 @@ from kineverse_studies.bench.control_workloads import (
     loop,
     nod,
     orbit,
+    split_coordinate,
 )
-from kineverse_studies.bench.inverse_kinematics import ReachingProblem
+from kineverse_studies.bench.inverse_kinematics import ReachingProblem, TaskReaching
 
 from .mujoco import add_mujoco_options
 
@@ -45,63 +46,35 @@ SOLVER = "daqp"
 class MinkRobot:
     def __init__(self, model: Any, start: Mapping[str, float], speeds: Mapping[str, float]) -> None:
         self.model, self.speeds = model, speeds
-        q = model.qpos0.copy()
+        self.start: Array = model.qpos0.copy()
         for name, value in start.items():
-            joint, _, axis = name.rpartition("/") if name.startswith(f"{ROOT}/") else (name, "", "x")
-            q[model.joint(joint).qposadr[0] + "xyz".index(axis)] = value
-        self.start: Array = q
-        self.configuration: Any = mink.Configuration(model, q)
-
-    def reset(self) -> None:
-        self.configuration.update(self.start)
+            joint, number = split_coordinate(name)
+            self.start[model.joint(joint).qposadr[0] + number] = value
+        self.configuration: Any = mink.Configuration(model, self.start)
 
     def pose(self, frame: str) -> Any:
-        """Return the placement of a body."""
         return self.configuration.get_transform_frame_to_world(frame, "body")
 
 
 @dataclass
-class MinkLoop:
-    robot: MinkRobot
-    period: float  # control period [s]
-    tasks: list[Any]
-    move: Callable[[float], None]  # moves the targets of the tasks to a time [s]
-    error: Callable[[], float]  # returns the error of the most important position [m]
+class MinkLoop(PeerLoop):
     damping: float = 1e-3  # weight of squared displacements
     limits: list[Any] = field(default_factory=list)
     # returns the tasks to be kept exactly at a time [s]
     constraints: Callable[[float], list[Any] | None] = field(default=lambda time: None)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.limits = self.limits or [mink.ConfigurationLimit(self.robot.model)]
-        self._kept: list[Any] | None = None
-        self._q = self.robot.start
-        self._velocity = np.zeros(self.robot.model.nv)
-
-    def reset(self) -> None:
-        self.robot.reset()
-        self._q = self.robot.start
+        self._options: dict[str, Any] = {"damping": self.damping, "limits": self.limits}
 
     def aim(self, time: float) -> None:
         self.move(time)
-        self._kept = self.constraints(time)
+        self._options["constraints"] = self.constraints(time)
 
-    def step(self) -> None:
+    def solve(self) -> Array:
         configuration = self.robot.configuration
-        configuration.update(self._q)
-        self._velocity = mink.solve_ik(
-            configuration,
-            self.tasks,
-            self.period,
-            SOLVER,
-            damping=self.damping,
-            limits=self.limits,
-            constraints=self._kept,
-        )
-
-    def advance(self) -> None:
-        self.robot.configuration.integrate_inplace(self._velocity, self.period)
-        self._q = self.robot.configuration.q
+        return np.array(mink.solve_ik(configuration, self.tasks, self.period, SOLVER, **self._options))
 
 
 def make_loop(name: str, workload: ControlWorkload) -> MinkLoop:
@@ -346,38 +319,28 @@ MINK_LOOPS: Mapping[str, tuple[Callable[[ControlWorkload], Any], Callable[[MinkR
 """Models and control loops by the name of the workload, each as in the example that it follows."""
 
 
-class MinkReaching:
-    """Full Gauss-Newton steps of mink within the limits of positions; see :class:`.IterativeSolver`."""
-
-    def __init__(self, problem: ReachingProblem, iterations: int = 25, lm_damping: float = 1e-2) -> None:
-        self.iterations = iterations
+class MinkReaching(TaskReaching):
+    def __init__(self, problem: ReachingProblem) -> None:
         root = remove_masses(ElementTree.fromstring(problem.urdf()))
         model: Any = mujoco.MjModel.from_xml_string(add_mujoco_options(root))
         self._columns = [int(model.joint(name).qposadr[0]) for name in problem.names()]
-        self._configuration = mink.Configuration(model)
-        self._task = mink.FrameTask(
-            problem.frame, "body", position_cost=1.0, orientation_cost=1.0, lm_damping=lm_damping
+        self.configuration = mink.Configuration(model)
+        self.task = mink.FrameTask(
+            problem.frame, "body", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-2
         )
         self._limits = [mink.ConfigurationLimit(model)]
 
     def aim(self, target: Array) -> None:
-        self._task.set_target(mink.SE3.from_matrix(target))
+        self.task.set_target(mink.SE3.from_matrix(target))
 
     def start(self, q: Array) -> None:
-        positions = self._configuration.q
+        positions = self.configuration.q
         positions[self._columns] = q
-        self._configuration.update(positions)
+        self.configuration.update(positions)
 
-    def iterate(self) -> float:
-        step = mink.solve_ik(
-            self._configuration, [self._task], 1.0, SOLVER, damping=1e-8, limits=self._limits
-        )
-        self._configuration.integrate_inplace(step, 1.0)
-        return float(np.abs(step).max())
-
-    def errors(self) -> tuple[float, float]:
-        error = self._task.compute_error(self._configuration)
-        return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+    def solve(self) -> Array:
+        options: dict[str, Any] = {"damping": 1e-8, "limits": self._limits}
+        return np.array(mink.solve_ik(self.configuration, [self.task], 1.0, SOLVER, **options))
 
     def positions(self) -> Array:
-        return np.array(self._configuration.q[self._columns])
+        return np.array(self.configuration.q[self._columns])

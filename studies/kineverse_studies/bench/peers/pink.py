@@ -26,14 +26,15 @@ from kineverse_studies.bench.control_workloads import (
     FEET,
     HANDS,
     QUADRUPED_FEET,
-    ROOT,
     WORKLOADS,
     ControlWorkload,
+    PeerLoop,
     reachable_targets,
+    split_coordinate,
     squat,
     swing,
 )
-from kineverse_studies.bench.inverse_kinematics import ReachingProblem
+from kineverse_studies.bench.inverse_kinematics import ReachingProblem, TaskReaching
 
 SOLVER = "daqp"
 
@@ -41,57 +42,32 @@ SOLVER = "daqp"
 class PinkRobot:
     def __init__(self, workload: ControlWorkload) -> None:
         self.model: Any = pin.buildModelFromXML(workload.urdf())
-        self.start = self._coordinates(workload.start)
-        self.configuration: Any = pink.Configuration(self.model, self.model.createData(), self.start)
-
-    def reset(self) -> None:
-        self.configuration.update(self.start)
-
-    def pose(self, frame: str) -> Any:
-        return self.configuration.get_transform_frame_to_world(frame)
-
-    def _coordinates(self, positions: Mapping[str, float]) -> Array:
         q = pin.neutral(self.model)
-        for name, value in positions.items():
-            joint, _, axis = name.rpartition("/") if name.startswith(f"{ROOT}/") else (name, "", "x")
+        for name, value in workload.start.items():
+            joint, number = split_coordinate(name)
             entry = self.model.joints[self.model.getJointId(joint)]
             if entry.nq == 2:  # a continuous joint has cosine and sine
                 q[entry.idx_q : entry.idx_q + 2] = np.cos(value), np.sin(value)
             else:
-                q[entry.idx_q + "xyz".index(axis)] = value
-        return np.array(q)
+                q[entry.idx_q + number] = value
+        self.start = np.array(q)
+        self.configuration: Any = pink.Configuration(self.model, self.model.createData(), self.start)
+
+    def pose(self, frame: str) -> Any:
+        return self.configuration.get_transform_frame_to_world(frame)
 
 
 @dataclass
-class PinkLoop:
-    robot: PinkRobot
-    period: float  # control period [s]
-    tasks: list[Any]
-    move: Callable[[float], None]  # moves the targets of the tasks to a time [s]
-    error: Callable[[], float]  # returns the error of the most important position [m]
+class PinkLoop(PeerLoop):
     options: dict[str, Any] = field(default_factory=dict)  # further options of ``pink.solve_ik``
     after: Callable[[Array], None] | None = None  # called with the velocity of each step
 
-    def __post_init__(self) -> None:
-        self._q = self.robot.start
-        self._velocity = np.zeros(self.robot.model.nv)
-
-    def reset(self) -> None:
-        self.robot.reset()
-        self._q = self.robot.start
-
-    def aim(self, time: float) -> None:
-        self.move(time)
-
-    def step(self) -> None:
+    def solve(self) -> Array:
         configuration = self.robot.configuration
-        configuration.update(self._q)
-        self._velocity = pink.solve_ik(configuration, self.tasks, self.period, solver=SOLVER, **self.options)
+        return np.array(pink.solve_ik(configuration, self.tasks, self.period, solver=SOLVER, **self.options))
 
     def advance(self) -> None:
-        configuration = self.robot.configuration
-        configuration.integrate_inplace(self._velocity, self.period)
-        self._q = configuration.q
+        super().advance()
         if self.after is not None:
             self.after(self._velocity)
 
@@ -286,44 +262,26 @@ class _PinocchioArm:
         )
 
 
-class PinkReaching:
-    """Full Gauss-Newton steps of pink within the limits of positions; see :class:`.IterativeSolver`."""
-
-    def __init__(self, problem: ReachingProblem, iterations: int = 25, lm_damping: float = 1e-2) -> None:
-        self.iterations = iterations
+class PinkReaching(TaskReaching):
+    def __init__(self, problem: ReachingProblem) -> None:
         self._arm = _PinocchioArm(problem)
-        model = self._arm.model
-        self._configuration: Any = pink.Configuration(
-            model, model.createData(), self._arm.to_pinocchio(problem.starts[0, 0])
-        )
-        self._task = FrameTask(problem.frame, position_cost=1.0, orientation_cost=1.0, lm_damping=lm_damping)
+        model, start = self._arm.model, self._arm.to_pinocchio(problem.starts[0, 0])
+        self.configuration = pink.Configuration(model, model.createData(), start)
+        self.task = FrameTask(problem.frame, position_cost=1.0, orientation_cost=1.0, lm_damping=1e-2)
         self._limits = [ConfigurationLimit(model)]
 
     def aim(self, target: Array) -> None:
-        self._task.set_target(pin.SE3(target))
+        self.task.set_target(pin.SE3(target))
 
     def start(self, q: Array) -> None:
-        self._configuration.update(self._arm.to_pinocchio(q))
+        self.configuration.update(self._arm.to_pinocchio(q))
 
-    def iterate(self) -> float:
-        step = pink.solve_ik(
-            self._configuration,
-            [self._task],
-            1.0,
-            solver=SOLVER,
-            damping=1e-8,
-            limits=self._limits,
-            safety_break=False,
-        )
-        self._configuration.integrate_inplace(step, 1.0)
-        return float(np.abs(step).max())
-
-    def errors(self) -> tuple[float, float]:
-        error = self._task.compute_error(self._configuration)
-        return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+    def solve(self) -> Array:
+        options = {"damping": 1e-8, "limits": self._limits, "safety_break": False}
+        return np.array(pink.solve_ik(self.configuration, [self.task], 1.0, solver=SOLVER, **options))
 
     def positions(self) -> Array:
-        return self._arm.from_pinocchio(self._configuration.q)
+        return self._arm.from_pinocchio(self.configuration.q)
 
 
 class PinocchioReaching:

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 Flags = npt.NDArray[np.bool_]
 NEAR, TELLING = 10.0, 5.0
 """Bounds [deg] below which errors are compared with the bound, and below which families must be correct."""
-
 MOST_OVER, LEAST_RIGHT = 1.1, 0.99  # largest ratio of errors to a bound, and least share of right families
 FAR_OFF = 6.0
 """Ratio of an error to the attainable bound that counts as divergence. The chance is one in a million."""

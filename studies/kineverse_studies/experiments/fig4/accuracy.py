@@ -144,7 +144,6 @@ GAUSSIAN_LEVELS = (
 )
 INTERIOR_DEVIATIONS = 3.0
 """Least distance of an interior state from its limits, in standard deviations of the bound."""
-
 _STEP = 1e-5
 
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import and_, mul
 from time import thread_time
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -21,13 +20,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 Rule: TypeAlias = Literal["and", "product", "none", "undemanded"]
-RULES: Mapping[Rule, str] = MappingProxyType(
-    {"and": "trends of & and |", "product": "product rule", "none": "exact gradients alone"}
-)
+RULES: Mapping[Rule, str] = {
+    "and": "trends of & and |",
+    "product": "product rule",
+    "none": "exact gradients alone",
+}
 """Rules of trends, with their names in tables."""
-LOCK_RULES: Mapping[Rule, str] = MappingProxyType({**RULES, "undemanded": "trends without demand"})
+LOCK_RULES: Mapping[Rule, str] = {**RULES, "undemanded": "trends without demand"}
 """Rules for locks: also the pursuit of all locks, whether or not something needs them."""
-
 DT, STEPS = 0.19, 200  # control period [s] and largest number of steps (thesis)
 _REACHED = 0.01
 _BEGUN = 0.1

@@ -192,7 +192,6 @@ ROW = (
     Column("dof", "DoF", lambda trials: trials[0].dof, 4),
 )
 """Columns with which each table begins; their keys are attributes of trials, by which rows are grouped."""
-
 SUCCESS = (
     Column("objects", "objects", lambda trials: count_objects(trials).objects, 6),
     Column("done", "done", lambda trials: count_objects(trials).done, 6),
@@ -200,7 +199,6 @@ SUCCESS = (
     Column("rate", "of those in reach [%]", lambda trials: 100 * count_objects(trials).rate, 4),
     *(Column(kind, kind, _failures(kind), 6) for kind in FAILURES if kind),
 )
-
 TIMES = (
     Column("steps", "steps", lambda trials: step_times(trials).count, 9),
     Column("cpu_mean_ms", "CPU mean", lambda trials: step_times(trials).mean),
@@ -210,7 +208,6 @@ TIMES = (
     Column("cpu_worst_ms", "worst", lambda trials: step_times(trials).worst),
     Column("wall_mean_ms", "wall mean", lambda trials: step_times(trials).wall),
 )
-
 QUALITY = (
     Column("limit_violation", "limits violated", worst("limit_violation")),
     Column("grasp_error_mm", "grasp error [mm]", worst("grasp_error", 1e3)),
@@ -221,7 +218,6 @@ QUALITY = (
     Column("peak_force", "force [N]", worst("peak_force")),
 )
 """Largest values of single trials; penetration is that of the pairs that are not excepted."""
-
 COLUMNS = (*ROW, *SUCCESS, *TIMES, *QUALITY)  # columns of JSON data
 _LONGEST_REASON = 90
 _TIMED = (

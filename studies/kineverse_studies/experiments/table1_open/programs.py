@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from time import thread_time
-from types import MappingProxyType
 
 import numpy as np
 
@@ -48,16 +47,14 @@ class GraspedObject:
 _BAR_GRASP = translation(0.04, 0.0, 0.0) @ rpy(math.pi / 2, 0.0, math.pi)
 # x of the folding door's handle points inward, and its plate is across z.
 _PLATE_GRASP = translation(-0.04, 0.0, 0.0) @ rpy(math.pi / 2, 0.0, 0.0)
-OBJECTS: Mapping[str, GraspedObject] = MappingProxyType(
-    {
-        one.name: one
-        for one in (
-            GraspedObject("folding door", "articulations/folding_door", "door", "door/handle", _PLATE_GRASP),
-            GraspedObject("hinged door", "shelf_door", "door", "door_handle", _BAR_GRASP),
-            GraspedObject("drawer", "shelf_drawers", "upper_drawer", "upper_drawer_handle", _BAR_GRASP),
-        )
-    }
-)
+OBJECTS: Mapping[str, GraspedObject] = {
+    one.name: one
+    for one in (
+        GraspedObject("folding door", "articulations/folding_door", "door", "door/handle", _PLATE_GRASP),
+        GraspedObject("hinged door", "shelf_door", "door", "door_handle", _BAR_GRASP),
+        GraspedObject("drawer", "shelf_drawers", "upper_drawer", "upper_drawer_handle", _BAR_GRASP),
+    )
+}
 """Objects by name."""
 
 
@@ -136,8 +133,6 @@ TOLERANCE = 1e-3
 POSITION_WEIGHT, ROTATION_WEIGHT = 10.0, 1.0
 DONE = 0.99
 """Share of the upper limit from which an object counts as open. The gain of 1 reaches it after 4.6 s."""
-
-
 LOST = 0.01  # grasp error from which the handle counts as lost [m]
 
 
