@@ -19,6 +19,19 @@ class KineverseError(Exception):
         # KeyError prints the repr of its argument; the message is printed as it is.
         return str(self.args[0]) if len(self.args) == 1 else super().__str__()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # An exception is pickled as a call with its message, which constructors with other parameters refuse.
+        return _restore_error, (type(self), self.args, self.__dict__)
+
+
+def _restore_error(
+    kind: type[KineverseError], args: tuple[Any, ...], state: dict[str, Any]
+) -> KineverseError:
+    error = kind.__new__(kind, *args)
+    error.args = args
+    error.__dict__.update(state)
+    return error
+
 
 class UnknownNameError(KineverseError, KeyError):
     """A frame, symbol, constraint, tag or model of that name does not exist."""

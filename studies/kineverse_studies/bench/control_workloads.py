@@ -256,8 +256,8 @@ WORKLOADS: Mapping[str, ControlWorkload] = {
 }
 """Workloads by the name of the example of pink or mink that they follow.
 
-``arm_hand_xarm`` has an Allegro instead of a LEAP hand, ``arm_ur5_wrist_cam_lookat`` a UR5 instead of a UR5e, and
-``mobile_tiago`` a TIAGo on an omnidirectional base instead of a Kinova arm.
+``arm_hand_xarm`` has an Allegro for a LEAP hand, ``arm_ur5_wrist_cam_lookat`` a UR5 for a UR5e, and
+``mobile_tiago`` a TIAGo on an omnidirectional base for a Kinova arm on one.
 """
 
 
