@@ -30,6 +30,7 @@ BATCH = pytest.param("batch", marks=pytest.mark.compiler)
 
 # test_control_bench.py and test_planning_bench.py run these without their long parts.
 LONG = ("control", "planning")
+SHORT = ("call", "frames", "batch", "edit", "examples")
 
 
 # Some of their rows are about robots, kitchens and examples that the minimal settings leave out.
@@ -69,7 +70,12 @@ def programs_run_once(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", [BATCH if name == "batch" else name for name in BENCHMARKS if name not in LONG]
+    "name",
+    [
+        BATCH if name == "batch" else name if name in SHORT else pytest.param(name, marks=pytest.mark.long)
+        for name in BENCHMARKS
+        if name not in LONG
+    ],
 )
 @pytest.mark.usefixtures("programs_run_once", "clutter_made_once")
 def test_a_benchmark_measures_all_installed_peers_and_its_rows_are_documented(name, tiny, monkeypatch):

@@ -72,6 +72,7 @@ def test_mujoco_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     check_distances([ours, SearchEntry("mujoco", MujocoRobotSearch(room), 1e-5)], robot.values)
 
 
+@pytest.mark.long
 def test_bullet_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("pybullet")
     from kineverse_studies.bench.peers.bullet import BulletRobotSearch
@@ -115,6 +116,7 @@ def test_further_boxes_keep_a_distance(arm):
     assert np.linalg.norm(many.poses[60:, :3, 3], axis=1).max() > 1.0
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("clutter_made_once")
 def test_peers_that_are_not_installed_are_reported(tiny, without):
     without("mujoco", "pybullet")

@@ -71,6 +71,7 @@ def test_a_robot_opens_the_fridge_within_its_limits():
     assert dict(loop.state) == dict(start)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("library", ["pink", "mink"])
 def test_a_peer_opens_the_fridge_with_few_joints_as_with_all(library):
     opening, controller, start = opened("pr2")
@@ -108,6 +109,7 @@ def test_an_original_takes_a_step_towards_its_target(name):
     assert set(EXAMPLES) == set(WORKLOADS)
 
 
+@pytest.mark.long
 def test_our_example_starts_with_the_error_of_the_original():
     skip_without_robots()
     ours, theirs = make_example_loop(SHORT), peer_loop("mink", SHORT)
@@ -123,6 +125,7 @@ def test_our_example_starts_with_the_error_of_the_original():
     assert [c.name for c in timed.bounds(mean=1.0, worst=1.0)] == ["ours, mean", "ours, worst"]
 
 
+@pytest.mark.long
 def test_control_is_measured_without_contacts_where_coal_is_missing(tiny, monkeypatch):
     for library in ("pink", "mink"):
         pytest.importorskip(library)

@@ -9,11 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from kineverse_studies.experiments import Options
 from kineverse_studies.experiments.estimation_grid import (
     SAMPLES,
     CellResult,
-    fit_all,
     fit_cell,
     make_grid,
     make_quick_grid,
@@ -244,12 +242,3 @@ def test_report_says_which_targets_are_met(tmp_path):
     pytest.importorskip("matplotlib")
     made.figure.save(tmp_path / "grid.png")
     assert (tmp_path / "grid.png").stat().st_size > 10_000
-
-
-def test_results_are_independent_of_the_number_of_processes():
-    cells = [Cell("prismatic", 0.001, 1 * DEG, n, 0.4) for n in (5, 6)]
-    alone = fit_all(cells, 2, lambda items, what, unit: items, Options(processes=1))
-    together = fit_all(cells, 2, lambda items, what, unit: items, Options(processes=2))
-    for one, other in zip(alone, together, strict=True):
-        assert one.cell == other.cell
-        np.testing.assert_allclose(one.degrees, other.degrees, rtol=1e-5)

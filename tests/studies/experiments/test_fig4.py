@@ -201,6 +201,7 @@ def report(cupboard, few):
     return reproduce("fig4", options=Options(quick=True, model=str(cupboard)))
 
 
+@pytest.mark.long
 def test_report_has_all_measurements(report):
     numbers = json.loads(json.dumps(dict(report.numbers), allow_nan=False))
     assert numbers == report.numbers
@@ -251,6 +252,7 @@ def leaves(value):
     return [number for part in inside for number in leaves(part)]
 
 
+@pytest.mark.long
 def test_the_figure_is_drawn(report, tmp_path):
     pytest.importorskip("matplotlib")
     report.figure.save(tmp_path / "fig4.png")

@@ -105,6 +105,7 @@ def test_systematic_search_finds_exactly_the_boxes_that_can_be_opened():
     assert 5 < found < 40
 
 
+@pytest.mark.long
 def test_thesis_box_is_recorded_in_three_ways(tmp_path):
     record_thesis_box(tmp_path / "runs")
     for name in ("trends", "plan", "unknown-locks"):

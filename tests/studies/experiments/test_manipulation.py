@@ -192,6 +192,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
     assert "larder_door" in format_report(report)
 
 
+@pytest.mark.long
 def test_leader_follower_opens_the_drawer_within_the_papers_tolerance():
     setup = make_opening_setup(SHIPPED["hsr"], OBJECTS["drawer"])
     start = setup.find_start()

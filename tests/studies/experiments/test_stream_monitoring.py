@@ -19,6 +19,7 @@ def test_repeated_motion_is_smooth() -> None:
     assert angles.max() == pytest.approx(1.3)
 
 
+@pytest.mark.long
 def test_monitor_on_correlated_streams() -> None:
     rows = {
         row.case: row

@@ -131,6 +131,7 @@ def test_the_command_takes_the_folder(folder, capsys):
     assert "all_poses" not in answer
 
 
+@pytest.mark.long
 def test_all_poses_are_judged_under_each_statement_of_the_noise():
     points = arc(0.4, 1.5, 25)
     pair = RecordedPair("world", "door", None, points, np.arange(len(points)))
