@@ -36,8 +36,6 @@ from .harness import (
 
 
 class ControllerLoop:
-    """Control loop of a controller, with vectors for states."""
-
     command: Command
 
     def __init__(
@@ -100,7 +98,6 @@ class TimedLoop:
 
     @property
     def contender(self) -> Contender:
-        """The contender; its cost is the median step of a motion."""
         return Contender(self.name, self.run)
 
     def _steps(self, count: int) -> Iterator[int]:
@@ -147,7 +144,6 @@ class TimedLoop:
         return Measurement(f"{self.name}, in use", "slots", (float(np.mean(used)),))
 
     def p99(self) -> Measurement:
-        """Return the 99th percentile of all steps."""
         return Measurement(f"{self.name}, p99", "s", (float(np.percentile(self.times, 99)),))
 
     def solver_alone(self) -> list[Measurement]:
@@ -203,7 +199,6 @@ class Opening:
         return Scene(self.model, rules=[Rule(a, b) for a, b in pairs])
 
     def controller(self, scene: Scene | None = None) -> Controller:
-        """Return the controller, with contact slots if there is a scene."""
         return Controller(
             self.model, self.tasks, dt=PERIOD, scene=scene, contacts=CONTACTS, margin=MARGIN, radius=RADIUS
         )
@@ -221,7 +216,6 @@ class Opening:
 
 
 def make_peer_loop(library: str, name: str, workload: ControlWorkload | None = None) -> ControlLoop:
-    """Return the control loop of pink or mink for a workload, by default that of the name."""
     peer = importlib.import_module(f"{__package__}.peers.{library}")
     loop: ControlLoop = peer.make_loop(name, workload or WORKLOADS[name])
     return loop

@@ -62,7 +62,6 @@ class PeerLoop:
         self._velocity = np.zeros(self.robot.model.nv)
 
     def solve(self) -> Array:
-        """Return the velocity at the present configuration."""
         raise NotImplementedError
 
     def reset(self) -> None:
@@ -89,8 +88,6 @@ def split_coordinate(name: str) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class ControlWorkload:
-    """Robot, start and rate of a control benchmark."""
-
     robot: Callable[[], Model]  # returns the model
     start: Mapping[str, float]  # positions of joints at the start [m], [rad] by name; the others are zero
     held: tuple[str, ...] = ()  # joints that the peers' models have as fixed ones
@@ -98,12 +95,10 @@ class ControlWorkload:
     steps: int = 1000  # number of control periods of one motion
 
     def urdf(self) -> str:
-        """Return the robot as URDF text without shapes."""
         return export_urdf(self.robot(), self.held)
 
 
 def export_urdf(model: Model, held: Iterable[str] = ()) -> str:
-    """Return a model as URDF text without shapes, with some of its joints fixed."""
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
         file = Path(folder, "robot.urdf")
         model.save(file)

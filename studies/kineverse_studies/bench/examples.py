@@ -78,7 +78,6 @@ def find_examples(folder: Path | None = None) -> Path:
 
 
 def load_example(name: str, folder: Path) -> ModuleType:
-    """Return an example of this library, as a module that has not run."""
     file = folder / f"from_{EXAMPLES[name].library}" / f"{name}.py"
     specification = importlib.util.spec_from_file_location(f"example_{name}", file)
     assert specification is not None
@@ -89,7 +88,6 @@ def load_example(name: str, folder: Path) -> ModuleType:
 
 
 def make_example_loop(name: str, folder: Path | None = None) -> ControlLoop:
-    """Return the control loop of an example of this library, compiled."""
     module = load_example(name, find_examples(folder))
     if name == "inverse_kinematics_ur10":
         return TargetLoop(module, WORKLOADS[name].period)

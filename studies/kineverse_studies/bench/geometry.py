@@ -62,7 +62,6 @@ class Clutter:
         return ((0, 0, 1), (0, 1, 0))[link % 2]
 
     def model(self, folder: Path) -> Model:
-        """Return the model of arm and boxes; hulls are written to files in a folder."""
         model = Model()
         with model.edit() as edit:
             parent = "world"
@@ -93,11 +92,7 @@ CENTRE = 0.0, 0.0, LINK_LENGTH / 2  # position of the centre of a link's shape i
 
 
 def make_clutter(boxes: int = _BOXES_NEAR_ARM, steps: int = 200, seed: int = 0) -> Clutter:
-    """Return an arm among boxes, the same for equal arguments.
-
-    The first 60 boxes stand along the arm. Others stand further away, with a density independent of their
-    number.
-    """
+    """Return an arm among boxes; the first 60 stand along it, others further away with a fixed density."""
     rng = np.random.default_rng(seed)
     corners = [_round_to_float32(rng.normal(size=(24, 3)) * (0.02, 0.02, 0.028)) for _ in range(LINKS)]
     home = rng.uniform(-0.35, 0.35, LINKS)
@@ -185,10 +180,7 @@ class KineverseSearch:
 
 
 class CoalSearch:
-    """Search with coal: broadphase of boxes and spheres in numpy, then a functor for each pair.
-
-    Poses are written in place by Kineverse's compiled function.
-    """
+    """Search with coal: broadphase in numpy, then a functor for each pair; poses are written in place."""
 
     def __init__(self, scene: Scene, radius: float = RADIUS) -> None:
         coal = import_coal()
@@ -404,7 +396,6 @@ def _scene(folder: Path, boxes: int, steps: int) -> Scene:
 
 
 def _timed(entries: Iterable[SearchEntry], rows: Array) -> Iterator[Contender]:
-    """Yield two contenders for each search, one for the time of updates and one for that of queries."""
     for entry in entries:
         yield Contender(f"{entry.name}, {UPDATE}", _sample(entry.search, rows, queries=False))
         yield Contender(f"{entry.name}, {QUERY}", _sample(entry.search, rows, queries=True))

@@ -71,7 +71,6 @@ class DisagreementError(KineverseError, ArithmeticError):
 def check_equal(
     what: str, results: Sequence[tuple[str, Sequence[Array]]], tolerance: float = EQUALITY_TOLERANCE
 ) -> None:
-    """Compare the results of contenders with those of the first one."""
     (first, expected), *others = results
     if not all(np.isfinite(array).all() for array in expected):
         raise DisagreementError(f"Benchmark {what!r}: {first!r} computed what is not finite.")
@@ -161,11 +160,9 @@ class Benchmark:
         self.measured |= time_contenders(what or self.name, [*contenders], rounds, self.settings.progress)
 
     def add(self, *measurements: Measurement) -> None:
-        """Add measurements."""
         self.measured |= {one.name: one for one in measurements}
 
     def note(self, name: str, unit: str, *samples: float) -> Measurement:
-        """Add the measurement of samples, and return it."""
         self.measured[name] = Measurement(name, unit, tuple(map(float, samples)))
         return self.measured[name]
 
@@ -175,17 +172,14 @@ class Benchmark:
             self.comparisons += [compare_speed(self.measured, one, peer, at_least) for peer in theirs]
 
     def bound(self, limit: float, *names: str) -> None:
-        """Compare medians with an upper limit."""
         self.comparisons += [bound_median(self.measured[name], limit) for name in names]
 
     def compare(
         self, name: str, value: float | None, unit: str, limit: float, at_least: bool = False
     ) -> None:
-        """Compare a figure with its limit."""
         self.comparisons.append(Comparison(name, value, unit, Bar(limit, at_least)))
 
     def result(self, work: str) -> BenchmarkResult:
-        """Return the result, with a description of the work."""
         measurements, missing = tuple(self.measured.values()), tuple(dict.fromkeys(self.missing))
         return BenchmarkResult(self.name, work, measurements, tuple(self.comparisons), missing)
 
@@ -218,7 +212,6 @@ def _ignore_warning(warning: str) -> None:
 
 
 def install_advice(module: str) -> str:
-    """Return a line on how to install a peer."""
     distribution = DISTRIBUTIONS.get(module, module)
     if module in PEERS_EXTRA:
         called = "" if distribution == module else f" (the package {distribution!r})"
@@ -270,8 +263,6 @@ Status: TypeAlias = Literal["met", "missed", "missing", "no bar"]
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Times of one contender."""
-
     name: str  # contender
     unit: str  # ``s`` for times, else the unit of the count
     samples: tuple[float, ...]  # a number for each round; a single one if it does not vary
@@ -293,7 +284,6 @@ class Bar:
     at_least: bool
 
     def met_by(self, value: float) -> bool:
-        """Return whether a figure reaches the target."""
         return value >= self.limit if self.at_least else value <= self.limit
 
     def __str__(self) -> str:
@@ -302,8 +292,6 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Figure computed from measurements, and its target."""
-
     name: str
     value: float | None  # None if a peer is missing
     unit: str  # ``x`` for ratios, else as in measurements
@@ -323,8 +311,6 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkResult:
-    """Result of a benchmark."""
-
     name: str
     work: str
     measurements: tuple[Measurement, ...]  # of all contenders
@@ -335,11 +321,7 @@ class BenchmarkResult:
 def compare_speed(
     measured: Mapping[str, Measurement], ours: str, theirs: str, at_least: float | None = None
 ) -> Comparison:
-    """Return the speed of a contender relative to a peer.
-
-    It is the median over the rounds of the ratio within a round, because a temporary slowdown of the machine
-    affects both.
-    """
+    """Return the median over the rounds of the ratio of speeds: slowdowns of the machine affect both."""
     bar = None if at_least is None else Bar(at_least, at_least=True)
     name = f"{ours}, beside {theirs}"
     if theirs not in measured:
@@ -350,7 +332,6 @@ def compare_speed(
 
 
 def bound_median(measurement: Measurement, limit: float) -> Comparison:
-    """Return the median of a measurement, with an upper limit in its unit as the target."""
     return Comparison(measurement.name, measurement.median, measurement.unit, Bar(limit, at_least=False))
 
 
@@ -383,7 +364,6 @@ _MODULES = {
 
 
 def select_benchmarks(names: Sequence[str]) -> list[str]:
-    """Return the names of the benchmarks to run, each once and in their order; all if none is named."""
     for name in names:
         if name not in BENCHMARKS:
             raise UnknownNameError(
@@ -428,19 +408,7 @@ def run_benchmarks(
         yield result
 
 
-VERSIONS = [
-    "casadi",
-    "numpy",
-    "pin",
-    "mujoco",
-    "coal",
-    "pybullet",
-    "daqp",
-    "pin-pink",
-    "mink",
-    "qpsolvers",
-    "ompl",
-]
+VERSIONS = "casadi numpy pin mujoco coal pybullet daqp pin-pink mink qpsolvers ompl".split()  # noqa: SIM905
 
 
 @dataclass(frozen=True, slots=True)
@@ -454,7 +422,6 @@ class Machine:
 
 
 def describe_machine() -> Machine:
-    """Return the machine and software of this process."""
     return Machine(
         tier=_evaluation_tier(),
         compiler=compiler_information(),

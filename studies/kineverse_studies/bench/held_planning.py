@@ -33,8 +33,6 @@ _BETWEEN = (0.25, 0.5, 0.75)  # fractions of edges at which residuals are measur
 
 @dataclass(frozen=True)
 class HeldMotion:
-    """Motion of a door or drawer that hands hold."""
-
     robot: str
     joint: str  # joint of the door or drawer in the shipped kitchen
     closed: float  # its positions at the start and the goal [m], [rad]
@@ -47,7 +45,6 @@ class HeldMotion:
 
     @cached_property
     def model(self) -> Model:
-        """The robot in the kitchen, with the frames of the grasps."""
         model = load(self.robot)
         with model.edit() as edit:
             edit.include("kitchen", "kitchen")
@@ -127,10 +124,7 @@ class HeldResults:
 
 
 def run_held_motion(name: str, places: int, progress: Progress, seed: int = 0) -> HeldResults:
-    """Return attempts at a motion of :data:`MOTIONS` from given starts to given goals.
-
-    The base stands at random places. They count where grasps without collisions exist at both ends.
-    """
+    """Return attempts at a motion from random places of the base where both ends have free grasps."""
     motion, results = MOTIONS[name], HeldResults(name)
     model, joint = motion.model, motion.model.symbol(motion.joint)
     planner = Planner(model, move=(*motion.moving, joint))

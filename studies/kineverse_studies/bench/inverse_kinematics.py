@@ -36,8 +36,6 @@ ARMS: Mapping[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class ReachingProblem:
-    """Poses that an arm can reach, with the starts of their searches."""
-
     model: Model
     frame: str  # frame that reaches
     joints: tuple[Symbol, ...]  # joints that move the frame
@@ -69,7 +67,6 @@ class ReachingProblem:
 
 
 def make_reaching_problem(arm: str, count: int, starts: int = STARTS, seed: int = 0) -> ReachingProblem:
-    """Return targets and starts for an arm; the first start is the middle of the limits."""
     file, frame = ARMS[arm]
     model = load(file, prefix="")
     pose = model.fk(frame)
@@ -87,8 +84,6 @@ def make_reaching_problem(arm: str, count: int, starts: int = STARTS, seed: int 
 
 
 class IterativeSolver(Protocol):
-    """Iterative inverse kinematics of a library."""
-
     iterations: int  # largest number of iterations from one start
 
     def aim(self, target: Array) -> None:
@@ -115,7 +110,6 @@ class TaskReaching:
     task: Any
 
     def solve(self) -> Array:
-        """Return the step at the present configuration."""
         raise NotImplementedError
 
     def iterate(self) -> float:
@@ -236,7 +230,6 @@ class _Reaching:
         self._forward = compile(pose, problem.joints)
 
     def search(self, index: int, start: Array, starts: int) -> Search:
-        """Solve one target from a start, and from random ones."""
         problem, wanted = self._problem, self._problem.targets[index]
         values = dict(zip(problem.joints, start.tolist(), strict=True)) | self._target.values(wanted)
         begin = thread_time_ns()

@@ -61,7 +61,6 @@ def pose_and_jacobian(robot: BenchmarkRobot) -> CompiledFunction:
 
 
 def stack_results(results: Iterable[tuple[Array, ...]]) -> list[Array]:
-    """Return all poses and all Jacobians."""
     poses, jacobians = zip(*results, strict=True)
     return [np.array(poses), np.array(jacobians)]
 

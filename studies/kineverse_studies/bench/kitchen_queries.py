@@ -88,12 +88,10 @@ class KitchenArm:
 
     @property
     def tool(self) -> str:
-        """Frame of the hand."""
         return f"{ROBOT}/{self.arm.tool}"
 
     @cached_property
     def base(self) -> tuple[Symbol, ...]:
-        """Coordinates x, y and angle of the base."""
         return tuple(self.model.symbol(f"{BASE}/{name}") for name in ("x", "y", "angle"))
 
     @cached_property
@@ -117,17 +115,13 @@ class KitchenArm:
             yield home | State(dict(zip(self.symbols, q.tolist(), strict=True)))
 
     def queries(self, count: int, seed: int = 0) -> Iterator[PlanningQuery]:
-        """Yield queries between handles, the same for equal arguments.
-
-        The first ones of a larger count are those of a smaller one.
-        """
+        """Yield queries between handles; the first ones of a larger count are those of a smaller one."""
         search = _QuerySearch(self)
         random = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
         for _ in range(count):
             yield search.find(random)
 
     def fridge_queries(self, count: int, seed: int = 0) -> Iterator[PlanningQuery]:
-        """Yield queries from beside the open fridge of the shipped kitchen to the inside of it."""
         search = _QuerySearch(self, FRIDGE_OPEN)
         random = np.random.default_rng(seed)
         while count > 0:
@@ -160,7 +154,6 @@ def make_kitchen_arm(robot: str, kitchen: str, except_touching: bool = True) -> 
 
 
 def _include_robot(edit: Edit, arm: KitchenRobotArm) -> None:
-    """Include a robot, on a base that moves freely over the floor if it has none."""
     edit.include(arm.file, ROBOT)
     for body in arm.without:
         edit.remove(f"body {ROBOT}/{body}")
@@ -171,8 +164,6 @@ def _include_robot(edit: Edit, arm: KitchenRobotArm) -> None:
 
 
 class _QuerySearch:
-    """Search for configurations of an arm at handles, without collisions."""
-
     def __init__(self, arm: KitchenArm, state: Mapping[str, float] = {}) -> None:
         self._arm = arm
         model = arm.model
@@ -198,7 +189,6 @@ class _QuerySearch:
         self._points, self._axes = pose[:, :3, 3], pose[:, :3, :3] @ np.array(arm.arm.axis)
 
     def find(self, random: np.random.Generator) -> PlanningQuery:
-        """Return a query, with the base at a free place from which it reaches a random handle."""
         while True:
             here, *others = self._handles[random.permutation(len(self._handles))]
             found = self._place(here, random)
@@ -218,7 +208,6 @@ class _QuerySearch:
         return PlanningQuery(start, goal, self._home | State(here))
 
     def _place(self, handle: Array, random: np.random.Generator) -> tuple[Array, Array] | None:
-        """Return a configuration, and a base from which the hand is beside a handle; None if not free."""
         offset = self._arm.arm.length + random.uniform(*OFFSET)
         touched = self._points + offset * self._axes
         at_height = np.flatnonzero(np.abs(touched[:, 2] - handle[2]) < _HEIGHT)

@@ -41,8 +41,6 @@ _QUERIES = 100
 
 @dataclass(frozen=True)
 class Measured(Operation):
-    """Operation that writes a number."""
-
     name: str
     value: float
 
@@ -52,13 +50,10 @@ class Measured(Operation):
 
 @dataclass(frozen=True)
 class Doubled(Operation):
-    """Operation that reads a number and writes its double."""
-
     name: str
     of: str
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write twice the number that is read."""
         return Writes(data={self.name: 2.0 * model.data[self.of]})
 
 
@@ -146,7 +141,6 @@ NODES_PER_CONSTRAINT = 9  # number of nodes that one constraint adds to a docume
 
 
 def make_document_model(nodes: int) -> Model:
-    """Return a model of constraints on two coordinates each, with about ``nodes`` nodes as a document."""
     model = Model()
     with model.edit() as edit, no_collection():
         for i in range(max(nodes // NODES_PER_CONSTRAINT, 1)):
@@ -156,7 +150,6 @@ def make_document_model(nodes: int) -> Model:
 
 
 def read_document(text: str) -> Model:
-    """Return the model of a document, with all operations applied."""
     model = Model()
     with model.edit() as edit, no_collection():
         for tag, operation in read_operations(text):
@@ -313,7 +306,6 @@ _CONFIGURATION_RANGE = 0.3  # value of all coordinates [rad], [m]
 
 
 def replace_joint(robot: BenchmarkRobot) -> Contender:
-    """Return the contender that replaces an operation and evaluates the new pose."""
     model = robot.model.copy()
     tag, joint = _middle_joint(robot)
     origin = joint.origin

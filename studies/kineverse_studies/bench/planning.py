@@ -70,10 +70,7 @@ FIGURES: Mapping[str, PublishedFigures] = {
 def run_published_problems(
     robot: str, most: int | None, seeds: int, progress: Progress
 ) -> dict[str, AttemptSummary]:
-    """Return the attempts of each planner at the problems of a robot.
-
-    All planners attempt a problem before the next one, because times drift.
-    """
+    """Return the attempts of each planner; all attempt a problem in turn, because times drift."""
     attempts: dict[str, list[Attempt]] = {}
     for problems in progress([*load_problem_sets(robot, most)], f"planning, {robot}", "set"):
         planners = dict(_planners(problems))
@@ -164,7 +161,6 @@ class KitchenResults:
         yield Measurement("kitchens: paths checked by the scene", "paths", (float(self.checked),))
 
     def comparisons(self) -> Iterator[Comparison]:
-        """Yield the figures with targets."""
         summary = self.summary
         if self.solvable:
             solved = sum(a.found for a in summary.attempts)
@@ -316,7 +312,6 @@ def measure_planning(settings: BenchmarkSettings, parts: Sequence[str] = PARTS) 
 
 
 def _fresh_builds(robot: str) -> list[Contender]:
-    """Return the build of a planner in a fresh process with an empty cache, and again from that cache."""
     found: dict[str, float] = {}
 
     def build() -> float:

@@ -1,7 +1,4 @@
-"""Planning problems, checks of configurations by a scene, and attempts of planners.
-
-Robots are those of VAMP, covered by its spheres, with its SRDFs, so that everybody checks the same geometry.
-"""
+"""Planning problems, checks by a scene, and attempts; robots are covered by VAMP's spheres."""
 
 from __future__ import annotations
 
@@ -49,7 +46,6 @@ class Attempt:
 def attempt_with_kineverse(
     planner: Planner, start: Array, goals: Array, seconds: float, seed: int
 ) -> Attempt:
-    """Return the attempt of our planner, whose obstacles are placed."""
     path = planner.plan(start, goals, seconds=seconds, seed=seed)
     return Attempt(path.found, path.search_seconds, path.seconds, path.points, path.why)
 
@@ -124,11 +120,6 @@ class PublishedProblem:
 
 @dataclass(frozen=True, eq=False)
 class ProblemSet:
-    """Problems that differ by the poses of the same obstacles.
-
-    The poses are coordinates of one model: to place the obstacles of a problem takes no edit.
-    """
-
     robot: str
     name: str  # robot and name of the set
     model: Model  # robot and obstacles, with the rules of the SRDF
@@ -165,11 +156,7 @@ def _add_obstacles(model: Model, objects: Sequence[Sequence[Any]], srdf: Path) -
 
 
 def _load_robot(file: Path, ends: Sequence[Mapping[str, float]]) -> Model:
-    """Return the robot with the limits of its joints, widened to hold given starts and goals.
-
-    Some are beyond the limits by digits of π. VAMP checks no start or goal against limits, and knows no soft
-    ones. Meshes that are only drawn are not among the files.
-    """
+    """Return the robot without drawn meshes, its limits widened to hold given starts and goals."""
     tree = ElementTree.parse(file)
     for link in tree.iterfind("link"):
         for visual in link.findall("visual"):
@@ -224,8 +211,6 @@ FINER = 20.0  # factor by which a returned path is sampled finer than that
 
 
 class ConfigurationCheck:
-    """Collision check of configurations, for planners that call Python for each of them."""
-
     def __init__(self, scene: Scene, symbols: Sequence[Symbol], state: StateLike | None = None) -> None:
         self.scene, self._symbols = scene, tuple(symbols)
         # Faster than the first contact of the scene, which asks about pairs that stand still as well.
@@ -246,7 +231,6 @@ class ConfigurationCheck:
         return len(self._query()) == 0
 
     def count_contacts(self, points: Array, density: float = FINER * CHECKS_PER_RADIAN) -> int:
-        """Return the number of samples of a path that are in contact."""
         samples, contacts = interpolate_path(points, density), 0
         self(samples[0])
         while (k := self._query.first_within(self._symbols, samples)) is not None:

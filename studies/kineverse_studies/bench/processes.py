@@ -101,7 +101,6 @@ def _import(module: str) -> Contender:
 
 
 def find_requirements(distribution: str) -> set[str]:
-    """Return a distribution and all that it requires here, without extras."""
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 

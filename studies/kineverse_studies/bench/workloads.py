@@ -30,8 +30,6 @@ _ONE_COORDINATE = ("fixed", "revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class BenchmarkRobot:
-    """Robot of a URDF file, with one frame of interest."""
-
     file: Path  # file that all libraries read
     model: Model  # model of the file in Kineverse, without prefix
     frame: str  # frame of the pose and Jacobian, which are relative to the robot's root
@@ -43,7 +41,6 @@ class BenchmarkRobot:
 
     @cached_property
     def chain(self) -> tuple[Symbol, ...]:
-        """Coordinates that move the frame, in the order of the columns of its Jacobian."""
         return self.model.fk(self.frame).symbols
 
     @cached_property
@@ -65,7 +62,6 @@ class BenchmarkRobot:
         return np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self.coordinates)))
 
     def chain_columns(self, configurations: Array) -> Array:
-        """Return the columns of the coordinates that move the frame."""
         columns = [self.coordinates.index(symbol) for symbol in self.chain]
         return np.ascontiguousarray(configurations[:, columns])
 
@@ -91,7 +87,6 @@ class BenchmarkRobot:
 
 
 def find_benchmark_robot(settings: BenchmarkSettings) -> BenchmarkRobot:
-    """Return the requested robot, else the first PR2 that is found."""
     file = locate_model(settings.robot or _first_found(PR2)).path
     if file.suffix != ".urdf":
         raise InvalidValueError(f"Peers read URDF, and {str(file)!r} is none; give another --robot.")
@@ -137,7 +132,6 @@ def _mimic_joint(model: Model, frame: str) -> str | None:
 
 
 def strip_shapes(file: str | os.PathLike[str]) -> str:
-    """Return the text of a URDF file without shapes, so that no library opens meshes."""
     try:
         root = ElementTree.parse(file).getroot()
     except ElementTree.ParseError as error:
@@ -166,11 +160,9 @@ class KitchenRobot:
 
     @property
     def gripper(self) -> str:
-        """Frame at the end of the robot's right arm."""
         return f"robot/{GRIPPER}"
 
     def scene(self) -> Scene:
-        """Return a scene that checks pairs of a robot's and a kitchen's body only."""
         return _make_scene(self.model)
 
     def whole_scene(self) -> Scene:
@@ -179,7 +171,6 @@ class KitchenRobot:
 
 
 def make_kitchen_robot(steps: int) -> KitchenRobot:
-    """Return the first PR2 and kitchen that are found, with hulls for meshes."""
     robot, kitchen = _first_found(PR2), _first_found(tuple(KITCHENS))
     model = _on_omni_base(robot, kitchen)
     scene = _make_scene(model)

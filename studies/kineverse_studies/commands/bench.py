@@ -32,7 +32,6 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     add, flag = parser.add_argument, "store_true"
     add("names", metavar="NAME", nargs="*", help="names of benchmarks, see --list")
     add("--list", action=flag, help="list the benchmarks and exit")
@@ -48,7 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure and print."""
     from kineverse_studies import bench
 
     if arguments.list:
@@ -121,10 +119,7 @@ def benchmark_to_json(result: BenchmarkResult) -> dict[str, Any]:
 
 
 def benchmark_to_markdown(result: BenchmarkResult) -> str:
-    """Return one table in Markdown: each contender, and how many times as long it takes as the first.
-
-    A ratio without an entry in :attr:`~.BenchmarkResult.comparisons` is left out.
-    """
+    """Return one table in Markdown: each contender, and how many times as long it takes as the first."""
     rows = []
     for m in result.measurements:
         slower = [f"{_format_speedup(c)} × {c.ours}" for c in result.comparisons if c.theirs == m.name]
@@ -136,7 +131,6 @@ def benchmark_to_markdown(result: BenchmarkResult) -> str:
 
 
 def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
-    """Return a result as tables; missing peers are listed once, after all results."""
     measured = [
         (m.name, format_quantity(m.median, m.unit), format_quantity(m.best, m.unit))
         for m in result.measurements

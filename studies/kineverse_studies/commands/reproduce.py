@@ -29,7 +29,6 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     add, flag, noise = parser.add_argument, "store_true", "3mm+3mm/m,0.5deg,30Hz"
     add("name", metavar="NAME", nargs="?", help="name of an experiment, see --list")
     add("--list", action=flag, help="list the experiments and exit")
@@ -111,7 +110,6 @@ def _save_figures(report: Report, requested: Path) -> list[Path]:
 
 
 def format_report(report: Report, markdown: bool = False) -> str:
-    """Return a report as tables, plain ones or in Markdown."""
     title = f"# {report.title}" if markdown else report.title
     return "\n\n".join([title, *(_format_report_table(table, markdown) for table in report.tables)])
 

@@ -79,7 +79,6 @@ def run(progress: Progress, options: Options) -> Report:
 
 
 def run_boxes(count: int, seed: int, progress: Progress) -> dict[tuple[Rule, int], list[UnlockingRun]]:
-    """Return the openings of random boxes by rule and number of parts."""
     cases = [(rule, parts, seed + k) for rule in RULES for parts in PARTS for k in range(count)]
     found: dict[tuple[Rule, int], list[UnlockingRun]] = {}
     for rule, parts, number in progress(cases, "ablations", "box"):

@@ -25,10 +25,6 @@ def run_jobs(
     unit: str,
     options: Options | None = None,
 ) -> list[Result]:
-    """Return the results of all jobs, such as trials, in the order of the jobs.
-
-    They run in the executor of the options, else in so many processes, one on each core by default.
-    """
     options = options or Options()
     count = min(options.processes or os.cpu_count() or 1, len(jobs))
     if options.executor is None and count <= 1:
@@ -50,10 +46,7 @@ def run_jobs(
 
 @contextmanager
 def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Provide a pool of processes with one thread each.
-
-    They are spawned, because a fork during a background compilation may hang.
-    """
+    """Provide processes of one thread; spawned, as a fork during a background compilation may hang."""
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))
@@ -85,8 +78,6 @@ def _end_with_parent() -> None:
 
 
 class _Sized(Generic[Item]):
-    """Iterable with a length, of which progress bars show a share."""
-
     def __init__(self, items: Iterable[Item], count: int) -> None:
         self._items, self._count = items, count
 

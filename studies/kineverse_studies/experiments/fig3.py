@@ -40,8 +40,6 @@ _BEFORE_CLOSED = tuple(10.0**-k for k in range(1, 9))
 
 @dataclass(frozen=True)
 class GarageDoorCurves:
-    """Curves of the three plots."""
-
     paths: dict[str, Array]  # paths of points in x and z by name, (20, 2) each [m]
     unlocked: dict[float, Array]  # upper bound of the speed by the position of the door, (50,) each
     published: Array  # speed of the upper edge per unit of a [m/m], and of the angle [m/rad], (200,) each
@@ -49,7 +47,6 @@ class GarageDoorCurves:
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Evaluate the door and its lock at the positions of the paper."""
     published, regular = _make_door("published"), _make_door("regular")
     paths = {
         name: _edge_path(published, part, _OPENINGS)

@@ -110,8 +110,6 @@ _CHUNK = 10  # number of cases that a process identifies at a time
 
 @dataclass(frozen=True)
 class Setting:
-    """Observations and noise that the estimator is given of a case."""
-
     poses: bool  # true for poses of the child, False for its positions
     stated: bool  # true if the noise is stated
 
@@ -165,7 +163,6 @@ def identify_case(number: int, setting: Setting) -> TypeAnswer:
 def identify_cases(
     count: int, progress: Progress, options: Options | None = None
 ) -> dict[Setting, list[TypeAnswer]]:
-    """Identify the families of the first cases in all settings."""
     chunks = [range(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
     found = run_jobs(_identify_chunk, chunks, progress, "joint-types", "chunk", options)
     return {setting: [answer for chunk in found for answer in chunk[k]] for k, setting in enumerate(SETTINGS)}
@@ -188,7 +185,6 @@ RATIOS = (0.0, 1 / 8, 1 / 2, 2.0, 8.0, math.inf)
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Identify the cases; with the option ``quick`` a few of them."""
     return report_answers(identify_cases(QUICK_CASES if options.quick else CASES, progress, options))
 
 
@@ -316,7 +312,6 @@ def _error_table(answers: Answers) -> ReportTable:
 
 
 def draw_answers(canvas: Canvas, answers: Answers) -> None:
-    """Draw the shares of right answers by probability and by ratio of the noise."""
     calibration, ratios = canvas.subplots(1, 2)
     for setting, some in answers.items():
         for axes, of, edges in (

@@ -73,7 +73,6 @@ def run(progress: Progress, options: Options) -> Report:
 
 
 def name_kitchens(seed: int, count: int) -> list[str]:
-    """Return the names of generated kitchens, from a first seed on."""
     return [f"kitchens/{k}" for k in range(seed, seed + count)]
 
 
@@ -125,10 +124,7 @@ def make_kitchen_with(robot: RobotSource, name: str) -> Model:
 
 
 def start_in_aisle(robot: RobotSource, model: Model) -> State:
-    """Return a state with the robot in the aisle, as near to its middle as it stands free.
-
-    It looks along the aisle, where its arms fit. Where the aisle is too narrow, it stands before its end.
-    """
+    """Return a state with the robot in the aisle, which looks along it, near to its middle."""
     floor, begin = f"{KITCHEN}/floor", robot.start_state(model)
     states = (
         begin.updated({f"{robot.prefix}/base/y": offset, f"{robot.prefix}/base/angle": angle})

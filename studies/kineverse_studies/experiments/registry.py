@@ -33,7 +33,6 @@ class Options:
     executor: Executor | None = None  # where trials run, such as dask's client.get_executor()
 
     def check(self, name: str, supported: Sequence[str]) -> None:
-        """Check that an experiment supports the options that are set."""
         given = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         for option in given:
             if option == "executor" and "processes" not in supported:
@@ -65,7 +64,7 @@ EXPERIMENTS: Mapping[str, str] = {
     "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
 }
 """Descriptions of experiments by name; the names are modules of this package, with dashes for underscores."""
-REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = {
+REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = {  # extras without which an experiment cannot run
     "ablations": ("control", "geometry"),
     "kitchens": ("control", "geometry"),
     "lockbox": ("control",),
@@ -73,9 +72,7 @@ REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = {
     "table1-push": ("control", "geometry"),
     "unknown-objects": ("control", "geometry"),
 }
-"""Extras without which an experiment cannot run."""
-PLANNED = ("kitchens", "table1-open", "unknown-objects")
-"""Experiments with a planner, which needs a C compiler."""
+PLANNED = ("kitchens", "table1-open", "unknown-objects")  # they plan, which needs a C compiler
 
 
 def reproduce(name: str, progress: Progress | None = None, options: Options | None = None) -> Report:

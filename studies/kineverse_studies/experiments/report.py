@@ -17,8 +17,6 @@ Cell = float | str
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Table of a report."""
-
     title: str
     head: tuple[str, ...]  # titles of the columns, with units
     rows: tuple[tuple[Cell, ...], ...]  # numbers or texts
@@ -26,8 +24,6 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class Report:
-    """Measurements of an experiment."""
-
     name: str
     title: str
     tables: tuple[ReportTable, ...]
@@ -42,13 +38,11 @@ class Report:
 def make_table(
     title: str, items: Iterable[Item], columns: Mapping[str, Callable[[Item], Cell]]
 ) -> ReportTable:
-    """Return a table with a row for each item, from the titles of the columns and functions of an item."""
     rows = tuple(tuple(cell(item) for cell in columns.values()) for item in items)
     return ReportTable(title, tuple(columns), rows)
 
 
 def format_fixed(value: float, digits: int = 2, scale: float = 1.0) -> str:
-    """Return a number times a scale with some decimals; a dash for NaN."""
     return "-" if math.isnan(value) else f"{scale * value:.{digits}f}"
 
 

@@ -202,7 +202,6 @@ def make_streams(
 
 
 def make_door_tracker(model: Model, process: Process) -> Tracker:
-    """Return a tracker of the door that is told nothing but the noise."""
     noise = pose_covariance(POSITION, ORIENTATION)
     tracker = Tracker(
         model, [ObservedPose(frame, covariance=noise) for frame in FRAMES], process=process, outliers=True
@@ -212,7 +211,6 @@ def make_door_tracker(model: Model, process: Process) -> Tracker:
 
 
 def track_stream(tracker: Tracker, stream: Stream) -> TrackedStream:
-    """Return the estimates of a tracker, which does not change."""
     tracker = tracker.copy()
     looks = [stream.look(k) for k in range(len(stream.times))]
     angles, variances, lost, seconds = [], [], [], []
@@ -229,7 +227,6 @@ def track_stream(tracker: Tracker, stream: Stream) -> TrackedStream:
 def run_trackers(
     model: Model, streams: Sequence[Stream], progress: Progress
 ) -> dict[str, list[TrackedStream]]:
-    """Return the estimates of trackers and of the textbook filter, by name."""
     results: dict[str, list[TrackedStream]] = {}
     for process in PROCESSES:
         tracker = make_door_tracker(model, process)
@@ -241,7 +238,6 @@ def run_trackers(
 
 
 def run_textbook_filter(model: Model, streams: Sequence[Stream], progress: Progress) -> list[TrackedStream]:
-    """Return the estimates of the textbook filter with the best of its noises."""
     poses = compile(
         array([entry for frame in FRAMES for entry in model.fk(frame).reshape(16)]), [model.symbol(DOOR)]
     )
@@ -260,7 +256,6 @@ def run_textbook_filter(model: Model, streams: Sequence[Stream], progress: Progr
 
 
 def summarize_tracking(name: str, results: Sequence[TrackedStream]) -> TrackingSummary:
-    """Return the summary of a filter over all streams."""
     moving = np.concatenate([r.errors[r.stream.moving] for r in results])
     resting = np.concatenate([r.errors[~r.stream.moving & (r.stream.times > _SETTLED)] for r in results])
     nees = [float(np.mean((r.errors**2 / r.variances)[r.stream.times > _SETTLED])) for r in results]
@@ -332,10 +327,7 @@ def _simulate(
     displacement: float,
     same_when_shut: bool,
 ) -> Stream:
-    """Return a stream of a door whose axis is displaced [m].
-
-    The shut door is at its modelled place if ``same_when_shut``; otherwise the door is displaced too.
-    """
+    """Return a stream of a displaced axis [m]; the shut door is at its modelled place, or displaced too."""
     times = np.arange(round(duration * RATE)) / RATE
     stream = simulate_stream(model, repeated_motion(times), random, errors)
     if not displacement:
@@ -387,7 +379,6 @@ FIGURE_SIZE = (11.0, 8.0)
 
 
 def make_report(tracked: Mapping[str, Sequence[TrackedStream]], monitored: Sequence[MonitoringRow]) -> Report:
-    """Return the report of trackers by name, and of the monitor."""
     summaries = summarize_trackers(tracked)
     count = len(next(iter(tracked.values())))
     table = make_table(

@@ -39,17 +39,11 @@ if TYPE_CHECKING:
 
 Label = Literal["revolute", "prismatic"]
 SOURCE = "https://github.com/tum-vision/articulation"
-LABELS: Mapping[str, Label] = {
+LABELS: Mapping[str, Label] = {  # derived from the names of the objects
     "cabinet_one/*.log": "revolute",
     "drawer_one/*.log": "prismatic",
-    "kitchen_6d/M2U00389.log": "revolute",
-    "kitchen_6d/M2U00390.log": "revolute",
-    "kitchen_6d/M2U00391.log": "revolute",
-    "kitchen_6d/M2U00393.log": "revolute",
-    "kitchen_6d/M2U00394.log": "prismatic",
-    "kitchen_6d/M2U00395.log": "prismatic",
-    "kitchen_6d/M2U00406.log": "revolute",
-    "kitchen_6d/M2U00411.log": "revolute",
+    **dict.fromkeys((f"kitchen_6d/M2U00{n}.log" for n in (389, 390, 391, 393, 406, 411)), "revolute"),
+    **dict.fromkeys((f"kitchen_6d/M2U00{n}.log" for n in (394, 395)), "prismatic"),
     "mechanisms_iros_2010/dishwasher/*.log": "revolute",
     "mechanisms_iros_2010/drawer/*.log": "prismatic",
     "mechanisms_iros_2010/left_door/*.log": "revolute",
@@ -57,9 +51,7 @@ LABELS: Mapping[str, Label] = {
     "microwave/*.log": "revolute",
     "models_data/door.txt": "revolute",
 }
-"""Label of each file, derived from the names of the objects."""
-COLUMNS: Mapping[str, str] = {"models_data/door.txt": "x,y,z,qx,qy,qz,qw,-,-"}
-"""Columns of files that have more than those of a pose."""
+COLUMNS = {"models_data/door.txt": "x,y,z,qx,qy,qz,qw,-,-"}  # of files with more than those of a pose
 POSITION, ORIENTATION = 0.01, math.radians(5.0)
 """Standard deviations of the deviation from an ideal joint, of each coordinate [m] and about each axis [rad].
 
@@ -84,10 +76,7 @@ class LabelledRecording:
 
 
 def read_labelled_recordings(folder: Path | None) -> Iterator[LabelledRecording]:
-    """Return the recordings in a folder, sorted by name, reduced to some poses each.
-
-    See :func:`read_labelled_pairs`.
-    """
+    """Return the recordings in a folder, sorted by name, reduced to some poses each."""
     return (
         LabelledRecording(name, label, pair.thin(THINNED).child_poses)
         for name, label, pair in read_labelled_pairs(folder)
@@ -114,14 +103,13 @@ def _read_labelled(file: Path, name: Path, label: Label) -> tuple[str, Label, Re
 
 
 GUESS = (0.005, math.radians(1.0))  # guessed noise of positions [m] and orientations [rad]
-STATEMENTS: Mapping[str, str] = {
+STATEMENTS: Mapping[str, str] = {  # of the noise
     "estimated": "estimated",
     "residuals": "stated, as large as the residuals of the labelled joint",
     "guess": "stated, 5 mm and 1 deg for all",
     "half": "stated, half of the residuals",
     "twice": "stated, twice the residuals",
 }
-"""Statements of the noise by name."""
 
 
 @dataclass(frozen=True)
@@ -134,14 +122,12 @@ class StatementAnswer:
 
     @property
     def verdict(self) -> str:
-        """``right``, ``wrong`` or ``cannot tell``."""
         if not self.is_sure:
             return "cannot tell"
         return "right" if self.family == self.label else "wrong"
 
 
 def answer_statements(name: str, label: Label, pair: RecordedPair) -> list[StatementAnswer]:
-    """Return the answers for a recording under all statements of the noise."""
     labelled = identify(pair.parent_poses, pair.child_poses, families=label, outliers=True).best
     noise = residual_noise(labelled)
     stated = {
@@ -160,7 +146,6 @@ def answer_statements(name: str, label: Label, pair: RecordedPair) -> list[State
 
 
 def statement_table(answers: Sequence[StatementAnswer]) -> ReportTable:
-    """Return the table with the number of right, wrong and ambiguous answers for each statement."""
     rows: tuple[tuple[float | str, ...], ...] = tuple(
         (STATEMENTS[name], *(float(n) for n in counts)) for name, counts in _counts(answers).items()
     )
@@ -210,7 +195,6 @@ class Classification:
 
 
 def classify_recording(recording: LabelledRecording) -> Classification:
-    """Identify the joint of one recording."""
     return Classification(recording, identify(None, recording.poses, child_covariance=recording.covariance))
 
 
@@ -275,10 +259,7 @@ LABEL_NAMES = {"revolute": "hinge", "prismatic": "drawer"}
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Identify the joint of each recording, with fixed noise, and with all of its poses.
-
-    ``quick`` leaves out the second part.
-    """
+    """Identify each recording, with fixed noise, and with all of its poses unless ``quick``."""
     recordings = list(read_labelled_recordings(options.data))
     classified = [classify_recording(recording) for recording in progress(recordings, "sturm", "recording")]
     if options.quick:
@@ -291,7 +272,6 @@ def run(progress: Progress, options: Options) -> Report:
 def report_recordings(
     classified: Sequence[Classification], answers: Sequence[StatementAnswer] = ()
 ) -> Report:
-    """Return the report on the classified recordings, and on the answers by all poses if there are any."""
     right = sum(j.is_correct for j in classified)
     misclassified = [j for j in classified if not j.is_correct]
     share = right / len(classified)
@@ -367,7 +347,6 @@ def axis_distance(fit: Fit) -> float:
 
 
 def format_travel(fit: Fit) -> str:
-    """Format the range of the joint values."""
     ranges = np.ptp(fit.joint_values, axis=0) if fit.joint_values.size else []
     turns = fit.family in ("revolute", "screw")
     return (

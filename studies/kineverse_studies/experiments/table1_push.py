@@ -89,10 +89,6 @@ class PushSetup:
 
 
 def find_kitchens(data: Path | None) -> Mapping[str, tuple[str, ...]]:
-    """Return the objects by kitchen: the shipped one, and the authors' if it is in the folder.
-
-    The folding door stands alone, so it is an object of both.
-    """
     found = {SHIPPED_KITCHEN: OBJECTS}
     if data is not None and (data / _FILES[AUTHORS_KITCHEN]).is_file():
         found[AUTHORS_KITCHEN] = OBJECTS
@@ -100,7 +96,6 @@ def find_kitchens(data: Path | None) -> Mapping[str, tuple[str, ...]]:
 
 
 def make_push_setup(robot: RobotSource, kitchen: str, thing: str, data: Path | None = None) -> PushSetup:
-    """Return a robot before an open object."""
     if thing not in OBJECTS:
         raise UnknownNameError(f"There is no object {thing!r}. {suggest(thing, OBJECTS, 'object')}")
     model = robot.load()
@@ -125,7 +120,6 @@ _PICTURES = 5
 
 
 def make_push_pictures(trials: Sequence[Trial]) -> dict[str, Figure]:
-    """Return the pictures of shipped robots in the shipped kitchen, by name."""
     own = [t for t in trials if t.film and t.robot in SHIPPED and t.case == SHIPPED_KITCHEN]
     # Of several worlds the first counts.
     films = {(t.robot, str(t.measures["thing"])): t for t in reversed(own)}
@@ -256,8 +250,7 @@ def _draw_commands(canvas: Canvas, trials: Sequence[Trial]) -> None:
 
 
 OPTIONS = ("quick", "data", "seed", "robot", "processes", *SettingOptions)
-PERIODS = {"2022": (0.02, 1200), "2020": (0.1, 500)}
-"""Control period [s] and largest number of steps, by paper."""
+PERIODS = {"2022": (0.02, 1200), "2020": (0.1, 500)}  # control period [s] and largest number of steps
 QUICK_OBJECTS = ("fridge door", "sink trash drawer")
 
 

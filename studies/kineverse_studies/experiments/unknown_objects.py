@@ -51,8 +51,6 @@ _PLACE = translation(1.6, 0.0, 0.7)  # place of the furniture in front of the ro
 
 @dataclass(frozen=True)
 class UnknownObject:
-    """Object of which the robot knows the bodies alone."""
-
     source: str  # name of the model; frames of the part and of its handle. The part's joint has its name
     part: str
     handle: str

@@ -25,8 +25,6 @@ _LINKS_PER_BODY = 100  # number of boxes in one body, as Bullet limits the numbe
 
 
 class BulletSearch:
-    """Search with Bullet's getClosestPoints of the arm and bodies with the boxes as links."""
-
     def __init__(self, clutter: Clutter) -> None:
         import pybullet
 
@@ -124,8 +122,6 @@ def _xyzw_quaternions(poses: Array) -> list[list[float]]:
 
 
 class BulletRobotSearch:
-    """Search with Bullet's getClosestPoints of each object of the robot and bodies of the others."""
-
     def __init__(self, room: RobotSurroundings) -> None:
         import pybullet
 

@@ -22,10 +22,6 @@ COMPILER_FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
 
 
 def make_casadi_function(robot: BenchmarkRobot) -> Any:
-    """Return pose and Jacobian of the robot's frame as a CasADi function with common subexpressions shared.
-
-    CasADi stores columns first, numpy rows first, so the outputs are transposed.
-    """
     pose, jacobian = robot.model.fk(robot.frame), robot.model.jacobian(robot.frame)
     inputs = ca.vertcat(*(symbol.casadi for symbol in robot.chain))
     outputs = [ca.densify(pose.casadi.T), ca.densify(jacobian.casadi.T)]
@@ -33,7 +29,6 @@ def make_casadi_function(robot: BenchmarkRobot) -> Any:
 
 
 def compile_map(function: Any, rows: int, folder: Path) -> Any:
-    """Return the map of a function over rows, compiled in a folder."""
     mapped = function.map(rows)
     generator = ca.CodeGenerator("map.c")
     generator.add(mapped)
@@ -48,8 +43,6 @@ def compile_map(function: Any, rows: int, folder: Path) -> Any:
 
 
 class BoundMap:
-    """CasADi map bound to its input and output memory."""
-
     def __init__(self, function: Any, points: Array, outputs: tuple[Array, ...]) -> None:
         self._references = function, points, outputs
         self._buffer, self._run = function.buffer()
@@ -80,8 +73,6 @@ NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = {
 
 
 class NumpyGraph:
-    """CasADi function of one vector, evaluated with numpy at many points."""
-
     def __init__(self, function: Any) -> None:
         self._columns = np.zeros((function.sz_w(), CHUNK_SIZE))
         self._steps: list[tuple[int, Any, list[int], list[int]]] = []

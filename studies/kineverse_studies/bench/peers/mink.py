@@ -78,7 +78,6 @@ class MinkLoop(PeerLoop):
 
 
 def make_loop(name: str, workload: ControlWorkload) -> MinkLoop:
-    """Return the control loop of a workload."""
     make_model, make = MINK_LOOPS[name]
     speeds = {} if make_model is _with_loops else joint_speeds(workload.urdf())
     return make(MinkRobot(make_model(workload), workload.start, speeds), workload.period)
@@ -93,7 +92,6 @@ def _plain(workload: ControlWorkload) -> Any:
 
 
 def remove_masses(root: ElementTree.Element) -> ElementTree.Element:
-    """Remove the inertias of a URDF."""
     for link in root.iterfind("link"):
         for inertial in link.findall("inertial"):
             link.remove(inertial)

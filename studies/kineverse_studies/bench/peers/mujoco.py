@@ -34,8 +34,6 @@ from kineverse_studies.bench.workloads import BenchmarkRobot, strip_shapes
 
 
 class MujocoRobot:
-    """Robot in MuJoCo, with all links and without shapes."""
-
     def __init__(self, robot: BenchmarkRobot) -> None:
         self.model: Any = mujoco.MjModel.from_xml_string(make_robot_mjcf(robot))
         self.data: Any = mujoco.MjData(self.model)
@@ -84,7 +82,6 @@ def call(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
 
 
 def frames(robot: BenchmarkRobot, names: Sequence[str], configurations: Array) -> Iterator[Contender]:
-    """Yield the contender for the poses of all frames."""
     peer = MujocoRobot(robot)
     model, data = peer.model, peer.data
     rows = peer.rows(robot.positions(configurations))
@@ -107,7 +104,6 @@ def frames(robot: BenchmarkRobot, names: Sequence[str], configurations: Array) -
 
 
 def document(robot: BenchmarkRobot) -> Iterator[Contender]:
-    """Yield the contenders that write and read the robot, as a text and as bytes."""
     model: Any = MujocoRobot(robot).model
     spec: Any = mujoco.MjSpec.from_string(make_robot_mjcf(robot))
     spec.compile()
@@ -124,7 +120,6 @@ def document(robot: BenchmarkRobot) -> Iterator[Contender]:
 def edit(
     robot: BenchmarkRobot, moved: BenchmarkRobot, body: str, positions: dict[str, Array]
 ) -> Iterator[Contender]:
-    """Yield the contender that moves a body in MuJoCo's specification and compiles it."""
     peer = MujocoRobot(robot)
     (row,) = peer.rows(positions)
     specification = mujoco.MjSpec.from_string(make_robot_mjcf(robot))
@@ -144,15 +139,11 @@ def edit(
 
 
 def make_robot_mjcf(robot: BenchmarkRobot) -> str:
-    """Return the robot's file with options for MuJoCo.
-
-    By default MuJoCo requires mesh files, merges fixed links, and refuses moving links without inertia.
-    """
+    """Return the robot's file with options for MuJoCo, so that it neither reads meshes nor merges links."""
     return add_mujoco_options(ElementTree.fromstring(strip_shapes(robot.file)))
 
 
 def add_mujoco_options(root: ElementTree.Element) -> str:
-    """Return the text of a URDF without shapes, with options that MuJoCo needs."""
     options = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-6", "boundinertia": "1e-9"}
     ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", options)
     return ElementTree.tostring(root, encoding="unicode")
@@ -219,7 +210,6 @@ class MujocoPairSearch(MujocoSearch):
 
 
 def _clutter_mjcf(clutter: Clutter) -> str:
-    """Return the MJCF of the arm as nested bodies, and of the boxes as geoms of the world."""
     assets, arm, world = [], "", []
     here = format_mjcf_numbers(CENTRE)
     for link in reversed(range(LINKS)):
@@ -246,7 +236,6 @@ def _clutter_mjcf(clutter: Clutter) -> str:
 
 
 def make_mjcf(assets: Iterable[str], world: Iterable[str]) -> str:
-    """Return the MJCF of assets and bodies of the world, with tight tolerances of distances."""
     return (
         '<mujoco><size memory="64M"/><compiler angle="radian"/>'
         '<option ccd_tolerance="1e-8" ccd_iterations="100"><flag multiccd="disable"/></option>'

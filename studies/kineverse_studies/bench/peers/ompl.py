@@ -17,8 +17,6 @@ RANGE = 1.0  # longest edge of the trees [rad], [m]
 
 
 class OmplRrtConnect:
-    """RRT-Connect of OMPL over a box of coordinates, which calls Python for each configuration."""
-
     def __init__(self, check: Callable[[Sequence[float]], bool], lower: Array, upper: Array) -> None:
         ou.setLogLevel(ou.LOG_NONE)
         self._check, self._size = check, len(lower)

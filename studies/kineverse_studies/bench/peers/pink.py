@@ -73,7 +73,6 @@ class PinkLoop(PeerLoop):
 
 
 def make_loop(name: str, workload: ControlWorkload) -> PinkLoop:
-    """Return the control loop of a workload."""
     return PINK_LOOPS[name](PinkRobot(workload), workload.period)
 
 
@@ -239,8 +238,6 @@ PINK_LOOPS: Mapping[str, Callable[[PinkRobot, float], PinkLoop]] = {
 
 
 class _PinocchioArm:
-    """Arm in pinocchio, with joint positions in Kineverse's order."""
-
     def __init__(self, problem: ReachingProblem) -> None:
         self.model: Any = pin.buildModelFromXML(problem.urdf())
         self._joints = [self.model.joints[self.model.getJointId(name)] for name in problem.names()]
@@ -256,7 +253,6 @@ class _PinocchioArm:
         return np.array(q)
 
     def from_pinocchio(self, q: Array) -> Array:
-        """Return joint positions."""
         return np.array(
             [q[j.idx_q] if j.nq == 1 else np.arctan2(q[j.idx_q + 1], q[j.idx_q]) for j in self._joints]
         )
@@ -285,10 +281,7 @@ class PinkReaching(TaskReaching):
 
 
 class PinocchioReaching:
-    """Closed-loop inverse kinematics as in pinocchio's example: damped pseudoinverse, no limits.
-
-    Positions are taken modulo 2π before they are compared with limits.
-    """
+    """Inverse kinematics of pinocchio's example; positions are compared with limits modulo 2π."""
 
     def __init__(self, problem: ReachingProblem, iterations: int = 1000, rate: float = 0.1) -> None:
         self.iterations = iterations

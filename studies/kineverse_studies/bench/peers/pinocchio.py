@@ -18,8 +18,6 @@ ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
 class PinocchioRobot:
-    """Robot in pinocchio; reduced, all joints are fixed that do not move the frame."""
-
     def __init__(self, robot: BenchmarkRobot, reduced: bool = False) -> None:
         model = pin.buildModelFromUrdf(str(robot.file))
         moving = [symbol.path for symbol in robot.chain]
@@ -87,7 +85,6 @@ def call(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
 
 
 def frames(robot: BenchmarkRobot, names: Sequence[str], configurations: Array) -> Iterator[Contender]:
-    """Yield the contender for the poses of all frames."""
     peer = PinocchioRobot(robot)
     model, data = peer.model, peer.data
     rows = peer.rows(robot.positions(configurations))
@@ -107,7 +104,6 @@ def frames(robot: BenchmarkRobot, names: Sequence[str], configurations: Array) -
 
 
 def batch(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
-    """Yield a loop in Python, as pinocchio has no batches."""
     peer = PinocchioRobot(robot, reduced=True)
     rows = peer.rows(robot.positions(configurations))
     poses, jacobians = np.zeros((len(rows), 4, 4)), np.zeros((len(rows), 6, len(robot.chain)))
@@ -128,7 +124,6 @@ def batch(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
 
 
 def document(robot: BenchmarkRobot) -> Iterator[Contender]:
-    """Yield the contender that writes and reads the robot."""
     model = PinocchioRobot(robot).model
     yield Contender(
         "pinocchio, archive", time_calls(lambda: pin.Model().loadFromString(model.saveToString()))

@@ -38,7 +38,6 @@ class VampRrtConnect:
                 environment.add_capsule(vamp.Cylinder(where, angles, radius, height))
 
     def plan(self, problem: PublishedProblem, seed: int) -> Attempt:
-        """Return the attempt at a problem that is placed; the seed skips as many samples of its sequence."""
         sampler = self._robot.halton()
         sampler.skip(seed)
         start, goal = problem.start.tolist(), problem.goal.tolist()

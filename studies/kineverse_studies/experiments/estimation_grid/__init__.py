@@ -125,7 +125,6 @@ class GridSummary:
 
 
 def summarize_cells(results: Sequence[CellResult]) -> GridSummary:
-    """Summarise several cells."""
     telling = [r for r in results if r.bound < TELLING]
     return GridSummary(
         cells=len(results),
@@ -142,7 +141,6 @@ def summarize_cells(results: Sequence[CellResult]) -> GridSummary:
 
 
 def rms(values: Array) -> float:
-    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -184,7 +182,6 @@ def make_grid() -> list[Cell]:
 
 
 def make_quick_grid() -> list[Cell]:
-    """Return a few cells spread over the grid."""
     return [
         Cell(joint, position, orientation, count, reach)
         for joint, ranges in RANGES.items()
@@ -196,7 +193,6 @@ def make_quick_grid() -> list[Cell]:
 def fit_all(
     cells: Sequence[Cell], samples: int, progress: Progress, options: Options | None = None
 ) -> list[CellResult]:
-    """Fit samples of each cell and return the results in the same order."""
     # Long cells first, so that all processes end at about the same time.
     order = sorted(range(len(cells)), key=lambda k: -cells[k].count)
     jobs = [(cells[k], samples) for k in order]
@@ -411,7 +407,6 @@ def _target_table(total: GridSummary) -> ReportTable:
 def _grouped_table(
     title: str, results: Sequence[CellResult], by: Mapping[str, Callable[[Cell], TableCell]]
 ) -> ReportTable:
-    """Return a table with a row for each group of cells that agree in some columns."""
     groups: dict[tuple[TableCell, ...], list[CellResult]] = {}
     for result in results:
         groups.setdefault(tuple(of(result.cell) for of in by.values()), []).append(result)

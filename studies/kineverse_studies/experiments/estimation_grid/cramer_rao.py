@@ -119,7 +119,6 @@ class Bound:
 
 
 def compute_bound(samples: JointSamples) -> Bound:
-    """Return the Cramér-Rao bound of samples."""
     cell = samples.cell
     shared = 8 if cell.joint == "prismatic" else 10
     weighted = _derivatives(samples, shared, range(shared + UNKNOWNS_PER_OBSERVATION))

@@ -52,8 +52,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fig4Results:
-    """Results of all parts of the experiment, see the modules of this package."""
-
     model: str  # name of the model, and the model with its observed frames
     scene: ObservedModel
     seeds: tuple[int, ...]  # seeds, and number of configurations of each
@@ -117,7 +115,6 @@ _KINDS = (("shifting", 1e3), ("turning", 180 / math.pi))
 
 
 def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
-    """Return all tables, first the one of published values."""
     strongest = results.errors[-1]
     turning = results.scene.turning
     kinds = [(~turning, 1e3), (turning, 180 / math.pi)]
@@ -254,7 +251,6 @@ _COLORS = {"published": "tab:orange", "proper": "tab:blue"}
 
 
 def draw_results(canvas: Canvas, results: Fig4Results) -> None:
-    """Draw the results on an empty figure."""
     (noise, size), (time, consistency) = canvas.subplots(2, 2)
     places = np.arange(len(results.errors))
     sizes = [dof for dof, _ in results.by_size]
@@ -299,10 +295,7 @@ TIMED = 40  # number of configurations that are timed
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Track the model with both filters, by the papers' protocol and beyond it.
-
-    The option ``quick`` reduces four seeds to one, and the configurations to a tenth.
-    """
+    """Track the model; ``quick`` takes one seed of four, and a tenth of the configurations."""
     model = options.model or "kitchen"
     scene = make_observed_model(load(model))
     seeds = range(1) if options.quick else range(4)

@@ -64,7 +64,6 @@ class Errors:
         }
 
     def rms(self, filter_name: str, coordinates: Any) -> float:
-        """Return the root mean square error of some coordinates."""
         return float(np.sqrt((self.by_filter[filter_name][:, :, coordinates] ** 2).mean()))
 
 
@@ -120,7 +119,6 @@ def measure_variants(
     progress: Progress,
     variants: Sequence[Variant] = VARIANTS,
 ) -> dict[str, list[float]]:
-    """Return the mean error of each variant at the papers' levels of noise."""
     mean_errors = {}
     for variant in progress(variants, "fig4: variants", "variant"):
         means = []
@@ -175,7 +173,6 @@ class FilterConsistency:
 def measure_consistency(
     scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
 ) -> dict[PoseNoise, dict[str, FilterConsistency]]:
-    """Return the statistics of both filters at each level of noise."""
     statistics = {}
     for noise in progress(GAUSSIAN_LEVELS, "fig4: consistency", "level"):
         truths, runs = [], []
@@ -283,7 +280,6 @@ class MechanismErrors:
 
 
 def measure_mechanisms(configurations: int, progress: Progress) -> list[MechanismErrors]:
-    """Return the errors of both filters for each mechanism at each level of noise."""
     jobs = [(name, noise) for name in MECHANISMS for noise in GAUSSIAN_LEVELS]
     return [
         _track_mechanism(name, noise, configurations)

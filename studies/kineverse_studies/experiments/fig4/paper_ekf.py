@@ -150,11 +150,7 @@ class PaperEkf:
 
 @dataclass(eq=False)
 class _CoordinateGroup:
-    """Coordinates that share observations.
-
-    ``columns`` are indices into the filter's vector. ``entries`` are indices into all poses written row by
-    row, and ``rows`` their indices among those of all groups.
-    """
+    """Coordinates that share observations; indices of columns, of entries of all poses, and of rows."""
 
     symbols: tuple[Symbol, ...]
     columns: npt.NDArray[np.intp]

@@ -46,14 +46,11 @@ class PoseNoise:
         return f"{100 * self.position:g} cm, {math.degrees(self.orientation):g}°"
 
 
-LEVELS = tuple(PoseNoise(0.05 * k, math.radians(7.5 * k)) for k in (1, 2, 3, 4))
-"""Levels of noise of the papers."""
+LEVELS = tuple(PoseNoise(0.05 * k, math.radians(7.5 * k)) for k in (1, 2, 3, 4))  # of the papers
 
 
 @dataclass(frozen=True)
 class ObservedModel:
-    """Model with all moving frames observed, in groups that share coordinates."""
-
     model: ModelView
     frames: tuple[str, ...]  # observed frames, m, group by group
     sizes: tuple[tuple[int, int], ...]  # cumulative numbers of frames and coordinates over the groups
@@ -79,7 +76,6 @@ class ObservedModel:
         return rng.uniform(lower, upper, (count, len(lower)))
 
     def first(self, groups: int) -> ObservedModel:
-        """Return the scene of the first groups alone."""
         m, n = self.sizes[groups - 1]
         return ObservedModel(
             self.model, self.frames[:m], self.sizes[:groups], self.symbols[:n], self.limits[:n]
@@ -215,10 +211,7 @@ REPORTED = 4.0  # upper bound of the times in the papers, with 23 degrees of fre
 
 @dataclass(frozen=True)
 class Duration:
-    """Mean, standard deviation and median of processor times [ms], and number of updates.
-
-    The papers plot mean and deviation.
-    """
+    """Mean, deviation and median of processor times [ms], and number of updates."""
 
     mean: float
     sd: float
@@ -238,7 +231,6 @@ def time_updates_by_size(
 
 
 def time_updates(scene: ObservedModel, noise: PoseNoise, configurations: int) -> dict[str, Duration]:
-    """Return the times of both filters for all updates except the first."""
     _, observations, training = simulate_observations(scene, noise, 0, configurations)
     published = PaperEkf(scene.model, scene.frames)
     published.learn_noise(training)

@@ -1,7 +1,4 @@
-"""``lockbox``: boxes of parts that lock each other, opened by trends, by plans, and with unknown locks.
-
-The boxes are that of the thesis behind the 2020 paper, random ones, and the Chinese rings.
-"""
+"""``lockbox``: boxes of the thesis behind the 2020 paper, random ones, the Chinese rings, unknown locks."""
 
 from __future__ import annotations
 
@@ -54,7 +51,6 @@ _DT = 0.05
 
 
 def record_thesis_box(folder: Path) -> None:
-    """Record how the lockbox of the thesis is opened, a file for each of the three ways."""
     make_record_folder(folder)
     with _start(folder, "trends") as (_, recorder):
         run = run_unlocking(THESIS, recorder=recorder)
@@ -155,7 +151,6 @@ def list_explorer_jobs(count: int, seed: int, quick: bool) -> list[ExplorerJob]:
 
 
 def list_planner_jobs(count: int, seed: int, quick: bool) -> list[PlannerJob]:
-    """Return the boxes to plan."""
     jobs = [PlannerJob("monotone", 10 if quick else 50, seed + k) for k in range(math.ceil(count / 10))]
     jobs += [PlannerJob("negated", 10 if quick else 30, seed + k) for k in range(math.ceil(count / 2))]
     small = range(count if quick else 10 * count)
@@ -168,7 +163,6 @@ def _spread(k: int, largest: int) -> int:
 
 
 def run_explorer(job: ExplorerJob) -> list[ExplorerResult]:
-    """Open one random box."""
     box = draw_lockbox(job.parts, job.seed, negated=job.negated)
     found = run_unlocking(box, job.rule, 400 + _STEPS_A_PART * job.parts)
     solvable: bool | None = True
@@ -179,7 +173,6 @@ def run_explorer(job: ExplorerJob) -> list[ExplorerResult]:
 
 
 def run_planner(job: PlannerJob) -> list[PlannerResult]:
-    """Plan the opening of one box, and check the plan."""
     box = _draw(job)
     model = make_lockbox_model(box, None)
     begin = process_time()

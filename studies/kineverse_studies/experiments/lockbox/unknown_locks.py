@@ -24,7 +24,6 @@ from kineverse_studies.experiments.report import ReportTable
 
 
 def can_be_opened(box: Lockbox) -> bool:
-    """Return whether a box can be opened, by search over all positions between the thresholds."""
     places = {name: _places(box, name) for name in box.parts}
     names = list(places)
     start = (0,) * len(names)
@@ -200,7 +199,6 @@ def _draw_unknown(job: UnknownLockJob) -> Lockbox:
 
 
 def make_unknown_table(results: Sequence[UnknownLockResult]) -> ReportTable:
-    """Return the table of the mean numbers of tries."""
     rows: list[tuple[float | str, ...]] = []
     for kind, name in UNKNOWN_KINDS.items():
         own = [r for r in results if r.job.kind == kind]

@@ -104,7 +104,6 @@ def draw_boxes(canvas: Canvas, boxes: Mapping[tuple[Rule, int], Sequence[Unlocki
 
 
 def make_thesis_table(title: str, order: str, runs: Mapping[Rule, UnlockingRun]) -> ReportTable:
-    """Return the table of the box of the thesis, with a title of the column of the order."""
     return make_table(
         title,
         runs.items(),

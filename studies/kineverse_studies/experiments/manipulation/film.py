@@ -72,7 +72,6 @@ def make_row(
     label: str,
     shown: tuple[str, ...],
 ) -> FilmRow:
-    """Return a row of moments of a film, evenly in time; the label is a format of a moment."""
     numbers = np.linspace(0, len(film) - 1, count).round().astype(int).tolist() if film else []
     chosen = [film[k] for k in numbers]
     return FilmRow(title, load, [m.values for m in chosen], [label.format(m) for m in chosen], shown)
@@ -112,7 +111,6 @@ class RowView:
 
 
 def choose_cameras(views: Sequence[RowView], aspect: float) -> list[Camera]:
-    """Return cameras of one direction that see most of some views, for an aspect of pictures."""
     azimuths = (2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS).tolist()
     best = max(
         product(_ELEVATIONS, azimuths),
@@ -174,10 +172,7 @@ def find_telling_moment(film: Sequence[Moment]) -> tuple[float, Moment | None]:
 def draw_vectors(
     vectors: Mapping[str, tuple[Array, Array]], length: float = 0.16
 ) -> tuple[list[Drawable], Array]:
-    """Return the points p and r and the vectors of a push as parts in the world, and the ends of all (N, 3).
-
-    Vectors are drawn as directions, of a length [m].
-    """
+    """Return a push's points and vectors as parts, and their ends (N, 3); vectors have one length [m]."""
     p, apart = (np.asarray(v, dtype=float) for v in vectors["r - p"])
     arrows = {name: np.asarray(vector, dtype=float) for name, (_, vector) in vectors.items()}
     arrows["neutral"] = np.cross(arrows["push"], arrows["n"])

@@ -68,8 +68,6 @@ _FILM_STEPS = 5  # number of steps from one moment of a film to the next
 
 @dataclass(frozen=True)
 class TrialSetting:
-    """World of a trial, and what is known of it."""
-
     world: str = WORLDS[0]
     noise: str = ""
     record: Path | None = None  # folder of recordings; None for none
@@ -102,7 +100,6 @@ def make_record_folder(folder: Path) -> None:
 
 
 def make_settings(options: Options) -> tuple[TrialSetting, ...]:
-    """Return the settings that options ask for, one for each world."""
     noise = "" if options.noise is None else str(Sensors.parse(options.noise))
     if options.record is not None:
         make_record_folder(options.record)
@@ -111,8 +108,6 @@ def make_settings(options: Options) -> tuple[TrialSetting, ...]:
 
 
 class TrialWatch(ExitStack):
-    """Session of a trial that is recorded and filmed, where that is wanted; a context."""
-
     def __init__(
         self, setting: TrialSetting, model: Model, about: Mapping[str, str], *, film: bool = False
     ) -> None:
@@ -233,7 +228,6 @@ class TrialCase:
         )
 
     def fail(self, skill: str, model: Model, failure: Failure, reason: str) -> Trial:
-        """Return the trial of a skill that was not begun."""
         outcome = Outcome(False, math.nan, reason, self.setting.world, 0.0, 0, {"failure": failure})
         return self.run(skill, model, lambda watch: outcome)
 
@@ -241,10 +235,6 @@ class TrialCase:
 def open_then_close(
     case: TrialCase, model: Model, world: World, start: State, targets: tuple[float, float]
 ) -> list[Trial]:
-    """Return the trials of opening an object in a world and, if that was done, of closing it.
-
-    Closing knows the ways on which the object was opened.
-    """
     world.reset(start)
     trials: list[Trial] = []
     session: Session | None = None
@@ -333,8 +323,6 @@ def run_push_trial(
 
 
 class PushJudge:
-    """Judge of a push, which is called after each step of its session."""
-
     def __init__(self, pushing: Pushing, world: World, watch: TrialWatch) -> None:
         model = world.model
         try:
@@ -349,7 +337,6 @@ class PushJudge:
         self._session: Session | None = None
 
     def watch_controller(self, pushing: Pushing) -> None:
-        """Note whether the controller pushes, and what it sees."""
         self._touching, self._watch.view = pushing.touching, pushing.view
 
     def __call__(self, session: Session) -> None:

@@ -127,7 +127,6 @@ class ObjectCount(NamedTuple):
 
 
 def count_objects(trials: Iterable[Trial]) -> ObjectCount:
-    """Return the success of one robot in one world."""
     by_object = group_trials(trials, "case", "what")
     done = sum(all(t.done for t in group) for group in by_object.values())
     far = sum(any(t.out_of_reach for t in group) for group in by_object.values())
@@ -135,7 +134,6 @@ def count_objects(trials: Iterable[Trial]) -> ObjectCount:
 
 
 def group_trials(trials: Iterable[Trial], *names: str) -> dict[tuple[Any, ...], list[Trial]]:
-    """Return the trials by the values of some of their attributes, in their order."""
     found: dict[tuple[Any, ...], list[Trial]] = {}
     for trial in trials:
         found.setdefault(tuple(getattr(trial, name) for name in names), []).append(trial)
@@ -244,10 +242,7 @@ def make_trial_tables(
 def make_group_table(
     title: str, trials: Sequence[Trial], columns: Sequence[Column], by: Sequence[str] = ()
 ) -> ReportTable:
-    """Return a table with a row for each robot, world and noise, and value of further attributes.
-
-    Columns that are empty in all rows, and that of the noise if there is none, are left out.
-    """
+    """Return a row for each robot, world, noise and attribute; columns that are empty are left out."""
     groups = group_trials(trials, *by, *(column.key for column in ROW))
     columns = [c for c in columns if c.key != "noise" or any(t.noise for t in trials)]
     rows = [
@@ -302,8 +297,6 @@ def make_trial_numbers(trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def make_success_figure(trials: Sequence[Trial], measure: str, label: str) -> Figure:
-    """Return the figure of success over a measure, one row of points for each robot."""
-
     def draw(canvas: Canvas) -> None:
         axes = canvas.add_subplot()
         robots = list(dict.fromkeys(t.robot for t in trials))
@@ -324,6 +317,5 @@ def make_success_figure(trials: Sequence[Trial], measure: str, label: str) -> Fi
 
 
 def shorten_reason(reason: str) -> str:
-    """Return a reason on one line of limited length."""
     line = " ".join(reason.split())
     return line if len(line) <= _LONGEST_REASON else f"{line[: _LONGEST_REASON - 1]}…"

@@ -110,7 +110,6 @@ FIGURE_SIZE = (9.0, 4.0)
 
 
 def make_opening_report(trials: Sequence[Trial], starts: int, seed: int) -> Report:
-    """Return the report on the trials of programs and of the skill."""
     alone = [t for t in trials if t.skill in PROGRAMS]
     skill = [t for t in trials if t.skill not in PROGRAMS]
     groups = list(group_trials(alone, "robot", "skill").values())

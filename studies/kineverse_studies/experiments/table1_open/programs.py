@@ -73,16 +73,12 @@ class OpeningSetup:
         return float(self.model.limits(self.what)[1])
 
     def scene(self) -> Scene:
-        """Return the collision scene, in which the gripper may touch the object."""
         gripper = self.robot.gripper(self.model)
         rules = [Rule(body, f"{OBJECT}/*") for body in gripper.bodies]
         return Scene(self.model, rules=[*rules, Rule(f"{OBJECT}/*", f"{OBJECT}/*")])
 
     def find_start(self, seed: int = 0) -> State:
-        """Return a state with the hand at the grasp, the object shut and without contacts.
-
-        Inverse kinematics begins at the robot's start for the seed 0, else at random positions nearby.
-        """
+        """Return a state with the hand at the grasp; the search begins nearby for seeds other than 0."""
         held = Hold(same_pose(self.grasp, self.hand), name="grasp")
         gripper = self.robot.gripper(self.model)
         scene = self.scene()
@@ -131,8 +127,7 @@ MOST_STEPS = 500
 INNER_STEPS = 20
 TOLERANCE = 1e-3
 POSITION_WEIGHT, ROTATION_WEIGHT = 10.0, 1.0
-DONE = 0.99
-"""Share of the upper limit from which an object counts as open. The gain of 1 reaches it after 4.6 s."""
+DONE = 0.99  # share of the upper limit from which an object counts as open; reached after 4.6 s
 LOST = 0.01  # grasp error from which the handle counts as lost [m]
 
 
@@ -151,8 +146,6 @@ class ProgramRun:
 
 
 class LeaderFollower:
-    """The papers' two quadratic programs."""
-
     name = "leader and follower"
 
     def __init__(self, setup: OpeningSetup) -> None:
