@@ -9,149 +9,110 @@
 
 from typing import TYPE_CHECKING
 
-from kineverse import articulations, errors, expressions, formats, logic, loops, model, spatial, symbols
-from kineverse._version import __version__
-from kineverse.articulations import Continuous, Fixed, Floating, Limits, Planar, Prismatic, Revolute
-from kineverse.compilation import CompiledFunction, compile
-from kineverse.errors import KineverseError
-from kineverse.expressions import Expression, array
-from kineverse.expressions.functions import clip, maximum, minimum, norm, where
-from kineverse.expressions.piecewise import spline
-from kineverse.formats import load, shipped_models
-from kineverse.loops import CloseLoop
-from kineverse.model import Constraint, Model, Operation
-from kineverse.spatial import (
-    axis_angle,
-    inverse,
-    quaternion,
-    rotation_x,
-    rotation_y,
-    rotation_z,
-    rpy,
-    transform,
-    translation,
-)
-from kineverse.state import State, StateLike
-from kineverse.symbols import Symbol, parameter, position, velocity
+from kineverse._lazy import lazy_face
+from kineverse._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from kineverse import control, estimation, geometry, grasping, manipulation, planning, reasoning, worlds
-    from kineverse.view.page import show
-
-__all__ = [
-    "CloseLoop",
-    "CompiledFunction",
-    "Constraint",
-    "Continuous",
-    "Expression",
-    "Fixed",
-    "Floating",
-    "KineverseError",
-    "Limits",
-    "Model",
-    "Operation",
-    "Planar",
-    "Prismatic",
-    "Revolute",
-    "State",
-    "StateLike",
-    "Symbol",
-    "__version__",
-    "array",
-    "articulations",
-    "axis_angle",
-    "clip",
-    "compile",
-    "control",
-    "errors",
-    "estimation",
-    "expressions",
-    "formats",
-    "geometry",
-    "grasping",
-    "inverse",
-    "load",
-    "logic",
-    "loops",
-    "manipulation",
-    "maximum",
-    "minimum",
-    "model",
-    "norm",
-    "parameter",
-    "planning",
-    "position",
-    "quaternion",
-    "reasoning",
-    "rotation_x",
-    "rotation_y",
-    "rotation_z",
-    "rpy",
-    "shipped_models",
-    "show",
-    "spatial",
-    "spline",
-    "symbols",
-    "transform",
-    "translation",
-    "velocity",
-    "where",
-    "worlds",
-]
-
-_LAZY = ("control", "estimation", "geometry", "grasping", "manipulation", "planning", "reasoning", "worlds")
-
-# Entries are texts: the packages are imported at first use.
-model.registry.register_collection(
-    "articulations",
-    model.registry.ModelCollection(
-        "kineverse.gallery:names",
-        summary="one for each articulation",
-        find_document="kineverse.gallery:find_document",
-    ),
-)
-model.registry.register_collection(
-    "kitchens",
-    model.registry.ModelCollection(
-        "kineverse.gallery.kitchens:example_seeds",
-        summary="one for each seed from 0 on",
-        build="kineverse.gallery.kitchens:kitchen_operations",
-        accept="kineverse.gallery.kitchens:is_seed",
-        prefix="kitchen",
-    ),
-)
-model.registry.register_collection(
-    "lockboxes",
-    model.registry.ModelCollection(
-        "kineverse.gallery.lockboxes:example_boxes",
-        summary="one for each seed from 0 on",
-        build="kineverse.gallery.lockboxes:lockbox_operations",
-        accept="kineverse.gallery.lockboxes:has_lockbox",
-        prefix="lockbox",
-    ),
-)
-model.registry.register_service("read_mesh", "kineverse.geometry.mesh_files:read_mesh")
+    from kineverse import (
+        articulations as articulations,
+        control as control,
+        errors as errors,
+        estimation as estimation,
+        expressions as expressions,
+        formats as formats,
+        geometry as geometry,
+        grasping as grasping,
+        logic as logic,
+        loops as loops,
+        manipulation as manipulation,
+        model as model,
+        planning as planning,
+        reasoning as reasoning,
+        spatial as spatial,
+        symbols as symbols,
+        worlds as worlds,
+    )
+    from kineverse.articulations import (
+        Continuous as Continuous,
+        Fixed as Fixed,
+        Floating as Floating,
+        Limits as Limits,
+        Planar as Planar,
+        Prismatic as Prismatic,
+        Revolute as Revolute,
+    )
+    from kineverse.compilation import CompiledFunction as CompiledFunction, compile as compile
+    from kineverse.errors import KineverseError as KineverseError
+    from kineverse.expressions import Expression as Expression, array as array
+    from kineverse.expressions.functions import (
+        clip as clip,
+        maximum as maximum,
+        minimum as minimum,
+        norm as norm,
+        where as where,
+    )
+    from kineverse.expressions.piecewise import spline as spline
+    from kineverse.formats import load as load, shipped_models as shipped_models
+    from kineverse.loops import CloseLoop as CloseLoop
+    from kineverse.model import Constraint as Constraint, Model as Model, Operation as Operation
+    from kineverse.spatial import (
+        axis_angle as axis_angle,
+        inverse as inverse,
+        quaternion as quaternion,
+        rotation_x as rotation_x,
+        rotation_y as rotation_y,
+        rotation_z as rotation_z,
+        rpy as rpy,
+        transform as transform,
+        translation as translation,
+    )
+    from kineverse.state import State as State, StateLike as StateLike
+    from kineverse.symbols import (
+        Symbol as Symbol,
+        parameter as parameter,
+        position as position,
+        velocity as velocity,
+    )
+    from kineverse.view import show as show
 
 
-def __getattr__(name: str) -> object:
-    import importlib
-
-    if name in _LAZY:
-        return importlib.import_module(f"kineverse.{name}")
-    if name == "show":
-        return importlib.import_module("kineverse.view.page").show
-    from kineverse._synonyms import MODULE_SYNONYMS
-    from kineverse.errors import unknown_attribute_error
+def _list_names_below() -> dict[str, str]:
+    """Return the public names of all packages and modules of the face, with their full names."""
+    import importlib  # for start-up time
 
     below: dict[str, str] = {}
-    if not name.startswith("_"):
-        lazy = (importlib.import_module(f"kineverse.{package}") for package in _LAZY)
-        for package in (*lazy, expressions, spatial, logic, errors, loops, formats, model, articulations):
-            path, values = package.__name__, vars(package)
-            defined = [n for n in values if getattr(values[n], "__module__", "") == path and n[0] != "_"]
-            below |= {n: f"kv.{path.removeprefix('kineverse.')}.{n}" for n in values.get("__all__", defined)}
-    raise unknown_attribute_error("The package kineverse", name, __all__, MODULE_SYNONYMS, below)
+    for package in _PACKAGES:
+        values = vars(importlib.import_module(f"kineverse.{package}"))
+        defined = [n for n in values if getattr(values[n], "__module__", "") == values["__name__"]]
+        public = (n for n in values.get("__all__", defined) if not n.startswith("_"))
+        below |= {name: f"kv.{package}.{name}" for name in public}
+    return below
 
 
-def __dir__() -> list[str]:
-    return sorted({*(name for name in globals() if name.startswith("__")), *__all__})
+_PACKAGES = (
+    *("symbols", "control", "estimation", "geometry", "grasping", "manipulation", "planning", "reasoning"),
+    *("worlds", "expressions", "spatial", "logic", "errors", "loops", "formats", "model", "articulations"),
+)
+"""Packages and modules of the face; a name that several have is that of the last one."""
+
+lazy_face(
+    __name__,
+    {
+        ".": " ".join(_PACKAGES),
+        ".articulations": "Continuous Fixed Floating Limits Planar Prismatic Revolute",
+        ".compilation": "CompiledFunction compile",
+        ".errors": "KineverseError",
+        ".expressions": "Expression array",
+        ".expressions.functions": "clip maximum minimum norm where",
+        ".expressions.piecewise": "spline",
+        ".formats": "load shipped_models",
+        ".loops": "CloseLoop",
+        ".model": "Constraint Model Operation",
+        ".spatial": "axis_angle inverse quaternion rotation_x rotation_y rotation_z "
+        "rpy transform translation",
+        ".state": "State StateLike",
+        ".symbols": "Symbol parameter position velocity",
+        ".view": "show",
+    },
+    below=_list_names_below,
+)

@@ -7,7 +7,6 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable
-from importlib import metadata
 from pathlib import Path
 
 DISTRIBUTION = "kineverse-articulation"
@@ -52,18 +51,20 @@ def checkout(module: Path) -> Path | None:
 
 def requirements(extra: str, declared: Iterable[str]) -> list[str]:
     """Return the requirements of an extra, from lines of metadata (``coal>=3.0; extra == "geometry"``)."""
-    found = []
+    result = []
     for line in declared:
         match = _EXTRA.search(line)
         if match is not None and match["name"] == extra:
             requirement, _, marker = (line[: match.start()] + line[match.end() :]).partition(";")
-            found.append(
+            result.append(
                 f"{requirement.strip()}; {marker.strip()}" if marker.strip() else requirement.strip()
             )
-    return found
+    return result
 
 
 def _declared() -> list[str]:
+    from importlib import metadata  # for start-up time
+
     try:
         return metadata.requires(DISTRIBUTION) or []
     except metadata.PackageNotFoundError:

@@ -235,14 +235,14 @@ class State(Mapping[Symbol, float]):
     def _with(self, values: Mapping[Symbol, float], stamp: float | None, source: str | None) -> State:
         # All values have been checked already.
         every = {**self._values, **values}
-        found = State.__new__(State)
-        found._set(
+        result = State.__new__(State)
+        result._set(
             every,
             self._names if len(every) == len(self._values) else None,
             self.stamp if stamp is None else stamp,
             self.source if source is None else source,
         )
-        return found
+        return result
 
     def _unknown(self, key: object) -> KineverseError:
         symbol = _symbol(key)
@@ -285,12 +285,12 @@ class State(Mapping[Symbol, float]):
 
 def _symbols_by_name(symbols: Collection[Symbol]) -> dict[str, Symbol | None]:
     """Return the symbol of each name, None where several have it."""
-    found: dict[str, Symbol | None] = {str(s): s for s in symbols}
-    if len(found) < len(symbols):
+    result: dict[str, Symbol | None] = {str(s): s for s in symbols}
+    if len(result) < len(symbols):
         # A parameter may have the name of another symbol; then the name is ambiguous.
         counts = Counter(map(str, symbols))
-        found = {name: s if counts[name] == 1 else None for name, s in found.items()}
-    return found
+        result = {name: s if counts[name] == 1 else None for name, s in result.items()}
+    return result
 
 
 def _items(values: object) -> Iterable[tuple[Any, Any]]:

@@ -7,7 +7,9 @@ from functools import partial
 import pytest
 
 from kineverse.cli import main
-from kineverse.view import pictures
+from kineverse.view import picture, pictures
+
+assert picture  # in the face of the package before tests exchange that of the module
 
 
 @pytest.fixture(autouse=True)

@@ -7,9 +7,8 @@ import sys
 
 import pytest
 
+from kineverse.cli import command_line
 from kineverse.cli.command_line import COMMANDS, find_added_commands, load_command
-
-MAIN = sys.modules["kineverse.cli.main"]
 
 GREETING = """HELP = "greet somebody"
 def add_arguments(parser):
@@ -44,7 +43,7 @@ def add_command(tmp_path, monkeypatch):
 @pytest.fixture
 def without_added_commands(monkeypatch):
     """Have no distribution add a command."""
-    monkeypatch.setattr(MAIN, "entry_points", lambda group: ())
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: ())
 
 
 def test_command_of_another_distribution_runs(run, add_command):
@@ -88,7 +87,7 @@ def test_command_of_this_package_is_not_replaced(run, add_command):
 
 def test_entry_points_are_looked_up_for_unknown_names_and_for_help_only(run, monkeypatch):
     looked_up = []
-    monkeypatch.setattr(MAIN, "entry_points", lambda group: looked_up.append(group) or ())
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: looked_up.append(group) or ())
     assert run("info", "kitchen")[0] == 0
     assert run("fk", "--help")[0] == 0
     assert looked_up == []
@@ -140,7 +139,7 @@ def test_half_installed_extra_is_one_line(run, monkeypatch, error, expected):
     def fail(arguments):
         raise error
 
-    monkeypatch.setattr(COMMANDS["info"], "run", fail)
+    monkeypatch.setattr(load_command("info"), "run", fail)
     status, out, err = run("info", "kitchen")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert expected in err
@@ -150,7 +149,7 @@ def test_extra_whose_requirement_is_missing_is_named(run, tmp_path, monkeypatch)
     (tmp_path / "daqp.py").write_text("import nowhere_at_all\n", encoding="utf-8")
     monkeypatch.delitem(sys.modules, "daqp", raising=False)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(COMMANDS["info"], "run", lambda arguments: __import__("daqp"))
+    monkeypatch.setattr(load_command("info"), "run", lambda arguments: __import__("daqp"))
     status, _, err = run("info", "kitchen")
     assert (status, err.count("\n")) == (2, 1)
     assert "The extra 'control' is not installed completely (No module named 'nowhere_at_all')" in err
@@ -160,6 +159,6 @@ def test_import_error_of_this_package_is_no_message(monkeypatch):
     def fail(arguments):
         raise ImportError("cannot import name", name="kineverse.model")
 
-    monkeypatch.setattr(COMMANDS["info"], "run", fail)
+    monkeypatch.setattr(load_command("info"), "run", fail)
     with pytest.raises(ImportError):
-        MAIN.main(["info", "kitchen"])
+        command_line.main(["info", "kitchen"])

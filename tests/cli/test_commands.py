@@ -41,7 +41,7 @@ def test_help_names_all_commands_and_gives_examples(run):
 
 
 def test_help_imports_nothing_heavy():
-    heavy = ("viser", "trimesh", "tqdm", "scipy", "PIL", "websockets")
+    heavy = ("viser", "trimesh", "rich", "scipy", "PIL", "websockets")
     code = (
         "import sys; from kineverse.cli import main; main(['--help']); "
         f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
@@ -151,20 +151,60 @@ def test_fk_beyond_limits_is_evaluated_with_a_note(run):
 
 
 @pytest.mark.parametrize(
-    ("assigned", "remark"),
+    ("assigned", "reason"),
     [
-        ("fridge_door=5mm", "kitchen/fridge_door is an angle, and 5mm is none: it is taken for 0.005 rad"),
+        ("fridge_door=5mm", "'kitchen/fridge_door' is in rad; write 30deg or 0.5, for instance."),
         (
             "sink_left_upper_drawer=10deg",
-            "kitchen/sink_left_upper_drawer is a length, and 10deg is none: it is taken for 0.174533 m",
+            "'kitchen/sink_left_upper_drawer' is in m; write 12cm or 0.12, for instance.",
         ),
         ("fridge_door=pi/4", ""),
         ("sink_left_upper_drawer=10cm", ""),
     ],
 )
-def test_a_unit_of_another_quantity_is_noted(run, assigned, remark):
-    status, _, err = run("fk", "kitchen", "kitchen/fridge_door", "--set", f"kitchen/{assigned}")
-    assert (status, err) == (0, f"kineverse: note: {remark}\n" if remark else "")
+def test_a_unit_of_another_quantity_is_refused(run, assigned, reason):
+    status, out, err = run("fk", "kitchen", "kitchen/fridge_door", "--set", f"kitchen/{assigned}")
+    if not reason:
+        assert (status, err) == (0, "")
+    else:
+        assert (status, out, err) == (2, "", f"kineverse: --set kitchen/{assigned}: {reason}\n")
+
+
+@pytest.mark.parametrize(
+    "words", [("-v", "info", "shelf_door"), ("info", "shelf_door", "-v"), ("info", "-v", "shelf_door")]
+)
+def test_verbose_may_stand_before_or_after_the_command(run, words):
+    status, out, _ = run(*words)
+    assert (status, out.splitlines()[0]) == (0, "shelf_door")
+
+
+def test_info_counts_one_thing_and_names_missing_meshes(run, tmp_path):
+    robot = tmp_path / "r.urdf"
+    visual = '<visual><geometry><mesh filename="nowhere.stl"/></geometry></visual>'
+    robot.write_text(f'<robot name="r"><link name="arm">{visual}</link></robot>', encoding="utf-8")
+    status, out, _ = run("info", str(robot))
+    assert status == 0
+    assert "  1 frame, 0 DoF, 0 constraints\n" in out
+    assert '1 shape, 1 of them not loaded\n  arm: "nowhere.stl": there is no such file.' in out
+    assert f"Looked for: {tmp_path / 'nowhere.stl'}\n" in out
+    robot.write_text(
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="prismatic"><parent link="a"/>'
+        '<child link="b"/><limit lower="-0.0" upper="1" velocity="0" effort="1"/></joint></robot>',
+        encoding="utf-8",
+    )
+    status, out, _ = run("info", str(robot), "--constraints")
+    assert "-0" not in out
+
+
+def test_picture_that_cannot_be_written_is_refused_before_the_work(run, tmp_path):
+    for words in (
+        ("open", "kitchen", "--robot", "hsr", "--what", "kitchen/fridge_door"),
+        ("reach", "fetch", "fetch/gripper_link", "--pose", "0.7", "0.2", "0.9"),
+        ("view", "kitchen"),
+    ):
+        status, out, err = run(*words, "--picture", str(tmp_path / "none" / "x.png"))
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert "No such file" in err
 
 
 @pytest.mark.parametrize(

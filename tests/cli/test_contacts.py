@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.cli import summary
+from kineverse.cli import info
 
 pytest.importorskip("coal", reason="distances need the extra 'geometry'")
 imaging = pytest.importorskip("PIL.Image")
@@ -50,7 +50,7 @@ def test_info_in_json_has_the_distances_or_null(run, robot, monkeypatch):
     assert (pair["a"], pair["b"]) == ("l0", "l2")
     assert pair["distance"] == pytest.approx(-0.25)
     assert json.loads(run("info", robot(0, 5, 10), "--json")[1])["touching"] == []
-    monkeypatch.setattr(summary, "is_installed", lambda: False)
+    monkeypatch.setattr(info, "is_installed", lambda: False)
     assert json.loads(run("info", file, "--json")[1])["touching"] is None
 
 
@@ -106,6 +106,4 @@ def test_view_refuses_invalid_radii(run, robot, tmp_path, radius, said):
 
 def test_shipped_models_have_no_penetrations():
     for name in kv.shipped_models():
-        assert not any(
-            pair.distance < -summary.CONTACT_DEPTH for pair in summary.find_contacts(kv.load(name))
-        )
+        assert not any(pair.distance < -info.CONTACT_DEPTH for pair in info.find_contacts(kv.load(name)))

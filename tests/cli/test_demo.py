@@ -13,8 +13,7 @@ from living_kitchen.unknown_mechanisms import MECHANISMS
 import kineverse as kv
 from kineverse.cli import main
 from kineverse.cli.demo import add_arguments
-from kineverse.cli.demo_living import MODELS, STATE, _find_example
-from kineverse.cli.exercise import SAMPLES_PER_RANGE, exercise_model
+from kineverse.cli.demo_living import MODELS, SAMPLES_PER_RANGE, STATE, _find_example, exercise_model
 
 
 @pytest.fixture(scope="module")

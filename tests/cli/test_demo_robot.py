@@ -26,7 +26,7 @@ def fails():
 def asked(monkeypatch, fails):
     """Stand in for the skill: it puts the object where it is wanted. Returns what it was asked for."""
     calls = []
-    monkeypatch.setattr("kineverse.cli.demo_robot.KITCHEN", "shelf_drawers")  # a small kitchen
+    monkeypatch.setattr("kineverse.cli.demo.KITCHEN", "shelf_drawers")  # a small kitchen
 
     def open_object(session, coordinate, *, target, hand, **options):
         calls.append((str(coordinate), target))

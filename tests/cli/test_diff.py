@@ -383,3 +383,13 @@ def test_added_frames_are_a_difference(run, files, tmp_path):
         status, out, _ = run(*files(**more), "--values")
         assert status == 1
         assert "not counted" not in out
+
+
+def test_behaviour_is_compared_from_python_too():
+    before, after = kv.load("shelf_door"), kv.load("shelf_door")
+    assert kv.model.BehaviourComparison(before, after).equal
+    with after.edit() as edit:
+        edit.add_frame("shelf_door/mark", parent="shelf_door/door", transform=kv.translation(0, 0, 1))
+    found = kv.model.BehaviourComparison(before, after)
+    assert not found.apart
+    assert found.frames["added"] == ["shelf_door/mark"] or found.helpers == ["shelf_door/mark"]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import kineverse as kv
 from kineverse.cli import main
+from kineverse.estimation import recordings
 
 DOOR = ("--parent", "cupboard", "--child", "door")
 # All families take seconds: they are tried where the choice among them is the subject.
@@ -358,3 +359,12 @@ def test_correlated_errors_do_not_make_a_screw(capsys, published):
     found = json.loads(capsys.readouterr().out)
     assert found["judged"] < 20
     assert found["family"] == "revolute"
+
+
+def test_the_model_of_a_joint_is_made_from_python_too(door):
+    recorded = recordings.read_recording(door).pair("cupboard", "door")
+    noise = recordings.ObservationNoise(0.002, 0.01, True)
+    learned = recordings.identify_recorded_joint(recorded, noise, ["revolute"])
+    model = recordings.make_joint_model(recorded, learned.fit)
+    assert [str(s) for s in model.degrees_of_freedom] == ["door"]
+    assert model.articulations["door"].parent == "cupboard"

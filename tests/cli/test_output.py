@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import argparse
 import io
 import math
 import sys
 
 import pytest
 
-from kineverse.cli.output import format_table, shorten_text, show_progress
+from kineverse.cli.command_line import make_parser
+from kineverse.cli.output import format_table, name_options, shorten_text, show_progress
 from kineverse.expressions.printing import format_number
 
 
@@ -53,3 +55,29 @@ def test_progress_is_shown_on_a_terminal_and_not_in_a_pipe(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal)
     assert list(show_progress([1, 2, 3], "working", "steps")) == [1, 2, 3]
     assert "working" in terminal.getvalue()
+
+
+def test_table_on_a_terminal_is_drawn_and_its_cells_are_escaped(monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    rows = [("a\x1b]0;title\x07", "1"), ("b", "a reason of many words, which goes on below")]
+    text = format_table(("name", "value"), rows)
+    assert "\x1b[1m" in text
+    assert "───" in text
+    assert "\\x1b]0;title\\x07" in text
+    assert "which goes" in text
+    assert len(text.splitlines()) > 4
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert "\x1b" not in format_table(("name", "value"), [("a", "1")])
+    assert format_table(("name",), [("a",)]).splitlines()[1] == "----"
+
+
+def test_messages_name_options_in_place_of_arguments():
+    arguments = argparse.Namespace(command=make_parser("plan")._subparsers._group_actions[0].choices["plan"])
+    text = "The time is up. Give more seconds=, or margin=. logic= is 'and'; leave_out='a', a=3."
+    assert name_options(text, arguments) == (
+        "The time is up. Give more --seconds, or --margin. logic= is 'and'; leave_out='a', a=3."
+    )

@@ -115,7 +115,7 @@ def test_requests_and_robots_are_parsed():
     request.resolve({"ready": {"a": 1.0, "d": 2.0}}, "--to")
     assert request.values == pytest.approx({"a": np.pi / 6, "d": 2.0})
     assert parse_robot("fetch") == ("fetch", None)
-    assert parse_robot("fetch@1,-2cm,90deg") == ("fetch", (1.0, -0.02, 0.0, np.pi / 2))
+    assert parse_robot("fetch@1,-2cm,90deg") == ("fetch", (1.0, -0.02, np.pi / 2))
     assert parse_robot("arm.urdf@1,2,.5,0") == ("arm.urdf", (1.0, 2.0, 0.5, 0.0))
     with pytest.raises(InvalidValueError, match="X,Y,ANGLE"):
         parse_robot("fetch@1,2")

@@ -163,3 +163,17 @@ def test_a_bolted_arm_is_put_where_its_place_says(run, tmp_path):
     assert run(*words, slide, "--pose", 0.9, -0.4, 0.5)[0] == 1
     status, out, _ = run(*words, slide.replace(",0.5,90deg", ",0"), "--pose", 0.9, -0.4, 0)
     assert json.loads(out)["positions"] == {"slide": pytest.approx(0.6, abs=1e-4)}
+
+
+def test_angles_of_many_turns_are_noted(run):
+    _, _, err = run("reach", "fetch", "fetch/gripper_link", "--pose", "0.6", "0.2", "0.9", "0", "90", "0")
+    assert "90 rad is 14.3 turns; in degrees it is 90deg" in err
+
+
+def test_patterns_keep_coordinates_still(run):
+    words = ["reach", "pr2", "pr2/l_gripper_tool_frame", "--pose", "0.6", "0.2", "0.9", "--json", "--still"]
+    status, out, _ = run(*words, "pr2/base/*", "pr2/torso*")
+    assert status == 0
+    assert not [name for name in json.loads(out)["positions"] if "base/" in name or "torso" in name]
+    status, _, err = run(*words, "pr3/*")
+    assert (status, "--still pr3/*: no coordinate matches" in err) == (2, True)

@@ -315,3 +315,14 @@ def test_a_file_without_permission_is_status_2(run, good, monkeypatch):
     status, out, err = run(good)
     assert (status, out, len(err.splitlines())) == (2, "", 1)
     assert "Permission denied" in err
+
+
+def test_a_file_is_validated_from_python_too(good):
+    found = kv.formats.validate_file(good)
+    assert (found.status, found.format, list(found.problems)) == (0, "URDF", [])
+    seen = []
+    kv.formats.validate_file(good, further=lambda model: seen.append(len(model.frames)) or ())
+    assert seen == [len(found.model.frames)]
+    missing = kv.formats.validate_file(good.with_name("nowhere.urdf"))
+    assert (missing.status, missing.model) == (2, None)
+    assert "nowhere.urdf" in missing.reason

@@ -58,7 +58,8 @@ def test_every_entry_can_be_imported():
     entries = [*registry._SCHEMES.values(), *registry._SHORTHANDS.values(), *registry._SERVICES.values()]
     for one in registry._COLLECTIONS.values():
         entries += filter(None, (one.list_names, one.build, one.find_document, one.accept))
-    entries += [text for one in registry._FORMATS.values() for text in (one.read, one.write) if text]
+    entries += [registry._FORMATS]
+    entries += [text for one in registry.list_formats() for text in (one.read, one.write) if text]
     for entry in entries:
         assert callable(registry.import_entry(entry))
 

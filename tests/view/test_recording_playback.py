@@ -89,7 +89,7 @@ def test_a_recording_is_played_on_the_page(scene):
         play_recording(page, scene.recording, time=0.7)
         assert page.settled()
         assert page.values["cupboard/door"] == pytest.approx(0.7)
-        layer = page._playback._layer._layer
+        layer = page._playback._layer
         (ghost,) = layer._ghosts.values()
         np.testing.assert_allclose(ghost.position, page.pose("cupboard/panel")[:3, 3])
         assert ghost.visible

@@ -49,7 +49,7 @@ def test_each_degree_of_freedom_has_a_slider_within_its_limits(page):
     found = sliders(page)
     assert found["cabinet/drawer"] == ("drawer [m]   0 to 0.4", 0.0, 0.4, 0.0)
     assert found["cabinet/door"] == ("door [rad]   0 to 1.5", 0.0, 1.5, 0.0)
-    assert found["cabinet/knob"] == ("knob [rad]   −3.14 to 3.14", -np.pi, np.pi, 0.0)
+    assert found["cabinet/knob"] == ("knob [rad]   −∞ to ∞", -np.pi, np.pi, 0.0)
 
 
 def test_move_and_reset(page):
@@ -74,7 +74,8 @@ def test_angles_are_shown_in_degrees_on_demand_also_after_edits(page):
     assert sliders(page)["cabinet/drawer"] == ("drawer [m]   0 to 0.4", 0.0, 0.4, 0.1)
     page.move({"cabinet/door": 2.0})
     assert page.settled()
-    assert sliders(page)["cabinet/door"][0] == "door [°]   0 to 114.59"
+    assert sliders(page)["cabinet/door"][0] == "door [°]   0 to 85.94"
+    assert "114.6 is not in [0, 85.94], by 28.65 °" in page._panel._status.content
     assert page._panel._value("cabinet/door") == pytest.approx(2.0)
     with page.model.edit() as edit:
         edit.constrain("cabinet/knob/range", -1, kv.position("cabinet/knob"), 0.0123)
@@ -83,6 +84,17 @@ def test_angles_are_shown_in_degrees_on_demand_also_after_edits(page):
     page._panel._convert(False)
     assert sliders(page)["cabinet/knob"][:3] == ("knob [rad]   −1 to 0.012", -1.0, 0.0123)
     assert page.values["cabinet/door"] == 2.0
+
+
+def test_limits_that_are_zero_but_for_rounding_are_labelled_zero():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Prismatic(name="slide", parent="world", child="box", lower=-8.8e-20, upper=0.69))
+    with view(model, port=0) as page:
+        assert sliders(page)["slide"][0] == "slide [m]   0 to 0.69"
+        page._panel._beyond.value = True
+        page._panel._widen()
+        assert sliders(page)["slide"][:2] == ("slide [m]   0 to 0.69", pytest.approx(-0.1))
 
 
 def test_speeds_are_shown_in_degrees_too():

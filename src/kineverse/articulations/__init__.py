@@ -1,73 +1,71 @@
 """Library of articulations: joints, transmissions, mobile bases, mechanisms and locks."""
 
-from kineverse._synonyms import MODULE_SYNONYMS
-from kineverse.errors import unknown_attribute_error
+from typing import TYPE_CHECKING
 
-from .bases import Ackermann, Base, DifferentialDrive, Mecanum, OmniBase
-from .joint import Fixed, Joint, OneAxisMotion, OneDofJoint
-from .limits import Limits
-from .locks import position_lock, speed_lock, tabulated_limit
-from .mechanisms import (
-    DeskLamp,
-    DoorWithHandle,
-    Faucet,
-    FoldingDoor,
-    GarageDoor,
-    Latch,
-    Mechanism,
-    Microwave,
-    PedalBin,
-    PistonAndRod,
-    Ratchet,
-    ScissorLift,
-    ScrewAndNut,
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .bases import (
+        Ackermann as Ackermann,
+        Base as Base,
+        DifferentialDrive as DifferentialDrive,
+        Mecanum as Mecanum,
+        OmniBase as OmniBase,
+    )
+    from .joint import (
+        Fixed as Fixed,
+        Joint as Joint,
+        OneAxisMotion as OneAxisMotion,
+        OneDofJoint as OneDofJoint,
+    )
+    from .limits import Limits as Limits
+    from .locks import (
+        position_lock as position_lock,
+        speed_lock as speed_lock,
+        tabulated_limit as tabulated_limit,
+    )
+    from .mechanisms import (
+        DeskLamp as DeskLamp,
+        DoorWithHandle as DoorWithHandle,
+        Faucet as Faucet,
+        FoldingDoor as FoldingDoor,
+        GarageDoor as GarageDoor,
+        Latch as Latch,
+        Mechanism as Mechanism,
+        Microwave as Microwave,
+        PedalBin as PedalBin,
+        PistonAndRod as PistonAndRod,
+        Ratchet as Ratchet,
+        ScissorLift as ScissorLift,
+        ScrewAndNut as ScrewAndNut,
+    )
+    from .multi_axis import Ball as Ball, Floating as Floating, Planar as Planar, Universal as Universal
+    from .single_axis import (
+        Continuous as Continuous,
+        Cylindrical as Cylindrical,
+        Prismatic as Prismatic,
+        Revolute as Revolute,
+        Screw as Screw,
+    )
+    from .transmissions import (
+        Cam as Cam,
+        Gearbox as Gearbox,
+        RackAndPinion as RackAndPinion,
+        Transmission as Transmission,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".bases": "Ackermann Base DifferentialDrive Mecanum OmniBase",
+        ".joint": "Fixed Joint OneAxisMotion OneDofJoint",
+        ".limits": "Limits",
+        ".locks": "position_lock speed_lock tabulated_limit",
+        ".mechanisms": "DeskLamp DoorWithHandle Faucet FoldingDoor GarageDoor Latch Mechanism "
+        "Microwave PedalBin "
+        "PistonAndRod Ratchet ScissorLift ScrewAndNut",
+        ".multi_axis": "Ball Floating Planar Universal",
+        ".single_axis": "Continuous Cylindrical Prismatic Revolute Screw",
+        ".transmissions": "Cam Gearbox RackAndPinion Transmission",
+    },
 )
-from .multi_axis import Ball, Floating, Planar, Universal
-from .single_axis import Continuous, Cylindrical, Prismatic, Revolute, Screw
-from .transmissions import Cam, Gearbox, RackAndPinion, Transmission
-
-__all__ = [
-    "Ackermann",
-    "Ball",
-    "Base",
-    "Cam",
-    "Continuous",
-    "Cylindrical",
-    "DeskLamp",
-    "DifferentialDrive",
-    "DoorWithHandle",
-    "Faucet",
-    "Fixed",
-    "Floating",
-    "FoldingDoor",
-    "GarageDoor",
-    "Gearbox",
-    "Joint",
-    "Latch",
-    "Limits",
-    "Mecanum",
-    "Mechanism",
-    "Microwave",
-    "OmniBase",
-    "OneAxisMotion",
-    "OneDofJoint",
-    "PedalBin",
-    "PistonAndRod",
-    "Planar",
-    "Prismatic",
-    "RackAndPinion",
-    "Ratchet",
-    "Revolute",
-    "ScissorLift",
-    "Screw",
-    "ScrewAndNut",
-    "Transmission",
-    "Universal",
-    "position_lock",
-    "speed_lock",
-    "tabulated_limit",
-]
-
-
-def __getattr__(name: str) -> object:
-    raise unknown_attribute_error("The package kineverse.articulations", name, __all__, MODULE_SYNONYMS)

@@ -1,7 +1,15 @@
 """The ``kineverse`` command."""
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-from .command_line import main
+from kineverse._lazy import lazy_face
 
-__all__ = ["main"]
+if TYPE_CHECKING:
+    from .command_line import main as main
+
+lazy_face(
+    __name__,
+    {
+        ".command_line": "main",
+    },
+)

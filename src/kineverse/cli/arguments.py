@@ -11,18 +11,29 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import kineverse as kv
 from kineverse._extras import install_command
-from kineverse.errors import CompileError, DuplicateNameError, InvalidValueError, MissingDependencyError
+from kineverse.compilation.toolchain import NO_COMPILER, toolchain
+from kineverse.errors import (
+    CompileError,
+    DuplicateNameError,
+    InvalidValueError,
+    MissingDependencyError,
+    UnknownNameError,
+    suggest,
+)
 from kineverse.expressions.printing import format_number
+from kineverse.formats.file_formats import is_mjcf
+from kineverse.view.sliders import infer_units
 
 from .output import format_cells, print_line
 
 if TYPE_CHECKING:
-    import kineverse as kv
     from kineverse.model.model_view import ModelView
 
 
@@ -168,8 +179,6 @@ def add_model_options(
 
 def load_model(arguments: argparse.Namespace, source: str, prefix: str | None = None) -> kv.Model:
     """Load a model with the options of the command line."""
-    import kineverse as kv
-
     return kv.load(source, prefix, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
 
 
@@ -178,22 +187,17 @@ ALTERNATIVE_UNITS = {"rad": ("deg",), "m": ("cm", "mm")}
 
 
 def find_limit_notes(model: ModelView, values: Mapping[str, float], texts: Iterable[str]) -> list[str]:
-    """Return a line for each violated limit or constraint, and for each angle above 2π without a unit."""
-    import kineverse as kv
-    from kineverse.view.sliders import infer_units
+    """Return a line for each violated limit or constraint, and for each angle above 2π without a unit.
 
+    A value in a unit of lengths is refused for an angle, and the other way round.
+    """
     given = {text.rpartition("=")[0].strip(): text for text in texts}
     kinds = infer_units(model, values, given) if given else {}
     reported, lines = set(), []
     for name, text in given.items():
         lower, upper = map(float, model.limits(model.symbol(name)))
         kind, value = kinds[name], values[name]
-        if unit_kind(text) not in (None, kind) and kind:
-            quantity, number = "an angle" if kind == "rad" else "a length", text.rpartition("=")[2].strip()
-            lines.append(
-                f"{name} is {quantity}, and {number} is none: "
-                f"it is taken for {format_number(value, 6)} {kind}"
-            )
+        check_unit("--set", text, name, kind)
         turns = kind == "rad" and abs(value) > math.tau and not has_unit(text)
         if lower <= value <= upper and not turns:
             continue
@@ -213,6 +217,41 @@ def find_limit_notes(model: ModelView, values: Mapping[str, float], texts: Itera
             f"[{format_number(violation.lower)}, {format_number(violation.upper)}]"
         )
     return lines
+
+
+def check_unit(option: str, text: str | None, coordinate: object, unit: str) -> None:
+    """Raise InvalidValueError for a value in a unit of lengths or angles that is not its coordinate's."""
+    stated = unit_kind(text or "")
+    if unit and stated not in (None, unit):
+        raise InvalidValueError(
+            f"{option} {(text or '').strip()}: '{coordinate}' is in {unit}; write "
+            f"{'30deg or 0.5' if unit == 'rad' else '12cm or 0.12'}, for instance."
+        )
+
+
+def find_turn_notes(texts: Iterable[str]) -> list[str]:
+    """Return a line for each number of an angle above 2π without a unit."""
+    angles = [text for text in texts if not has_unit(text) and abs(parse_value(text)) > math.tau]
+    return [
+        f"{text} rad is {format_number(parse_value(text) / math.tau, 3)} turns; in degrees it is {text}deg"
+        for text in angles
+    ]
+
+
+def match_coordinates(model: ModelView, words: Iterable[str], option: str) -> list[str]:
+    """Return the names of an option, with those of coordinates in place of patterns such as ``kitchen/*``."""
+    names = [str(symbol) for symbol in model.degrees_of_freedom]
+    found: list[str] = []
+    for word in words:
+        matching = [word]
+        if any(sign in word for sign in "*?["):
+            matching = [name for name in names if fnmatchcase(name, word)]
+            if not matching:
+                raise UnknownNameError(
+                    f"{option} {word}: no coordinate matches. {suggest(word, names, 'coordinate')}"
+                )
+        found += matching
+    return found
 
 
 def print_notes(lines: Iterable[str]) -> None:
@@ -260,8 +299,6 @@ _HEAD = 1 << 16  # of a file, in which its root element begins [byte]
 
 def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> None:
     """Raise if something is missing, and name all of it with how to install it."""
-    from kineverse.compilation.toolchain import NO_COMPILER, toolchain
-
     missing = [extra for extra, needed in extras.items() if needed and not _is_installed(extra)]
     sentences = []
     if missing:
@@ -277,8 +314,6 @@ def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> No
 
 def needs_mujoco(model: str) -> bool:
     """Return True for the path of a file that only MuJoCo reads."""
-    from kineverse.formats.file_formats import is_mjcf
-
     try:
         with open(model, "rb") as file:
             return is_mjcf(model, file.read(_HEAD))

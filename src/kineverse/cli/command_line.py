@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import logging
 import os
 import re
@@ -10,42 +11,26 @@ import signal
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from traceback import walk_tb
-from types import MappingProxyType, ModuleType
-from typing import Any, Protocol, TextIO, cast
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Protocol, TextIO, cast
 
 from kineverse._extras import STUDIES, install_command, install_studies
 from kineverse._version import __version__
 from kineverse.errors import FormatError, KineverseError, MissingDependencyError, UnknownNameError, suggest
 
-from . import (
-    convert,
-    decompose,
-    demo,
-    diff,
-    fit,
-    fk,
-    info,
-    manipulate,
-    plan,
-    reach,
-    spheres,
-    unlock,
-    validate,
-    view,
-)
-from .arguments import MODULES
-from .output import join_lines, safe_streams
+from .output import join_lines, name_options, safe_streams
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 class CommandModule(Protocol):
-    """Module or object that is a command."""
+    """Module or object that is a command; it is imported only if it runs."""
 
     @property
     def HELP(self) -> str:
-        """Summary, and after it the description."""
+        """Description; that of a command of another distribution begins with a line of summary."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Declare the options."""
@@ -54,24 +39,30 @@ class CommandModule(Protocol):
         """Run the command and return its exit status."""
 
 
-def _by_name(*modules: ModuleType) -> dict[str, Any]:
-    return {module.__name__.rpartition(".")[2]: module for module in modules}
-
-
-COMMANDS: dict[str, CommandModule] = {
-    **_by_name(info, fk, reach, plan, unlock),
-    **manipulate.COMMANDS,
-    **_by_name(
-        view,
-        convert,
-        diff,
-        validate,
-        decompose,
-        spheres,
-        fit,
-        demo,
-    ),
-}
+COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "info": ("info", "print the contents of a model: frames, degrees of freedom, constraints, size"),
+        "fk": ("fk", "print the pose of a frame at given positions"),
+        "reach": ("reach", "find positions in which a frame has a pose: inverse kinematics"),
+        "plan": ("plan", "find a path without collisions"),
+        "unlock": ("unlock", "find the order in which locked parts have to move"),
+        "open": ("manipulate:OPEN", "open a door or drawer with a robot that grasps its handle"),
+        "close": ("manipulate:CLOSE", "close a door or drawer with a robot that grasps its handle"),
+        "push": ("manipulate:PUSH", "push a door or drawer shut with a robot"),
+        "view": ("view", "show a model in the browser, with a slider for everything that moves"),
+        "convert": ("convert", "write a model to a file, in the format of its suffix"),
+        "diff": ("diff", "print the differences of two models: operations, frames, constraints, bodies"),
+        "validate": ("validate", "read files strictly, and list their mistakes and problems"),
+        "decompose": (
+            "decompose",
+            "decompose meshes into convex hulls, for fast distances with penetration depth",
+        ),
+        "spheres": ("spheres", "cover collision shapes by spheres, and show how far these stick out"),
+        "fit": ("fit", "identify the joint of a part from a table of its poses"),
+        "demo": ("demo", "let a robot open and close the doors and drawers of a kitchen"),
+    }
+)
+"""Module of each command, with its object after a colon if there are several, and the summary."""
 
 ENTRY_POINTS = "kineverse.commands"
 """Group of entry points by which other distributions add commands; each names a :class:`CommandModule`."""
@@ -85,6 +76,8 @@ ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 _PACKAGE = __name__.partition(".")[0]
 
 _NEGATIVE_VALUE = re.compile(r"-\s*(\d|\.\d|(pi|π|inf|nan)\b)")
+
+VERBOSE = "print more messages on standard error"
 
 # The commands report missing meshes themselves; a missing compiler does not change their results.
 QUIET = ("kineverse.view.meshes", "kineverse.compilation.toolchain")
@@ -146,11 +139,15 @@ def _run(words: Sequence[str]) -> int:
     """Run the command of some words and return its status; print the reason of a failure."""
     try:
         if not set(words) - {"-v", "--verbose"}:
-            make_parser(_list_added_commands()).print_help()
+            make_parser().print_help()
             return 0
         arguments = _parse_arguments(words)
-        with _log_warnings_to(sys.stderr, arguments.verbose):
-            status: int = arguments.run(arguments)
+        try:
+            with _log_warnings_to(sys.stderr, arguments.verbose):
+                status: int = arguments.run(arguments)
+        except KineverseError as error:
+            print(f"kineverse: {name_options(format_error(error), arguments)}", file=sys.stderr)
+            return ERROR
     except SystemExit as stop:  # argparse would end the process.
         return stop.code if isinstance(stop.code, int) else ERROR
     except BrokenPipeError:
@@ -176,6 +173,8 @@ def _explain_import(error: ImportError) -> str | None:
         return None
     importers = [error.name or ""]
     importers += [str(frame.f_globals.get("__name__")) for frame, _ in walk_tb(error.__traceback__)]
+    from .arguments import MODULES  # for start-up time
+
     modules = {name.partition(".")[0] for name in importers}
     extra = next((extra for extra, module in MODULES.items() if module in modules), None)
     if extra is None:
@@ -205,6 +204,8 @@ def _end_by_exception(enabled: bool) -> Iterator[None]:
 
 def find_added_commands() -> Mapping[str, EntryPoint]:
     """Return the entry points of commands that other distributions add, by name, without importing them."""
+    from importlib.metadata import entry_points  # for start-up time
+
     found = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
     return {name: found[name] for name in sorted(found) if name not in COMMANDS}
 
@@ -212,7 +213,9 @@ def find_added_commands() -> Mapping[str, EntryPoint]:
 def load_command(name: str) -> CommandModule:
     """Return a command of this package, or import one that another distribution adds."""
     if name in COMMANDS:
-        return COMMANDS[name]
+        module, _, attribute = COMMANDS[name][0].partition(":")
+        found: Any = importlib.import_module(f".{module}", __package__)
+        return cast(CommandModule, getattr(found, attribute) if attribute else found)
     added = find_added_commands()
     if name not in added:
         if name in STUDY_COMMANDS:
@@ -239,8 +242,8 @@ def load_command(name: str) -> CommandModule:
     return cast(CommandModule, command)
 
 
-def make_parser(added: Mapping[str, CommandModule] = MappingProxyType({})) -> argparse.ArgumentParser:
-    """Return the parser of the whole command line, with commands that other distributions add."""
+def make_parser(name: str | None = None) -> argparse.ArgumentParser:
+    """Return the parser of the command line with the options of one command; None only lists commands."""
     top = argparse.ArgumentParser(
         prog="kineverse",
         description="View, move and query articulation models.",
@@ -248,32 +251,35 @@ def make_parser(added: Mapping[str, CommandModule] = MappingProxyType({})) -> ar
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"kineverse {__version__}")
-    top.add_argument("-v", "--verbose", action="store_true", help="print more messages on standard error")
+    top.add_argument("-v", "--verbose", action="store_true", help=VERBOSE)
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, command in {**COMMANDS, **added}.items():
-        summary, _, description = command.HELP.partition("\n")
-        sub = commands.add_parser(
-            name,
-            help=summary,
-            description=f"{summary}\n{description}".strip(),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        command.add_arguments(sub)
-        sub.set_defaults(run=command.run, command=sub)
+    if name is None:
+        for listed, summary in _list_summaries().items():
+            commands.add_parser(listed, help=summary)
+        return top
+    command = load_command(name)
+    summary, _, description = command.HELP.partition("\n")
+    if name in COMMANDS:
+        summary, description = COMMANDS[name][1], command.HELP
+    sub = commands.add_parser(
+        name,
+        help=summary,
+        description=f"{summary}\n\n{description.strip()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.add_arguments(sub)
+    if "--verbose" not in sub._option_string_actions:
+        sub.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS, help=VERBOSE)
+    sub.set_defaults(run=command.run, command=sub)
     return top
 
 
 def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     """Parse the arguments of the command line."""
     name = next((word for word in words if not word.startswith("-")), None)
-    # Other distributions are asked for an unknown name and for the list of commands only: that takes 20 ms.
-    if name is None:
-        added = _list_added_commands()
-    else:
-        added = {} if name in COMMANDS else {name: load_command(name)}
     # A leading space tells argparse that -30deg, -pi/2 or -1e-3 is a value and no option.
     words = [f" {word}" if _NEGATIVE_VALUE.match(word) else word for word in words]
-    arguments, unknown = make_parser(added).parse_known_args(words)
+    arguments, unknown = make_parser(name).parse_known_args(words)
     if unknown:
         sub: argparse.ArgumentParser = arguments.command
         word = unknown[0].partition("=")[0]
@@ -291,35 +297,19 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     return arguments
 
 
-@dataclass(frozen=True)
-class _ListedCommand:
-    """Command of another distribution in the list of commands, which is not imported for that."""
-
-    HELP: str
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declare nothing."""
-
-    def run(self, arguments: argparse.Namespace) -> int:
-        """Do nothing: only ``--help`` lists the command."""
-        return ERROR
-
-
-def _list_added_commands() -> dict[str, CommandModule]:
-    added = find_added_commands()
-    listed: dict[str, CommandModule] = {
-        name: _ListedCommand(f"command of {point.dist.name if point.dist else point.value}")
-        for name, point in added.items()
+def _list_summaries() -> dict[str, str]:
+    """Return the summaries of all commands; those of other distributions are not imported for that."""
+    found = {name: summary for name, (_, summary) in COMMANDS.items()}
+    for name, point in find_added_commands().items():
+        found[name] = f"command of {point.dist.name if point.dist else point.value}"
+    return found | {
+        name: f"command of {STUDIES}, which is not installed" for name in STUDY_COMMANDS if name not in found
     }
-    for name in STUDY_COMMANDS:
-        if name not in listed:
-            listed[name] = _ListedCommand(f"command of {STUDIES}, which is not installed")
-    return listed
 
 
 def _suggest_command(name: str, added: Iterable[str]) -> str:
     """Return advice on a command that does not exist."""
-    from kineverse.formats.locate import shipped_models
+    from kineverse.formats.locate import shipped_models  # for start-up time
 
     if name in shipped_models() or os.path.exists(name):
         return f"It is a model or file: 'kineverse info {name}' says what it consists of."

@@ -10,16 +10,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kineverse.errors import DuplicateNameError, FormatError, InvalidValueError
+from kineverse.formats.document import to_json
+from kineverse.formats.export.capabilities import UnsupportedError
+from kineverse.formats.locate import locate_model
+from kineverse.formats.reader_warnings import collect_warnings
+from kineverse.model.registry import SaveResult, writable_suffixes
 
 from .arguments import add_model_options, load_model
-from .output import show_activity, truncate_lines
+from .diff import format_pose_difference
+from .output import format_contents, format_count, show_activity, truncate_lines
 
 if TYPE_CHECKING:
     import kineverse as kv
-    from kineverse.model.registry import SaveResult
 
-HELP = """write a model to a file, in the format of its suffix
-
+HELP = """\
 IN is any model that can be loaded. OUT is a document (.kv.json), which holds the whole model, URDF (.urdf)
 or MJCF (.xml). A motion that the format cannot represent is refused by name, and nothing is written; with
 --tolerance, such motions are approximated, and a guaranteed bound on the errors of frames is printed.
@@ -92,9 +96,6 @@ def run(arguments: argparse.Namespace) -> int:
                 f"{option} and - exclude each other: the output is a document, which says all."
             )
 
-    from kineverse.formats.reader_warnings import collect_warnings
-    from kineverse.model.registry import SaveResult
-
     with collect_warnings() as left_out, show_activity(f"reading {arguments.source}"):
         model = load_model(arguments, arguments.source, arguments.prefix)
     with show_activity(f"writing {arguments.target}"):
@@ -114,7 +115,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
-    from kineverse.formats.export.capabilities import UnsupportedError
 
     try:
         return model.save(
@@ -129,9 +129,6 @@ def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
 
 def check_writable(target: str, source: str, force: bool = False) -> None:
     """Check that a file can be written, before the model is loaded."""
-    from kineverse.formats.locate import locate_model
-    from kineverse.model.registry import writable_suffixes
-
     endings = writable_suffixes()
     if not target:
         raise FormatError("The name of the file to write is empty.")
@@ -162,8 +159,6 @@ def _source_stem(source: str) -> str:
 
 def _print_document(model: kv.Model) -> int:
     """Write a document to standard output, and return its size [byte]."""
-    from kineverse.formats.document import to_json
-
     content = to_json(model).encode()
     sys.stdout.buffer.write(content)
     sys.stdout.flush()
@@ -173,7 +168,6 @@ def _print_document(model: kv.Model) -> int:
 def _format_report(
     arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: SaveResult
 ) -> list[str]:
-    from .diff_report import format_contents
 
     lines = [f"{arguments.source} → {arguments.target}", f"  {format_contents(model)}, {_format_size(size)}"]
     if saved.errors:
@@ -190,8 +184,6 @@ def _format_report(
 
 def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[str]:
     """Return a line for each thing that the file leaves out, below a heading."""
-    from .diff_report import format_count
-
     count = format_count(len(saved.left_out), "thing")
     lines = [f"  {name} {reason}" for name, reason in saved.left_out.items()]
     head = f"{arguments.target} leaves out {count} that it cannot express; --strict refuses instead:"
@@ -200,8 +192,6 @@ def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[st
 
 def _approximation_errors(saved: SaveResult) -> str:
     """Return the largest errors of approximated frames, with their names."""
-    from .diff_report import format_count, format_pose_difference
-
     errors = saved.errors
     furthest = max(errors, key=lambda name: errors[name].position)
     most_turned = max(errors, key=lambda name: errors[name].angle)

@@ -13,6 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
+from kineverse.geometry.decomposition import (
+    DecompositionSettings,
+    ResourceLimits,
+    clear,
+    decompose_all,
+    folder,
+    list_entries,
+)
 from kineverse.model.body import Mesh
 
 from .arguments import (
@@ -29,8 +37,7 @@ from .output import colorize, format_cells, join_lines, show_activity, show_prog
 if TYPE_CHECKING:
     from kineverse.geometry.decomposition import CacheEntry, Decomposition, DecompositionOutcome
 
-HELP = """decompose meshes into convex hulls, for fast distances with penetration depth
-
+HELP = """\
 Of a model, the meshes of collision shapes are decomposed; of bodies without collision shapes, the visual
 meshes. The hulls are stored in the user's cache by the content of the mesh and the settings; cached meshes
 are not decomposed again. Each mesh takes seconds to minutes; after Ctrl-C, finished meshes stay cached.
@@ -97,7 +104,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.names:
         raise UnknownNameError("Name a model or a mesh file; see kineverse decompose --help.")
     require("kineverse decompose", {"decomposition": True, "mjcf": any(map(needs_mujoco, arguments.names))})
-    from kineverse.geometry.decomposition import decompose_all
 
     settings, limits, jobs = _settings(arguments)
     tasks, unread = _tasks(arguments)
@@ -117,7 +123,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
-    from kineverse.geometry.decomposition import DecompositionSettings, ResourceLimits
 
     options: dict[str, Any] = {}
     if arguments.error is not None:
@@ -240,7 +245,6 @@ def _outcome_to_json(task: MeshTask, outcome: DecompositionOutcome) -> dict[str,
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-    from kineverse.geometry.decomposition import clear, folder, list_entries
 
     def describe(entry: CacheEntry) -> tuple[dict[str, Any], tuple[str, ...]]:
         made = entry.decomposition.made

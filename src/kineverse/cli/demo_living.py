@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
+
 import kineverse
+import kineverse as kv
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
+from kineverse.model.model_view import ModelView
+from kineverse.view import save_picture
+from kineverse.view.camera import Camera
+from kineverse.view.poses import FramePoses, complete
+from kineverse.view.sliders import Ranges, choose_slider_range, infer_units
 
 from .output import format_table, show_progress
-from .view import handle_interrupts, page_options, print_address
+from .pages import check_file_path, handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
     from living_kitchen.track import TrackingQuality
 
-    import kineverse as kv
-    from kineverse.view.camera import Camera
 
 MODELS = ("kitchen", "pr2")
 
@@ -87,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
             "--living is an example of the source checkout (examples/living_kitchen), which is not here. "
             "Leave it out, or take --sliders."
         )
-    from living_kitchen.simulation import Simulation
+    from living_kitchen.simulation import Simulation  # an example of the checkout
 
     if arguments.headless:
         return _simulate(arguments)
@@ -116,15 +124,15 @@ def _find_example() -> bool:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     """Run the simulation without a browser, print its results, and write a picture of its end."""
-    from living_kitchen.picture import save
+    from living_kitchen.picture import save  # an example of the checkout
     from living_kitchen.report import tabulate_identification, tabulate_tracking
-    from living_kitchen.simulation import Simulation
+    from living_kitchen.simulation import Simulation  # an example of the checkout
     from living_kitchen.track import average
 
     steps = _count_steps(SECONDS if arguments.seconds is None else arguments.seconds)
     simulation = Simulation(mechanism=arguments.stranger or _STRANGER)
     # First, so that an unwritable path is reported before the work.
-    check_picture_path(arguments.picture)
+    check_file_path(arguments.picture)
     qualities: list[TrackingQuality] = []
     for _ in show_progress(range(steps), "living", "step"):
         simulation.step(STEP)
@@ -137,14 +145,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def check_picture_path(path: str) -> None:
-    """Check that a file can be written, without leaving an empty one if the run is interrupted."""
-    new = not os.path.lexists(path)
-    open(path, "ab").close()
-    if new:
-        os.remove(path)
-
-
 def _count_steps(seconds: float) -> int:
     """Return the number of steps of a duration."""
     if not STEP <= seconds <= LONGEST:
@@ -154,14 +154,12 @@ def _count_steps(seconds: float) -> int:
 
 def _show_sliders(arguments: argparse.Namespace) -> int:
     """Load both models; show or drive them."""
-    import kineverse as kv
-
     model = kv.Model()
     for name in MODELS:
         model.include(name)
     if arguments.headless:
         return _exercise_models(model, arguments.picture)
-    from kineverse.view.viewer import Viewer
+    from kineverse.view.viewer import Viewer  # for start-up time
 
     with (
         handle_interrupts(),
@@ -182,7 +180,6 @@ def _initial_state(model: kv.Model) -> dict[str, float]:
 
 
 def _camera() -> Camera:
-    from kineverse.view.camera import Camera
 
     return Camera(EYE, TARGET, field_of_view=VIEW)
 
@@ -204,10 +201,6 @@ def _contents(model: kv.Model) -> str:
 
 def _exercise_models(model: kv.Model, path: str) -> int:
     """Drive all coordinates through their ranges, write a picture, and report problems."""
-    from kineverse.view import save_picture
-
-    from .exercise import exercise_model
-
     # First, so that an unwritable path is reported before the work.
     save_picture(path, model, _initial_state(model), camera=_camera())
     print(_contents(model), flush=True)
@@ -220,3 +213,60 @@ def _exercise_models(model: kv.Model, path: str) -> int:
         print(f"kineverse: {line}", file=sys.stderr)
     print(f"picture: {path}")
     return 1 if result.problems else 0
+
+
+SAMPLES_PER_RANGE = 65
+"""Number of samples of each range, limits included."""
+
+CHECKED_PER_RANGE = 5
+"""Number of these samples at which constraints are evaluated, limits included."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExerciseResult:
+    """Result of an exercise."""
+
+    freedoms: int  # number of degrees of freedom
+    poses: int  # number of frame poses computed
+    rate: float  # frame poses per second
+    violations: int  # number of constraints violated inside the ranges
+    problems: list[str]  # texts for these constraints, and for frames whose poses are not finite and rigid
+
+
+def exercise_model(model: ModelView) -> ExerciseResult:
+    """Move each degree of freedom of a model from limit to limit, with the others at their defaults.
+
+    Problems are poses that are not finite and rigid, and constraints that are violated although each
+    coordinate is within its limits.
+    """
+    values = complete(model)
+    poses, ranges = FramePoses(model), Ranges(model)
+    unit = infer_units(model, values, ranges.names)
+    limits = ranges.limits_at(values)
+    base = np.array([values[name] for name in poses.inputs])
+    count, seconds, violated, problems = 0, 0.0, set(), []
+    for name in show_progress(ranges.names, "driving", "DoF"):
+        path = np.linspace(*choose_slider_range(limits[name], values[name], unit[name]), SAMPLES_PER_RANGE)
+        # Rounding must not move the last sample beyond the limit.
+        path = np.clip(path, *limits[name])
+        if name in poses.inputs:
+            rows = np.tile(base, (SAMPLES_PER_RANGE, 1))
+            rows[:, poses.inputs.index(name)] = path
+            start = time.perf_counter()
+            results = poses.batch(rows)
+            seconds += time.perf_counter() - start
+            count += SAMPLES_PER_RANGE * len(results)
+            wrong = [frame for frame, pose in zip(poses.moving, results, strict=True) if not _rigid(pose)]
+            if wrong:
+                problems.append(f"{name}: {len(wrong)} frames have no rigid pose, such as {wrong[0]}")
+        for value in path[:: (SAMPLES_PER_RANGE - 1) // (CHECKED_PER_RANGE - 1)]:
+            violated |= {v.name for v in model.violations({**values, name: float(value)})}
+    problems += [f"{name} is violated inside the limits" for name in sorted(violated)]
+    return ExerciseResult(len(ranges.names), count, count / max(seconds, 1e-9), len(violated), problems)
+
+
+def _rigid(poses: npt.NDArray[np.float64]) -> bool:
+    """Return whether all of (K, 4, 4) matrices are finite and their rotations orthonormal."""
+    rotation = poses[:, :3, :3]
+    error = rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)
+    return bool(np.isfinite(poses).all() and np.abs(error).max() < 1e-6)

@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from kineverse.errors import InvalidValueError
+from kineverse.estimation.recordings import (
+    ObservationNoise,
+    identify_recorded_joint,
+    make_joint_model,
+    read_recording,
+)
+from kineverse.estimation.recordings.recorded_joint import MAX_ROTATION_STEP
+from kineverse.expressions.printing import format_number
 
 from .arguments import parse_length, parse_value, require
-from .output import show_activity
+from .output import format_table, show_activity
 
 if TYPE_CHECKING:
-    from kineverse.estimation.recordings import ObservationNoise, RecordedJoint, RecordedPair
+    from kineverse.estimation import Fit, IdentificationResult
+    from kineverse.estimation.recordings import Assumption, RecordedJoint, RecordedPair
 
 
-HELP = """identify the joint of a part from a table of its poses
-
+HELP = """\
 The table is text, with a head that names its columns: time, part, x, y, z and qx, qy, qz, qw (or roll,
 pitch, yaw, or rx, ry, rz, a rotation vector), in m, rad and s unless a unit follows as in "x [mm]". There is
 a part in each row, or all parts are in one row, and then columns are called door.x. Without a head, 3 columns
@@ -76,10 +88,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the table, identify the joint, and print, draw and save it."""
-    from kineverse.estimation.recordings import identify_recorded_joint, read_recording
-
-    from .fit_output import fit_to_json, format_fit
-
     if arguments.document and not arguments.document.endswith(".kv.json"):
         raise InvalidValueError(
             f"--document {arguments.document!r}: the joint is written as a document, whose name ends in "
@@ -130,8 +138,6 @@ def parse_noise(text: str) -> tuple[float, float | None]:
 
 def check_noise(stated: tuple[float, float | None], pair: RecordedPair) -> ObservationNoise:
     """Return the stated noise of the observations of a pair."""
-    from kineverse.estimation.recordings import ObservationNoise
-
     position, orientation = stated
     if orientation is None and pair.has_orientation:
         raise InvalidValueError("--noise: poses have two, of positions and orientations: 3mm,1deg")
@@ -144,13 +150,228 @@ def write_results(
     """Write the requested picture and document, and return their paths."""
     fit = learned.fit
     if arguments.picture:
-        from kineverse.view.plots import SIZE, Figure, draw_fit
+        from kineverse.view.plots import SIZE, Figure, draw_fit  # for start-up time
 
         title = f"{pair.child} in {pair.parent}: {learned.found}"
         picture = Figure(lambda c: draw_fit(c, fit, pair.relative, title), SIZE)
         picture.save(arguments.picture)
     if arguments.document:
-        from .fit_output import make_joint_model
-
         make_joint_model(pair.select(fit.inliers), fit).save(arguments.document)
     return {"picture": arguments.picture, "document": arguments.document}
+
+
+_LEAST_PROBABILITY = 1e-4
+"""Less probable families are named without numbers."""
+
+_MOST_LISTED = 10
+"""Number of outliers listed."""
+
+
+def format_fit(source: str, pair: RecordedPair, learned: RecordedJoint) -> str:
+    """Return the joint as text, with its uncertainty and the alternatives."""
+    found, best, count = learned.found, learned.fit, len(pair.child_poses)
+    verdict = f"{best.family}, {_format_percent(best.probability)}"
+    if learned.is_ambiguous:
+        verdict = f"{format_doubt(learned)}\nThe most probable one: {verdict}"
+    what = "poses" if pair.child_poses.ndim == 3 else "positions"
+    lines = [
+        f"{pair.child} in {pair.parent}: {count} {what} ({source})",
+        *_format_correlation(learned, count),
+        f"noise: {_format_noise(learned.noise)}",
+        "",
+        verdict,
+        *(f"  {name:10}{value}" for name, value in _format_parameters(best)),
+        *_format_outliers(best.outliers, count, what),
+        *_revolution_warning(best, pair),
+        "",
+        *_format_ranking(found),
+    ]
+    return "\n".join(lines)
+
+
+def fit_to_json(pair: RecordedPair, learned: RecordedJoint) -> dict[str, Any]:
+    """Return the identified joints as JSON data."""
+    found, noise = learned.found, learned.noise
+    return {
+        "parent": pair.parent,
+        "child": pair.child,
+        "count": len(pair.child_poses),
+        "judged": learned.judged,
+        "orientations": pair.child_poses.ndim == 3,
+        "noise": {"position": noise.position, "orientation": noise.orientation, "given": noise.given},
+        "correlation_time": learned.correlation_time,
+        "repeated": learned.repeated,
+        "told": not learned.is_ambiguous,
+        "family": found.best.family,
+        "says": format_doubt(learned) if learned.is_ambiguous else str(found),
+        "objections": [
+            {
+                "family": other.found.best.family,
+                "probability": other.found.best.probability,
+                "noise": {"position": other.noise.position, "orientation": other.noise.orientation},
+                "correlation_time": other.correlation_time,
+            }
+            for other in learned.objections
+        ],
+        "outliers": list(learned.fit.outliers),
+        "fits": [_fit_to_json(fit) for fit in (learned.fit, *found.fits[1:])],
+    }
+
+
+def format_doubt(learned: RecordedJoint) -> str:
+    """Return the reason why a joint is ambiguous: the result itself, or what it depends on."""
+    found = learned.found
+    if not learned.objections:
+        return "no joint explains these poses" if learned.is_free else str(found)
+    answers = [] if found.is_ambiguous else [f"{found.best.family} if {_format_assumption(learned, learned)}"]
+    for other in learned.objections:
+        result = other.found
+        answer = "nothing is sure" if result.is_ambiguous else result.best.family
+        answers.append(f"{answer} if {_format_assumption(other, learned)}")
+    first = f"{found}; " if found.is_ambiguous else "cannot tell: "
+    return first + ", ".join(answers)
+
+
+def _format_assumption(assumed: RecordedJoint | Assumption, made: RecordedJoint) -> str:
+    """Return the noise, or the correlation time if that is what differs from the assumption made."""
+    if assumed.correlation_time != made.correlation_time:
+        return f"errors are alike over {format_number(assumed.correlation_time, 2)} rows"
+    return f"the noise is {_format_deviations(assumed.noise)}"
+
+
+def _format_correlation(learned: RecordedJoint, count: int) -> list[str]:
+    """Return lines on repeated rows and on correlated errors."""
+    lines = []
+    if learned.repeated:
+        do = "row repeats" if learned.repeated == 1 else "rows repeat"
+        lines.append(f"{learned.repeated} {do} the one before in every digit, and count as not there")
+    if learned.judged < count - learned.repeated:
+        time = format_number(learned.correlation_time, 2)
+        lines.append(
+            f"errors are alike over {time} rows, so these are worth {learned.judged} independent ones "
+            f"(--thin {count} takes all as independent)"
+        )
+    return lines
+
+
+def _format_noise(noise: ObservationNoise) -> str:
+    return f"{_format_deviations(noise)}, {'as given' if noise.given else 'estimated'}"
+
+
+def _format_deviations(noise: ObservationNoise) -> str:
+    position = f"{format_number(1e3 * noise.position, 3)} mm"
+    if noise.orientation is None:
+        return position
+    return f"{position} and {format_number(math.degrees(noise.orientation), 3)} deg"
+
+
+def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
+    """Return the names and texts of the parameters of a joint, with standard deviations."""
+    parts = []
+    for name in ("axis", "normal"):
+        if name in fit.parameters:
+            spread = _standard_deviation(fit, "axis.x", "axis.y")
+            parts.append(
+                (name, f"{_format_vector(fit, name)}   ± {format_number(math.degrees(spread), 2)} deg")
+            )
+    for name in ("point", "centre"):
+        if name in fit.parameters:
+            spread = _standard_deviation(fit, "point.x", "point.y", "point.z")
+            parts.append((name, f"{_format_vector(fit, name)} m   ± {format_number(1e3 * spread, 2)} mm"))
+    if "pitch" in fit.parameters:
+        pitch, spread = 1e3 * float(fit.parameters["pitch"]), 1e3 * fit.deviation("pitch")
+        parts.append(("pitch", f"{format_number(pitch)} mm per revolution   ± {format_number(spread, 2)} mm"))
+    for low, high, spread, turns in joint_ranges(fit):
+        scale, unit = (math.degrees(1.0), "deg") if turns else (1e3, "mm")
+        ends = f"{format_number(scale * low)} … {format_number(scale * high)} {unit}"
+        parts.append(("seen", f"{ends}   ± {format_number(scale * spread, 2)} {unit} at each end"))
+    rms = f"{format_number(1e3 * fit.rms[0], 3)} mm"
+    if fit.residuals.shape[1] > 3:
+        rms += f", {format_number(math.degrees(fit.rms[1]), 3)} deg"
+    return [*parts, ("left over", f"{rms} rms")]
+
+
+def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str]:
+    """Return a line with the indices of outliers, from 0; none if there are no outliers."""
+    if not outliers:
+        return []
+    numbers = ", ".join(map(str, outliers[:_MOST_LISTED]))
+    more = ", …" if len(outliers) > _MOST_LISTED else ""
+    do = "does" if len(outliers) == 1 else "do"
+    return [f"  {len(outliers)} of {count} {what} {do} not fit: {numbers}{more} (counted from 0)"]
+
+
+def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
+    """Return a warning if revolutions may be miscounted."""
+    if not pair.is_timed or fit.largest_turn < MAX_ROTATION_STEP:
+        return []
+    most = format_number(math.degrees(fit.largest_turn), 3)
+    return [f"  from one to the next it turns by up to {most} deg: it may be more turns, or fewer"]
+
+
+def joint_ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:
+    """Return for each joint value its range, the standard deviation of the ends, and if it is an angle."""
+    ranges = []
+    for k, kind in enumerate(fit.motion.kinds):
+        values, deviations = fit.joint_values[fit.inliers, k], fit.deviations[fit.inliers, k]
+        ends = [int(np.argmin(values)), int(np.argmax(values))]
+        spread = float(deviations[ends].max())
+        ranges.append((float(values[ends[0]]), float(values[ends[1]]), spread, bool(kind)))
+    return ranges
+
+
+def _format_ranking(found: IdentificationResult) -> list[str]:
+    shown = [found[name] for name, p in found.probabilities.items() if p >= _LEAST_PROBABILITY]
+    rows: list[tuple[str, ...]] = []
+    for fit in shown:
+        angle = format_number(math.degrees(fit.rms[1]), 3) if fit.residuals.shape[1] > 3 else "-"
+        position = format_number(1e3 * fit.rms[0], 3)
+        rows.append(
+            (
+                fit.family,
+                _format_percent(fit.probability),
+                format_number(fit.log_evidence, 6),
+                position,
+                angle,
+                fit.reason,
+            )
+        )
+    head: tuple[str, ...] = ("joint", "probability", "log evidence", "left [mm]", "left [deg]", "not known")
+    if not any(fit.reason for fit in shown):
+        head, rows = head[:-1], [row[:-1] for row in rows]
+    lines = [format_table(head, rows, "<>>>>")]
+    rest = [name for name, p in found.probabilities.items() if p < _LEAST_PROBABILITY]
+    return [*lines, f"not: {', '.join(rest)}"] if rest else lines
+
+
+def _fit_to_json(fit: Fit) -> dict[str, Any]:
+    return {
+        "family": fit.family,
+        "probability": fit.probability,
+        "log_evidence": fit.log_evidence,
+        "told": fit.is_determined,
+        "reason": fit.reason,
+        "parameters": {name: np.asarray(value).tolist() for name, value in fit.parameters.items()},
+        "deviations": {name: fit.deviation(name) for name in fit.coordinates},
+        "frame": fit.frame.tolist(),
+        "ranges": [
+            {"lower": low, "upper": high, "deviation": spread, "unit": "rad" if turns else "m"}
+            for low, high, spread, turns in joint_ranges(fit)
+        ],
+        "rms": {"position": fit.rms[0], "orientation": fit.rms[1] if fit.residuals.shape[1] > 3 else None},
+    }
+
+
+def _standard_deviation(fit: Fit, *coordinates: str) -> float:
+    """Return the root of the summed variances of coordinates; those that the fit lacks are skipped."""
+    return math.hypot(*(fit.deviation(name) for name in coordinates if name in fit.coordinates))
+
+
+def _format_vector(fit: Fit, name: str) -> str:
+    return " ".join(f"{x:.4f}" for x in np.asarray(fit.parameters[name]))
+
+
+def _format_percent(probability: float) -> str:
+    """Return a probability in percent; below 1 it is at most 99.99 %."""
+    percent = 100.0 * probability
+    return f"{min(percent, 99.99):.4g} %" if probability < 1.0 else "100 %"

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 
+import numpy as np
+
+import kineverse as kv
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 from kineverse.lie import to_quaternion
+from kineverse.view.poses import complete, roll_pitch_yaw
 
 from .arguments import (
     add_model_options,
@@ -18,8 +22,7 @@ from .arguments import (
     print_notes,
 )
 
-HELP = """print the pose of a frame at given positions
-
+HELP = """\
 Positions that are not set have their defaults: 0, or the nearest value within the limits.
 
 examples:
@@ -43,18 +46,14 @@ def run(arguments: argparse.Namespace) -> int:
     # Parsed before the model is loaded, so that a typing error is reported at once.
     assigned = parse_assignments(arguments.assignments)
 
-    import numpy as np
-
-    import kineverse as kv
-    from kineverse.view.poses import complete, roll_pitch_yaw
-
     model = load_model(arguments, arguments.model)
     expression = model.fk(arguments.frame, arguments.relative_to)
     values = complete(model, assigned)
     pose = np.asarray(expression(kv.State(values)), dtype=float)
+    notes = find_limit_notes(model, values, arguments.assignments)
     used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
     if not np.isfinite(pose).all():
-        print_notes(find_limit_notes(model, values, arguments.assignments))
+        print_notes(notes)
         where = ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()) or "all values"
         raise InvalidValueError(
             f"The pose of '{arguments.frame}' in '{arguments.relative_to}' is not finite at {where}; "
@@ -88,5 +87,5 @@ def run(arguments: argparse.Namespace) -> int:
             )
         if used:
             print("  at " + ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()))
-    print_notes(find_limit_notes(model, values, arguments.assignments))
+    print_notes(notes)
     return 0

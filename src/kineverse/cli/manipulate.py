@@ -3,24 +3,45 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import numpy as np
+
 from kineverse.errors import InvalidValueError, MissingDependencyError
 from kineverse.expressions.printing import format_number
+from kineverse.manipulation.belief import EstimateError
+from kineverse.manipulation.swept_volume import find_obstacle
+from kineverse.worlds import KinematicWorld, Sensors
+from kineverse.worlds.sensor_sampler import find_robot_base
 
 from .arguments import add_model_options, add_set_option, needs_mujoco, print_notes, require
-from .manipulate_output import PhaseLines, report_outcome
-from .manipulate_setup import ManipulationScene, make_scene
-from .manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
-from .output import show_activity
-from .view import add_page_options, handle_interrupts, page_options, print_address, print_mesh_problems
+from .manipulate_skills import (
+    ManipulationScene,
+    grasp_object,
+    is_shut,
+    make_scene,
+    open_as_unknown,
+    push_object,
+    skip_skill,
+)
+from .output import format_table, join_lines, name_options, show_activity
+from .pages import (
+    add_page_options,
+    check_picture_path,
+    handle_interrupts,
+    list_mesh_problems,
+    page_options,
+    print_address,
+    print_mesh_problems,
+)
 
 if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief
@@ -58,39 +79,34 @@ class ManipulationCommand(NamedTuple):
         return _run(arguments, self.skill)
 
 
-COMMANDS = {
-    "open": ManipulationCommand(
-        "open",
-        f"""open a door or drawer with a robot that grasps its handle
-
+OPEN = ManipulationCommand(
+    "open",
+    f"""\
 The object is at its default value at first, unless --from says otherwise, and is opened to the limit that
 is farthest from shut, or to --to.
 {_COMMON}  kineverse open kitchen --robot fetch --what kitchen/fridge_door
   kineverse open kitchens/17 --robot hsr --what kitchen/oven_door --world mujoco --json
   kineverse open shelf.urdf --robot arm.urdf --base omni --what drawer --to 20cm
   kineverse open kitchen --robot hsr --what kitchen/fridge_door --unknown --noise 3mm,0.5deg,30Hz""",
-    ),
-    "close": ManipulationCommand(
-        "close",
-        f"""close a door or drawer with a robot that grasps its handle
-
+)
+CLOSE = ManipulationCommand(
+    "close",
+    f"""\
 The object is open by .4 (rad, m) or to its limit at first, unless --from says otherwise. It is shut at the
 limit nearest to its default value.
 {_COMMON}  kineverse close kitchen --robot fetch --what kitchen/fridge_door
   kineverse close kitchen --robot hsr --what kitchen/oven_door --from 60deg --record run.mcap
   kineverse close kitchen --robot hsr --what kitchen/fridge_door --set kitchen/oven_door=90deg""",
-    ),
-    "push": ManipulationCommand(
-        "push",
-        f"""push a door or drawer shut with a robot
-
+)
+PUSH = ManipulationCommand(
+    "push",
+    f"""\
 The object is open by .4 (rad, m) or to its limit at first, unless --from says otherwise. It is shut at the
 limit nearest to its default value. A robot without a place starts where it stands, or from a place that is
 searched if the push does not go through from there. --hand may name any body of the robot, which then pushes.
 {_COMMON}  kineverse push kitchen --robot hsr --what kitchen/sink_left_upper_drawer
   kineverse push kitchen --robot pr2@-0.6,-1.4,0 --what kitchen/fridge_door --view""",
-    ),
-}
+)
 
 
 class _Once(argparse.Action):
@@ -170,7 +186,7 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
 
 
 def _run(arguments: argparse.Namespace, skill: str) -> int:
-    from kineverse.planning.bindings import request_planner
+    from kineverse.planning.bindings import request_planner  # for start-up time
 
     _check(arguments, skill)
     request_planner()
@@ -191,7 +207,7 @@ def _run(arguments: argparse.Namespace, skill: str) -> int:
             outcome = _view(arguments, skill, scene, world, stack)
         else:
             outcome = _act(arguments, skill, scene, world, [], arguments.record)
-            report_outcome(arguments, skill, scene, world, outcome)
+            _report_outcome(arguments, skill, scene, world, outcome)
     if outcome is None:
         raise KeyboardInterrupt  # before there was a result
     return DONE if outcome else NOT_DONE
@@ -216,26 +232,21 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
     if arguments.grasp is not None and arguments.world != "mujoco":
         raise InvalidValueError("--grasp is for --world mujoco; the kinematic world has no friction.")
     if arguments.noise is not None:
-        from kineverse.worlds import Sensors
-
         Sensors.parse(arguments.noise)  # says at once what cannot be read
-    if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name
-
-        check_png_name(arguments.picture)
+    check_picture_path(arguments.picture)
     if arguments.record is not None:
-        from kineverse.worlds.recorder import check_recording_name
+        from kineverse.worlds.recorder import check_recording_name  # for start-up time
 
         check_recording_name(arguments.record)
 
 
 def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:
     """Return the world, at the start."""
-    from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
-
     world: World
     sensors = None if arguments.noise is None else Sensors.parse(arguments.noise)
     if arguments.world == "mujoco":
+        from kineverse.worlds import MujocoWorld  # for start-up time
+
         grasp: Literal["friction", "tie"] = arguments.grasp or "friction"
         world = MujocoWorld(
             scene.model, scene.robot, scene.gripper, grasp=grasp, sensors=sensors, seed=arguments.seed
@@ -255,16 +266,13 @@ def _act(
     record: str | None,
 ) -> Outcome:
     """Run the skill, with a recording if wanted, and return its outcome."""
-    from kineverse.manipulation.belief import EstimateError
-    from kineverse.manipulation.tracked_belief import TrackedBelief
-    from kineverse.worlds import Recorder, Sensors
-    from kineverse.worlds.sensor_sampler import find_robot_base
-
     belief: Belief | None = None
     error = EstimateError(scene.coordinate)
     with ExitStack() as stack:
-        watchers = [PhaseLines(scene), *watchers]
+        watchers = [_PhaseLines(scene), *watchers]
         if arguments.noise is not None and not arguments.unknown:
+            from kineverse.manipulation import TrackedBelief  # for start-up time
+
             tracked = TrackedBelief(scene.model, scene.robot, Sensors.parse(arguments.noise))
             print_notes(tracked.remarks)
             if tracked.sensors.position > 0.0 and tracked.sensors.orientation == 0.0:
@@ -276,6 +284,8 @@ def _act(
             about = {"skill": skill, "robot": scene.robot, "what": str(scene.coordinate), "world": world.name}
             if arguments.noise is not None:
                 about["noise"] = arguments.noise
+            from kineverse.worlds import Recorder  # for start-up time
+
             recorder = stack.enter_context(Recorder(record, scene.model, about))
             watchers.append(recorder)
 
@@ -305,8 +315,6 @@ def _act(
 
 def _find_obstacle(scene: ManipulationScene) -> Obstacle | None:
     """Return what is in the way of the object at the start of a scene; None if nothing is."""
-    from kineverse.manipulation.swept_volume import find_obstacle
-
     return find_obstacle(scene.model, scene.coordinate, scene.start, scene.target, robot=scene.robot)
 
 
@@ -318,11 +326,11 @@ def _view(
     stack: ExitStack,
 ) -> Outcome | None:
     """Run the skill on a page, then play it there until Ctrl-C; return None if it was interrupted before."""
-    from kineverse.view.page import read_title
-    from kineverse.view.run_overlay import LiveRun, play_recording
-    from kineverse.view.viewer import Viewer
-    from kineverse.worlds import read_run_recording
-    from kineverse.worlds.recorder import import_mcap
+    from kineverse.view.page import read_title  # for start-up time
+    from kineverse.view.run_overlay import LiveRun, play_recording  # for start-up time
+    from kineverse.view.viewer import Viewer  # for start-up time
+    from kineverse.worlds import read_run_recording  # for start-up time
+    from kineverse.worlds.recorder import import_mcap  # for start-up time
 
     record = arguments.record
     if record is None:
@@ -344,9 +352,122 @@ def _view(
         live = LiveRun(page)
         outcome = _act(arguments, skill, scene, world, [live], record)
         live.remove()
-        report_outcome(arguments, skill, scene, world, outcome)
+        _report_outcome(arguments, skill, scene, world, outcome)
         sys.stdout.flush()
         if record is not None and outcome.steps:
             play_recording(page, read_run_recording(record), loop=True)
         page.wait()
     return outcome
+
+
+class _PhaseLines:
+    """Lines on standard error, one for each phase that begins."""
+
+    def __init__(self, scene: ManipulationScene) -> None:
+        self._scene, self._phase = scene, ""
+
+    def __call__(self, session: RecordedStep) -> None:
+        """Print the phase if it is another one."""
+        if session.phase != self._phase:
+            self._phase, scene = session.phase, self._scene
+            value = f"{session.world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()
+            print(f"{session.world.time:7.2f} s  {self._phase:<12}  {value}", file=sys.stderr, flush=True)
+
+
+def _report_outcome(
+    arguments: argparse.Namespace, skill: str, scene: ManipulationScene, world: World, outcome: Outcome
+) -> None:
+    """Print the result of a skill, and write a picture if wanted."""
+    if arguments.picture is not None:
+        from kineverse.view import save_picture  # for start-up time
+
+        save_picture(arguments.picture, scene.model, {str(s): v for s, v in world.state.items()})
+        print_mesh_problems(list_mesh_problems(scene.model))
+        print(f"picture: {arguments.picture}", file=sys.stderr)
+    if arguments.json:
+        answer = {
+            "claimed": outcome.claimed,
+            "done": outcome.done,
+            "value": outcome.value,
+            "reason": outcome.reason,
+            "world": outcome.world,
+            "seconds": outcome.seconds,
+            "steps": outcome.steps,
+            "skill": skill,
+            "robot": scene.robot,
+            "what": str(scene.coordinate),
+            "start": scene.start[scene.coordinate],
+            "target": None if arguments.unknown and arguments.to is None else scene.target,
+            "hand": None if scene.gripper is None else scene.gripper.hand,
+            "measures": outcome.measures,
+            "remarks": world.remarks,
+        }
+        print(json.dumps(_plain(answer), allow_nan=False))
+        return
+    at = f"{format_number(outcome.value, 4)} {scene.unit}".rstrip()
+    if not outcome:
+        verdict = f"not done, at {at}. {outcome.reason}"
+    else:
+        state = "shut" if is_shut(scene) else "done"
+        verdict = f"{state} at {at}, after {format_number(outcome.seconds, 4)} s in the {world.name} world"
+    print(f"{scene.coordinate}: {name_options(join_lines(verdict), arguments)}")
+    if "family" in outcome.measures:
+        if outcome:
+            print(outcome.reason)
+        print(f"learned joint: {_describe_joint(outcome.measures)}")
+    if outcome.steps:
+        rows = [("steps", str(outcome.steps))]
+        rows += [
+            (name, _format_measure(value, _MEASURE_UNITS.get(name, scene.unit if name in _OF_OBJECT else "")))
+            for name, value in _plain(outcome.measures).items()
+        ]
+        print(format_table(("measure", "value"), rows))
+    if arguments.record is not None:
+        print(f"recording: {arguments.record}")
+
+
+def _describe_joint(measures: Mapping[str, Any]) -> str:
+    """Return a learned joint in words: family, axis, and a point on it."""
+    words = str(measures["family"])
+    for key, link in (("axis", "axis"), ("point", "through")):
+        if key in measures:
+            words += f", {link} [{', '.join(f'{v:.3f}' for v in np.ravel(measures[key]))}]"
+    certain = f"certain after {100 * measures['decided_way']:.1f} cm"
+    return f"{words} in {measures['parent']}, {certain} and {math.degrees(measures['decided_turn']):.1f}°"
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: what is not finite is null, and what is unknown is its text."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
+
+
+_MEASURE_UNITS = {
+    **dict.fromkeys(("penetration", "grasp_error", "distance", "hand_distance", "way", "decided_way"), "m"),
+    **dict.fromkeys(("grasp_rotation", "turn", "decided_turn"), "rad"),
+    **dict.fromkeys(("opened_seconds", "pull_seconds", "decided_seconds"), "s"),
+    "jitter": "rad/s, m/s",
+    "peak_force": "N",
+    "reversals": "1/s",
+}
+"""Units of figures; others are numbers, or have the unit of what they are about."""
+
+_OF_OBJECT = ("penetration_from", "tolerance")
+"""Figures in the unit of the object's coordinate."""
+
+
+def _format_measure(value: Any, unit: str) -> str:
+    if isinstance(value, float):
+        return f"{format_number(value, 4)} {unit}".rstrip()
+    if isinstance(value, list) and all(isinstance(one, str) for one in value):
+        return ", ".join(filter(None, value)) or "-"
+    if isinstance(value, (list, dict)):
+        return f"{len(value)}, see --json"
+    return "-" if value is None else str(value)

@@ -1,4 +1,4 @@
-"""Skills of ``kineverse open``, ``close`` and ``push``, called with the options of the command line."""
+"""Scenes and skills of ``kineverse open``, ``close`` and ``push``, from the options of the command line."""
 
 from __future__ import annotations
 
@@ -6,22 +6,202 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from kineverse.errors import InvalidValueError, UnknownNameError
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.geometry import Scene
+from kineverse.geometry.exclusions import remove_unusable_shapes
+from kineverse.grasping import Gripper, Handle, find_gripper, find_handle
+from kineverse.manipulation import Outcome, PlacedRobot, Session, place_robot
+from kineverse.manipulation.articulated_objects import find_shut_value
+from kineverse.manipulation.skill_arguments import choose_tolerance, explain_fixed
+from kineverse.model.model import Model
+from kineverse.state import State
+from kineverse.symbols import Symbol
+from kineverse.view.sliders import infer_units
 
-from .manipulate_setup import ManipulationScene
+from .arguments import check_unit, load_model, parse_assignments, parse_value, print_notes
 from .output import join_lines, print_line, show_activity
+from .plan_arguments import parse_robot
 
 if TYPE_CHECKING:
-    from kineverse.grasping import Gripper, Handle
     from kineverse.manipulation.belief import Belief
-    from kineverse.manipulation.outcome import Outcome
     from kineverse.worlds import World
     from kineverse.worlds.recorder import RecordedStep
+
+OPENING = 0.4
+"""Distance from shut at which closing and pushing begin [m], [rad]."""
+_NEXT_STEP = (
+    "Name a hand with two opposed fingers by --hand FRAME, or move the object with any body of the robot: "
+    "kineverse push ... --hand BODY --to VALUE.",
+    "Name the body of the robot that is to push by --hand BODY.",
+)
+"""Advice without a gripper: for grasps, and for pushes."""
+_MOST_NOTES = 3
+
+
+@dataclass(frozen=True)
+class ManipulationScene:
+    """Robot and furniture before a skill."""
+
+    model: Model  # model of both
+    robot: str  # prefix of the robot
+    coordinate: Symbol  # coordinate of the object
+    unit: str  # its unit, rad, m, or nothing
+    start: State  # state of everything
+    target: float  # wanted value [m], [rad]
+    gripper: Gripper | None  # gripper that is used; None if the robot has none
+    why: str  # why there is no gripper
+    pusher: tuple[str, ...]  # bodies that may push
+    stays: bool  # whether the start of the robot was given, so that it is not placed elsewhere
+    fixed: str  # why the object cannot move at the start; empty if it can
+    tolerance: float  # distance from the target within which the object is there [m], [rad]
+
+
+def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
+    """Load the model, put the robot into it, and return everything before a skill begins."""
+    begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
+    source, place = parse_robot(arguments.robot)
+    model = load_model(arguments, arguments.model)
+    robot = place_robot(
+        model,
+        source,
+        place,
+        base=arguments.base,
+        root=arguments.root,
+        strict=arguments.strict,
+        loops=arguments.loops,
+    )
+    named = robot.name
+    lost = remove_unusable_shapes(model)
+    more = [f"and {len(lost) - _MOST_NOTES} more"] if len(lost) > _MOST_NOTES else []
+    print_notes([f"without this shape: {line}" for line in lost[:_MOST_NOTES]] + more)
+
+    coordinate = _find_coordinate(model, arguments.what, named)
+    default = model.default_state()
+    values = {str(s): default[s] for s in model.symbols if s in default}
+    others = _parse_other_positions(arguments.assignments, model, coordinate, robot.place)
+    default = default.updated(others)
+    unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
+    for option, text in (("--from", arguments.start), ("--to", arguments.to)):
+        check_unit(option, text, coordinate, unit)
+    shut = find_shut_value(model, coordinate)
+    lower, upper = model.limits(coordinate)
+    if begin is None:
+        begin = default[coordinate] if skill == "open" else _open_from(shut, lower, upper)
+    if end is None:
+        end = shut if skill != "open" else max(lower, upper, key=lambda limit: abs(limit - shut))
+    if not math.isfinite(end):
+        raise InvalidValueError(f"'{coordinate}' has no limit at which it is open; say how far: --to VALUE.")
+    fixed = explain_fixed(model, coordinate, default.updated({coordinate: begin}))
+    _check_limits(model, "--from", coordinate, begin)
+    if not fixed:  # that it is fixed is the result
+        _check_limits(model, "--to", coordinate, end)
+    state = robot.start_state(model).updated(others).updated({coordinate: begin})
+    if skill != "push":  # pushes search a place for the whole push
+        state = _find_free_start(model, robot, state)
+    gripper, why, pusher = _find_pusher(model, named, arguments.hand, skill)
+    return ManipulationScene(
+        model,
+        named,
+        coordinate,
+        unit,
+        state,
+        end,
+        gripper,
+        why,
+        pusher,
+        place is not None,
+        fixed,
+        choose_tolerance(model, coordinate, state, end),
+    )
+
+
+def _parse_other_positions(
+    texts: list[str], model: Model, coordinate: Symbol, standing: Mapping[Symbol, float]
+) -> dict[Symbol, float]:
+    """Return the values of ``--set``, of anything but the coordinate that is to change."""
+    given = {model.symbol(name): value for name, value in parse_assignments(texts).items()}
+    if coordinate in given:
+        raise InvalidValueError(f"--set {coordinate}: --from VALUE says where it is at the start.")
+    for symbol, value in given.items():
+        if symbol in standing:
+            raise InvalidValueError(f"--set {symbol}: --robot ROBOT@X,Y,ANGLE says where the robot stands.")
+        _check_limits(model, "--set", symbol, value)
+    return given
+
+
+def _check_limits(model: Model, option: str, coordinate: Symbol, value: float) -> None:
+    """Raise InvalidValueError for the value of an option that is out of limits."""
+    lower, upper = model.limits(coordinate)
+    if not lower - 1e-9 <= value <= upper + 1e-9:
+        raise InvalidValueError(
+            f"{option} {value:.4g}: '{coordinate}' is between {lower:.4g} and {upper:.4g}."
+        )
+
+
+def is_shut(scene: ManipulationScene) -> bool:
+    """Return whether the target of a scene is where its object is shut."""
+    shut = find_shut_value(scene.model, scene.coordinate)
+    return abs(scene.target - shut) <= scene.tolerance
+
+
+def _open_from(shut: float, lower: float, upper: float) -> float:
+    """Return the value at a distance of :data:`OPENING` from shut, or the limit."""
+    if upper - shut >= shut - lower:
+        return min(shut + OPENING, upper)
+    return max(shut - OPENING, lower)
+
+
+def _find_free_start(model: Model, robot: PlacedRobot, state: State) -> State:
+    """Return the state with the base of a robot where it touches nothing."""
+    try:
+        free, contact = robot.find_free_start(model, state)
+    except InvalidValueError as error:
+        raise InvalidValueError(f"{str(error).removesuffix('.')}: --robot ROBOT@X,Y,ANGLE.") from None
+    if contact:
+        where = ", ".join(f"{free[s]:.2f}" for s in robot.base[:2])
+        print_line(f"start: {contact} touch, so the robot begins at {where}")
+    return free
+
+
+def _find_coordinate(model: Model, name: str, robot: str) -> Symbol:
+    """Return the coordinate of a name, which is one of an object."""
+    objects = [str(s) for s in model.degrees_of_freedom if not str(s).startswith(f"{robot}/")]
+    if name.startswith(f"{robot}/"):
+        raise InvalidValueError(
+            f"--what {name} is of the robot itself; it names what the robot moves. "
+            f"{suggest(name, objects, 'coordinate')}"
+        )
+    if name not in objects:
+        raise UnknownNameError(
+            f"--what {name}: the model has no such coordinate that is free to move. "
+            f"{suggest(name, objects, 'coordinate')}"
+        )
+    return model.symbol(name)
+
+
+def _find_pusher(
+    model: Model, robot: str, hand: str | None, skill: str
+) -> tuple[Gripper | None, str, tuple[str, ...]]:
+    """Return the gripper, or why there is none, and the bodies that push."""
+    if hand is not None and skill == "push":
+        model.fk(hand)  # raises for an unknown frame: any body can push
+    try:
+        gripper = find_gripper(model, robot, hand)
+    except UnknownNameError as error:
+        if hand is None:
+            return None, f"{error} {_NEXT_STEP[skill == 'push']}", ()
+        if skill == "push" and hand in model.bodies and hand.startswith(f"{robot}/"):
+            print_line(f"pusher: {hand}")
+            return None, "", (hand,)
+        raise
+    print_line(f"gripper: {gripper}")
+    return gripper, "", gripper.bodies
+
 
 _PLACEMENT = 60.0
 """Largest time of the search for a place of the base [s]."""
@@ -44,8 +224,7 @@ def grasp_object(
         return skip_skill(scene, world, False, found)
     gripper, _ = found
 
-    from kineverse.manipulation.opening.grasped_opening import open_object
-    from kineverse.manipulation.session import Session
+    from kineverse.manipulation.opening.grasped_opening import open_object  # for start-up time
 
     outcome: Outcome = open_object(
         Session(world, belief=belief, on_step=look, on_search=_SearchLines()),
@@ -85,10 +264,13 @@ def open_as_unknown(
         return skip_skill(scene, world, False, found)
     gripper, handle = found
 
-    from kineverse.manipulation import Session, open_unknown
-    from kineverse.manipulation.unknown_objects import forget_joint
-    from kineverse.manipulation.unknown_objects.unknown_opening import OPEN_TURN, OPEN_WAY
-    from kineverse.worlds import Sensors
+    from kineverse.manipulation import open_unknown  # for start-up time
+    from kineverse.manipulation.unknown_objects import forget_joint  # for start-up time
+    from kineverse.manipulation.unknown_objects.unknown_opening import (  # for start-up time
+        OPEN_TURN,
+        OPEN_WAY,
+    )
+    from kineverse.worlds import Sensors  # for start-up time
 
     model, coordinate, start = scene.model, scene.coordinate, scene.start
     part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
@@ -123,10 +305,9 @@ def push_object(
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Push the object, from where the robot stands or from a place that is searched."""
-    from kineverse.manipulation.pushing.base_placement import find_push_start, roll_out
-    from kineverse.manipulation.pushing.push_controller import Pushing
-    from kineverse.manipulation.pushing.push_skill import push
-    from kineverse.manipulation.session import Session
+    from kineverse.manipulation.pushing.base_placement import find_push_start, roll_out  # for start-up time
+    from kineverse.manipulation.pushing.push_controller import Pushing  # for start-up time
+    from kineverse.manipulation.pushing.push_skill import push  # for start-up time
 
     if not scene.pusher:
         return skip_skill(scene, world, False, scene.why)
@@ -173,9 +354,6 @@ def _find_gripper_and_handle(
     arguments: argparse.Namespace, scene: ManipulationScene
 ) -> tuple[Gripper, Handle] | str:
     """Return the gripper, and the handle that is named or the best one, which is printed; or why not."""
-    from kineverse.geometry import Scene
-    from kineverse.grasping import find_handle
-
     if scene.gripper is None:
         return scene.why
     try:
@@ -198,7 +376,5 @@ def skip_skill(
     measures: Mapping[str, Any] = MappingProxyType({}),
 ) -> Outcome:
     """Return the outcome of what was not begun."""
-    from kineverse.manipulation.outcome import Outcome
-
     value = world.state[scene.coordinate]
     return Outcome(done, value, join_lines(reason), world.name, 0.0, 0, measures)

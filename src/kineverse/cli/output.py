@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import codecs
 import contextlib
 import os
@@ -11,14 +12,19 @@ import sys
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager
-from typing import Any, Literal, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TextIO, TypeVar
 
 from kineverse.errors import FormatError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from kineverse.model.model_view import ModelView
 
 # Control characters other than tab and line feed, and those that turn the direction of writing.
 _UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 # What this program itself writes to terminals: colours, and the end of a line.
-_OWN = re.compile("(\033\\[[0-9]{1,2}m|\r\033\\[K)")
+_OWN = re.compile("(\033\\[[0-9;]{1,8}m|\r\033\\[K)")
 
 _PLAIN = {
     "→": "->", "←": "<-", "±": "+-", "°": "deg", "µ": "u", "μ": "u", "−": "-", "–": "-", "—": "-", "·": "*",
@@ -133,7 +139,17 @@ def _fill_descriptors() -> None:
             os.open(os.devnull, os.O_RDWR)
 
 
-_CODES = {"+": "32", "-": "31", "~": "33", ">": "36", "!": "31", "bold": "1"}
+_STYLES = {"+": "green", "-": "red", "~": "yellow", ">": "cyan", "!": "red", "bold": "bold"}
+
+
+def _find_console(stream: TextIO) -> Console | None:
+    """Return rich's console for a terminal; None for a pipe or a file, where everything is plain text."""
+    if not stream.isatty():
+        return None
+    from rich.console import Console  # for start-up time: most output goes to pipes and small screens
+
+    console = Console(file=unwrap_stream(stream), highlight=False, markup=False, emoji=False)
+    return None if console.no_color or console.is_dumb_terminal else console
 
 
 def colorize(text: str, style: str) -> str:
@@ -141,9 +157,12 @@ def colorize(text: str, style: str) -> str:
 
     The text stays plain if standard output is not a terminal, or the environment has ``NO_COLOR``.
     """
-    if not text or not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+    console = _find_console(sys.stdout) if text else None
+    if console is None:
         return text
-    return f"\033[{_CODES[style]}m{text}\033[0m"
+    with console.capture() as captured:
+        console.out(text, style=_STYLES[style], end="")
+    return captured.get()
 
 
 def truncate_lines(lines: Sequence[str], most: int | None, indent: str = "  ") -> list[str]:
@@ -169,13 +188,35 @@ def format_table(
     available = (terminal_width() if width is None else width) - sum(widths[1:]) - 2 * (len(head) - 1)
     if widths and widths[0] > available:
         widths[0] = max(available, 12)
-    lines = []
     for row in cells:
         row[0] = shorten_text(row[0], widths[0])
-        texts = (f"{cell:{side}{w}}" for cell, side, w in zip(row, sides, widths, strict=True))
-        lines.append("  ".join(texts).rstrip())
+    console = _find_console(sys.stdout) if width is None else None
+    if console is not None:
+        return _render_table(console, cells, sides)
+    lines = [
+        "  ".join(f"{cell:{side}{w}}" for cell, side, w in zip(row, sides, widths, strict=True)).rstrip()
+        for row in cells
+    ]
     lines.insert(1, "  ".join("-" * w for w in widths))
     return "\n".join(lines)
+
+
+def _render_table(console: Console, cells: Sequence[Sequence[str]], sides: Sequence[str]) -> str:
+    """Return a table for a terminal, whose long cells go on in the next line."""
+    from rich.box import SIMPLE_HEAD  # for start-up time
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, header_style="bold")
+    for k, (title, side) in enumerate(zip(cells[0], sides, strict=True)):
+        table.add_column(
+            Text(title), justify="right" if side == ">" else "left", no_wrap=k == 0, overflow="fold"
+        )
+    for row in cells[1:]:
+        table.add_row(*(Text(escape_controls(cell)) for cell in row))
+    with console.capture() as captured:
+        console.print(table)
+    return "\n".join(line.rstrip() for line in captured.get().splitlines())
 
 
 def format_markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -189,9 +230,29 @@ def format_cells(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return format_table(head, rows, "<" + ">" * (len(head) - 1))
 
 
+def format_contents(model: ModelView) -> str:
+    """Return the numbers of frames, degrees of freedom and constraints of a model."""
+    counts = (model.frames, "frame"), (model.degrees_of_freedom, "DoF"), (model.constraints, "constraint")
+    return ", ".join(format_count(len(items), noun) for items, noun in counts)
+
+
+def format_count(count: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless it is 1."""
+    if count != 1 and noun != "DoF":
+        noun = f"{noun[:-1]}ies" if noun.endswith("dy") else f"{noun}s"
+    return f"{count} {noun}"
+
+
 def join_lines(message: object) -> str:
     """Return a message, such as an exception, on one line."""
     return " ".join(str(message).split())
+
+
+def name_options(text: str, arguments: argparse.Namespace) -> str:
+    """Return a message of the library with options of the command in place of arguments: ``--seconds``."""
+    parser: argparse.ArgumentParser = arguments.command
+    options = {one[2:].replace("-", "_"): one for one in parser._option_string_actions if one[:2] == "--"}
+    return re.sub(r"\b([a-z_]+)=(?![\w'\"({\[<])", lambda found: options.get(found[1], found[0]), text)
 
 
 def shorten_text(text: str, width: int) -> str:
@@ -214,22 +275,26 @@ def show_progress(
     items: Iterable[Item], what: str, unit: str = "", total: int | None = None
 ) -> Iterator[Item]:
     """Yield the items, with a bar on standard error if that is a terminal."""
-    if not sys.stderr.isatty():
+    console = _find_console(sys.stderr)
+    if console is None:
         yield from items
         return
-    from tqdm import tqdm
+    # For start-up time.
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(f"{unit}s" if unit else ""),
+        TimeRemainingColumn(),
+    )
     if isinstance(items, Sized):
         total = len(items)
-    # The stream of commands would escape the moves of the cursor.
-    yield from tqdm(
-        items,
-        file=unwrap_stream(sys.stderr),
-        desc=what,
-        total=total,
-        unit=f" {unit}" if unit else "it",
-        leave=False,
-    )
+    with Progress(
+        *columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False
+    ) as progress:
+        yield from progress.track(items, total, description=what)
 
 
 @contextmanager

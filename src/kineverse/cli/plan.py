@@ -12,11 +12,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kineverse.control import Hold
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
+from kineverse.formats import read_srdf
+from kineverse.geometry import Rule
+from kineverse.planning import Planner
+from kineverse.planning.trajectories.trajectory_file import check_trajectory_name
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
-from .output import format_table, show_activity
+from .output import format_table, name_options, show_activity
+from .pages import (
+    add_page_options,
+    check_picture_path,
+    handle_interrupts,
+    list_mesh_problems,
+    page_options,
+    print_address,
+    print_mesh_problems,
+)
 from .plan_arguments import (
     FrameTarget,
     Request,
@@ -28,23 +42,13 @@ from .plan_arguments import (
     parse_frame_target,
     parse_request,
 )
-from .view import (
-    add_page_options,
-    handle_interrupts,
-    list_mesh_problems,
-    page_options,
-    print_address,
-    print_mesh_problems,
-)
 
 if TYPE_CHECKING:
     import kineverse as kv
-    from kineverse.control import Hold
-    from kineverse.planning import Path, Planner
+    from kineverse.planning import Path
 
 
-HELP = """find a path without collisions
-
+HELP = """\
 A goal is values of coordinates (NAME=VALUE), poses of frames, or a state of an SRDF. FRAME@FRAME brings a
 frame to another one, in all directions or some (FRAME@FRAME:xyz, :xyz,rx,ry), FRAME@FRAME+X,Y,Z to a place
 beside it, FRAME@X,Y,Z to a position in the world; ROLL,PITCH,YAW may follow. A start is the same, or a file
@@ -137,7 +141,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", action="store_true", help="play the trajectory in the browser")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument(
-        "--verbose", action="store_true", default=argparse.SUPPRESS, help="print the positions on the way"
+        "-v",
+        "--verbose",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help="print the positions on the way",
     )
     add_model_options(parser)
     add_page_options(parser)
@@ -170,18 +178,13 @@ def run(arguments: argparse.Namespace) -> int:
     goal = parse_request(arguments.to, "--to")
     holds = [parse_frame_target(word, "--along") for word in arguments.along]
     margin = parse_length(arguments.margin)
-    if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name
-
-        check_png_name(arguments.picture)
+    check_picture_path(arguments.picture)
     if arguments.save is not None:
-        from kineverse.planning.trajectories.trajectory_file import check_trajectory_name
-
         check_trajectory_name(arguments.save)
     if not arguments.seconds > 0 or math.isinf(arguments.seconds):
         raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
 
-    from kineverse.planning.bindings import planning_functions
+    from kineverse.planning.bindings import planning_functions  # for start-up time
 
     with show_activity("compiling the planner"):
         planning_functions()
@@ -207,10 +210,6 @@ def _prepare(
     arguments: argparse.Namespace, start: Request, goal: Request, holds: list[FrameTarget], margin: float
 ) -> _Problem:
     """Load the model and build the planner."""
-    from kineverse.formats import read_srdf
-    from kineverse.geometry import Rule
-    from kineverse.planning import Planner
-
     with show_activity(f"reading {arguments.model}"):
         model = load_model(arguments, arguments.model)
         standing: dict[kv.Symbol, float] = {}
@@ -262,8 +261,6 @@ def _srdf_prefix(model: kv.Model, robot: str) -> str:
 
 def _plan(problem: _Problem, seconds: float, seed: int, optimize: bool) -> Path:
     """Return the path from the first of some starts from which there is one."""
-    from kineverse.control import Hold
-
     planner, start, goal = problem.planner, problem.start, problem.goal
     symbol = problem.model.symbol
     starts: list[Any] = [None]
@@ -323,7 +320,7 @@ def _moved_frame(problem: _Problem) -> str:
 
 def _trace(problem: _Problem, path: Path) -> Any:
     """Return the way of the moved frame as a drawable."""
-    from kineverse.view.drawables import draw_frame_path
+    from kineverse.view.drawables import draw_frame_path  # for start-up time
 
     states = [path.at(fraction) for fraction in np.linspace(0.0, 1.0, 60)]
     return draw_frame_path(problem.model, _moved_frame(problem), states)
@@ -331,8 +328,8 @@ def _trace(problem: _Problem, path: Path) -> Any:
 
 def _write_picture(file: str, problem: _Problem, path: Path) -> None:
     """Write a picture of some configurations on the way."""
-    from kineverse.view import save_picture
-    from kineverse.view.drawables import draw_ghosts
+    from kineverse.view import save_picture  # for start-up time
+    from kineverse.view.drawables import draw_ghosts  # for start-up time
 
     model, planner = problem.model, problem.planner
     overlay = [_trace(problem, path)]
@@ -346,8 +343,8 @@ def _write_picture(file: str, problem: _Problem, path: Path) -> None:
 
 def _view(arguments: argparse.Namespace, problem: _Problem, path: Path) -> None:
     """Play the path in the browser; without one, show how far the search came."""
-    from kineverse.view.page import read_title
-    from kineverse.view.viewer import Viewer
+    from kineverse.view.page import read_title  # for start-up time
+    from kineverse.view.viewer import Viewer  # for start-up time
 
     label, model = read_title(arguments.model), problem.model
     state = path.at(0.0 if path.found else 1.0)
@@ -368,7 +365,7 @@ def print_path(arguments: argparse.Namespace, path: Path, preparation: float) ->
     """Print what was found."""
     goal = " ".join(arguments.to)
     if not path.found:
-        print(f"{goal}: not found. {path.why}")
+        print(f"{goal}: not found. {name_options(path.why, arguments)}")
         if not arguments.move:
             print(f"  moves      {_list_moving(path)}; --move names others")
         return

@@ -8,18 +8,17 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
+import kineverse as kv
+from kineverse.control import Hold
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
+from kineverse.manipulation import place_robot
+from kineverse.planning.manifold import hold_frames
+from kineverse.planning.planning_space import free_coordinates
 
 from .arguments import parse_assignments, parse_value
 
-if TYPE_CHECKING:
-    import kineverse as kv
-    from kineverse.control import Hold
-
 _ALL = "xyz rx ry rz"
-_BASE = ("x", "y", "angle")
 
 
 @dataclass(frozen=True)
@@ -104,23 +103,19 @@ def add_robot_option(parser: argparse.ArgumentParser) -> None:
 def include_robot(arguments: argparse.Namespace, model: kv.Model) -> tuple[str, dict[kv.Symbol, float]]:
     """Put the robot of ``--robot`` into a model; return its prefix and the place of its base by symbol."""
     source, place = parse_robot(arguments.robot)
-    before, frames = {*model.articulations}, {*model.frames}
-    names = model.include(source, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
-    joints = [a for a in model.articulations if a not in before]
-    standing = place_robot(model, joints, [f for f in model.frames if f not in frames], place)
-    return next((n.partition(" ")[2].partition("/")[0] for n in names if "/" in n), ""), standing
+    robot = place_robot(
+        model,
+        source,
+        place,
+        prefix="",
+        root=arguments.root,
+        strict=arguments.strict,
+        loops=arguments.loops,
+    )
+    return robot.name, dict(robot.place)
 
 
-class Place(NamedTuple):
-    """Place of a robot in the world: x, y, z [m] and its angle about z [rad]."""
-
-    x: float
-    y: float
-    z: float
-    angle: float
-
-
-def parse_robot(text: str) -> tuple[str, Place | None]:
+def parse_robot(text: str) -> tuple[str, tuple[float, ...] | None]:
     """Return the source of a robot and its place from ``ROBOT@X,Y,ANGLE`` or ``ROBOT@X,Y,Z,ANGLE``."""
     source, at, place = text.rpartition("@")
     if not at:
@@ -131,66 +126,11 @@ def parse_robot(text: str) -> tuple[str, Place | None]:
             f"--robot {text}: a place is X,Y,ANGLE, such as fetch@1,0.5,90deg, or X,Y,Z,ANGLE for a robot "
             "that is bolted to something."
         )
-    numbers = [parse_value(part) for part in parts]
-    return source, Place(numbers[0], numbers[1], numbers[2] if len(parts) == 4 else 0.0, numbers[-1])
-
-
-def find_base(model: kv.Model, joints: Iterable[str]) -> tuple[kv.Symbol, ...]:
-    """Return the coordinates x, y and angle of a mobile base among articulations; none without one."""
-    for name in joints:
-        coordinates = model.articulations[name].coordinates
-        if tuple(s.path.rpartition("/")[2] for s in coordinates) == _BASE:
-            return tuple(coordinates)
-    return ()
-
-
-def place_robot(
-    model: kv.Model, joints: Iterable[str], frames: Iterable[str], place: Place | None
-) -> dict[kv.Symbol, float]:
-    """Put a robot to a place, and return the values of the coordinates of its mobile base.
-
-    A robot without such a base is moved with its root; then there are no values.
-    """
-    if place is None:
-        return {}
-    if base := find_base(model, joints):
-        if place.z:
-            raise InvalidValueError(
-                f"The robot's base stands on the floor, so it has no height {place.z:g}: give X,Y,ANGLE."
-            )
-        return dict(zip(base, (place.x, place.y, place.angle), strict=True))
-    from kineverse.model.frame import WORLD
-
-    roots = [name for name in frames if model.frames[name].parent == WORLD]
-    moving = [name for name in roots if model.speeds_of(name)]
-    if moving:
-        raise InvalidValueError(
-            f"'{moving[0]}' moves in the world by coordinates of its own, and not by x, y and angle: set "
-            "those instead of a place."
-        )
-    _move_roots(model, roots, place)
-    return {}
-
-
-def _move_roots(model: kv.Model, roots: Iterable[str], place: Place) -> None:
-    """Move frames that are fixed in the world, as if the world's origin was at a place."""
-    import numpy as np
-
-    import kineverse as kv
-    from kineverse.model.frame import WORLD
-
-    moved = kv.translation(place.x, place.y, place.z) @ kv.rotation_z(place.angle)
-    with model.edit() as edit:
-        for root in roots:
-            edit.attach(root, WORLD, np.asarray((moved @ model.fk(root))({})))
+    return source, tuple(parse_value(part) for part in parts)
 
 
 def make_hold(model: kv.Model, given: FrameTarget) -> Hold:
     """Return the hold that a target stands for."""
-    import kineverse as kv
-    from kineverse.control import Hold
-    from kineverse.planning.manifold import hold_frames
-
     offset = None
     if given.numbers:
         offset = kv.translation(*given.numbers[:3]) @ kv.rpy(*(given.numbers[3:] or (0.0, 0.0, 0.0)))
@@ -208,8 +148,6 @@ def make_grip(
 
     Without a state it is None where the start says nothing.
     """
-    from kineverse.planning.manifold import hold_frames
-
     same = find_same_grip(given, start)
     if same is not None:
         return make_hold(model, replace(same, mask=given.mask))
@@ -242,8 +180,6 @@ def choose_coordinates(
 
     These are the named ones, and the free ones that frames depend on, but for some that stay still.
     """
-    from kineverse.planning.planning_space import free_coordinates
-
     frames = {t.frame for t in targets} | {frame for t in holds for frame in (t.frame, t.target)}
     needed = {s for frame in frames for s in model.symbols_of(frame)}
     found = [s for s in free_coordinates(model) if s in needed and s not in {*still}]

@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+import kineverse as kv
+from kineverse.control import Goal, InverseKinematics, same_pose, same_position
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 
-from .arguments import add_model_options, load_model, needs_mujoco, parse_assignments, parse_value, require
+from .arguments import (
+    add_model_options,
+    find_turn_notes,
+    load_model,
+    match_coordinates,
+    needs_mujoco,
+    parse_assignments,
+    parse_value,
+    print_notes,
+    require,
+)
+from .output import name_options
+from .pages import check_picture_path, list_mesh_problems, print_mesh_problems
 from .plan_arguments import add_robot_option, include_robot
-from .view import list_mesh_problems, print_mesh_problems
 
-if TYPE_CHECKING:
-    import kineverse as kv
-    from kineverse.control import Goal
-
-HELP = """find positions in which a frame has a pose: inverse kinematics
-
+HELP = """\
 The pose is given by 3 numbers [m] for a position alone, by 6 for position and roll, pitch, yaw [rad], or by
 the name of a frame. All limits are respected. Without a solution the nearest positions are printed, with the
 reason, and the exit status is 1. This needs the extra 'control'.
@@ -56,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME",
-        help="coordinates or articulations that stay still",
+        help="coordinates, articulations or patterns ('kitchen/*') that stay still",
     )
     parser.add_argument("--starts", type=int, default=16, metavar="N", help="largest number of starts (16)")
     parser.add_argument(
@@ -82,14 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
     )
     assigned = parse_assignments(arguments.assignments, "--from")
     numbers = parse_pose(arguments.pose)
-    if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name
+    print_notes(find_turn_notes(arguments.pose[3:]))
+    check_picture_path(arguments.picture)
 
-        check_png_name(arguments.picture)
-
-    from kineverse.control import InverseKinematics
-    from kineverse.geometry import Scene
-    from kineverse.view import save_picture
+    from kineverse.geometry import Scene  # for start-up time
+    from kineverse.view import save_picture  # for start-up time
 
     model = load_model(arguments, arguments.model)
     standing: dict[kv.Symbol, float] = {}
@@ -99,7 +106,8 @@ def run(arguments: argparse.Namespace) -> int:
     goal, still = make_goal(model, arguments, numbers)
     still += [s for s in standing if s not in still]
     scene = Scene(model) if arguments.collisions else None
-    solver = InverseKinematics(model, [goal], scene=scene, fixed=[*arguments.still, *still])
+    fixed: list[kv.Symbol | str] = [*match_coordinates(model, arguments.still, "--still"), *still]
+    solver = InverseKinematics(model, [goal], scene=scene, fixed=fixed)
     result = solver.solve(assigned, starts=arguments.starts)
     positions = {str(s): result.best[s] for s in solver.coordinates}
     if arguments.picture is not None:
@@ -118,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
         }
         print(json.dumps(answer, allow_nan=False))
     else:
-        verdict = "reached" if result.solved else f"not reached. {result.why}"
+        verdict = "reached" if result.solved else f"not reached. {name_options(result.why, arguments)}"
         print(f"{arguments.frame}: {verdict}")
         width = max(map(len, positions))
         for name, value in positions.items():
@@ -144,11 +152,6 @@ def make_goal(
     model: kv.Model, arguments: argparse.Namespace, numbers: list[float] | None
 ) -> tuple[Goal, list[kv.Symbol]]:
     """Return the goal, and the coordinates that move nothing but the target."""
-    import numpy as np
-
-    import kineverse as kv
-    from kineverse.control import Goal, same_pose, same_position
-
     if numbers is None:
         (frame,) = arguments.pose
         hand, target = model.fk(arguments.frame), model.fk(frame)

@@ -12,6 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
+from kineverse.geometry.objects import CollisionObjects
+from kineverse.geometry.shapes import import_coal
+from kineverse.planning.spheres import cover_objects
+from kineverse.planning.spheres.object_covers import (
+    CachedCover,
+    are_covered,
+    clear_covers,
+    cover_folder,
+    list_covers,
+)
+from kineverse.planning.spheres.sphere_cover import MOST, check_cover_settings
 
 from .arguments import (
     add_cache_options,
@@ -25,15 +36,14 @@ from .arguments import (
     require,
 )
 from .output import colorize, format_cells, join_lines, show_activity, show_progress
-from .view import add_page_options, handle_interrupts, page_options, print_address
+from .pages import add_page_options, check_picture_path, handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.geometry.objects import CollisionObject
     from kineverse.planning.spheres import SphereCover
 
-HELP = """cover collision shapes by spheres, and show how far these stick out
-
+HELP = """\
 Every point of a shape lies in a sphere; the shapes of a link are covered together. Meshes are covered as the
 convex hulls that distances are computed to. The spheres are stored in the user's cache by the content of the
 shapes and the settings.
@@ -87,16 +97,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
         raise UnknownNameError("Name a model, before --links; see kineverse spheres --help.")
     require("kineverse spheres", {"geometry": True, "mjcf": needs_mujoco(arguments.model)})
-    from kineverse.planning.spheres.sphere_cover import MOST, check_cover_settings
 
     protrusion = None if arguments.protrusion is None else parse_length(arguments.protrusion)
     most = MOST if arguments.most is None else arguments.most
     check_cover_settings(protrusion, most)
     state = parse_assignments(arguments.assignments)
-    if arguments.picture is not None:
-        from kineverse.view.pictures import check_png_name
-
-        check_png_name(arguments.picture)
+    check_picture_path(arguments.picture)
     with show_activity(f"reading {arguments.model}"):
         model = load_model(arguments, arguments.model)
     for name in state:
@@ -118,9 +124,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _objects(model: kv.Model, arguments: argparse.Namespace) -> dict[str, Sequence[CollisionObject]]:
     """Return the collision objects of each of the wanted links."""
-    from kineverse.geometry.objects import CollisionObjects
-    from kineverse.geometry.shapes import import_coal
-
     import_coal()
     source = CollisionObjects((), ("*",) if arguments.decomposed else (), ())
     source.synchronize(model)
@@ -138,9 +141,6 @@ def _objects(model: kv.Model, arguments: argparse.Namespace) -> dict[str, Sequen
 
 def _cover(link: LinkCover, protrusion: float | None, most: int, force: bool) -> None:
     """Add the cover of a link, or the reason why there is none."""
-    from kineverse.planning.spheres import cover_objects
-    from kineverse.planning.spheres.object_covers import are_covered
-
     try:
         cached = not force and are_covered(link.items, protrusion, most)
         begin = time.perf_counter()
@@ -165,6 +165,7 @@ def _format_links(links: Sequence[LinkCover]) -> list[str]:
 
 
 def _format_row(name: str, links: Sequence[tuple[LinkCover, SphereCover]]) -> tuple[str, ...]:
+
     seconds = sum(link.seconds for link, _ in links)
     return (
         name,
@@ -195,13 +196,13 @@ def _cover_to_json(cover: SphereCover) -> dict[str, Any]:
 
 
 def _drawables(links: Iterable[LinkCover]) -> Iterator[Any]:
-    from kineverse.view.drawables import draw_cover
+    from kineverse.view.drawables import draw_cover  # for start-up time
 
     return (draw_cover(link.link, link.cover) for link in links if link.cover is not None)
 
 
 def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: Iterable[LinkCover]) -> None:
-    from kineverse.view.pictures import save_picture
+    from kineverse.view.pictures import save_picture  # for start-up time
 
     save_picture(path, model, state, overlay=list(_drawables(links)))
     print(f"picture: {path}", file=sys.stderr)
@@ -210,8 +211,8 @@ def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: I
 def _view(
     arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], links: Iterable[LinkCover]
 ) -> None:
-    from kineverse.view.page import read_title
-    from kineverse.view.viewer import Viewer
+    from kineverse.view.page import read_title  # for start-up time
+    from kineverse.view.viewer import Viewer  # for start-up time
 
     label = read_title(arguments.model)
     with handle_interrupts(), Viewer(model, state, label=label, **page_options(arguments)) as page:
@@ -221,7 +222,6 @@ def _view(
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-    from kineverse.planning.spheres.object_covers import CachedCover, clear_covers, cover_folder, list_covers
 
     def describe(one: CachedCover) -> tuple[dict[str, Any], tuple[str, ...]]:
         spheres, protrusion = len(one.cover), one.cover.protrusion

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kineverse.errors import InvalidValueError, KineverseError
+from kineverse.reasoning import plan_unlocking
 
-from .arguments import add_model_options, load_model, parse_assignments
+from .arguments import add_model_options, load_model, match_coordinates, parse_assignments
 
 if TYPE_CHECKING:
     from kineverse.manipulation import UnlockingExecution
     from kineverse.model.model import Model
     from kineverse.reasoning import UnlockingPlan
 
-HELP = """find the order in which locked parts have to move
-
+HELP = """\
 The interlocks of the model are derived from its constraints. Each step is printed with its reason. If the
 goal cannot be reached, the locks that prevent it are printed, and the exit status is 1; it is 3 if that stays
 undecided. Both answers are checked by evaluating the constraints.
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME",
-        help="coordinates that do not move, such as one that is stuck",
+        help="coordinates or patterns ('box/*') that do not move, such as one that is stuck",
     )
     parser.add_argument(
         "--budget", type=float, default=10.0, metavar="S", help="time for the search [s] (10)"
@@ -91,33 +91,34 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.jam or arguments.record) and not arguments.execute:
         raise InvalidValueError("--jam and --record are about the world of --execute.")
 
-    from kineverse.reasoning import plan_unlocking
-
     model = load_model(arguments, arguments.model)
-    plan = plan_unlocking(model, goal, start, fixed=arguments.still, budget=arguments.budget)
+    still = match_coordinates(model, arguments.still, "--still")
+    plan = plan_unlocking(model, goal, start, fixed=still, budget=arguments.budget)
     if arguments.execute:
-        return _execute(arguments, model, goal, start)
+        return _execute(arguments, model, goal, start, still)
     _print(arguments, plan)
     return STATUS[plan.verdict]
 
 
 def _execute(
-    arguments: argparse.Namespace, model: Model, goal: Mapping[str, float], start: Mapping[str, float]
+    arguments: argparse.Namespace,
+    model: Model,
+    goal: Mapping[str, float],
+    start: Mapping[str, float],
+    still: Sequence[str],
 ) -> int:
     """Execute the plan in a world, print what moved, and record it if wanted."""
-    from kineverse.manipulation import execute_unlocking
-    from kineverse.worlds import MechanismWorld, Recorder
+    from kineverse.manipulation import execute_unlocking  # for start-up time
+    from kineverse.worlds import MechanismWorld, Recorder  # for start-up time
 
-    world = MechanismWorld(model, arguments.jam)
+    world = MechanismWorld(model, match_coordinates(model, arguments.jam, "--jam"))
     world.reset(start)
     with ExitStack() as stack:
         recorder = None
         if arguments.record is not None:
             about = {"model": arguments.model, "world": world.name}
             recorder = stack.enter_context(Recorder(arguments.record, model, about))
-        done = execute_unlocking(
-            world, goal, fixed=arguments.still, budget=arguments.budget, on_step=recorder
-        )
+        done = execute_unlocking(world, goal, fixed=still, budget=arguments.budget, on_step=recorder)
         if recorder is not None:
             recorder.write_outcome(done.as_data())
     _print(arguments, done)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from kineverse.formats import ValidationResult, validate_file
+from kineverse.geometry.shapes import import_coal
 
 from .arguments import add_model_options
-from .diff_report import format_count
-from .output import colorize, format_table, show_progress, truncate_lines
+from .info import find_penetrations
+from .output import colorize, format_contents, format_count, format_table, show_progress, truncate_lines
 
-if TYPE_CHECKING:
-    from .file_validation import ValidationResult
-
-HELP = """read files strictly, and list their mistakes and problems
-
+HELP = """\
 All mistakes that kv.load tolerates with a remark are listed, and a file with mistakes counts as unreadable. A
 file that can be read is checked for limits that are violated at the default state, poses that are not finite
 there, loops that do not close there or within the limits, bodies with an impossible inertia, and missing mesh
@@ -61,17 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Validate the files, print the results, and return the worst status."""
-    from kineverse.geometry.shapes import import_coal
-
-    from .file_validation import validate_file
-
     files = show_progress(arguments.files, "validating", "file")
     if arguments.contacts:
         import_coal()
-    meshes, strict, contacts = not arguments.no_meshes, arguments.strict, arguments.contacts
-    results = [
-        validate_file(file, meshes, strict, contacts, arguments.root, arguments.loops) for file in files
-    ]
+    options = {"meshes": not arguments.no_meshes, "strict": arguments.strict, "root": arguments.root}
+    further = find_penetrations if arguments.contacts else None
+    results = [validate_file(file, loops=arguments.loops, further=further, **options) for file in files]
     status = max(result.status for result in results)
     most = None if arguments.all else SHOWN if len(results) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:
@@ -95,10 +89,20 @@ def format_validation(found: ValidationResult, most: int | None) -> list[str]:
     """Return the lines of one file, with at most ``most`` remarks, and problems of a kind."""
     if found.error is not None:
         return [found.name, f"  {colorize('cannot be read', '!')}: {found.reason}"]
-    lines = [f"{found.name}: {found.kind}", f"  {found.contents}", f"  {_format_verdict(found)}"]
+    assert found.model is not None
+    lines = [
+        f"{found.name}: {_describe_format(found)}",
+        f"  {format_contents(found.model)}, {format_count(len(found.model.bodies), 'body')}",
+        f"  {_format_verdict(found)}",
+    ]
     for kind, texts in _group_by_kind(found).items():
         lines += [f"  {kind}", *truncate_lines([f"    {text}" for text in texts], most, "    ")]
     return lines
+
+
+def _describe_format(found: ValidationResult) -> str:
+    """Return format and header; of a hash the first 12 digits."""
+    return ", ".join([found.format, *(f"{name} {str(fact)[:12]}" for name, fact in found.facts.items())])
 
 
 def _group_by_kind(found: ValidationResult) -> dict[str, list[str]]:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import InvalidValueError
+from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
+from kineverse.planning import Trajectory
+from kineverse.view import meshes, save_picture
+from kineverse.view.poses import complete
+from kineverse.worlds import RunRecording, read_run_recording
 
 from .arguments import (
     add_model_options,
@@ -26,15 +28,21 @@ from .arguments import (
 )
 from .info import is_gallery_list, print_articulations, print_models
 from .output import show_progress
+from .pages import (
+    add_page_options,
+    check_picture_path,
+    handle_interrupts,
+    list_mesh_problems,
+    page_options,
+    print_address,
+    print_mesh_problems,
+)
 from .plan_arguments import add_robot_option, include_robot
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
-    from kineverse.planning import Trajectory
-    from kineverse.worlds import RunRecording
 
-HELP = """show a model in the browser, with a slider for everything that moves
-
+HELP = """\
 The page is served to this computer only, until Ctrl-C; with --host also to others, who need the address with
 its token. With --picture, a picture of the state is written instead. This needs no browser, and no extra
 except for meshes and --near.
@@ -91,22 +99,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_page_options(parser)
 
 
-def add_page_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of a command that opens a page."""
-    parser.add_argument("--port", type=int, metavar="N", help="port of the page (8080, or any free one)")
-    parser.add_argument(
-        "--host",
-        metavar="ADDRESS",
-        help="serve other computers: listen on this address (0.0.0.0: all)",
-    )
-    parser.add_argument("--no-browser", action="store_true", help="only print the address")
-
-
-def page_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the page options as keyword arguments of a page."""
-    return {"port": arguments.port, **({"host": arguments.host} if arguments.host else {})}
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted."""
     assigned = parse_assignments(arguments.assignments)
@@ -125,9 +117,8 @@ def run(arguments: argparse.Namespace) -> int:
         "view": arguments.picture is None and arguments.plot is None,
     }
     require("kineverse view", extras)
-    from kineverse.view import meshes
-    from kineverse.view.page import read_title
-    from kineverse.view.poses import complete
+    check_picture_path(arguments.picture)
+    from kineverse.view.page import read_title  # for start-up time
 
     label = read_title(arguments.model)
     recording = _read_recording(arguments)
@@ -152,7 +143,7 @@ def run(arguments: argparse.Namespace) -> int:
         meshes.load_mesh(mesh)  # cached for the drawing
     if arguments.picture is not None:
         return _write_picture(arguments, model, assigned, near, motion)
-    from kineverse.view.viewer import Viewer
+    from kineverse.view.viewer import Viewer  # for start-up time
 
     options = page_options(arguments)
     with (
@@ -171,7 +162,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"kineverse: note: not finite at this state, and hidden: {names}", file=sys.stderr)
         speed = {"speed": arguments.speed, "loop": arguments.loop}
         if recording is not None:
-            from kineverse.view.run_overlay import play_recording
+            from kineverse.view.run_overlay import play_recording  # for start-up time
 
             play_recording(page, recording, time=arguments.time, **speed)
         elif trajectory is not None:
@@ -196,7 +187,6 @@ def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:
         )
     if not name.endswith(".mcap"):
         return None
-    from kineverse.worlds import read_run_recording
 
     for option in ("play", "robot", "assignments"):
         if getattr(arguments, option):
@@ -215,8 +205,6 @@ def _read_trajectory(arguments: argparse.Namespace, model: ModelView) -> Traject
     """Return the trajectory that is to be played, if there is one."""
     if arguments.play is None:
         return None
-    from kineverse.planning import Trajectory
-    from kineverse.view.poses import complete
 
     trajectory = Trajectory.load(arguments.play)
     complete(model, dict(trajectory.at(0.0)))  # raises for coordinates that the model does not have
@@ -226,8 +214,8 @@ def _read_trajectory(arguments: argparse.Namespace, model: ModelView) -> Traject
 def _write_plot(arguments: argparse.Namespace, recording: RunRecording | None) -> int:
     if recording is None:
         raise InvalidValueError("--plot is for recordings (.mcap); a model does not change over time")
-    from kineverse.view.plots import Figure
-    from kineverse.worlds.recording_plot import plot_recording
+    from kineverse.view.plots import Figure  # for start-up time
+    from kineverse.worlds.recording_plot import plot_recording  # for start-up time
 
     Figure(lambda canvas: plot_recording(recording, canvas), (11.0, 7.0)).save(Path(arguments.plot))
     print(f"plot: {arguments.plot}")
@@ -242,10 +230,7 @@ def _write_picture(
     motion: RunRecording | Trajectory | None,
 ) -> int:
     """Write a picture of the state, and print what it cannot show."""
-    from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
-    from kineverse.view import save_picture
-    from kineverse.view.run_overlay import RecordedScene
-    from kineverse.worlds import RunRecording
+    from kineverse.view.run_overlay import RecordedScene  # for start-up time
 
     options: dict[str, Any] = {"collisions": arguments.collisions, "near": near}
     options["decomposed"] = arguments.decomposed
@@ -265,50 +250,3 @@ def _write_picture(
         print(f"kineverse: note: no distances to {', '.join(left_out)}", file=sys.stderr)
     print(f"picture: {arguments.picture}")
     return 0
-
-
-class _Page(Protocol):
-    @property
-    def address(self) -> str:
-        """URL with the token of the page."""
-        ...  # pragma: no cover
-
-
-def print_address(page: _Page, browser: bool) -> None:
-    """Print the address of a page, and open it if there is a display."""
-    print(f"{page.address}   (Ctrl-C ends)", flush=True)
-    if browser:
-        from kineverse.view.page import open_page
-
-        open_page(page.address)
-
-
-def list_mesh_problems(model: ModelView) -> list[str]:
-    """Return a line for each visual mesh that cannot be read."""
-    from kineverse.view import meshes
-
-    loaded = {mesh.uri: meshes.load_mesh(mesh) for mesh in meshes.list_visual_meshes(model)}
-    return [f"{uri}: {mesh.problem}" for uri, mesh in loaded.items() if mesh.problem]
-
-
-def print_mesh_problems(problems: list[str]) -> None:
-    """Print a line on standard error if meshes are missing."""
-    if problems:
-        more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
-        print(f"kineverse: shown as placeholders: {problems[0]}{more}", file=sys.stderr)
-
-
-@contextmanager
-def handle_interrupts() -> Iterator[None]:
-    """Leave the context on Ctrl-C or SIGTERM, without an exception."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -1,7 +1,22 @@
 """Compilation of expressions to fast functions."""
 
-from .c_library import CompilerInformation, compiler_information
-from .evaluator import Evaluator
-from .function import CompiledFunction, compile
+from typing import TYPE_CHECKING
 
-__all__ = ["CompiledFunction", "CompilerInformation", "Evaluator", "compile", "compiler_information"]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .c_library import (
+        CompilerInformation as CompilerInformation,
+        compiler_information as compiler_information,
+    )
+    from .evaluator import Evaluator as Evaluator
+    from .function import CompiledFunction as CompiledFunction, compile as compile
+
+lazy_face(
+    __name__,
+    {
+        ".c_library": "CompilerInformation compiler_information",
+        ".evaluator": "Evaluator",
+        ".function": "CompiledFunction compile",
+    },
+)

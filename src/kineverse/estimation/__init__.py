@@ -5,55 +5,51 @@
 :mod:`kineverse.estimation.plausibility` tests a model against observations. Layer 5.
 """
 
-from kineverse._synonyms import MODULE_SYNONYMS
-from kineverse.errors import unknown_attribute_error
+from typing import TYPE_CHECKING
 
-from .identification import Family, FamilyParameter, Fit, IdentificationResult, Identifier, identify
-from .identification.kinematic_graph.graph import KinematicEdge, KinematicGraph, RigidBody, identify_graph
-from .noise import pose_covariance
-from .plausibility import (
-    ImplausibleError,
-    JointVerdict,
-    Plausibility,
-    PlausibilityMonitor,
-    check_plausibility,
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .identification import (
+        Family as Family,
+        FamilyParameter as FamilyParameter,
+        Fit as Fit,
+        IdentificationResult as IdentificationResult,
+        Identifier as Identifier,
+        identify as identify,
+    )
+    from .identification.kinematic_graph.graph import (
+        KinematicEdge as KinematicEdge,
+        KinematicGraph as KinematicGraph,
+        RigidBody as RigidBody,
+        identify_graph as identify_graph,
+    )
+    from .noise import pose_covariance as pose_covariance
+    from .plausibility import (
+        ImplausibleError as ImplausibleError,
+        JointVerdict as JointVerdict,
+        Plausibility as Plausibility,
+        PlausibilityMonitor as PlausibilityMonitor,
+        check_plausibility as check_plausibility,
+    )
+    from .tracking import (
+        Estimate as Estimate,
+        HypothesisBank as HypothesisBank,
+        ObservedExpression as ObservedExpression,
+        ObservedPose as ObservedPose,
+        ObservedPosition as ObservedPosition,
+        Outliers as Outliers,
+        Tracker as Tracker,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".identification": "Family FamilyParameter Fit IdentificationResult Identifier identify",
+        ".identification.kinematic_graph.graph": "KinematicEdge KinematicGraph RigidBody identify_graph",
+        ".noise": "pose_covariance",
+        ".plausibility": "ImplausibleError JointVerdict Plausibility PlausibilityMonitor check_plausibility",
+        ".tracking": "Estimate HypothesisBank ObservedExpression ObservedPose "
+        "ObservedPosition Outliers Tracker",
+    },
 )
-from .tracking import (
-    Estimate,
-    HypothesisBank,
-    ObservedExpression,
-    ObservedPose,
-    ObservedPosition,
-    Outliers,
-    Tracker,
-)
-
-__all__ = [
-    "Estimate",
-    "Family",
-    "FamilyParameter",
-    "Fit",
-    "HypothesisBank",
-    "IdentificationResult",
-    "Identifier",
-    "ImplausibleError",
-    "JointVerdict",
-    "KinematicEdge",
-    "KinematicGraph",
-    "ObservedExpression",
-    "ObservedPose",
-    "ObservedPosition",
-    "Outliers",
-    "Plausibility",
-    "PlausibilityMonitor",
-    "RigidBody",
-    "Tracker",
-    "check_plausibility",
-    "identify",
-    "identify_graph",
-    "pose_covariance",
-]
-
-
-def __getattr__(name: str) -> object:
-    raise unknown_attribute_error("The package kineverse.estimation", name, __all__, MODULE_SYNONYMS)

@@ -1,15 +1,24 @@
 """Layer 1: expressions with augmented gradients."""
 
-from .expression import Expression, ExpressionLike, array, as_expression
-from .gradient import total_derivative
-from .graph import gradient_keys, lower
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Expression",
-    "ExpressionLike",
-    "array",
-    "as_expression",
-    "gradient_keys",
-    "lower",
-    "total_derivative",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .expression import (
+        Expression as Expression,
+        ExpressionLike as ExpressionLike,
+        array as array,
+        as_expression as as_expression,
+    )
+    from .gradient import total_derivative as total_derivative
+    from .graph import gradient_keys as gradient_keys, lower as lower
+
+lazy_face(
+    __name__,
+    {
+        ".expression": "Expression ExpressionLike array as_expression",
+        ".gradient": "total_derivative",
+        ".graph": "gradient_keys lower",
+    },
+)

@@ -1,8 +1,7 @@
-"""Registration of the file formats: endings of file names, readers and writers."""
+"""The file formats: endings of file names, readers and writers."""
 
 from __future__ import annotations
 
-from kineverse.model import registry
 from kineverse.model.registry import FileFormat
 
 from .xml_reader import read_root_tag
@@ -19,13 +18,12 @@ def _is_urdf(name: str, content: bytes) -> bool:
     return name.endswith((".urdf", ".xml")) and not is_mjcf(name, content)
 
 
-def register_file_formats() -> None:
-    """Register all formats of this package, and the functions that load and save models."""
+def list_file_formats() -> tuple[FileFormat, ...]:
+    """Return all formats; of those that read the same file, the first one counts."""
     formats = "kineverse.formats"
-    for suffix, read in zip(
-        DOCUMENT_SUFFIXES, ("document_operations", "packed_document_operations"), strict=True
-    ):
-        registry.register_format(
+    documents = zip(DOCUMENT_SUFFIXES, ("document_operations", "packed_document_operations"), strict=True)
+    return (
+        *(
             FileFormat(
                 name=f"document ({suffix})",
                 suffixes=(suffix,),
@@ -34,8 +32,8 @@ def register_file_formats() -> None:
                 write=f"{formats}.document.writer:write_document",
                 exact=True,
             )
-        )
-    registry.register_format(
+            for suffix, read in documents
+        ),
         FileFormat(
             name="URDF",
             suffixes=(".urdf", ".xml"),
@@ -43,9 +41,7 @@ def register_file_formats() -> None:
             written=(".urdf",),
             write=f"{formats}.urdf.writer:to_urdf",
             recognize=_is_urdf,
-        )
-    )
-    registry.register_format(
+        ),
         FileFormat(
             name="MJCF",
             suffixes=(".xml", ".mjcf"),
@@ -55,25 +51,19 @@ def register_file_formats() -> None:
             recognize=is_mjcf,
             loop_element="equality",
             reference=b"file",
-        )
-    )
-    registry.register_format(
+        ),
         FileFormat(
             name="SDF",
             suffixes=(".sdf", ".world"),
             read=f"{formats}.sdf.operations:sdf_file_operations",
             loop_element="joint",
             reference=b"include",
-        )
-    )
-    registry.register_format(
+        ),
         FileFormat(
             name="xacro",
             suffixes=(".xacro",),
             read=f"{formats}.xacro:xacro_file_operations",
             loop_element="joint",
             reference=b"<",
-        )
+        ),
     )
-    registry.register_service("include", f"{formats}.loader:include")
-    registry.register_service("save", f"{formats}.saver:save")

@@ -1,18 +1,28 @@
-"""Checks of a loaded model: limits, loops, poses, inertias, mesh files."""
+"""Validation of a model file: mistakes, and problems of limits, loops, poses, inertias, mesh files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from math import isfinite, isnan
 
 import numpy as np
 
 from kineverse.errors import KineverseError, summarize_error
 from kineverse.expressions.printing import format_number
+from kineverse.formats.document import OpaqueOperation
+from kineverse.formats.files import read_file
+from kineverse.formats.loader import load
+from kineverse.formats.locate import Source, locate_model
+from kineverse.formats.reader_warnings import Fault, collect_warnings
+from kineverse.formats.xml_reader import read_root_tag
 from kineverse.loops.loop_records import find_loops
 from kineverse.model.body import Inertia, Mesh
+from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
+from kineverse.model.registry import LoopTreatment
 from kineverse.model.sampling import StateSamples
 from kineverse.state import State
 
@@ -78,13 +88,13 @@ def _find_limit_problems(model: ModelView) -> Iterator[ModelProblem]:
 def _states_within_limits(model: ModelView, samples: StateSamples) -> list[int]:
     """Return the indices of the sampled states that violate no constraint, and of the default state, 0."""
     symbols = model.symbols
-    found = [0]
+    result = [0]
     for k in range(1, samples.size) if symbols else ():
         state = State({symbol: samples.values_of(symbol)[k] for symbol in symbols})
         # Values that are not finite are the problem to find, and no violation.
         if all(isnan(violation.excess) for violation in model.violations(state)):
-            found.append(k)
-    return found
+            result.append(k)
+    return result
 
 
 def _find_open_loops(model: ModelView, samples: StateSamples, allowed: list[int]) -> Iterator[ModelProblem]:
@@ -159,3 +169,129 @@ def _find_missing_meshes(model: ModelView) -> Iterator[ModelProblem]:
                     missing[mesh] = summarize_error(error)
             if mesh in missing:
                 yield ModelProblem("mesh", name, missing[mesh])
+
+
+_FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
+
+VALID, INVALID, UNREADABLE = 0, 1, 2
+"""Values of :attr:`ValidationResult.status`."""
+
+
+@dataclass(frozen=True)
+class ValidationResult:
+    """Findings in one file.
+
+    Attributes
+    ----------
+    name
+        Name or path as given.
+    format
+        Format of the file; empty if unknown.
+    model
+        Loaded model; None if the file cannot be read, for the reason in ``error``.
+    error
+        Why it cannot be read.
+    facts
+        Header of a document: its ``version``, and ``sha256``, the hash of its content.
+    remarks
+        Reader warnings: content left out or interpreted.
+    faults
+        Mistakes that a strict reader refuses.
+    problems
+        Problems of the model.
+    strict
+        True if remarks count as problems.
+    """
+
+    name: str
+    format: str = ""
+    model: Model | None = None
+    error: KineverseError | OSError | None = None
+    facts: Mapping[str, int | str] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
+    faults: Sequence[str] = ()
+    problems: Sequence[ModelProblem] = ()
+    strict: bool = False
+
+    @property
+    def status(self) -> int:
+        """Exit status for this file."""
+        if self.model is None or self.faults:
+            return UNREADABLE
+        return INVALID if self.problems or (self.strict and self.remarks) else VALID
+
+    @property
+    def reason(self) -> str:
+        """Reason on one line if the file cannot be read."""
+        if isinstance(self.error, OSError) and self.error.strerror:
+            return self.error.strerror
+        return " ".join(str(self.error).split())
+
+
+def validate_file(
+    name: str | os.PathLike[str],
+    *,
+    meshes: bool = True,
+    strict: bool = False,
+    root: str | os.PathLike[str] | None = None,
+    loops: LoopTreatment = "solve",
+    further: Callable[[ModelView], Iterable[ModelProblem]] | None = None,
+) -> ValidationResult:
+    """Validate a file, as ``kineverse validate`` does; mistakes in it are returned, not raised.
+
+    Parameters
+    ----------
+    name
+        Name of a shipped model, or path of a file.
+    meshes
+        True to check that mesh files exist.
+    strict
+        True if remarks count as problems.
+    root, loops
+        See :func:`kineverse.load`.
+    further
+        Function that yields further problems of a model.
+    """
+    name, language = os.fspath(name), ""
+    with collect_warnings() as remarks:
+        try:
+            source = locate_model(name)
+            language = detect_format(source)
+            model = load(name, root=root, loops=loops)
+            facts = _document_header(source)
+            problems = (*find_problems(model, meshes), *(further(model) if further else ()))
+        except (KineverseError, OSError) as error:
+            return ValidationResult(name, language, error=error, remarks=remarks, strict=strict)
+    faults = [remark for remark in remarks if isinstance(remark, Fault)]
+    others = [remark for remark in remarks if not isinstance(remark, Fault)]
+    return ValidationResult(
+        name, language, model, None, facts, [*others, *_frozen_operations(model)], faults, problems, strict
+    )
+
+
+def _frozen_operations(model: Model) -> list[str]:
+    """Return a line for each operation that does not follow changes of what it reads, with the reason."""
+    operations = {tag: model.history.operation(tag) for tag in model.history.tags}
+    return [
+        f"operation {tag!r} is frozen: {operation.frozen}"
+        for tag, operation in operations.items()
+        if isinstance(operation, OpaqueOperation) and operation.frozen
+    ]
+
+
+def detect_format(source: Source) -> str:
+    """Return the format of a model; empty if its suffix is unknown."""
+    if source.collection:
+        return f"model of the collection '{source.collection}'"
+    if source.path.name.endswith(".xml"):
+        return "MJCF" if read_root_tag(read_file(source.path)).startswith("mujoco") else "URDF"
+    endings = (name for name in _FORMATS if source.path.name.endswith(name))
+    return _FORMATS.get(next(endings, ""), "")
+
+
+def _document_header(source: Source) -> dict[str, int | str]:
+    """Return the version of a document, and its hash if it has one; the reader has checked both."""
+    if source.collection or not source.path.name.endswith(".kv.json"):
+        return {}
+    head = json.loads(read_file(source.path))
+    return {key: head[key] for key in ("version", "sha256") if key in head}

@@ -1,27 +1,28 @@
 """Collision geometry of a model (layer 4); a scene needs the extra ``geometry``."""
 
-from kineverse._synonyms import MODULE_SYNONYMS
-from kineverse.errors import unknown_attribute_error
+from typing import TYPE_CHECKING
 
-from .collision_filter import RULES, Rule, rules_as_data
-from .distance_expressions import PairDistance
-from .distance_queries import PreparedQuery
-from .results import DistanceResult, DistanceResults, NearestPoint, RayHit
-from .scene import Scene
+from kineverse._lazy import lazy_face
 
-__all__ = [
-    "RULES",
-    "DistanceResult",
-    "DistanceResults",
-    "NearestPoint",
-    "PairDistance",
-    "PreparedQuery",
-    "RayHit",
-    "Rule",
-    "Scene",
-    "rules_as_data",
-]
+if TYPE_CHECKING:
+    from .collision_filter import RULES as RULES, Rule as Rule, rules_as_data as rules_as_data
+    from .distance_expressions import PairDistance as PairDistance
+    from .distance_queries import PreparedQuery as PreparedQuery
+    from .results import (
+        DistanceResult as DistanceResult,
+        DistanceResults as DistanceResults,
+        NearestPoint as NearestPoint,
+        RayHit as RayHit,
+    )
+    from .scene import Scene as Scene
 
-
-def __getattr__(name: str) -> object:
-    raise unknown_attribute_error("The package kineverse.geometry", name, __all__, MODULE_SYNONYMS)
+lazy_face(
+    __name__,
+    {
+        ".collision_filter": "RULES Rule rules_as_data",
+        ".distance_expressions": "PairDistance",
+        ".distance_queries": "PreparedQuery",
+        ".results": "DistanceResult DistanceResults NearestPoint RayHit",
+        ".scene": "Scene",
+    },
+)

@@ -1,16 +1,23 @@
 """Grasping: grippers, handles, and grasps of handles (layer 5)."""
 
-from .grasp_sampling import Grasp, sample_grasps
-from .gripper_detection import Gripper, find_gripper, find_grippers
-from .handles import Handle, find_handle, find_handles
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Grasp",
-    "Gripper",
-    "Handle",
-    "find_gripper",
-    "find_grippers",
-    "find_handle",
-    "find_handles",
-    "sample_grasps",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .grasp_sampling import Grasp as Grasp, sample_grasps as sample_grasps
+    from .gripper_detection import (
+        Gripper as Gripper,
+        find_gripper as find_gripper,
+        find_grippers as find_grippers,
+    )
+    from .handles import Handle as Handle, find_handle as find_handle, find_handles as find_handles
+
+lazy_face(
+    __name__,
+    {
+        ".grasp_sampling": "Grasp sample_grasps",
+        ".gripper_detection": "Gripper find_gripper find_grippers",
+        ".handles": "Handle find_handle find_handles",
+    },
+)

@@ -1,10 +1,17 @@
 """Closed kinematic loops: dependent coordinates, or equality constraints, that keep two frames together."""
 
-from kineverse.model import registry
+from typing import TYPE_CHECKING
 
-from .close_loop import CloseLoop, LoopConstraint
-from .loop_solution import SolvedLoop, solve_loop
+from kineverse._lazy import lazy_face
 
-__all__ = ["CloseLoop", "LoopConstraint", "SolvedLoop", "solve_loop"]
+if TYPE_CHECKING:
+    from .close_loop import CloseLoop as CloseLoop, LoopConstraint as LoopConstraint
+    from .loop_solution import SolvedLoop as SolvedLoop, solve_loop as solve_loop
 
-registry.register_shorthand("close_loop", "kineverse.loops.close_loop:CloseLoop")
+lazy_face(
+    __name__,
+    {
+        ".close_loop": "CloseLoop LoopConstraint",
+        ".loop_solution": "SolvedLoop solve_loop",
+    },
+)

@@ -1,35 +1,48 @@
 """Manipulation: skills that open, close and push articulated objects with a robot (layer 5)."""
 
-from .articulated_objects import ArticulatedObject, find_articulated_objects
-from .belief import Belief, TrueBelief
-from .open_close import OpenCloseReport, OpenCloseRunner
-from .opening import BasePlacement, PlacementSearch, open_object
-from .outcome import Outcome, SkillError
-from .pushing import push
-from .session import Session
-from .tracked_belief import TrackedBelief
-from .unknown_objects import open_unknown
-from .unlocking import LockExploration, PartMover, UnlockingExecution, execute_unlocking, explore_locks
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "ArticulatedObject",
-    "BasePlacement",
-    "Belief",
-    "LockExploration",
-    "OpenCloseReport",
-    "OpenCloseRunner",
-    "Outcome",
-    "PartMover",
-    "PlacementSearch",
-    "Session",
-    "SkillError",
-    "TrackedBelief",
-    "TrueBelief",
-    "UnlockingExecution",
-    "execute_unlocking",
-    "explore_locks",
-    "find_articulated_objects",
-    "open_object",
-    "open_unknown",
-    "push",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .articulated_objects import (
+        ArticulatedObject as ArticulatedObject,
+        find_articulated_objects as find_articulated_objects,
+    )
+    from .belief import Belief as Belief, TrueBelief as TrueBelief
+    from .open_close import OpenCloseReport as OpenCloseReport, OpenCloseRunner as OpenCloseRunner
+    from .opening import (
+        BasePlacement as BasePlacement,
+        PlacementSearch as PlacementSearch,
+        open_object as open_object,
+    )
+    from .outcome import Outcome as Outcome, SkillError as SkillError
+    from .pushing import push as push
+    from .robot_placement import PlacedRobot as PlacedRobot, place_robot as place_robot
+    from .session import Session as Session
+    from .tracked_belief import TrackedBelief as TrackedBelief
+    from .unknown_objects import open_unknown as open_unknown
+    from .unlocking import (
+        LockExploration as LockExploration,
+        PartMover as PartMover,
+        UnlockingExecution as UnlockingExecution,
+        execute_unlocking as execute_unlocking,
+        explore_locks as explore_locks,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".articulated_objects": "ArticulatedObject find_articulated_objects",
+        ".belief": "Belief TrueBelief",
+        ".open_close": "OpenCloseReport OpenCloseRunner",
+        ".opening": "BasePlacement PlacementSearch open_object",
+        ".outcome": "Outcome SkillError",
+        ".pushing": "push",
+        ".robot_placement": "PlacedRobot place_robot",
+        ".session": "Session",
+        ".tracked_belief": "TrackedBelief",
+        ".unknown_objects": "open_unknown",
+        ".unlocking": "LockExploration PartMover UnlockingExecution execute_unlocking explore_locks",
+    },
+)

@@ -13,6 +13,7 @@ from kineverse.geometry.exclusions import remove_unusable_shapes
 from kineverse.grasping.gripper_detection import Gripper, find_gripper
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
+from kineverse.model.model_view import ModelView
 from kineverse.spatial import translation
 from kineverse.state import State
 
@@ -61,7 +62,7 @@ class RobotSource:
         remove_unusable_shapes(model)
         return model
 
-    def start_state(self, model: Model) -> State:
+    def start_state(self, model: ModelView) -> State:
         """Return the default state of a model with the robot at its start."""
         known = {str(symbol) for symbol in model.degrees_of_freedom}
         values = {f"{self.prefix}/{joint}": value for joint, value in self.start.items()}

@@ -2,67 +2,65 @@
 
 from typing import TYPE_CHECKING
 
-from kineverse._synonyms import MODULE_SYNONYMS
-from kineverse.errors import unknown_attribute_error
+from kineverse._lazy import lazy_face
 
-from .articulation import Articulation
-from .basic_operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
-from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, Pose, Shape, Sphere
-from .changes import Change, Diff
-from .comparison import compare_models
-from .constraint import Constraint
-from .edit import Edit
-from .frame import WORLD, Frame
-from .frame_dependence import count_moved_bodies, moved_frames
-from .integration import Integrator
-from .model import Model, Snapshot
-from .operation import Operation, Writes
-from .rates import Rates
-from .read_recorder import ReadRecorder
-from .violations import ConstraintChecker, Violation, Violations
+if TYPE_CHECKING:
+    from .articulation import Articulation as Articulation
+    from .basic_operations import (
+        AddFrame as AddFrame,
+        Attach as Attach,
+        Constrain as Constrain,
+        Override as Override,
+        SetData as SetData,
+        SetRate as SetRate,
+    )
+    from .body import (
+        Body as Body,
+        Box as Box,
+        Capsule as Capsule,
+        Cone as Cone,
+        Cylinder as Cylinder,
+        Ellipsoid as Ellipsoid,
+        Inertia as Inertia,
+        Mesh as Mesh,
+        Pose as Pose,
+        Shape as Shape,
+        Sphere as Sphere,
+    )
+    from .changes import Change as Change, Diff as Diff
+    from .comparison import BehaviourComparison as BehaviourComparison, compare_models as compare_models
+    from .constraint import Constraint as Constraint
+    from .edit import Edit as Edit
+    from .frame import WORLD as WORLD, Frame as Frame
+    from .frame_dependence import count_moved_bodies as count_moved_bodies, moved_frames as moved_frames
+    from .integration import Integrator as Integrator
+    from .model import Model as Model, Snapshot as Snapshot
+    from .operation import Operation as Operation, Writes as Writes
+    from .rates import Rates as Rates
+    from .read_recorder import ReadRecorder as ReadRecorder
+    from .violations import (
+        ConstraintChecker as ConstraintChecker,
+        Violation as Violation,
+        Violations as Violations,
+    )
 
-__all__ = [
-    "WORLD",
-    "AddFrame",
-    "Articulation",
-    "Attach",
-    "Body",
-    "Box",
-    "Capsule",
-    "Change",
-    "Cone",
-    "Constrain",
-    "Constraint",
-    "ConstraintChecker",
-    "Cylinder",
-    "Diff",
-    "Edit",
-    "Ellipsoid",
-    "Frame",
-    "Inertia",
-    "Integrator",
-    "Mesh",
-    "Model",
-    "Operation",
-    "Override",
-    "Pose",
-    "Rates",
-    "ReadRecorder",
-    "SetData",
-    "SetRate",
-    "Shape",
-    "Snapshot",
-    "Sphere",
-    "Violation",
-    "Violations",
-    "Writes",
-    "compare_models",
-    "count_moved_bodies",
-    "moved_frames",
-]
-
-
-if not TYPE_CHECKING:  # a type checker finds unknown names itself
-
-    def __getattr__(name: str) -> object:
-        raise unknown_attribute_error("The package kineverse.model", name, __all__, MODULE_SYNONYMS)
+lazy_face(
+    __name__,
+    {
+        ".articulation": "Articulation",
+        ".basic_operations": "AddFrame Attach Constrain Override SetData SetRate",
+        ".body": "Body Box Capsule Cone Cylinder Ellipsoid Inertia Mesh Pose Shape Sphere",
+        ".comparison": "BehaviourComparison compare_models",
+        ".constraint": "Constraint",
+        ".changes": "Change Diff",
+        ".edit": "Edit",
+        ".frame": "WORLD Frame",
+        ".frame_dependence": "count_moved_bodies moved_frames",
+        ".integration": "Integrator",
+        ".model": "Model Snapshot",
+        ".operation": "Operation Writes",
+        ".rates": "Rates",
+        ".read_recorder": "ReadRecorder",
+        ".violations": "ConstraintChecker Violation Violations",
+    },
+)

@@ -209,8 +209,8 @@ def _measure_number_distance(a: Array, b: Array) -> Array:
         off = np.abs(a - b) / np.maximum(1.0, np.maximum(np.abs(a), np.abs(b)))
     off[(a == b) | (np.isnan(a) & np.isnan(b))] = 0.0
     off[np.isnan(off)] = inf
-    found: Array = off.reshape(len(a), -1).max(axis=1, initial=0.0)
-    return found
+    result: Array = off.reshape(len(a), -1).max(axis=1, initial=0.0)
+    return result
 
 
 def measure_pose_distances(a: Array, b: Array) -> tuple[Array, Array]:
@@ -323,11 +323,11 @@ class ModelComparison:
             and c.before.parent != c.after.parent
         ]
         poses = samples.values([model.fk(c.name) for c in changes for model in (self.before, self.after)])
-        found = {}
+        result = {}
         for change, one, other in zip(changes, poses[::2], poses[1::2], strict=True):
             off = _summarize(*measure_pose_distances(one, other))
-            found[change.path] = Delta("place", change.before.parent, change.after.parent, *off)
-        return found
+            result[change.path] = Delta("place", change.before.parent, change.after.parent, *off)
+        return result
 
     def _is_redundant_record(self, change: Change) -> bool:
         """Return whether a change is the record of a fixed joint between frames of both models."""
@@ -412,9 +412,33 @@ class LimitDifference:
 
 
 class BehaviourComparison:
-    """Differences in poses and limits between two models, beyond a tolerance."""
+    """Differences in poses and limits between two models, as ``kineverse diff --values`` prints them.
 
-    def __init__(self, before: ModelView, after: ModelView, tolerance: float) -> None:
+    Parameters
+    ----------
+    before, after
+        The models.
+    tolerance
+        Largest difference of equal numbers [m], [rad].
+
+    Attributes
+    ----------
+    states
+        Number of states at which poses are compared.
+    frames, freedoms
+        Names that are ``removed``, ``added`` and ``common``.
+    helpers
+        Frames without bodies that are in between in one of the models; they do not count.
+    apart
+        Frames whose poses differ by more than the tolerance, the farthest first, each with the largest
+        ``distance`` [m] and ``angle`` [rad].
+    largest
+        Largest distance [m] and angle [rad] of all.
+    ranges
+        Limits of positions and speeds that differ, each with those ``before`` and ``after``.
+    """
+
+    def __init__(self, before: ModelView, after: ModelView, tolerance: float = 1e-9) -> None:
         self.tolerance = tolerance
         self.helpers = [*find_helper_frames(before, after), *find_helper_frames(after, before)]
         self.frames = _partition_names(

@@ -1,4 +1,4 @@
-"""Registry of readers and writers of models, filled by the packages above the model.
+"""Registry of readers and writers of models, which are in packages above the model.
 
 A model imports nothing from above. It asks here for the reader of a source, by the address scheme or by the
 suffix of the file, for the writer of a file, and for the shorthands of other packages. Entries are texts,
@@ -73,8 +73,8 @@ class FileFormat:
 
     def operations(self, file: FileContent) -> Iterable[tuple[str, Operation]]:
         """Yield the operations of a file, each with its tag."""
-        found: Iterable[tuple[str, Operation]] = import_entry(self.read)(file)
-        return found
+        result: Iterable[tuple[str, Operation]] = import_entry(self.read)(file)
+        return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,25 +138,48 @@ class SaveResult:
         )
 
 
-# -- registration --------------------------------------------------------------------------------------------
+# -- entries -------------------------------------------------------------------------------------------------
 
-_FORMATS: dict[str, FileFormat] = {}
-_COLLECTIONS: dict[str, ModelCollection] = {}
+_COLLECTIONS: Mapping[str, ModelCollection] = {
+    "articulations": ModelCollection(
+        "kineverse.gallery:names",
+        summary="one for each articulation",
+        find_document="kineverse.gallery:find_document",
+    ),
+    "kitchens": ModelCollection(
+        "kineverse.gallery.kitchens:example_seeds",
+        summary="one for each seed from 0 on",
+        build="kineverse.gallery.kitchens:kitchen_operations",
+        accept="kineverse.gallery.kitchens:is_seed",
+        prefix="kitchen",
+    ),
+    "lockboxes": ModelCollection(
+        "kineverse.gallery.lockboxes:example_boxes",
+        summary="one for each seed from 0 on",
+        build="kineverse.gallery.lockboxes:lockbox_operations",
+        accept="kineverse.gallery.lockboxes:has_lockbox",
+        prefix="lockbox",
+    ),
+}
+"""Collections of models by the first part of their names."""
+
+_FORMATS = "kineverse.formats.file_formats:list_file_formats"
+"""Function that returns the file formats; of those that read the same file, the first one counts."""
+
+_SHORTHANDS = {"close_loop": "kineverse.loops.close_loop:CloseLoop"}
+"""Operations that an edit appends under a method's name."""
+
+_SERVICES = {
+    "include": "kineverse.formats.loader:include",
+    "read_mesh": "kineverse.geometry.mesh_files:read_mesh",
+    "save": "kineverse.formats.saver:save",
+}
+"""Readers and writers of files, and the reader of meshes."""
+
 _SCHEMES: dict[str, str] = {}
-_SHORTHANDS: dict[str, str] = {}
-_SERVICES: dict[str, str] = {}
+"""Readers of addresses ``scheme:…``, with the signature of :func:`include_source`."""
 
 Service: TypeAlias = Literal["include", "save", "read_mesh"]
-
-
-def register_format(file_format: FileFormat) -> None:
-    """Register a file format. Of formats that read the same file, the first one registered counts."""
-    _FORMATS[file_format.name] = file_format
-
-
-def register_collection(name: str, collection: ModelCollection) -> None:
-    """Register a collection of models under the first part of their names."""
-    _COLLECTIONS[name] = collection
 
 
 def register_scheme(scheme: str, include: str) -> None:
@@ -164,14 +187,10 @@ def register_scheme(scheme: str, include: str) -> None:
     _SCHEMES[scheme] = include
 
 
-def register_shorthand(name: str, operation: str) -> None:
-    """Register the class of operations that an edit appends under a method's name."""
-    _SHORTHANDS[name] = operation
-
-
-def register_service(name: Service, function: str) -> None:
-    """Register a function of a package above: the reader or writer of files, or the reader of meshes."""
-    _SERVICES[name] = function
+@cache
+def list_formats() -> tuple[FileFormat, ...]:
+    """Return all file formats."""
+    return tuple(import_entry(_FORMATS)())
 
 
 # -- queries -------------------------------------------------------------------------------------------------
@@ -219,12 +238,12 @@ def find_scheme(source: object) -> str | None:
 
 def find_format(name: str, content: bytes) -> FileFormat | None:
     """Return the format of a file; None if no registered format reads it."""
-    return next((one for one in _FORMATS.values() if one.reads(name, content)), None)
+    return next((one for one in list_formats() if one.reads(name, content)), None)
 
 
 def find_writer(name: str) -> FileFormat | None:
     """Return the format that writes files of this name; None if none does."""
-    return next((one for one in _FORMATS.values() if name.endswith(one.written)), None)
+    return next((one for one in list_formats() if name.endswith(one.written)), None)
 
 
 def find_collection(name: str) -> ModelCollection | None:
@@ -254,17 +273,17 @@ def find_service(name: Service) -> Callable[..., Any]:
 
 def readable_suffixes() -> tuple[str, ...]:
     """Return the endings of all file names that a registered format reads."""
-    return tuple(dict.fromkeys(suffix for one in _FORMATS.values() for suffix in one.suffixes))
+    return tuple(dict.fromkeys(suffix for one in list_formats() for suffix in one.suffixes))
 
 
 def writable_suffixes() -> tuple[str, ...]:
     """Return the endings of all file names that a registered format writes."""
-    return tuple(dict.fromkeys(suffix for one in _FORMATS.values() for suffix in one.written))
+    return tuple(dict.fromkeys(suffix for one in list_formats() for suffix in one.written))
 
 
 @cache
 def import_entry(entry: str) -> Callable[..., Any]:
     """Import the function of an entry ``"package.module:function"``."""
     module, _, name = entry.partition(":")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return found
+    result: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return result

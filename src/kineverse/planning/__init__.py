@@ -1,29 +1,32 @@
 """Motion planning for any model (layer 5); needs a C compiler."""
 
-from .manifold import FrameHold
-from .modes import Mode
-from .path import Path
-from .planner import Planner
-from .trajectories import (
-    BlendedPath,
-    MotionLimits,
-    Trajectory,
-    TrajectoryFollower,
-    motion_limits,
-    round_corners,
-    time_parameterize,
-)
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "BlendedPath",
-    "FrameHold",
-    "Mode",
-    "MotionLimits",
-    "Path",
-    "Planner",
-    "Trajectory",
-    "TrajectoryFollower",
-    "motion_limits",
-    "round_corners",
-    "time_parameterize",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .manifold import FrameHold as FrameHold
+    from .modes import Mode as Mode
+    from .path import Path as Path
+    from .planner import Planner as Planner
+    from .trajectories import (
+        BlendedPath as BlendedPath,
+        MotionLimits as MotionLimits,
+        Trajectory as Trajectory,
+        TrajectoryFollower as TrajectoryFollower,
+        motion_limits as motion_limits,
+        round_corners as round_corners,
+        time_parameterize as time_parameterize,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".manifold": "FrameHold",
+        ".modes": "Mode",
+        ".path": "Path",
+        ".planner": "Planner",
+        ".trajectories": "BlendedPath MotionLimits Trajectory TrajectoryFollower motion_limits round_corners "
+        "time_parameterize",
+    },
+)

@@ -1,33 +1,39 @@
 """Reasoning about models (layer 5): interlocks and their conditions."""
 
-from kineverse._synonyms import MODULE_SYNONYMS
-from kineverse.errors import unknown_attribute_error
+from typing import TYPE_CHECKING
 
-from .boxes import Interval, IntervalBox
-from .find_interlocks import interlocks
-from .interlock_records import Hold, Interlock, Interlocks, Undecided, opening_order
-from .interlock_verification import contradictions
-from .plan_verification import InvariantSet, plan_violations, refutation_gaps
-from .unlocking_plan import UnlockingPlan, UnlockingStep, plan_unlocking
+from kineverse._lazy import lazy_face
 
-__all__ = [
-    "Hold",
-    "Interlock",
-    "Interlocks",
-    "Interval",
-    "IntervalBox",
-    "InvariantSet",
-    "Undecided",
-    "UnlockingPlan",
-    "UnlockingStep",
-    "contradictions",
-    "interlocks",
-    "opening_order",
-    "plan_unlocking",
-    "plan_violations",
-    "refutation_gaps",
-]
+if TYPE_CHECKING:
+    from .boxes import Interval as Interval, IntervalBox as IntervalBox
+    from .find_interlocks import interlocks as interlocks
+    from .interlock_records import (
+        Hold as Hold,
+        Interlock as Interlock,
+        Interlocks as Interlocks,
+        Undecided as Undecided,
+        opening_order as opening_order,
+    )
+    from .interlock_verification import contradictions as contradictions
+    from .plan_verification import (
+        InvariantSet as InvariantSet,
+        plan_violations as plan_violations,
+        refutation_gaps as refutation_gaps,
+    )
+    from .unlocking_plan import (
+        UnlockingPlan as UnlockingPlan,
+        UnlockingStep as UnlockingStep,
+        plan_unlocking as plan_unlocking,
+    )
 
-
-def __getattr__(name: str) -> object:
-    raise unknown_attribute_error("The package kineverse.reasoning", name, __all__, MODULE_SYNONYMS)
+lazy_face(
+    __name__,
+    {
+        ".boxes": "Interval IntervalBox",
+        ".find_interlocks": "interlocks",
+        ".interlock_records": "Hold Interlock Interlocks Undecided opening_order",
+        ".interlock_verification": "contradictions",
+        ".plan_verification": "InvariantSet plan_violations refutation_gaps",
+        ".unlocking_plan": "UnlockingPlan UnlockingStep plan_unlocking",
+    },
+)

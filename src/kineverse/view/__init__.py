@@ -11,38 +11,20 @@
 Pictures are drawn by numpy. The page is served by viser, to this computer alone unless a host is given.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
-from kineverse.state import StateLike
-
-from .camera import Camera
-from .page import show
-from .pictures import picture, save_picture
+from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from kineverse.model.model_view import ModelView
+    from .camera import Camera as Camera
+    from .page import show as show, view as view
+    from .pictures import picture as picture, save_picture as save_picture
 
-    from .viewer import Viewer
-
-__all__ = ["Camera", "picture", "save_picture", "show", "view"]
-
-
-def view(
-    model: ModelView,
-    state: StateLike | None = None,
-    *,
-    port: int | None = None,
-    label: str | None = None,
-    camera: Camera | None = None,
-    host: str = "127.0.0.1",
-    degrees: bool = False,
-) -> Viewer:
-    """Show a model on a web page and return at once; :func:`kineverse.show` waits, and opens the browser.
-
-    Parameters, result and errors are those of :class:`kineverse.view.viewer.Viewer`.
-    """
-    from .viewer import Viewer
-
-    return Viewer(model, state, port=port, label=label, camera=camera, host=host, degrees=degrees)
+lazy_face(
+    __name__,
+    {
+        ".camera": "Camera",
+        ".page": "show view",
+        ".pictures": "picture save_picture",
+    },
+)

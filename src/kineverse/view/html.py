@@ -7,7 +7,8 @@ constraints and failures.
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 
@@ -68,8 +69,15 @@ MOST_LINES = 12
 _RED, _LIGHT_RED = "#c92a2a", "#fff5f5"
 
 
-def format_violations(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
-    """Return HTML: each violated constraint with its value, bounds and excess, or that there is none."""
+def format_violations(
+    violations: Iterable[Any],
+    unchecked: Iterable[Any] = (),
+    scales: Mapping[str, tuple[float, str]] = MappingProxyType({}),
+) -> Html:
+    """Return HTML: each violated constraint with its value, bounds and excess, or that there is none.
+
+    Numbers of the constraints in ``scales`` are multiplied by a factor, and have a unit.
+    """
     found = sorted(violations, key=lambda v: -abs(v.excess))
     rest = len(list(unchecked))
     aside = [element("span", f" · {rest} on speeds not checked", style="color:#868e96")] if rest else []
@@ -77,19 +85,14 @@ def format_violations(violations: Iterable[Any], unchecked: Iterable[Any] = ()) 
         return colored_box("#2b8a3e", "#ebfbee", element("b", "All constraints hold."), *aside)
     noun = "constraint" if len(found) == 1 else "constraints"
     lines = [element("b", f"{len(found)} {noun} violated"), *aside]
-    lines += [
-        element(
-            "div",
-            element("b", v.name),
-            BREAK,
-            "{} is not in [{}, {}], by {}".format(
-                *map(format_significant, (v.value, v.lower, v.upper, v.excess))
-            ),
-            class_="kineverse-violation",
-            style="margin-top:3px",
+    for v in found[:MOST_LINES]:
+        factor, unit = scales.get(v.name, (1.0, ""))
+        value, low, high, off = (
+            format_significant(factor * x) for x in (v.value, v.lower, v.upper, v.excess)
         )
-        for v in found[:MOST_LINES]
-    ]
+        text = f"{value} is not in [{low}, {high}], by {off} {unit}".rstrip()
+        style = {"class_": "kineverse-violation", "style": "margin-top:3px"}
+        lines.append(element("div", element("b", v.name), BREAK, text, **style))
     if len(found) > MOST_LINES:
         lines.append(element("div", f"and {len(found) - MOST_LINES} more"))
     return colored_box(_RED, _LIGHT_RED, *lines)

@@ -24,6 +24,9 @@ from .triangle_mesh import (
 
 logger = logging.getLogger(__name__)
 
+_PLACES = 3
+"""Number of places named in which a file was looked for."""
+
 
 @dataclass(frozen=True, slots=True)
 class LoadedMesh:
@@ -62,11 +65,13 @@ def list_visual_meshes(model: ModelView) -> list[Mesh]:
 
 
 def _substitute_placeholder(mesh: Mesh, problem: str) -> LoadedMesh:
-    first_line = (problem.strip().splitlines() or ["unknown error"])[0]
+    first, *others = [line.strip() for line in problem.strip().splitlines()] or ["unknown error"]
+    more = f" and {len(others) - _PLACES} more places" if len(others) > _PLACES else ""
+    reason = f"{first} {', '.join(others[:_PLACES])}{more}" if first.endswith(":") else first
     if (mesh.uri, mesh.folder) not in _reported:
         _reported.add((mesh.uri, mesh.folder))
-        logger.warning("mesh %s is shown as a placeholder: %s", mesh.uri, first_line)
-    return LoadedMesh(mesh_placeholder(), first_line)
+        logger.warning("mesh %s is shown as a placeholder: %s", mesh.uri, reason)
+    return LoadedMesh(mesh_placeholder(), reason)
 
 
 def _read(mesh: Mesh) -> TriangleMesh:

@@ -17,7 +17,7 @@ from kineverse.state import StateLike
 
 if TYPE_CHECKING:
     from .camera import Camera
-    from .viewer import Viewer
+    from .viewer import Viewer  # for start-up time
 
 
 def show(
@@ -75,7 +75,7 @@ def show(
     InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
     """
-    from .viewer import Viewer
+    from .viewer import Viewer  # for start-up time
 
     notebook = in_notebook()
     waits = not (notebook or at_prompt()) if block is None else block
@@ -95,6 +95,25 @@ def show(
             raise
         print(file=sys.stderr)  # the terminal has written ^C on this line
     return page
+
+
+def view(
+    model: ModelView,
+    state: StateLike | None = None,
+    *,
+    port: int | None = None,
+    label: str | None = None,
+    camera: Camera | None = None,
+    host: str = "127.0.0.1",
+    degrees: bool = False,
+) -> Viewer:
+    """Show a model on a web page and return at once; :func:`kineverse.show` waits, and opens the browser.
+
+    Parameters, result and errors are those of :class:`kineverse.view.viewer.Viewer`.
+    """
+    from .viewer import Viewer  # for start-up time
+
+    return Viewer(model, state, port=port, label=label, camera=camera, host=host, degrees=degrees)
 
 
 def in_notebook() -> bool:
@@ -117,7 +136,7 @@ def open_page(address: str) -> None:
     """Open an address in the browser, if there is a screen."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     if sys.platform in ("win32", "darwin") or any(os.environ.get(name) for name in screens):
-        import webbrowser
+        import webbrowser  # for start-up time
 
         webbrowser.open(address)
 

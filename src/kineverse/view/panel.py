@@ -19,6 +19,9 @@ BEYOND = 0.2
 MOST_UNFOLDED = 100
 """With at most so many degrees of freedom all groups are unfolded at first."""
 
+_NEGLIGIBLE = 1e-9
+"""Limits below this are 0 in labels: rounding of a file's units."""
+
 DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
 """The unit of angles in degrees, by unit, and the factor from radians."""
 
@@ -53,9 +56,11 @@ class Panel:
         on_drive: Callable[[str, float], None],
         on_reset: Callable[[], None],
         on_play: Callable[[bool], None],
+        on_convert: Callable[[], None],
         degrees: bool = False,
     ) -> None:
         self._gui, self._ranges, self._units, self._on_move = gui, ranges, dict(units), on_move
+        self._on_convert = on_convert
         self._shown: Mapping[str, float] = {**values, **quaternions.angles}
         self._locked: dict[str, bool] = {}
         # Events of the page and the motion of the model come from different threads.
@@ -190,7 +195,7 @@ class Panel:
         low, high = (self._to_shown(name, end) for end in range_)
         unit = self._units.get(name, "")
         slider = self._gui.add_slider(
-            self._label(name, range_),
+            self._label(name, self._limits[name]),
             min=low,
             max=high,
             step=choose_slider_step((low, high)),
@@ -201,16 +206,20 @@ class Panel:
         slider.on_update(lambda event: self._set(self._on_move, name, self._limits[name], event))
         return slider
 
-    def _label(self, name: str, range_: tuple[float, float], locked: bool = False) -> str:
+    def _label(self, name: str, limits: tuple[float, float], locked: bool = False) -> str:
         """Return the last part of a name with unit and range, such as ``door [rad]   0 to 1.57``."""
         unit = self._unit(name)
-        low, high = (_format_short(self._to_shown(name, end)) for end in range_)
+        low, high = (_format_short(self._to_shown(name, end)) for end in limits)
         last = name.removesuffix(":velocity").rpartition("/")[2]
         return f"{last}{f' [{unit}]' if unit else ''}   {low} to {high}{' · locked' if locked else ''}"
 
     def _unit(self, name: str) -> str:
         unit = self._units.get(name, "")
         return DEGREES[unit][0] if self.degrees and unit in DEGREES else unit
+
+    def scale(self, name: str) -> tuple[float, str]:
+        """Return the factor from the units of the model to the units shown of a coordinate, and these."""
+        return self._factor(name), self._unit(name)
 
     def _factor(self, name: str) -> float:
         """Return the factor from the units of the model to the units shown."""
@@ -245,8 +254,8 @@ class Panel:
                 slider.disabled = locked and not self.beyond
 
     def _relabel(self, name: str) -> None:
-        slider, factor = self._sliders[name], self._factor(name)
-        label = self._label(name, (slider.min / factor, slider.max / factor), self._locked.get(name, False))
+        slider = self._sliders[name]
+        label = self._label(name, self._limits[name], self._locked.get(name, False))
         if slider.label != label:
             slider.label = label
 
@@ -277,6 +286,7 @@ class Panel:
                 _set_range(slider, *(self._to_shown(name, limit) for limit in self._drive.limits[name]))
                 slider.value = self._to_shown(name, self._drive.speeds[name])
                 slider.label = self._label(name, self._drive.limits[name])
+        self._on_convert()
 
     def _find(self, text: str) -> None:
         shown = {name: text.lower() in name.lower() for name in self._sliders}
@@ -317,7 +327,8 @@ def _set_range(slider: Any, low: float, high: float) -> None:
 
 def _format_short(value: float) -> str:
     """Format a number with two decimals, or with two significant digits if it is small."""
-    digits = 2 if abs(value) >= 0.1 or value == 0.0 else 1 - math.floor(math.log10(abs(value)))
-    text = f"{value:.{digits}f}" if abs(value) < 1e6 else f"{value:.3g}"
-    text = text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
-    return text.replace("-", "−")
+    if abs(value) < _NEGLIGIBLE:
+        return "0"
+    digits = 2 if abs(value) >= 0.1 else 1 - math.floor(math.log10(abs(value)))
+    text = f"{value:.{digits}f}".rstrip("0").rstrip(".") if abs(value) < 1e6 else f"{value:.3g}"
+    return text.replace("-", "−").replace("inf", "∞")

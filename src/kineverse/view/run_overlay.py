@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -209,10 +209,16 @@ _CELL = "text-align:left;padding:1px 9px 1px 0;vertical-align:top;white-space:no
 
 
 class RunLayer:
-    """Ghost, arrows, way, text and table of a run on the page."""
+    """Ghost, arrows, way, text and table of a run on the page; with ``moment_at``, those of a recording."""
 
-    def __init__(self, server: Any, drawing: RunDrawing, title: str) -> None:
-        self._server, self._drawing = server, drawing
+    def __init__(
+        self,
+        server: Any,
+        drawing: RunDrawing,
+        title: str,
+        moment_at: Callable[[float], RunMoment] | None = None,
+    ) -> None:
+        self._server, self._drawing, self._moment_at = server, drawing, moment_at
         # Events of the page come from other threads than moments.
         self._lock = threading.RLock()
         self._moment = RunMoment({}, {})
@@ -230,6 +236,11 @@ class RunLayer:
             self._table = HtmlBox(server.gui, element("div"))
         for box in (self._ghost_box, self._arrow_box):
             box.on_update(lambda _: self.draw(self._moment))
+
+    def show(self, time: float) -> None:
+        """Show the moment of a recording at a time [s]."""
+        if self._moment_at is not None:
+            self.draw(self._moment_at(time))
 
     def draw(self, moment: RunMoment) -> None:
         """Show ghost, arrows and text of a moment, in place of those before."""
@@ -413,19 +424,5 @@ def play_recording(
     scene = RecordedScene(recording)
     if scene.trajectory is None:
         raise InvalidValueError(f"There is no state in {recording.path.name} to be played.")
-    page.play(scene.trajectory, speed=speed, loop=loop, layer=RecordingLayer(page.server, scene), at=time)
-
-
-class RecordingLayer:
-    """Layer of a recorded run, by time."""
-
-    def __init__(self, server: Any, scene: RecordedScene) -> None:
-        self._scene, self._layer = scene, RunLayer(server, scene.drawing, "recording")
-
-    def show(self, time: float) -> None:
-        """Show the belief, the vectors and the phase at a time [s]."""
-        self._layer.draw(self._scene.at(time))
-
-    def remove(self) -> None:
-        """Remove everything from the page."""
-        self._layer.remove()
+    layer = RunLayer(page.server, scene.drawing, "recording", scene.at)
+    page.play(scene.trajectory, speed=speed, loop=loop, layer=layer, at=time)

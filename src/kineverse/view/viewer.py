@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse.model.constraint import Constraint
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.planning.trajectories.trajectory import Trajectory
@@ -294,6 +295,7 @@ class Viewer:
             on_drive=lambda name, speed: self.drive({name: speed}),
             on_reset=self.reset,
             on_play=self.play,
+            on_convert=self._request_redraw,
             degrees=degrees,
         )
 
@@ -325,6 +327,10 @@ class Viewer:
         self._asked += 1
         self._driven.update(set_by_program)
         self._change.notify_all()
+
+    def _request_redraw(self) -> None:
+        with self._change:
+            self._request_update()
 
     def _work(self) -> None:
         """Draw the newest values until :meth:`stop`."""
@@ -400,7 +406,9 @@ class Viewer:
                 return
             # An empty mapping would lack values; an empty state is that of a model without symbols.
             violated = self._shown.violations(State(values))
-            self._panel.show(format_violations(violated, violated.unchecked))
+            lone = {v.name: _find_lone_symbol(self._shown.constraints.get(v.name)) for v in violated}
+            scales = {name: self._panel.scale(symbol) for name, symbol in lone.items() if symbol}
+            self._panel.show(format_violations(violated, violated.unchecked, scales))
         except KineverseError as error:
             self._panel.show(format_failure(str(error)))
         except Exception as error:
@@ -417,6 +425,14 @@ class Viewer:
             except Exception:
                 # The thread survives: the layer may be removed meanwhile.
                 logger.exception("the layer of the trajectory could not be updated")
+
+
+def _find_lone_symbol(constraint: Constraint | None) -> str:
+    """Return the name of the symbol that a constraint bounds; empty if it bounds anything else."""
+    if constraint is None or len(constraint.expression.symbols) != 1:
+        return ""
+    (symbol,) = constraint.expression.symbols
+    return str(symbol) if bool(constraint.expression == symbol) else ""
 
 
 def _describe(thing: object) -> str:

@@ -1,24 +1,28 @@
 """Mechanisms such as doors, taps, lifts and lamps: operations that write several frames."""
 
-from .doors import FoldingDoor, GarageDoor
-from .latched_doors import DoorWithHandle, Latch, Microwave
-from .linkages import DeskLamp, PedalBin, PistonAndRod, ScissorLift
-from .machine_elements import Faucet, Ratchet, ScrewAndNut
-from .mechanism import Mechanism, MechanismPart
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "DeskLamp",
-    "DoorWithHandle",
-    "Faucet",
-    "FoldingDoor",
-    "GarageDoor",
-    "Latch",
-    "Mechanism",
-    "MechanismPart",
-    "Microwave",
-    "PedalBin",
-    "PistonAndRod",
-    "Ratchet",
-    "ScissorLift",
-    "ScrewAndNut",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .doors import FoldingDoor as FoldingDoor, GarageDoor as GarageDoor
+    from .latched_doors import DoorWithHandle as DoorWithHandle, Latch as Latch, Microwave as Microwave
+    from .linkages import (
+        DeskLamp as DeskLamp,
+        PedalBin as PedalBin,
+        PistonAndRod as PistonAndRod,
+        ScissorLift as ScissorLift,
+    )
+    from .machine_elements import Faucet as Faucet, Ratchet as Ratchet, ScrewAndNut as ScrewAndNut
+    from .mechanism import Mechanism as Mechanism, MechanismPart as MechanismPart
+
+lazy_face(
+    __name__,
+    {
+        ".doors": "FoldingDoor GarageDoor",
+        ".latched_doors": "DoorWithHandle Latch Microwave",
+        ".linkages": "DeskLamp PedalBin PistonAndRod ScissorLift",
+        ".machine_elements": "Faucet Ratchet ScrewAndNut",
+        ".mechanism": "Mechanism MechanismPart",
+    },
+)

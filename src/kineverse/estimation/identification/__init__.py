@@ -1,8 +1,21 @@
 """Identification of joints and kinematic graphs from noisy poses."""
 
-from .families import Family, FamilyParameter
-from .joint_identification import identify
-from .online_identification import Identifier
-from .result import Fit, IdentificationResult
+from typing import TYPE_CHECKING
 
-__all__ = ["Family", "FamilyParameter", "Fit", "IdentificationResult", "Identifier", "identify"]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .families import Family as Family, FamilyParameter as FamilyParameter
+    from .joint_identification import identify as identify
+    from .online_identification import Identifier as Identifier
+    from .result import Fit as Fit, IdentificationResult as IdentificationResult
+
+lazy_face(
+    __name__,
+    {
+        ".families": "Family FamilyParameter",
+        ".joint_identification": "identify",
+        ".online_identification": "Identifier",
+        ".result": "Fit IdentificationResult",
+    },
+)

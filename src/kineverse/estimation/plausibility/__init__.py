@@ -1,7 +1,23 @@
 """Plausibility of a served model, and replacements of its joints."""
 
-from .check import check_plausibility
-from .monitor import PlausibilityMonitor
-from .report import ImplausibleError, JointVerdict, Plausibility
+from typing import TYPE_CHECKING
 
-__all__ = ["ImplausibleError", "JointVerdict", "Plausibility", "PlausibilityMonitor", "check_plausibility"]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .check import check_plausibility as check_plausibility
+    from .monitor import PlausibilityMonitor as PlausibilityMonitor
+    from .report import (
+        ImplausibleError as ImplausibleError,
+        JointVerdict as JointVerdict,
+        Plausibility as Plausibility,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".check": "check_plausibility",
+        ".monitor": "PlausibilityMonitor",
+        ".report": "ImplausibleError JointVerdict Plausibility",
+    },
+)

@@ -1,21 +1,37 @@
 """Recordings of poses, their text tables, and joints identified from them."""
 
-from kineverse.estimation.correlation import correlation_time, effective_sample_size
+from typing import TYPE_CHECKING
 
-from .reader import read_recording
-from .recorded_joint import Assumption, ObservationNoise, RecordedJoint, identify_recorded_joint
-from .recording import RecordedPair, RecordedTrack, Recording, spaced_indices
+from kineverse._lazy import lazy_face
 
-__all__ = [
-    "Assumption",
-    "ObservationNoise",
-    "RecordedJoint",
-    "RecordedPair",
-    "RecordedTrack",
-    "Recording",
-    "correlation_time",
-    "effective_sample_size",
-    "identify_recorded_joint",
-    "read_recording",
-    "spaced_indices",
-]
+if TYPE_CHECKING:
+    from .joint_model import make_joint_model as make_joint_model
+    from kineverse.estimation.correlation import (
+        correlation_time as correlation_time,
+        effective_sample_size as effective_sample_size,
+    )
+
+    from .reader import read_recording as read_recording
+    from .recorded_joint import (
+        Assumption as Assumption,
+        ObservationNoise as ObservationNoise,
+        RecordedJoint as RecordedJoint,
+        identify_recorded_joint as identify_recorded_joint,
+    )
+    from .recording import (
+        RecordedPair as RecordedPair,
+        RecordedTrack as RecordedTrack,
+        Recording as Recording,
+        spaced_indices as spaced_indices,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".joint_model": "make_joint_model",
+        ".reader": "read_recording",
+        ".recorded_joint": "Assumption ObservationNoise RecordedJoint identify_recorded_joint",
+        ".recording": "RecordedPair RecordedTrack Recording spaced_indices",
+        "kineverse.estimation.correlation": "correlation_time effective_sample_size",
+    },
+)

@@ -1,18 +1,28 @@
 """State estimation of a known model from noisy measurements."""
 
-from kineverse.estimation.noise import Outliers
+from typing import TYPE_CHECKING
 
-from .estimate import Estimate
-from .hypothesis_bank import HypothesisBank
-from .measurements import ObservedExpression, ObservedPose, ObservedPosition
-from .tracker import Tracker
+from kineverse._lazy import lazy_face
 
-__all__ = [
-    "Estimate",
-    "HypothesisBank",
-    "ObservedExpression",
-    "ObservedPose",
-    "ObservedPosition",
-    "Outliers",
-    "Tracker",
-]
+if TYPE_CHECKING:
+    from kineverse.estimation.noise import Outliers as Outliers
+
+    from .estimate import Estimate as Estimate
+    from .hypothesis_bank import HypothesisBank as HypothesisBank
+    from .measurements import (
+        ObservedExpression as ObservedExpression,
+        ObservedPose as ObservedPose,
+        ObservedPosition as ObservedPosition,
+    )
+    from .tracker import Tracker as Tracker
+
+lazy_face(
+    __name__,
+    {
+        ".estimate": "Estimate",
+        ".hypothesis_bank": "HypothesisBank",
+        ".measurements": "ObservedExpression ObservedPose ObservedPosition",
+        ".tracker": "Tracker",
+        "kineverse.estimation.noise": "Outliers",
+    },
+)

@@ -10,19 +10,31 @@ content (:mod:`.encoding`), and is optional. Reading a document runs no code and
 ``.kv.msgpack`` file is the same in binary form.
 """
 
-from .json_values import schema
-from .opaque_operation import OpaqueOperation
-from .reader import from_bytes, read_operations, read_packed_operations
-from .writer import document_hash, to_bytes, to_json, write_document
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "OpaqueOperation",
-    "document_hash",
-    "from_bytes",
-    "read_operations",
-    "read_packed_operations",
-    "schema",
-    "to_bytes",
-    "to_json",
-    "write_document",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .json_values import schema as schema
+    from .opaque_operation import OpaqueOperation as OpaqueOperation
+    from .reader import (
+        from_bytes as from_bytes,
+        read_operations as read_operations,
+        read_packed_operations as read_packed_operations,
+    )
+    from .writer import (
+        document_hash as document_hash,
+        to_bytes as to_bytes,
+        to_json as to_json,
+        write_document as write_document,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".json_values": "schema",
+        ".opaque_operation": "OpaqueOperation",
+        ".reader": "from_bytes read_operations read_packed_operations",
+        ".writer": "document_hash to_bytes to_json write_document",
+    },
+)

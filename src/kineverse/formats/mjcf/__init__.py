@@ -1,6 +1,22 @@
 """MJCF, the description format of MuJoCo, read by MuJoCo's own parser."""
 
-from .description import MjcfJoint, MjcfLink, MjcfScene, MjcfSite
-from .reader import parse_mjcf, read_mjcf
+from typing import TYPE_CHECKING
 
-__all__ = ["MjcfJoint", "MjcfLink", "MjcfScene", "MjcfSite", "parse_mjcf", "read_mjcf"]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .description import (
+        MjcfJoint as MjcfJoint,
+        MjcfLink as MjcfLink,
+        MjcfScene as MjcfScene,
+        MjcfSite as MjcfSite,
+    )
+    from .reader import parse_mjcf as parse_mjcf, read_mjcf as read_mjcf
+
+lazy_face(
+    __name__,
+    {
+        ".description": "MjcfJoint MjcfLink MjcfScene MjcfSite",
+        ".reader": "parse_mjcf read_mjcf",
+    },
+)

@@ -1,6 +1,24 @@
 """SDF, the Simulation Description Format of Gazebo."""
 
-from .description import SdfAxis, SdfFrame, SdfJoint, SdfLink, SdfRoot, SdfScene
-from .reader import parse_sdf, read_sdf
+from typing import TYPE_CHECKING
 
-__all__ = ["SdfAxis", "SdfFrame", "SdfJoint", "SdfLink", "SdfRoot", "SdfScene", "parse_sdf", "read_sdf"]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .description import (
+        SdfAxis as SdfAxis,
+        SdfFrame as SdfFrame,
+        SdfJoint as SdfJoint,
+        SdfLink as SdfLink,
+        SdfRoot as SdfRoot,
+        SdfScene as SdfScene,
+    )
+    from .reader import parse_sdf as parse_sdf, read_sdf as read_sdf
+
+lazy_face(
+    __name__,
+    {
+        ".description": "SdfAxis SdfFrame SdfJoint SdfLink SdfRoot SdfScene",
+        ".reader": "parse_sdf read_sdf",
+    },
+)

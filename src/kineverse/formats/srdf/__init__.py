@@ -1,6 +1,22 @@
 """SRDF, the Semantic Robot Description Format of MoveIt, which accompanies a URDF."""
 
-from .description import EndEffector, Srdf, SrdfGroup, VirtualJoint
-from .reader import parse_srdf, read_srdf
+from typing import TYPE_CHECKING
 
-__all__ = ["EndEffector", "Srdf", "SrdfGroup", "VirtualJoint", "parse_srdf", "read_srdf"]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .description import (
+        EndEffector as EndEffector,
+        Srdf as Srdf,
+        SrdfGroup as SrdfGroup,
+        VirtualJoint as VirtualJoint,
+    )
+    from .reader import parse_srdf as parse_srdf, read_srdf as read_srdf
+
+lazy_face(
+    __name__,
+    {
+        ".description": "EndEffector Srdf SrdfGroup VirtualJoint",
+        ".reader": "parse_srdf read_srdf",
+    },
+)

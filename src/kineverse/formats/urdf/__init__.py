@@ -1,24 +1,25 @@
 """URDF, the Unified Robot Description Format of ROS."""
 
-from .description import (
-    UrdfDynamics,
-    UrdfJoint,
-    UrdfLimits,
-    UrdfLink,
-    UrdfMimic,
-    UrdfRobot,
-    UrdfSafetyController,
-)
-from .reader import parse_urdf, read_urdf
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "UrdfDynamics",
-    "UrdfJoint",
-    "UrdfLimits",
-    "UrdfLink",
-    "UrdfMimic",
-    "UrdfRobot",
-    "UrdfSafetyController",
-    "parse_urdf",
-    "read_urdf",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .description import (
+        UrdfDynamics as UrdfDynamics,
+        UrdfJoint as UrdfJoint,
+        UrdfLimits as UrdfLimits,
+        UrdfLink as UrdfLink,
+        UrdfMimic as UrdfMimic,
+        UrdfRobot as UrdfRobot,
+        UrdfSafetyController as UrdfSafetyController,
+    )
+    from .reader import parse_urdf as parse_urdf, read_urdf as read_urdf
+
+lazy_face(
+    __name__,
+    {
+        ".description": "UrdfDynamics UrdfJoint UrdfLimits UrdfLink UrdfMimic UrdfRobot UrdfSafetyController",
+        ".reader": "parse_urdf read_urdf",
+    },
+)

@@ -5,23 +5,34 @@ Distances to convex solids are fast and have a depth, but many meshes, such as a
 the cache, and :func:`find_hulls` reads it.
 """
 
-from .accuracy import Accuracy
-from .coacd_process import DecompositionError, ResourceLimits
-from .convex_decomposition import DecompositionOutcome, decompose, decompose_all, find_hulls
-from .result import CacheEntry, Decomposition, DecompositionSettings, clear, folder, list_entries
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Accuracy",
-    "CacheEntry",
-    "Decomposition",
-    "DecompositionError",
-    "DecompositionOutcome",
-    "DecompositionSettings",
-    "ResourceLimits",
-    "clear",
-    "decompose",
-    "decompose_all",
-    "find_hulls",
-    "folder",
-    "list_entries",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .accuracy import Accuracy as Accuracy
+    from .coacd_process import DecompositionError as DecompositionError, ResourceLimits as ResourceLimits
+    from .convex_decomposition import (
+        DecompositionOutcome as DecompositionOutcome,
+        decompose as decompose,
+        decompose_all as decompose_all,
+        find_hulls as find_hulls,
+    )
+    from .result import (
+        CacheEntry as CacheEntry,
+        Decomposition as Decomposition,
+        DecompositionSettings as DecompositionSettings,
+        clear as clear,
+        folder as folder,
+        list_entries as list_entries,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".accuracy": "Accuracy",
+        ".coacd_process": "DecompositionError ResourceLimits",
+        ".convex_decomposition": "DecompositionOutcome decompose decompose_all find_hulls",
+        ".result": "CacheEntry Decomposition DecompositionSettings clear folder list_entries",
+    },
+)

@@ -1,6 +1,17 @@
 """Parts with an unknown joint: the hand pulls, the joint is learned, and written into the model."""
 
-from .unknown_opening import open_unknown
-from .unmodelled_joint import forget_joint
+from typing import TYPE_CHECKING
 
-__all__ = ["forget_joint", "open_unknown"]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .unknown_opening import open_unknown as open_unknown
+    from .unmodelled_joint import forget_joint as forget_joint
+
+lazy_face(
+    __name__,
+    {
+        ".unknown_opening": "open_unknown",
+        ".unmodelled_joint": "forget_joint",
+    },
+)

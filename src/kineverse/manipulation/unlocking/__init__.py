@@ -1,15 +1,27 @@
 """Mechanisms whose parts lock each other: execution of plans, exploration of unknown locks."""
 
-from .lock_exploration import LearnedLock, LockExploration, LockTry, explore_locks
-from .plan_execution import ExecutedMove, PartMover, UnlockingExecution, execute_unlocking
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "ExecutedMove",
-    "LearnedLock",
-    "LockExploration",
-    "LockTry",
-    "PartMover",
-    "UnlockingExecution",
-    "execute_unlocking",
-    "explore_locks",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .lock_exploration import (
+        LearnedLock as LearnedLock,
+        LockExploration as LockExploration,
+        LockTry as LockTry,
+        explore_locks as explore_locks,
+    )
+    from .plan_execution import (
+        ExecutedMove as ExecutedMove,
+        PartMover as PartMover,
+        UnlockingExecution as UnlockingExecution,
+        execute_unlocking as execute_unlocking,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".lock_exploration": "LearnedLock LockExploration LockTry explore_locks",
+        ".plan_execution": "ExecutedMove PartMover UnlockingExecution execute_unlocking",
+    },
+)

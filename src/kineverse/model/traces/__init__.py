@@ -5,8 +5,25 @@ model, and its writes as expressions of the results. A trace can be evaluated on
 class.
 """
 
-from .recorder import record_trace
-from .trace import ReadNode, Trace, TraceStep, UntraceableError
-from .trace_queries import Access, Query
+from typing import TYPE_CHECKING
 
-__all__ = ["Access", "Query", "ReadNode", "Trace", "TraceStep", "UntraceableError", "record_trace"]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .recorder import record_trace as record_trace
+    from .trace import (
+        ReadNode as ReadNode,
+        Trace as Trace,
+        TraceStep as TraceStep,
+        UntraceableError as UntraceableError,
+    )
+    from .trace_queries import Access as Access, Query as Query
+
+lazy_face(
+    __name__,
+    {
+        ".recorder": "record_trace",
+        ".trace": "ReadNode Trace TraceStep UntraceableError",
+        ".trace_queries": "Access Query",
+    },
+)

@@ -4,17 +4,29 @@
 convex solids. Covers contain what they cover, provably, and say how far they stick out of it.
 """
 
-from .object_covers import cover_objects
-from .sphere_cover import SphereCover, cover_solid, cover_solids, default_protrusion
-from .sphere_tree import SphereTree, enclosing_ball, make_sphere_tree
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "SphereCover",
-    "SphereTree",
-    "cover_objects",
-    "cover_solid",
-    "cover_solids",
-    "default_protrusion",
-    "enclosing_ball",
-    "make_sphere_tree",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .object_covers import cover_objects as cover_objects
+    from .sphere_cover import (
+        SphereCover as SphereCover,
+        cover_solid as cover_solid,
+        cover_solids as cover_solids,
+        default_protrusion as default_protrusion,
+    )
+    from .sphere_tree import (
+        SphereTree as SphereTree,
+        enclosing_ball as enclosing_ball,
+        make_sphere_tree as make_sphere_tree,
+    )
+
+lazy_face(
+    __name__,
+    {
+        ".object_covers": "cover_objects",
+        ".sphere_cover": "SphereCover cover_solid cover_solids default_protrusion",
+        ".sphere_tree": "SphereTree enclosing_ball make_sphere_tree",
+    },
+)

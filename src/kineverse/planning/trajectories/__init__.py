@@ -1,16 +1,21 @@
 """Trajectories: paths with times, within limits of speed and acceleration."""
 
-from .blends import BlendedPath, round_corners
-from .kinematic_limits import MotionLimits, motion_limits
-from .time_parameterization import time_parameterize
-from .trajectory import Trajectory, TrajectoryFollower
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "BlendedPath",
-    "MotionLimits",
-    "Trajectory",
-    "TrajectoryFollower",
-    "motion_limits",
-    "round_corners",
-    "time_parameterize",
-]
+from kineverse._lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .blends import BlendedPath as BlendedPath, round_corners as round_corners
+    from .kinematic_limits import MotionLimits as MotionLimits, motion_limits as motion_limits
+    from .time_parameterization import time_parameterize as time_parameterize
+    from .trajectory import Trajectory as Trajectory, TrajectoryFollower as TrajectoryFollower
+
+lazy_face(
+    __name__,
+    {
+        ".blends": "BlendedPath round_corners",
+        ".kinematic_limits": "MotionLimits motion_limits",
+        ".time_parameterization": "time_parameterize",
+        ".trajectory": "Trajectory TrajectoryFollower",
+    },
+)
