@@ -157,12 +157,7 @@ def duplicate_value_error(symbol: object) -> DuplicateNameError:
 def summarize_error(error: Exception, advice: bool = True) -> str:
     """Return the first line of an error's message, without the places in which a file was looked for.
 
-    Parameters
-    ----------
-    error
-        Any exception; without a message, the name of its type is returned.
-    advice
-        Whether to keep the sentence that says which variable to set.
+    Without ``advice``, the sentence that says which variable to set is dropped as well.
     """
     text = str(error).strip()
     if not advice:
@@ -210,18 +205,8 @@ def unknown_attribute_error(
 ) -> UnknownAttributeError:
     """Return the error for an unknown attribute, with similar names or the equivalent of a foreign name.
 
-    Parameters
-    ----------
-    owner
-        The object, as the subject of a sentence.
-    name
-        The unknown attribute.
-    available
-        The known attributes.
-    elsewhere
-        From names in other libraries to their equivalents here.
-    below
-        From names in the packages below the object to their full names.
+    ``owner`` is the subject of the sentence, ``elsewhere`` maps names of other libraries to ours, and
+    ``below`` names in the packages below the object to their full names.
     """
     below = below or {}
     problem = f"{owner} has no {name!r}."
