@@ -18,8 +18,8 @@ def lazy_face(
     For type checkers the package imports the same names below ``if TYPE_CHECKING``.
 
     ``names`` has public names, separated by spaces, by the module that defines them, relative to the package:
-    ``{".scene": "Scene"}``. Those of ``"."`` are modules. ``below`` returns names of other packages with their
-    full names, for errors.
+    ``{".scene": "Scene"}``. Those of ``"."`` are modules. ``below`` returns names of other packages with
+    their full names, for errors.
     """
     face = vars(sys.modules[package])
     homes = {name: module for module, group in names.items() for name in group.split()}
