@@ -15,11 +15,9 @@ def lazy_face(
 ) -> None:
     """Give a package its public names: ``__all__``, ``__dir__`` and a ``__getattr__`` that imports them.
 
-    For type checkers the package imports the same names below ``if TYPE_CHECKING``.
-
-    ``names`` has public names, separated by spaces, by the module that defines them, relative to the package:
-    ``{".scene": "Scene"}``. Those of ``"."`` are modules. ``below`` returns names of other packages with
-    their full names, for errors.
+    ``names`` are the public names, separated by spaces, by the module that defines them, relative to the
+    package: ``{".scene": "Scene"}``; those of ``"."`` are modules. ``below`` are names of other packages, for
+    errors. For type checkers the package imports the same names below ``if TYPE_CHECKING``.
     """
     face = vars(sys.modules[package])
     homes = {name: module for module, group in names.items() for name in group.split()}

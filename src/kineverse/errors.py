@@ -157,7 +157,7 @@ def duplicate_value_error(symbol: object) -> DuplicateNameError:
 def summarize_error(error: Exception, advice: bool = True) -> str:
     """Return the first line of an error's message, without the places in which a file was looked for.
 
-    Without ``advice``, the sentence that says which variable to set is dropped as well.
+    Without a message it is the name of the error's type; without ``advice``, no variable to set is named.
     """
     text = str(error).strip()
     if not advice:
@@ -205,8 +205,8 @@ def unknown_attribute_error(
 ) -> UnknownAttributeError:
     """Return the error for an unknown attribute, with similar names or the equivalent of a foreign name.
 
-    ``owner`` is the subject of the sentence, ``elsewhere`` maps names of other libraries to ours, and
-    ``below`` names in the packages below the object to their full names.
+    ``owner`` is the subject of a sentence; ``elsewhere`` leads from names of other libraries to their
+    equivalents here, ``below`` from names in packages below the object to their full names.
     """
     below = below or {}
     problem = f"{owner} has no {name!r}."

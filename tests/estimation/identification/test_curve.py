@@ -49,7 +49,7 @@ PATHS: dict[str, Callable[[int, np.random.Generator], Array]] = {
 }
 
 
-def seen_along(path: str, seed: int, rows: int, count: int = 36) -> Array:
+def poses_along(path: str, seed: int, rows: int, count: int = 36) -> Array:
     random = np.random.default_rng(seed)
     poses = noisy(PATHS[path](count, random), POSITION, ORIENTATION, random)
     return poses if rows == 6 else poses[:, :3, 3]
@@ -58,7 +58,7 @@ def seen_along(path: str, seed: int, rows: int, count: int = 36) -> Array:
 @pytest.mark.parametrize("rows", [6, 3], ids=["poses", "positions"])
 @pytest.mark.parametrize("path", PATHS)
 def test_a_curve_is_never_identified_as_a_joint(path: str, rows: int) -> None:
-    identified = identify(None, seen_along(path, 0, rows, count=24), noise=COVARIANCE)
+    identified = identify(None, poses_along(path, 0, rows, count=24), noise=COVARIANCE)
     assert identified.is_ambiguous or identified.best.family == "curve"
     if path != "garage window":  # whose ellipse is nearly a circle
         assert identified.best.family == "curve"
@@ -66,18 +66,18 @@ def test_a_curve_is_never_identified_as_a_joint(path: str, rows: int) -> None:
 
 @pytest.mark.parametrize(("path", "rows"), [("cosine", 3), ("free hand", 3)])
 def test_a_curve_by_unknown_noise_is_never_identified_as_a_joint(path: str, rows: int) -> None:
-    identified = identify(None, seen_along(path, 2, rows, count=16))
+    identified = identify(None, poses_along(path, 2, rows, count=16))
     assert identified.is_ambiguous or identified.best.family == "curve"
 
 
 def test_identify_of_few_poses_along_a_curve_is_ambiguous() -> None:
     for path in ("cosine", "free hand"):
-        identified = identify(None, seen_along(path, 2, 6, count=9), noise=COVARIANCE)
+        identified = identify(None, poses_along(path, 2, 6, count=9), noise=COVARIANCE)
         assert identified.is_ambiguous or identified.best.family == "curve"
 
 
 def test_a_curve_is_found_in_any_order_and_any_unit() -> None:
-    data = seen_along("cosine", 3, 6, count=24)
+    data = poses_along("cosine", 3, 6, count=24)
     shuffled = np.random.default_rng(0).permutation(data)
     identified = identify(None, shuffled, noise=COVARIANCE)
     assert (identified.best.family, identified.is_ambiguous) == ("curve", False)
@@ -90,7 +90,7 @@ def test_a_curve_is_found_in_any_order_and_any_unit() -> None:
 
 
 def test_a_curve_is_found_among_outliers() -> None:
-    data, wrong = seen_along("cosine", 4, 6, count=20), [3, 11, 16]
+    data, wrong = poses_along("cosine", 4, 6, count=20), [3, 11, 16]
     data[wrong, :3, 3] += [0.7, -0.5, 0.6]
     identified = identify(None, data, noise=COVARIANCE, outliers=True)
     assert identified.best.family == "curve"
@@ -99,7 +99,7 @@ def test_a_curve_is_found_among_outliers() -> None:
 
 @pytest.mark.parametrize("rows", [6, 3])
 def test_operation_of_a_curve_moves_as_its_fit(rows: int) -> None:
-    fit = identify(None, seen_along("garage window", 5, rows), noise=COVARIANCE, families="curve").best
+    fit = identify(None, poses_along("garage window", 5, rows), noise=COVARIANCE, families="curve").best
     model, open_model = kv.Model(), kv.Model()
     for made, limits in ((model, True), (open_model, False)):
         with made.edit() as edit:
@@ -155,7 +155,7 @@ def test_other_families_keep_their_odds_beside_the_curve() -> None:
 
 
 def test_a_curve_takes_five_poses() -> None:
-    data = seen_along("cosine", 7, 6, count=4)
+    data = poses_along("cosine", 7, 6, count=4)
     with pytest.raises(InvalidValueError, match="5 poses"):
         identify(None, data, noise=COVARIANCE, families="curve")
     assert "curve" not in identify(None, data, noise=COVARIANCE).probabilities
@@ -164,7 +164,7 @@ def test_a_curve_takes_five_poses() -> None:
 
 
 def test_identifier_finds_the_curve_of_identify() -> None:
-    data = np.random.default_rng(0).permutation(seen_along("cosine", 8, 6, count=22))
+    data = np.random.default_rng(0).permutation(poses_along("cosine", 8, 6, count=22))
     identifier = Identifier(noise=COVARIANCE)
     for k, pose in enumerate(data, start=1):
         identifier.add(None, pose)

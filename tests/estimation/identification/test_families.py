@@ -75,7 +75,7 @@ def garage() -> Family:
     return Family("garage", door, {a: (0.0, 1.5)}, {length: FamilyParameter(2.0, 0.5, 0.5, 4.0)})
 
 
-def seen_doors(count: int, position: float, orientation: float) -> tuple[np.ndarray, np.ndarray]:
+def door_poses(count: int, position: float, orientation: float) -> tuple[np.ndarray, np.ndarray]:
     family = garage()
     (a,), (length,) = family.joints, family.parameters
     random = np.random.default_rng(0)
@@ -86,7 +86,7 @@ def seen_doors(count: int, position: float, orientation: float) -> tuple[np.ndar
 
 @pytest.fixture(scope="module")
 def result() -> IdentificationResult:
-    _, poses = seen_doors(20, 0.01, 0.02)
+    _, poses = door_poses(20, 0.01, 0.02)
     return identify(None, poses, noise=pose_covariance(0.01, 0.02), families=["revolute", "planar", garage()])
 
 
@@ -106,7 +106,7 @@ def test_a_custom_familys_parameter_is_estimated(result: IdentificationResult) -
 def test_joint_values_and_limits_of_a_custom_family_are_the_observed_ones(
     result: IdentificationResult,
 ) -> None:
-    values, _ = seen_doors(20, 0.01, 0.02)
+    values, _ = door_poses(20, 0.01, 0.02)
     np.testing.assert_allclose(result["garage"].joint_values[:, 0], values, atol=0.05)
 
 

@@ -19,7 +19,7 @@ MOVING = ("prismatic", "revolute")
 FAMILIES = ("rigid", "prismatic", "revolute", "planar")
 
 
-def found_in(data: Recording) -> IdentificationResult:
+def identify_data(data: Recording) -> IdentificationResult:
     return identify(data.parent, data.child, noise=data.covariance, families=FAMILIES)
 
 
@@ -36,7 +36,7 @@ def some_pose(seed: int) -> np.ndarray:
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
 def test_identify_is_invariant_to_the_observers_pose(seed: int, family: str) -> None:
     data = seeded(family, seed)
-    before = found_in(data)
+    before = identify_data(data)
     elsewhere = some_pose(seed + 1)
     turn = np.kron(np.eye(2), elsewhere[:3, :3])
     after = identify(
@@ -54,7 +54,7 @@ def test_identify_is_equivariant_to_the_childs_frame(seed: int, family: str) -> 
     data = seeded(family, seed)
     change = np.eye(4)
     change[:3, :3] = some_pose(seed)[:3, :3]
-    before = found_in(data)
+    before = identify_data(data)
     after = identify(data.parent, data.child @ change, noise=data.covariance, families=FAMILIES)
     same_joint(before, after, family)
     np.testing.assert_allclose(
@@ -67,7 +67,7 @@ def test_identify_is_equivariant_to_the_childs_frame(seed: int, family: str) -> 
 def test_identify_is_invariant_to_the_order_of_poses(seed: int, family: str) -> None:
     data = seeded(family, seed)
     order = np.random.default_rng(seed).permutation(len(data.parent))
-    before = found_in(data)
+    before = identify_data(data)
     after = identify(data.parent[order], data.child[order], noise=data.covariance, families=FAMILIES)
     same_joint(before, after, family)
     np.testing.assert_allclose(before[family].joint_values[order], after[family].joint_values, atol=1e-3)
@@ -84,7 +84,7 @@ def same_joint(before: IdentificationResult, after: IdentificationResult, family
 @pytest.mark.parametrize("family", MOVING)
 def test_exchanging_parent_and_child_inverts_the_model(family: str) -> None:
     data = seeded(family, 5, count=20)
-    fit = found_in(data)[family]
+    fit = identify_data(data)[family]
     other = identify(data.child, data.parent, noise=data.covariance, families=FAMILIES)[family]
     inverse = np.linalg.inv(other.parameters["reference"])
     axis = inverse[:3, :3] @ other.parameters["axis"]
@@ -115,9 +115,9 @@ def test_the_likelihood_has_all_true_poses_as_unknowns(family: str) -> None:
             twist[5 if family == "revolute" else 2] = values[k]
             there = transform(Rotation.from_rotvec(parents[k, 3:]), parents[k, :3])
             motion = transform(Rotation.from_rotvec(twist[3:]), twist[:3])
-            for seen_pose, true in ((data.parent[k], there), (data.child[k], there @ left @ motion @ right)):
-                turned = Rotation.from_matrix(seen_pose[:3, :3] @ true[:3, :3].T).as_rotvec()
-                result.append(np.concatenate([seen_pose[:3, 3] - true[:3, 3], turned]) / deviation)
+            for noisy_pose, true in ((data.parent[k], there), (data.child[k], there @ left @ motion @ right)):
+                turned = Rotation.from_matrix(noisy_pose[:3, :3] @ true[:3, :3].T).as_rotvec()
+                result.append(np.concatenate([noisy_pose[:3, 3] - true[:3, 3], turned]) / deviation)
         return np.concatenate(result)
 
     start = [
@@ -145,7 +145,7 @@ def test_identifier_agrees_with_identify(family: str) -> None:
         identifier.add(a, b)
         if len(identifier) > 4:
             assert identifier.result.best.probability > 0.0
-    whole = found_in(data)
+    whole = identify_data(data)
     one, other = identifier.result[family], whole[family]
     assert one.log_evidence == pytest.approx(other.log_evidence, abs=0.02)
     assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * other.deviation("axis.x")

@@ -27,7 +27,7 @@ COVARIANCE = pose_covariance(0.002, 0.02)
 LEFT = transform(Rotation.from_rotvec([0.3, -0.4, 0.2]), (0.3, 0.1, 0.5))
 
 
-def seen_turning(turns: float, lead: float, count: int, seed: int = 0, start: float = 0.0) -> Array:
+def turning_poses(turns: float, lead: float, count: int, seed: int = 0, start: float = 0.0) -> Array:
     """Return poses of a screw with some revolutions and a pitch [m]."""
     turn = kv.position("turn")
     along = kv.translation(0, 0, lead / math.tau * turn)
@@ -36,20 +36,20 @@ def seen_turning(turns: float, lead: float, count: int, seed: int = 0, start: fl
     return noisy(true, 0.002, 0.02, np.random.default_rng(seed))
 
 
-def found_of(data: Array, **options: object) -> IdentificationResult:
+def identify_data(data: Array, **options: object) -> IdentificationResult:
     return identify(None, data, noise=COVARIANCE, **options)
 
 
 @pytest.mark.parametrize("turns", [2.3, 5.0, 20.0])
 def test_revolutions_of_a_crank_are_counted(turns: float) -> None:
-    data = seen_turning(turns, 0.0, int(10 * turns))
-    fit = found_of(data, sequential=True).best
+    data = turning_poses(turns, 0.0, int(10 * turns))
+    fit = identify_data(data, sequential=True).best
     assert fit.family == "revolute"
     assert np.ptp(fit.range) == pytest.approx(turns * math.tau, abs=0.1)
     assert fit.largest_turn == pytest.approx(turns * math.tau / (len(data) - 1), abs=0.1)
     np.testing.assert_allclose(fit.poses, data, atol=0.12)
     # Without the order, turns are unknown.
-    assert np.ptp(found_of(data).best.range) < math.tau
+    assert np.ptp(identify_data(data).best.range) < math.tau
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(fit.operation("crank", "world"))
@@ -60,7 +60,7 @@ def test_revolutions_of_a_crank_are_counted(turns: float) -> None:
 @pytest.mark.parametrize("lead", [0.002, 0.005, -0.01])
 def test_the_lead_of_a_screw_is_found_by_counted_revolutions(lead: float) -> None:
     for seed in range(3):
-        identified = found_of(seen_turning(5.0, lead, 60, seed), sequential=True)
+        identified = identify_data(turning_poses(5.0, lead, 60, seed), sequential=True)
         assert identified.best.family == "screw"
         axis = identified.best.parameters["axis"]
         pitch = identified.best.parameters["pitch"] * np.sign(axis @ LEFT[:3, 2]) ** 2
@@ -72,8 +72,8 @@ def test_the_lead_of_a_screw_is_found_by_counted_revolutions(lead: float) -> Non
 
 def test_less_than_a_revolution_agrees_with_unordered_poses() -> None:
     for start in (0.0, 4.0):
-        data = seen_turning(0.9, 0.0, 30, start=start)
-        one, other = found_of(data), found_of(data, sequential=True)
+        data = turning_poses(0.9, 0.0, 30, start=start)
+        one, other = identify_data(data), identify_data(data, sequential=True)
         assert one.best.family == other.best.family == "revolute"
         for fit in one:
             # Without order a screw may have turned anyhow to follow the noise, which pays for its turns.
@@ -85,10 +85,10 @@ def test_less_than_a_revolution_agrees_with_unordered_poses() -> None:
 
 def test_revolutions_are_counted_across_outliers() -> None:
     random = np.random.default_rng(3)
-    data = seen_turning(5.0, 0.004, 80)
+    data = turning_poses(5.0, 0.004, 80)
     wrong = np.sort(random.choice(80, 12, replace=False))
     data[wrong] = transform(Rotation.random(12, random_state=random), random.uniform(-1, 1, (12, 3)))
-    fit = found_of(data, sequential=True, outliers=True).best
+    fit = identify_data(data, sequential=True, outliers=True).best
     assert fit.family == "screw"
     assert fit.outliers == tuple(wrong)
     assert np.ptp(fit.range) == pytest.approx(5 * math.tau, abs=0.2)
@@ -96,11 +96,11 @@ def test_revolutions_are_counted_across_outliers() -> None:
 
 
 def test_revolutions_are_counted_from_positions() -> None:
-    data = seen_turning(4.0, 0.02, 60)[:, :3, 3]
+    data = turning_poses(4.0, 0.02, 60)[:, :3, 3]
     identified = identify(None, data, noise=COVARIANCE[:3, :3], sequential=True)
     assert identified.best.family == "screw"
     assert identified.best.parameters["pitch"] == pytest.approx(0.02, abs=1e-3)
-    round_and_round = seen_turning(4.0, 0.0, 60)[:, :3, 3]
+    round_and_round = turning_poses(4.0, 0.0, 60)[:, :3, 3]
     fit = identify(None, round_and_round, noise=COVARIANCE[:3, :3], sequential=True)["revolute"]
     assert np.ptp(fit.range) == pytest.approx(4 * math.tau, abs=0.1)
 
@@ -108,7 +108,7 @@ def test_revolutions_are_counted_from_positions() -> None:
 @pytest.mark.parametrize(("lead", "family"), [(0.0, "revolute"), (0.005, "screw")])
 def test_identifier_counts_revolutions(lead: float, family: str) -> None:
     identifier = Identifier(noise=COVARIANCE)
-    for k, pose in enumerate(seen_turning(4.0, lead, 45)):
+    for k, pose in enumerate(turning_poses(4.0, lead, 45)):
         identifier.add(None, pose)
         if k > 20 and k % 4 == 0:
             assert identifier.result

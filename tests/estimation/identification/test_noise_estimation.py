@@ -159,7 +159,7 @@ NOTHING = {
 }
 
 
-def found_online(parent, child, noise, outliers):
+def identify_online(parent, child, noise, outliers):
     identifier = Identifier(noise=noise, outliers=outliers)
     for k, pose in enumerate(child):
         identifier.add(None if parent is None else parent[k], pose)
@@ -182,7 +182,7 @@ def test_observations_without_information_have_no_sure_answer(case: str, noise) 
             continue  # with a stated noise and no outliers such a part is free
         for identified in (
             identify(parent, child, noise=noise, outliers=outliers),
-            found_online(parent, child, noise, outliers),
+            identify_online(parent, child, noise, outliers),
         ):
             assert identified.is_ambiguous
             assert all(np.isfinite(fit.log_evidence) for fit in identified)
@@ -202,7 +202,7 @@ def test_invalid_observations_are_refused(noise, outliers) -> None:
     ):
         for find in (
             lambda child: identify(None, child, noise=noise, outliers=outliers),
-            lambda child: found_online(None, child, noise, outliers),
+            lambda child: identify_online(None, child, noise, outliers),
         ):
             with pytest.raises(KineverseError, match=message):
                 find(child)

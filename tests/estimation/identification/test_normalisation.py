@@ -30,7 +30,7 @@ def larger(poses: np.ndarray, factor: float) -> np.ndarray:
     return result
 
 
-def found_of(data: Recording, factor: float, families: object = None) -> IdentificationResult:
+def identify_data(data: Recording, factor: float, families: object = None) -> IdentificationResult:
     noise = pose_covariance(0.002 * factor, 0.01)
     return identify(larger(data.parent, factor), larger(data.child, factor), noise=noise, families=families)
 
@@ -38,7 +38,7 @@ def found_of(data: Recording, factor: float, families: object = None) -> Identif
 @pytest.mark.parametrize("family", [*JOINTS])
 def test_identify_is_invariant_to_millimetres(family: str) -> None:
     data = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
-    assert found_of(data, 1000.0).best.family == family
+    assert identify_data(data, 1000.0).best.family == family
 
 
 @pytest.mark.parametrize(
@@ -51,8 +51,8 @@ def test_identify_is_invariant_to_millimetres(family: str) -> None:
 )
 def test_lengths_of_a_fit_scale_with_the_poses(family: str) -> None:
     data = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
-    small, factor = found_of(data, LARGE), 40.0
-    large = found_of(data, factor * LARGE)
+    small, factor = identify_data(data, LARGE), 40.0
+    large = identify_data(data, factor * LARGE)
     for one, other in zip(small, large, strict=True):
         assert other.probability == pytest.approx(one.probability, abs=1e-3)
     one, other = small.best, large.best

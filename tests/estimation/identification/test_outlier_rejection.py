@@ -26,7 +26,9 @@ def with_wrong(data: Recording, fraction: float, seed: int) -> tuple[Array, Arra
     return child, wrong
 
 
-def seen_as(family: str, seed: int, count: int = 20, noise: tuple[float, float] = (0.01, 0.03)) -> Recording:
+def record_joint(
+    family: str, seed: int, count: int = 20, noise: tuple[float, float] = (0.01, 0.03)
+) -> Recording:
     return recording(family, count=count, position=noise[0], orientation=noise[1], seed=seed)
 
 
@@ -44,7 +46,7 @@ def test_identify_with_outliers_agrees_with_the_inliers_alone(
     right, off, off_without = 0, [], []
     for family in TOLD:
         for seed in range(repeats):
-            data = seen_as(family, seed)
+            data = record_joint(family, seed)
             child, wrong = with_wrong(data, fraction, seed + 100)
             identified = identify(data.parent, child, noise=data.covariance, outliers=True)
             right += identified.best.family == family
@@ -71,7 +73,7 @@ def test_identify_with_outliers_agrees_with_the_inliers_alone(
     ],
 )
 def test_outliers_option_changes_nothing_without_outliers(family: str) -> None:
-    data = seen_as(family, 3)
+    data = record_joint(family, 3)
     before = identify(data.parent, data.child, noise=data.covariance)
     after = identify(data.parent, data.child, noise=data.covariance, outliers=True)
     assert after.best.family == before.best.family == family
@@ -86,7 +88,7 @@ def test_outliers_option_changes_nothing_without_outliers(family: str) -> None:
 
 @pytest.fixture(scope="module")
 def hinge() -> tuple[Recording, Array, Array, IdentificationResult]:
-    data = seen_as("revolute", 1)
+    data = record_joint("revolute", 1)
     child, wrong = with_wrong(data, 0.2, 7)
     return data, child, wrong, identify(data.parent, child, noise=data.covariance, outliers=True)
 
@@ -126,7 +128,7 @@ def test_evidence_includes_the_density_of_the_outliers(hinge) -> None:
 @pytest.mark.parametrize("family", ["revolute", "prismatic", "rigid"])
 def test_outliers_among_positions_are_found(family: str) -> None:
     for seed in range(3):
-        data = seen_as(family, seed, noise=(0.005, 0.03))
+        data = record_joint(family, seed, noise=(0.005, 0.03))
         child, wrong = with_wrong(data, 0.2, seed)
         points = (np.linalg.inv(data.parent) @ child)[:, :3, 3]
         points[:] = (np.linalg.inv(data.true_parent) @ child)[:, :3, 3]
@@ -138,7 +140,7 @@ def test_outliers_among_positions_are_found(family: str) -> None:
 
 @pytest.mark.parametrize("family", TOLD)
 def test_outliers_are_found_with_unknown_noise(family: str) -> None:
-    data = seen_as(family, 2)
+    data = record_joint(family, 2)
     child, wrong = with_wrong(data, 0.2, 2)
     identified = identify(data.parent, child, outliers=True)
     assert identified.best.family == family
@@ -147,7 +149,7 @@ def test_outliers_are_found_with_unknown_noise(family: str) -> None:
 
 
 def test_outliers_are_found_in_millimetres() -> None:
-    data = seen_as("revolute", 4)
+    data = record_joint("revolute", 4)
     child, wrong = with_wrong(data, 0.2, 4)
     parent = data.parent.copy()
     for poses in (parent, child):
@@ -159,7 +161,7 @@ def test_outliers_are_found_in_millimetres() -> None:
 
 def test_half_of_the_observations_as_outliers_is_no_explanation() -> None:
     """Motion about four axes in turn is no hinge with mostly wrong observations."""
-    several = [seen_as("revolute", seed, count=5) for seed in range(4)]
+    several = [record_joint("revolute", seed, count=5) for seed in range(4)]
     parent, child = (np.concatenate([getattr(s, part) for s in several]) for part in ("parent", "child"))
     identified = identify(parent, child, noise=several[0].covariance, outliers=True)
     assert identified["revolute"].outliers == identified["rigid"].outliers == ()
@@ -167,7 +169,7 @@ def test_half_of_the_observations_as_outliers_is_no_explanation() -> None:
 
 
 def test_identifier_finds_outliers() -> None:
-    data = seen_as("revolute", 5, count=30)
+    data = record_joint("revolute", 5, count=30)
     child, wrong = with_wrong(data, 0.2, 5)
     identifier = Identifier(noise=data.covariance, outliers=True)
     for a, b in zip(data.parent, child, strict=True):
@@ -183,6 +185,6 @@ def test_identifier_finds_outliers() -> None:
 
 
 def test_invalid_outlier_models_are_refused() -> None:
-    data = seen_as("rigid", 0)
+    data = record_joint("rigid", 0)
     with pytest.raises(InvalidValueError, match="Outliers are True, False or Outliers"):
         identify(data.parent, data.child, noise=data.covariance, outliers=0.2)  # type: ignore[arg-type]

@@ -29,7 +29,7 @@ HOW = ("both noisy", "parent known", "positions", "each with another noise")
 MOVING = [family for family in JOINTS if family not in ("rigid", "free")]
 
 
-def seen_as(how: str, family: str) -> Observations:
+def record_joint(how: str, family: str) -> Observations:
     data = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
     c = data.covariance
     if how == "both noisy":
@@ -75,7 +75,7 @@ def compiled() -> None:
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
 def test_levenberg_marquardt_in_c_agrees_with_numpy(family: str, how: str) -> None:
-    data = seen_as(how, family)
+    data = record_joint(how, family)
     start = next(initial_guesses(family, MotionStatistics(data)))
     slow = levenberg_marquardt(data, *start)
     fast = solver.solve(data, start, data.parent, slow.joint_prior)
@@ -90,7 +90,7 @@ def test_levenberg_marquardt_in_c_agrees_with_numpy(family: str, how: str) -> No
 @pytest.mark.parametrize("family", MOVING)
 @pytest.mark.parametrize("how", HOW)
 def test_marginal_steps_in_c_agree_with_numpy(family: str, how: str) -> None:
-    data = seen_as(how, family)
+    data = record_joint(how, family)
     start = next(initial_guesses(family, MotionStatistics(data)))
     near = levenberg_marquardt(data, start.motion, start.values)
     # C has derivatives in closed form, and numpy takes differences.
@@ -107,7 +107,7 @@ def test_marginal_steps_in_c_agree_with_numpy(family: str, how: str) -> None:
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
 def test_linearised_poses_in_c_agree_with_numpy(family: str, how: str) -> None:
-    start = next(initial_guesses(family, MotionStatistics(seen_as(how, family))))
+    start = next(initial_guesses(family, MotionStatistics(record_joint(how, family))))
     assert isinstance(start.motion, GroupMotion)
     for slow, fast in zip(
         start.motion.linearise(start.values, native=False), start.motion.linearise(start.values), strict=True
@@ -119,7 +119,7 @@ def test_linearised_poses_in_c_agree_with_numpy(family: str, how: str) -> None:
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
 def test_maximum_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
-    data = seen_as(how, family)
+    data = record_joint(how, family)
     begin = [*initial_guesses(family, MotionStatistics(data))]
     same(marginal_likelihood.maximum_likelihood(data, begin), solver.maximum_likelihood(data, begin))
 
@@ -128,7 +128,7 @@ def test_maximum_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> Non
 @pytest.mark.parametrize("family", MOVING)
 @pytest.mark.parametrize("how", ["both noisy", "parent known"])
 def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
-    data = seen_as(how, family)
+    data = record_joint(how, family)
     near = solve_from_best_start(data, [*initial_guesses(family, MotionStatistics(data))])
     slow, fast = (
         marginal_likelihood.maximise_marginal_likelihood(data, near),
@@ -176,7 +176,7 @@ def test_c_stays_within_its_work_memory(family: str, how: str, monkeypatch: pyte
         return lent[-1][:size]
 
     monkeypatch.setattr(native._memory, "reserve", lend)
-    data = precise(family, True) if how == "precise" else seen_as(how, family)
+    data = precise(family, True) if how == "precise" else record_joint(how, family)
     identified = solver.maximum_likelihood(data, [*initial_guesses(family, MotionStatistics(data))]).solution
     identified = solver.maximise_marginal_likelihood(data, identified).solution
     solver.continue_from(
@@ -191,7 +191,7 @@ def test_c_stays_within_its_work_memory(family: str, how: str, monkeypatch: pyte
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
 def test_evidence_in_c_agrees_with_numpy(family: str, how: str) -> None:
-    data = seen_as(how, family)
+    data = record_joint(how, family)
     solution = solver.maximum_likelihood(data, [*initial_guesses(family, MotionStatistics(data))]).solution
     parts = np.stack([0.3 * solution.covariance, 0.7 * solution.covariance])
     factors = np.array([[1.0, 1.0], [3.0, 3.0], [2.0, 0.5]])
@@ -210,7 +210,7 @@ def test_evidence_in_c_agrees_with_numpy(family: str, how: str) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", ["revolute", "planar"])
 def test_evidence_of_an_unconverged_solution_is_reduced_in_c(family: str) -> None:
-    data = seen_as("both noisy", family)
+    data = record_joint("both noisy", family)
     near = solver.maximum_likelihood(data, [*initial_guesses(family, MotionStatistics(data))])
     reached = solver.maximise_marginal_likelihood(data, near.solution)
     early = replace(reached.solution, converged=False, cost=reached.solution.cost + 20.0)
@@ -235,7 +235,7 @@ class Pinned(GroupMotion):
 
 @pytest.mark.compiler
 def test_a_subclass_of_a_motion_is_solved_in_numpy() -> None:
-    data = seen_as("both noisy", "revolute")
+    data = record_joint("both noisy", "revolute")
     start = next(initial_guesses("revolute", MotionStatistics(data)))
     pinned = Pinned(JOINT_FAMILIES["revolute"], 6, start.motion.left, start.motion.right)
     begin = InitialGuess(pinned, start.values)

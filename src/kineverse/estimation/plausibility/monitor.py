@@ -217,7 +217,7 @@ class PlausibilityMonitor:
             raise ShapeError(f"The pose of '{name}' is a 4×4 transform, not of shape {matrix.shape}.")
         if not covariance and self._covariances is not None and _is_rigid(matrix):
             # The usual case in a fraction of the time.
-            return PoseTrack(matrix[None].copy(), self._covariances, _SEEN)
+            return PoseTrack(matrix[None].copy(), self._covariances, _OBSERVED)
         poses = (matrix[None], covariance[0]) if covariance else matrix[None]
         track = check_tracks({name: poses}, self._noise)[name]
         if not covariance:
@@ -293,7 +293,7 @@ class PlausibilityMonitor:
         return judge_joint(self.model, data, since, self._families, outliers, self._correlation)
 
 
-_SEEN = np.ones(1, dtype=bool)
+_OBSERVED = np.ones(1, dtype=bool)
 
 
 def _is_rigid(pose: Array) -> bool:
