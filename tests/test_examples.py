@@ -14,7 +14,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.formats.locate import locate_model
-from kineverse_studies.bench.measure_examples import EXAMPLES
+from kineverse_studies.bench.examples import EXAMPLES
 from markdown_examples import ROOT, agree
 
 FOLDER = ROOT / "examples"

@@ -27,7 +27,8 @@ TWINS = {"lie", "spatial"}
 
 INTERFACES = {
     "cli": {"add_arguments", "main", "run"},
-    "studies": {"add_arguments", "main", "measure", "run"},
+    "studies": {"add_arguments", "main", "measure", "run"}
+    | {"batch", "call", "document", "edit", "frames", "loop", "make_loop"},
 }
 """Functions that every command, benchmark or experiment has, since they are called by that name."""
 

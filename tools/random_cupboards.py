@@ -24,10 +24,12 @@ from pathlib import Path
 import coal
 import numpy as np
 
+from kineverse.grasping import find_gripper
 from kineverse.manipulation import Outcome, Session, open_object
-from kineverse.manipulation.pushing.trials import try_push
+from kineverse.manipulation.pushing import Pushing
 from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.worlds import KinematicWorld
+from kineverse_studies.experiments.manipulation.skills import try_push
 
 ROBOTS = ("hsr", "pr2", "fetch")
 SKILLS = ("open", "close", "push")
@@ -355,11 +357,9 @@ def run_robot(robot: str, cupboard: Cupboard, folder: Path) -> Run:
 
     read()
     if cupboard.skill == "push":
-        trial = try_push(
-            world, state, what, target=cupboard.target,
-            open_session=lambda world, judge: Session(world, on_step=lambda s: (judge(s), read())),
-        )  # fmt: skip
-        outcome = trial.outcome
+        bodies = find_gripper(model, robot).bodies
+        pushing = Pushing(model, what, bodies, state, target=cupboard.target, robot=robot)
+        outcome, _, _ = try_push(pushing, world, state, lambda: Session(world, on_step=look))
     else:
         outcome = open_object(Session(world, on_step=look), what, target=cupboard.target)
     read()

@@ -24,9 +24,9 @@ from kineverse.manipulation import PartMover, Session, explore_locks
 from kineverse.manipulation.unlocking.lock_hypothesis import Enclosure, KeySide, LockHypothesis
 from kineverse.reasoning import plan_unlocking
 from kineverse.worlds import MechanismWorld
-from kineverse_studies.experiments.lockbox.exhaustive_search import can_be_opened
-from kineverse_studies.experiments.lockbox.systematic_search import (
+from kineverse_studies.experiments.lockbox.unknown_locks import (
     LockboxTrials,
+    can_be_opened,
     count_systematic_tries,
     permute_parts,
 )

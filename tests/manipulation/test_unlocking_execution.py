@@ -9,7 +9,7 @@ from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.gallery.lockboxes import THESIS, draw_tangled_lockbox, make_lockbox_model, make_rings
 from kineverse.manipulation import execute_unlocking
 from kineverse.worlds import MechanismWorld
-from kineverse_studies.experiments.lockbox.exhaustive_search import can_be_opened
+from kineverse_studies.experiments.lockbox.unknown_locks import can_be_opened
 
 A, B, C = map(kv.position, "abc")
 

@@ -17,7 +17,7 @@ from kineverse.gallery.lockboxes import (
 )
 from kineverse.reasoning import Interval, interlocks, plan_unlocking, plan_violations, refutation_gaps
 from kineverse.reasoning.move_search import MoveSearch
-from kineverse_studies.experiments.lockbox.exhaustive_search import can_be_opened
+from kineverse_studies.experiments.lockbox.unknown_locks import can_be_opened
 
 A, B, C = map(kv.position, "abc")
 

@@ -50,8 +50,7 @@ def tables_of(*tables: ReportTable) -> Tables:
 @cache
 def fig4() -> Tables:
     """Track few configurations, with one seed, and without times and mechanisms."""
-    from kineverse_studies.experiments.fig4.accuracy import measure_errors
-    from kineverse_studies.experiments.fig4.consistency import measure_consistency
+    from kineverse_studies.experiments.fig4.accuracy import measure_consistency, measure_errors
     from kineverse_studies.experiments.fig4.protocol import make_observed_model
 
     scene = make_observed_model(kv.load("kitchen"))
@@ -84,9 +83,9 @@ def fig4_authors() -> Tables:
 
 
 def _fig4_tables(scene: Any, errors: Any, variants: Any = None, consistency: Any = None) -> Tables:
+    from kineverse_studies.experiments.fig4 import Fig4Results, make_tables
     from kineverse_studies.experiments.fig4.accuracy import FILTERS
-    from kineverse_studies.experiments.fig4.report import Fig4Results, make_tables
-    from kineverse_studies.experiments.fig4.timing import Duration
+    from kineverse_studies.experiments.fig4.protocol import Duration
 
     untimed = dict.fromkeys(FILTERS, Duration(math.nan, math.nan, math.nan, 0))
     results = Fig4Results(
@@ -115,8 +114,7 @@ def sturm() -> Tables:
 @cache
 def sturm_statements() -> Tables:
     """Identify the shortest recording by all of its poses."""
-    from kineverse_studies.experiments.sturm.noise_statements import answer_statements, statement_table
-    from kineverse_studies.experiments.sturm.recordings import read_labelled_pairs
+    from kineverse_studies.experiments.sturm import answer_statements, read_labelled_pairs, statement_table
 
     pairs = read_labelled_pairs(DATA / "sturm_tracks")
     shortest = min(pairs, key=lambda one: len(one[2].child_poses))
@@ -126,8 +124,7 @@ def sturm_statements() -> Tables:
 @cache
 def stream_tracking() -> Tables:
     """Track two streams of 45 s."""
-    from kineverse_studies.experiments.stream.report import make_report
-    from kineverse_studies.experiments.stream.tracking import make_streams, run_trackers
+    from kineverse_studies.experiments.stream import make_report, make_streams, run_trackers
 
     model = kv.load("kitchen")
     streams = make_streams(model, range(STREAMS), _quiet, STREAM_SECONDS)
@@ -137,8 +134,7 @@ def stream_tracking() -> Tables:
 @cache
 def stream_monitoring() -> Tables:
     """Monitor one stream of a minute of each kind."""
-    from kineverse_studies.experiments.stream.monitoring import measure_monitoring
-    from kineverse_studies.experiments.stream.report import monitoring_table
+    from kineverse_studies.experiments.stream import measure_monitoring, monitoring_table
 
     return tables_of(monitoring_table(measure_monitoring(kv.load("kitchen"), seeds=1, minutes=1.0)))
 
@@ -146,26 +142,26 @@ def stream_monitoring() -> Tables:
 @cache
 def joint_types() -> Tables:
     """Identify the first cases."""
-    from kineverse_studies.experiments.joint_types.answers import identify_cases
-    from kineverse_studies.experiments.joint_types.report import report_answers
+    from kineverse_studies.experiments import Options
+    from kineverse_studies.experiments.joint_types import identify_cases, report_answers
 
-    return as_tables(report_answers(identify_cases(TYPE_CASES, _quiet, workers=1)))
+    return as_tables(report_answers(identify_cases(TYPE_CASES, _quiet, Options(processes=1))))
 
 
 @cache
 def estimation_grid() -> Tables:
     """Fit few samples of each cell."""
-    from kineverse_studies.experiments.estimation_grid.fits import fit_all, make_quick_grid
-    from kineverse_studies.experiments.estimation_grid.report import report_grid
+    from kineverse_studies.experiments import Options
+    from kineverse_studies.experiments.estimation_grid import fit_all, make_quick_grid, report_grid
 
-    return as_tables(report_grid(fit_all(make_quick_grid(), GRID_SAMPLES, _quiet, workers=1)))
+    return as_tables(report_grid(fit_all(make_quick_grid(), GRID_SAMPLES, _quiet, Options(processes=1))))
 
 
 @cache
 def kitchen(what: str) -> Tables:
     """Open and close one object of the shipped kitchen, with the last robot."""
     from kineverse_studies.experiments.kitchens import KitchenJob, report_trials, run_kitchen
-    from kineverse_studies.experiments.manipulation.robots import find_robots
+    from kineverse_studies.experiments.manipulation.skills import find_robots
 
     trials = run_kitchen(KitchenJob("kitchen", find_robots((), None)[-1], only=what))
     return as_tables(report_trials(trials, ["kitchen"]))
@@ -174,10 +170,8 @@ def kitchen(what: str) -> Tables:
 @cache
 def pushes() -> Tables:
     """Push the fridge door shut with the last robot."""
-    from kineverse_studies.experiments.manipulation.robots import find_robots
-    from kineverse_studies.experiments.table1_push import PushJob, run_push
-    from kineverse_studies.experiments.table1_push.objects import SHIPPED_KITCHEN
-    from kineverse_studies.experiments.table1_push.report import make_push_report
+    from kineverse_studies.experiments.manipulation.skills import find_robots
+    from kineverse_studies.experiments.table1_push import SHIPPED_KITCHEN, PushJob, make_push_report, run_push
 
     job = PushJob(find_robots((), None)[-1], SHIPPED_KITCHEN, None, "fridge door")
     return as_tables(make_push_report(run_push(job), seed=0))

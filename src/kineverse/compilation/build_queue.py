@@ -69,6 +69,9 @@ class NoRoomError(Exception):
         )
         super().__init__(f"there is no room to compile in: {self.reason}")
 
+    def __reduce__(self) -> tuple[object, ...]:
+        return NoRoomError, (self.reason,)
+
 
 class _Waits(threading.local):
     seconds = 0.0

@@ -12,12 +12,6 @@ import numpy as np
 
 from kineverse.errors import KineverseError, summarize_error
 from kineverse.expressions.printing import format_number
-from kineverse.formats.document import OpaqueOperation
-from kineverse.formats.files import read_file
-from kineverse.formats.loader import load
-from kineverse.formats.locate import Source, locate_model
-from kineverse.formats.reader_warnings import Fault, collect_warnings
-from kineverse.formats.xml_reader import read_root_tag
 from kineverse.loops.loop_records import find_loops
 from kineverse.model.body import Inertia, Mesh
 from kineverse.model.model import Model
@@ -26,7 +20,13 @@ from kineverse.model.registry import LoopTreatment
 from kineverse.model.sampling import StateSamples
 from kineverse.state import State
 
+from .document import OpaqueOperation
+from .files import read_file
+from .loader import load
+from .locate import Source, locate_model
+from .reader_warnings import Fault, collect_warnings
 from .resource_paths import locate_mesh
+from .xml_reader import read_root_tag
 
 SAMPLED_STATES = 32  # number of random states within the limits in which poses and loops are checked
 

@@ -38,6 +38,9 @@ class ElementError(Exception):
         self.element = element
         self.message = message
 
+    def __reduce__(self) -> tuple[object, ...]:
+        return ElementError, (self.element, self.message)
+
 
 def parse_xml(
     data: str | bytes,

@@ -1,13 +1,19 @@
-"""Benchmarks of the package beside peer libraries (layer 7).
+"""Benchmarks of the package, with peer libraries. They only measure: no build fails because of them."""
 
-:func:`run_benchmarks` yields a :class:`BenchmarkResult` for each benchmark. Benchmarks only measure;
-no build fails because of them.
-"""
-
-from .harness import QUICK, BenchmarkSettings, DisagreementError
-from .machine import Machine, describe_machine
-from .registry import BENCHMARKS, run_benchmarks, select_benchmarks
-from .result import Bar, BenchmarkResult, Comparison, Measurement
+from .harness import (
+    BENCHMARKS,
+    QUICK,
+    Bar,
+    BenchmarkResult,
+    BenchmarkSettings,
+    Comparison,
+    DisagreementError,
+    Machine,
+    Measurement,
+    describe_machine,
+    run_benchmarks,
+    select_benchmarks,
+)
 
 __all__ = [
     "BENCHMARKS",

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 from xml.etree import ElementTree
 
 import numpy as np
@@ -26,8 +25,7 @@ from kineverse.model.model import Model
 
 from .workloads import strip_shapes
 
-ROOT = "root_joint"
-"""Name of floating joints; pink finds the floating base by it."""
+ROOT = "root_joint"  # name of floating joints; pink finds the floating base by it
 
 
 class ControlLoop(Protocol):
@@ -49,43 +47,58 @@ class ControlLoop(Protocol):
         """Return the error of the most important task [m], [rad]."""
 
 
+@dataclass
+class PeerLoop:
+    """Control loop of pink or mink, by their tasks and their configuration, which integrates velocities."""
+
+    robot: Any  # with ``model``, ``start`` and ``configuration`` of the library
+    period: float  # control period [s]
+    tasks: list[Any]
+    move: Callable[[float], None]  # moves the targets of the tasks to a time [s]
+    error: Callable[[], float]  # returns the error of the most important position [m]
+
+    def __post_init__(self) -> None:
+        self._q = self.robot.start
+        self._velocity = np.zeros(self.robot.model.nv)
+
+    def solve(self) -> Array:
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        self._q = self.robot.start
+        self.robot.configuration.update(self._q)
+
+    def aim(self, time: float) -> None:
+        self.move(time)
+
+    def step(self) -> None:
+        self.robot.configuration.update(self._q)
+        self._velocity = self.solve()
+
+    def advance(self) -> None:
+        self.robot.configuration.integrate_inplace(self._velocity, self.period)
+        self._q = self.robot.configuration.q
+
+
+def split_coordinate(name: str) -> tuple[str, int]:
+    """Return the joint of a coordinate, and its number in the joint: 0 to 2 for x, y and z of the root."""
+    joint, _, axis = name.rpartition("/") if name.startswith(f"{ROOT}/") else (name, "", "x")
+    return joint, "xyz".index(axis)
+
+
 @dataclass(frozen=True)
 class ControlWorkload:
-    """Robot, start and rate of a control benchmark.
-
-    Attributes
-    ----------
-    origin
-        Library and file of the published example.
-    robot
-        Returns the model.
-    start
-        Positions of joints at the start [m], [rad] by name; the others are zero.
-    held
-        Joints that the peers' models have as fixed ones.
-    period
-        Control period [s].
-    steps
-        Number of control periods of one motion.
-    substitute
-        Difference between this robot and that of the example; empty if there is none.
-    """
-
-    origin: str
-    robot: Callable[[], Model]
-    start: Mapping[str, float]
-    held: tuple[str, ...] = ()
-    period: float = 0.005
-    steps: int = 1000
-    substitute: str = ""
+    robot: Callable[[], Model]  # returns the model
+    start: Mapping[str, float]  # positions of joints at the start [m], [rad] by name; the others are zero
+    held: tuple[str, ...] = ()  # joints that the peers' models have as fixed ones
+    period: float = 0.005  # control period [s]
+    steps: int = 1000  # number of control periods of one motion
 
     def urdf(self) -> str:
-        """Return the robot as URDF text without shapes."""
         return export_urdf(self.robot(), self.held)
 
 
 def export_urdf(model: Model, held: Iterable[str] = ()) -> str:
-    """Return a model as URDF text without shapes, with some of its joints fixed."""
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
         file = Path(folder, "robot.urdf")
         model.save(file)
@@ -164,7 +177,6 @@ HANDS = ("left_rubber_hand", "right_rubber_hand")
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
 QUADRUPED_FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
 FINGERS = ("hand/link_3.0_tip", "hand/link_7.0_tip", "hand/link_11.0_tip", "hand/link_15.0_tip")
-
 _BENT = {"shoulder_lift_joint": 1.0, "shoulder_pan_joint": 1.0, "elbow_joint": 1.0}
 _PANDA = {"panda_joint4": -1.5708, "panda_joint6": 1.5708, "panda_joint7": -0.7854}
 _SQUAT = {
@@ -203,7 +215,6 @@ _XARM = {
     "hand/joint_14.0": 0.4,
     "hand/joint_15.0": 0.5,
 }
-
 _CAMERA = {
     "shoulder_pan_joint": 0.3,
     "shoulder_lift_joint": -1.6,
@@ -211,73 +222,38 @@ _CAMERA = {
     "wrist_1_joint": -0.4,
     "wrist_2_joint": 1.3,
 }
-
 G1, GO2 = "g1_description/urdf/g1_29dof_rev_1_0.urdf", "go2_description/urdf/go2.urdf"
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
+WORKLOADS: Mapping[str, ControlWorkload] = {
+    "arm_ur5": ControlWorkload(_robot("ur_description/urdf/ur5_robot.urdf"), _BENT),
+    "arm_ur3_velocity_smoothing": ControlWorkload(_robot("ur_description/urdf/ur3_robot.urdf"), _BENT),
+    "flying_dual_arm_ur3": ControlWorkload(
+        _flying_arms,
+        {f"{side}/{joint}": angle for side in ("left", "right") for joint, angle in _BENT.items()},
+    ),
+    "humanoid_g1_com": ControlWorkload(_floating(G1, "pelvis"), {f"{ROOT}/z": 0.72}),
+    "go2_squat": ControlWorkload(_floating(GO2, "base"), {f"{ROOT}/z": 0.3, **_SQUAT}),
+    "inverse_kinematics_ur10": ControlWorkload(
+        _robot("ur_description/urdf/ur10_robot.urdf"), {}, period=0.01, steps=20
+    ),
+    "arm_panda_dof_freezing": ControlWorkload(
+        _robot("panda_description/urdf/panda.urdf"), _PANDA, FINGER_JOINTS, steps=2000
+    ),
+    "humanoid_g1_teleop": ControlWorkload(_floating(G1, "pelvis"), {f"{ROOT}/z": 0.76, **_STANDING}),
+    "biped_cassie": ControlWorkload(
+        _floating("cassie_description/robots/cassie_v2.sdf", "pelvis"), {f"{ROOT}/z": 1.0}
+    ),
+    "arm_hand_xarm": ControlWorkload(_arm_with_hand, _XARM),
+    "arm_ur5_wrist_cam_lookat": ControlWorkload(_arm_with_camera, _CAMERA),
+    "mobile_tiago": ControlWorkload(
+        _mobile_arm, _TIAGO, ("wheel_right_joint", "wheel_left_joint", "head_1_joint", "head_2_joint")
+    ),
+}
+"""Workloads by the name of the example of pink or mink that they follow.
 
-WORKLOADS: Mapping[str, ControlWorkload] = MappingProxyType(
-    {
-        "arm_ur5": ControlWorkload(
-            "pink examples/arm_ur5.py", _robot("ur_description/urdf/ur5_robot.urdf"), _BENT
-        ),
-        "arm_ur3_velocity_smoothing": ControlWorkload(
-            "pink examples/arm_ur3_velocity_smoothing.py", _robot("ur_description/urdf/ur3_robot.urdf"), _BENT
-        ),
-        "flying_dual_arm_ur3": ControlWorkload(
-            "pink examples/flying_dual_arm_ur3.py",
-            _flying_arms,
-            {f"{side}/{joint}": angle for side in ("left", "right") for joint, angle in _BENT.items()},
-        ),
-        "humanoid_g1_com": ControlWorkload(
-            "pink examples/humanoid_g1_com.py", _floating(G1, "pelvis"), {f"{ROOT}/z": 0.72}
-        ),
-        "go2_squat": ControlWorkload(
-            "pink examples/barriers/go2_squat.py", _floating(GO2, "base"), {f"{ROOT}/z": 0.3, **_SQUAT}
-        ),
-        "inverse_kinematics_ur10": ControlWorkload(
-            "pink examples/inverse_kinematics_ur10.py",
-            _robot("ur_description/urdf/ur10_robot.urdf"),
-            {},
-            period=0.01,
-            steps=20,
-        ),
-        "arm_panda_dof_freezing": ControlWorkload(
-            "mink examples/arm_panda_dof_freezing.py",
-            _robot("panda_description/urdf/panda.urdf"),
-            _PANDA,
-            FINGER_JOINTS,
-            steps=2000,
-        ),
-        "humanoid_g1_teleop": ControlWorkload(
-            "mink examples/humanoid_g1_teleop.py", _floating(G1, "pelvis"), {f"{ROOT}/z": 0.76, **_STANDING}
-        ),
-        "biped_cassie": ControlWorkload(
-            "mink examples/biped_cassie.py",
-            _floating("cassie_description/robots/cassie_v2.sdf", "pelvis"),
-            {f"{ROOT}/z": 1.0},
-        ),
-        "arm_hand_xarm": ControlWorkload(
-            "mink examples/arm_hand_xarm_leap.py",
-            _arm_with_hand,
-            _XARM,
-            substitute="an Allegro hand in place of the LEAP hand",
-        ),
-        "arm_ur5_wrist_cam_lookat": ControlWorkload(
-            "mink examples/arm_ur5e_wrist_cam_lookat.py",
-            _arm_with_camera,
-            _CAMERA,
-            substitute="a UR5 in place of the UR5e",
-        ),
-        "mobile_tiago": ControlWorkload(
-            "mink examples/mobile_tidybot.py",
-            _mobile_arm,
-            _TIAGO,
-            ("wheel_right_joint", "wheel_left_joint", "head_1_joint", "head_2_joint"),
-            substitute="a TIAGo's torso and arm on an omnidirectional base in place of a Kinova arm on one",
-        ),
-    }
-)
-"""Workloads by the name of the example."""
+``arm_hand_xarm`` has an Allegro for a LEAP hand, ``arm_ur5_wrist_cam_lookat`` a UR5 for a UR5e, and
+``mobile_tiago`` a TIAGo on an omnidirectional base for a Kinova arm on one.
+"""
 
 
 # -- target trajectories -----------------------------------------------------------------------------------
@@ -333,21 +309,9 @@ def drive(time: float) -> Array:
 
 @dataclass(frozen=True)
 class CollisionSphere:
-    """Sphere on a link.
-
-    Attributes
-    ----------
-    link
-        Link that carries it.
-    centre
-        Centre in the link's frame [m].
-    radius
-        Radius [m].
-    """
-
-    link: str
-    centre: tuple[float, float, float]
-    radius: float
+    link: str  # link that carries it
+    centre: tuple[float, float, float]  # centre in the link's frame [m]
+    radius: float  # radius [m]
 
 
 HAND_SPHERES = tuple(CollisionSphere(hand, (0.06, 0.0, 0.0), 0.06) for hand in HANDS)

@@ -1,7 +1,7 @@
 """Measurements in a fresh process without other modules; run as a file, not imported.
 
-``fresh_process.py FUNCTION ARGUMENT...`` prints one JSON object. Each function imports what it needs, because
-imports are part of what is measured.
+``fresh_process.py FUNCTION ARGUMENT...`` prints the JSON object of a function of this module. Each function
+imports what it needs, because imports are part of what is measured.
 """
 
 from __future__ import annotations
@@ -10,25 +10,20 @@ import importlib
 import json
 import os
 import sys
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
 
 def import_time(module: str) -> dict[str, Any]:
-    """Return the time of an import [s].
-
-    ``import_time MODULE``
-    """
+    """Return the time of an import [s]."""
     start = perf_counter()
     importlib.import_module(module)
     return {"seconds": perf_counter() - start}
 
 
 def load_with_kineverse(file: str, frame: str, *options: str) -> dict[str, Any]:
-    """Load a file twice up to the first pose and Jacobian; return both times [s], and the values at zero.
-
-    ``load_with_kineverse FILE FRAME [wait]``; ``wait`` waits until the function is cached.
-    """
+    """Load a file twice up to the first pose and Jacobian; return both times [s], and the values at zero."""
     import kineverse as kv
 
     seconds = []
@@ -46,10 +41,7 @@ def load_with_kineverse(file: str, frame: str, *options: str) -> dict[str, Any]:
 
 
 def load_with_mujoco(file: str, frame: str) -> dict[str, Any]:
-    """Load a file with MuJoCo up to its first pose and Jacobian; return time [s] and values at zero.
-
-    ``load_with_mujoco FILE FRAME``
-    """
+    """Load a file with MuJoCo up to its first pose and Jacobian; return time [s] and values at zero."""
     import mujoco
     import numpy as np
 
@@ -70,10 +62,7 @@ def load_with_mujoco(file: str, frame: str) -> dict[str, Any]:
 
 
 def load_with_pinocchio(file: str, frame: str) -> dict[str, Any]:
-    """Load a file with pinocchio up to its first pose and Jacobian; return time [s] and values at zero.
-
-    ``load_with_pinocchio FILE FRAME``
-    """
+    """Load a file with pinocchio up to its first pose and Jacobian; return time [s] and values at zero."""
     import pinocchio as pin
 
     start = perf_counter()
@@ -91,11 +80,8 @@ def load_with_pinocchio(file: str, frame: str) -> dict[str, Any]:
 
 
 def build_controller(robot: str) -> dict[str, Any]:
-    """Return the time of building a controller [s], and from there the time until C runs [s].
-
-    ``build_controller ROBOT``
-    """
-    from .opening import make_opening
+    """Return the time of building a controller [s], and from there the time until C runs [s]."""
+    from .control import make_opening
 
     opening = make_opening(robot)
     start = perf_counter()
@@ -106,10 +92,7 @@ def build_controller(robot: str) -> dict[str, Any]:
 
 
 def build_planner(robot: str) -> dict[str, Any]:
-    """Return the time from a robot's file to its planner in the shipped kitchen [s].
-
-    ``build_planner ROBOT``; a robot of :data:`kineverse_studies.bench.kitchen_queries.ARMS`.
-    """
+    """Return the time from a robot's file to its planner in the shipped kitchen [s]."""
     from kineverse.planning import Planner
 
     from .kitchen_queries import make_kitchen_arm
@@ -122,10 +105,7 @@ def build_planner(robot: str) -> dict[str, Any]:
 
 
 def memory_of_robot(library: str, file: str, frame: str) -> dict[str, Any]:
-    """Return the memory of a robot beyond that of the imports [MB], loaded and evaluated.
-
-    ``memory_of_robot LIBRARY FILE FRAME``
-    """
+    """Return the memory of a robot beyond that of the imports [MB], loaded and evaluated."""
     module = importlib.import_module(library)
     before = _resident_memory()
     objects = _LOADERS[library](module, file)
@@ -145,15 +125,6 @@ def _resident_memory() -> float:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def _load_kineverse(module: Any, file: str) -> tuple[Any, ...]:
-    return (module.load(file, prefix=""),)
-
-
-def _load_pinocchio(module: Any, file: str) -> tuple[Any, ...]:
-    model = module.buildModelFromUrdf(file)
-    return model, model.createData()
-
-
 def _load_mujoco(module: Any, file: str) -> tuple[Any, ...]:
     # By default MuJoCo writes warnings to a file in the current folder.
     module.set_mju_user_warning(lambda warning: None)
@@ -161,16 +132,16 @@ def _load_mujoco(module: Any, file: str) -> tuple[Any, ...]:
     return model, module.MjData(model)
 
 
-_LOADERS = {"kineverse": _load_kineverse, "pinocchio": _load_pinocchio, "mujoco": _load_mujoco}
-_PROGRAMS = (
-    import_time,
-    load_with_kineverse,
-    load_with_mujoco,
-    load_with_pinocchio,
-    build_controller,
-    build_planner,
-    memory_of_robot,
-)
+def _load_pinocchio(module: Any, file: str) -> tuple[Any, ...]:
+    model = module.buildModelFromUrdf(file)
+    return model, model.createData()
+
+
+_LOADERS: dict[str, Callable[[Any, str], tuple[Any, ...]]] = {
+    "kineverse": lambda module, file: (module.load(file, prefix=""),),
+    "pinocchio": _load_pinocchio,
+    "mujoco": _load_mujoco,
+}
 
 if __name__ == "__main__":
-    print(json.dumps({program.__name__: program for program in _PROGRAMS}[sys.argv[1]](*sys.argv[2:])))
+    print(json.dumps(globals()[sys.argv[1]](*sys.argv[2:])))

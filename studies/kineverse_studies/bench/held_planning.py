@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 
@@ -19,62 +18,33 @@ from kineverse.planning import Planner
 from kineverse.spatial import rpy, translation
 from kineverse.state import State
 
-from .harness import Progress
-from .planning_attempts import Attempt, AttemptSummary
-from .result import Bar, Comparison, Measurement, bound_median
+from .harness import Bar, Comparison, Measurement, Progress, bound_median
+from .planning_problems import Attempt, AttemptSummary
 
-SECONDS, SOON = 10.0, 0.1
-"""Largest time of a search, and the time in which nearly all are to be solved [s]."""
-
+SECONDS, SOON = 10.0, 0.1  # largest time of a search, and the time in which nearly all are to be solved [s]
 MEDIAN, LEAST_SOON, RESIDUAL = 1e-3, 95.0, 1e-5
 """Targets: median time of the search at the fridge, with its path shortened, polished and certified [s],
 share solved soon of what is solved [%], residual of holds [m], [rad]."""
-
-STARTS = 5
-"""Number of starts at each place of the base, each with a goal of its own."""
-
+STARTS = 5  # number of starts at each place of the base, each with a goal of its own
 _TRIES, _PATIENCE = 300, 0.2
 """Largest number of places of the base, and time of the search for grasps at each [s]."""
-
-_BETWEEN = (0.25, 0.5, 0.75)
-"""Fractions of edges at which residuals are measured as well."""
+_BETWEEN = (0.25, 0.5, 0.75)  # fractions of edges at which residuals are measured as well
 
 
 @dataclass(frozen=True)
 class HeldMotion:
-    """Motion of a door or drawer that hands hold.
-
-    Attributes
-    ----------
-    robot
-        Name of the shipped robot.
-    joint
-        Joint of the door or drawer in the shipped kitchen.
-    closed, opened
-        Its positions at the start and the goal [m], [rad].
-    hands
-        Frames of the hands, each with the pose of its grasp in the frame of the handle: x, y, z [m] and roll,
-        pitch, yaw [rad].
-    handle
-        Frame of the handle.
-    moving
-        Patterns of the coordinates that move, the joint besides.
-    base
-        Ranges of the base's x, y [m] and angle [rad], shape (2, 3).
-    """
-
     robot: str
-    joint: str
-    closed: float
+    joint: str  # joint of the door or drawer in the shipped kitchen
+    closed: float  # its positions at the start and the goal [m], [rad]
     opened: float
     hands: Mapping[str, tuple[float, ...]]
     handle: str
-    moving: tuple[str, ...]
+    moving: tuple[str, ...]  # patterns of the coordinates that move, the joint besides
+    # ranges of the base's x, y [m] and angle [rad], shape (2, 3)
     base: tuple[tuple[float, float, float], tuple[float, float, float]]
 
     @cached_property
     def model(self) -> Model:
-        """The robot in the kitchen, with the frames of the grasps."""
         model = load(self.robot)
         with model.edit() as edit:
             edit.include("kitchen", "kitchen")
@@ -85,75 +55,44 @@ class HeldMotion:
         return model
 
 
-MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
-    {
-        "fridge held by an arm": HeldMotion(
-            "fetch",
-            "kitchen/fridge_door",
-            0.03,
-            1.2,
-            {"fetch/gripper_link": (0.04, 0.0, 0.0, np.pi / 2, 0.0, np.pi)},
-            "kitchen/fridge_door_handle",
-            (
-                "fetch/torso*",
-                "fetch/shoulder*",
-                "fetch/upper*",
-                "fetch/elbow*",
-                "fetch/forearm*",
-                "fetch/wrist*",
-            ),
-            ((0.1, -1.9, -0.6), (0.7, -1.0, 0.6)),
-        ),
-        "drawer held by two arms": HeldMotion(
-            "pr2",
-            "kitchen/island_middle_upper_drawer",
-            0.02,
-            0.3,
-            {
-                "pr2/l_gripper_palm_link": (0.22, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
-                "pr2/r_gripper_palm_link": (0.22, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
-            },
-            "kitchen/island_middle_upper_drawer_handle",
-            (
-                "pr2/torso*",
-                "pr2/*_shoulder*",
-                "pr2/*_upper*",
-                "pr2/*_elbow*",
-                "pr2/*_forearm*",
-                "pr2/*_wrist*",
-            ),
-            ((-0.3, -0.2, np.pi - 0.3), (0.1, 0.2, np.pi + 0.3)),
-        ),
-    }
-)
+MOTIONS: Mapping[str, HeldMotion] = {
+    "fridge held by an arm": HeldMotion(
+        "fetch",
+        "kitchen/fridge_door",
+        0.03,
+        1.2,
+        {"fetch/gripper_link": (0.04, 0.0, 0.0, np.pi / 2, 0.0, np.pi)},
+        "kitchen/fridge_door_handle",
+        ("fetch/torso*", "fetch/shoulder*", "fetch/upper*", "fetch/elbow*", "fetch/forearm*", "fetch/wrist*"),
+        ((0.1, -1.9, -0.6), (0.7, -1.0, 0.6)),
+    ),
+    "drawer held by two arms": HeldMotion(
+        "pr2",
+        "kitchen/island_middle_upper_drawer",
+        0.02,
+        0.3,
+        {
+            "pr2/l_gripper_palm_link": (0.22, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
+            "pr2/r_gripper_palm_link": (0.22, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
+        },
+        "kitchen/island_middle_upper_drawer_handle",
+        ("pr2/torso*", "pr2/*_shoulder*", "pr2/*_upper*", "pr2/*_elbow*", "pr2/*_forearm*", "pr2/*_wrist*"),
+        ((-0.3, -0.2, np.pi - 0.3), (0.1, 0.2, np.pi + 0.3)),
+    ),
+}
 """Motions by name."""
 
 
 @dataclass
 class HeldResults:
-    """Attempts at a motion with holds.
-
-    Attributes
-    ----------
-    name
-        Name of the motion.
-    attempts
-        Attempts, :data:`STARTS` of them from each place of the base.
-    residual, residual_between
-        Largest residual of the holds at points of the paths, and between them [m], [rad].
-    tried
-        Number of places of the base that were tried to find these.
-    """
-
     name: str
     attempts: list[Attempt] = field(default_factory=list)
-    residual: float = 0.0
+    residual: float = 0.0  # largest residual of the holds at points of the paths, and between them [m], [rad]
     residual_between: float = 0.0
-    tried: int = 0
+    tried: int = 0  # number of places of the base that were tried to find these
 
     @property
     def summary(self) -> AttemptSummary:
-        """Summary of the attempts."""
         return AttemptSummary(f"kineverse, {self.name}", self.attempts)
 
     def measurements(self) -> Iterator[Measurement]:
@@ -185,10 +124,7 @@ class HeldResults:
 
 
 def run_held_motion(name: str, places: int, progress: Progress, seed: int = 0) -> HeldResults:
-    """Return attempts at a motion of :data:`MOTIONS` from given starts to given goals.
-
-    The base stands at random places. They count where grasps without collisions exist at both ends.
-    """
+    """Return attempts at a motion from random places of the base where both ends have free grasps."""
     motion, results = MOTIONS[name], HeldResults(name)
     model, joint = motion.model, motion.model.symbol(motion.joint)
     planner = Planner(model, move=(*motion.moving, joint))

@@ -6,7 +6,6 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 
@@ -23,124 +22,65 @@ from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .configuration_check import ConfigurationCheck
+from .planning_problems import ConfigurationCheck
 
-ROBOT, KITCHEN, BASE = "robot", "kitchen", "robot/base"
-"""Prefixes of both, and the base of the robot."""
+ROBOT, KITCHEN, BASE = "robot", "kitchen", "robot/base"  # prefixes of both, and the base of the robot
 
 
 @dataclass(frozen=True)
 class KitchenRobotArm:
-    """Robot with an arm.
-
-    Attributes
-    ----------
-    file
-        Name or path of the model.
-    tool
-        Frame of the hand.
-    axis
-        Direction of approach in that frame.
-    length
-        Distance of the fingertips from that frame [m].
-    without
-        Bodies that cannot be used, as their meshes are missing.
-    """
-
-    file: str
-    tool: str
-    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    length: float = 0.0
-    without: tuple[str, ...] = ()
+    file: str  # name or path of the model
+    tool: str  # frame of the hand
+    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)  # direction of approach in that frame
+    length: float = 0.0  # distance of the fingertips from that frame [m]
+    without: tuple[str, ...] = ()  # bodies that cannot be used, as their meshes are missing
 
 
-ARMS: Mapping[str, KitchenRobotArm] = MappingProxyType(
-    {
-        "pr2": KitchenRobotArm("pr2_description/robots/pr2.urdf", "r_gripper_tool_frame"),
-        "hsr": KitchenRobotArm(
-            "hsrb_description/robots/hsrb.urdf",
-            "hand_palm_link",
-            (0.0, 0.0, 1.0),
-            0.08,
-            ("head_l_stereo_camera_link", "head_r_stereo_camera_link"),
-        ),
-        "fetch": KitchenRobotArm("fetch_description/robots/fetch.urdf", "gripper_link"),
-        "pr2 (shipped)": KitchenRobotArm("pr2", "r_gripper_tool_frame"),
-        "hsr (shipped)": KitchenRobotArm("hsr", "hand_palm_link", (0.0, 0.0, 1.0), 0.08),
-        "fetch (shipped)": KitchenRobotArm("fetch", "gripper_link"),
-    }
-)
+ARMS: Mapping[str, KitchenRobotArm] = {
+    "pr2": KitchenRobotArm("pr2_description/robots/pr2.urdf", "r_gripper_tool_frame"),
+    "hsr": KitchenRobotArm(
+        "hsrb_description/robots/hsrb.urdf",
+        "hand_palm_link",
+        (0.0, 0.0, 1.0),
+        0.08,
+        ("head_l_stereo_camera_link", "head_r_stereo_camera_link"),
+    ),
+    "fetch": KitchenRobotArm("fetch_description/robots/fetch.urdf", "gripper_link"),
+    "pr2 (shipped)": KitchenRobotArm("pr2", "r_gripper_tool_frame"),
+    "hsr (shipped)": KitchenRobotArm("hsr", "hand_palm_link", (0.0, 0.0, 1.0), 0.08),
+    "fetch (shipped)": KitchenRobotArm("fetch", "gripper_link"),
+}
 """Robots by name: those of the model path, and those that ship."""
-
-KITCHENS: Mapping[str, str] = MappingProxyType(
-    {"iai_kitchen": "iai_kitchen/urdf_obj/kitchen.urdf", "kitchen (shipped)": "kitchen"}
-)
+KITCHENS: Mapping[str, str] = {
+    "iai_kitchen": "iai_kitchen/urdf_obj/kitchen.urdf",
+    "kitchen (shipped)": "kitchen",
+}
 """Kitchens by name."""
-
-FRIDGE_OPEN: Mapping[str, float] = MappingProxyType({f"{KITCHEN}/fridge_door": 1.4})
+FRIDGE_OPEN: Mapping[str, float] = {f"{KITCHEN}/fridge_door": 1.4}
 """Position of the door of the shipped fridge for the queries there [rad]."""
-
-FRIDGE_BASE = np.array([0.45, -1.5, 0.0])
-"""Place of the base there: x, y [m] and angle [rad]."""
-
+FRIDGE_BASE = np.array([0.45, -1.5, 0.0])  # place of the base there: x, y [m] and angle [rad]
 BESIDE_FRIDGE = np.array([[0.9, -1.2, 0.5], [1.1, -0.9, 1.3]])
 INSIDE_FRIDGE = np.array([[1.3, -1.8, 0.8], [1.5, -1.4, 1.5]])
 """Corners of the boxes of points that the hand points at: starts and goals [m]."""
-
-OFFSET = 0.06, 0.12
-"""Range of the distance of the fingertips from the handle [m]."""
-
-CLEARANCE = 0.005
-"""Least distance of the robot from the kitchen at starts and goals [m]."""
-
-_CONE = 0.5
-"""Least cosine of the angle between the direction of approach and that to the handle."""
-
+OFFSET = 0.06, 0.12  # range of the distance of the fingertips from the handle [m]
+CLEARANCE = 0.005  # least distance of the robot from the kitchen at starts and goals [m]
+_CONE = 0.5  # least cosine of the angle between the direction of approach and that to the handle
 _SAMPLES, _HEIGHT, _NEAR = 20_000, 0.03, 0.2
 """Number of random configurations from which poses of the hand are taken, and how far in height, and in all
 directions, they may be off the handle [m]. Those of the goal are then brought to it by inverse kinematics."""
-
-_STATES = 200
-"""Number of random states at which pairs of the robot touch that always do."""
-
-_STARTS = 4
-"""Number of starts of inverse kinematics."""
+_STATES = 200  # number of random states at which pairs of the robot touch that always do
+_STARTS = 4  # number of starts of inverse kinematics
 
 
 @dataclass(frozen=True, eq=False)
 class PlanningQuery:
-    """Start and goal of an arm at one place of the base.
-
-    Attributes
-    ----------
-    start, goal
-        Configurations of the arm, shape (n,) [m], [rad].
-    state
-        State of the model, with the arm at the start.
-    """
-
-    start: Array
+    start: Array  # configurations of the arm, shape (n,) [m], [rad]
     goal: Array
-    state: State
+    state: State  # state of the model, with the arm at the start
 
 
 @dataclass(frozen=True, eq=False)
 class KitchenArm:
-    """Arm of a robot that stands in a kitchen.
-
-    Attributes
-    ----------
-    name
-        Names of both.
-    model
-        Model of both, with the prefixes ``robot`` and ``kitchen``. Its rules except pairs within the kitchen,
-        and pairs of the robot that always touch.
-    arm
-        The robot.
-    handles
-        Frames of the handles.
-    """
-
     name: str
     model: Model
     arm: KitchenRobotArm
@@ -148,12 +88,10 @@ class KitchenArm:
 
     @property
     def tool(self) -> str:
-        """Frame of the hand."""
         return f"{ROBOT}/{self.arm.tool}"
 
     @cached_property
     def base(self) -> tuple[Symbol, ...]:
-        """Coordinates x, y and angle of the base."""
         return tuple(self.model.symbol(f"{BASE}/{name}") for name in ("x", "y", "angle"))
 
     @cached_property
@@ -177,17 +115,13 @@ class KitchenArm:
             yield home | State(dict(zip(self.symbols, q.tolist(), strict=True)))
 
     def queries(self, count: int, seed: int = 0) -> Iterator[PlanningQuery]:
-        """Yield queries between handles, the same for equal arguments.
-
-        The first ones of a larger count are those of a smaller one.
-        """
+        """Yield queries between handles; the first ones of a larger count are those of a smaller one."""
         search = _QuerySearch(self)
         random = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
         for _ in range(count):
             yield search.find(random)
 
     def fridge_queries(self, count: int, seed: int = 0) -> Iterator[PlanningQuery]:
-        """Yield queries from beside the open fridge of the shipped kitchen to the inside of it."""
         search = _QuerySearch(self, FRIDGE_OPEN)
         random = np.random.default_rng(seed)
         while count > 0:
@@ -199,20 +133,6 @@ class KitchenArm:
 
 
 def make_kitchen_arm(robot: str, kitchen: str, except_touching: bool = True) -> KitchenArm:
-    """Return a robot of :data:`ARMS` in a kitchen of :data:`KITCHENS`.
-
-    Parameters
-    ----------
-    robot, kitchen
-        Their names.
-    except_touching
-        Whether the rules except pairs of the robot that always touch. Otherwise no mesh is read.
-
-    Raises
-    ------
-    UnknownNameError
-        If one of them is not among the models.
-    """
     arm, room = ARMS[robot], KITCHENS[kitchen]
     model = Model()
     with model.edit() as edit:
@@ -234,7 +154,6 @@ def make_kitchen_arm(robot: str, kitchen: str, except_touching: bool = True) -> 
 
 
 def _include_robot(edit: Edit, arm: KitchenRobotArm) -> None:
-    """Include a robot, on a base that moves freely over the floor if it has none."""
     edit.include(arm.file, ROBOT)
     for body in arm.without:
         edit.remove(f"body {ROBOT}/{body}")
@@ -245,9 +164,7 @@ def _include_robot(edit: Edit, arm: KitchenRobotArm) -> None:
 
 
 class _QuerySearch:
-    """Search for configurations of an arm at handles, without collisions."""
-
-    def __init__(self, arm: KitchenArm, state: Mapping[str, float] = MappingProxyType({})) -> None:
+    def __init__(self, arm: KitchenArm, state: Mapping[str, float] = {}) -> None:
         self._arm = arm
         model = arm.model
         hand = model.fk(arm.tool)
@@ -272,7 +189,6 @@ class _QuerySearch:
         self._points, self._axes = pose[:, :3, 3], pose[:, :3, :3] @ np.array(arm.arm.axis)
 
     def find(self, random: np.random.Generator) -> PlanningQuery:
-        """Return a query, with the base at a free place from which it reaches a random handle."""
         while True:
             here, *others = self._handles[random.permutation(len(self._handles))]
             found = self._place(here, random)
@@ -284,17 +200,14 @@ class _QuerySearch:
                 return self.query(start, goal, base)
 
     def _check(self, base: Array, q: Array) -> bool:
-        """Return True for a configuration without contacts and with clearance of the kitchen."""
         return self._free(np.concatenate([base, q])) and len(self._near()) == 0
 
     def query(self, start: Array, goal: Array, base: Array) -> PlanningQuery:
-        """Return a query with the base at a place x, y [m] and angle [rad], shape (3,)."""
         coordinates = (*self._arm.base, *self._arm.symbols)
         here = dict(zip(coordinates, (*base.tolist(), *start.tolist()), strict=True))
         return PlanningQuery(start, goal, self._home | State(here))
 
     def _place(self, handle: Array, random: np.random.Generator) -> tuple[Array, Array] | None:
-        """Return a configuration, and a base from which the hand is beside a handle; None if not free."""
         offset = self._arm.arm.length + random.uniform(*OFFSET)
         touched = self._points + offset * self._axes
         at_height = np.flatnonzero(np.abs(touched[:, 2] - handle[2]) < _HEIGHT)

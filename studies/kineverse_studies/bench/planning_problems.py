@@ -1,16 +1,15 @@
-"""Published planning problems: an arm among boxes and cylinders (MotionBenchMaker, as VAMP ships them).
-
-Robots are those of VAMP, covered by its spheres, with its SRDFs, so that everybody checks the same geometry.
-"""
+"""Planning problems, checks by a scene, and attempts; robots are covered by VAMP's spheres."""
 
 from __future__ import annotations
 
 import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,85 +17,117 @@ import numpy as np
 from kineverse.formats import load
 from kineverse.formats.locate import locate_model
 from kineverse.formats.srdf import read_srdf
-from kineverse.geometry import RULES, Rule, rules_as_data
+from kineverse.geometry import RULES, Rule, Scene, rules_as_data
 from kineverse.lie import Array, to_rpy
 from kineverse.model.body import Body, Box, Cylinder, Geometry, Shape, Sphere
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.spatial import rpy, translation
-from kineverse.state import State
+from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol, position
 
-FOLDER = "planning_problems"
-"""Folder of the problems on the model path."""
+from .harness import Measurement
 
-ROBOTS = ("panda", "fetch")
-"""Robots with problems."""
+if TYPE_CHECKING:
+    from kineverse.planning import Planner
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    found: bool  # true if a path was found
+    seconds: float  # time of the search, without anything that is done once for a robot [s]
+    # time with the judgement of the path by a scene [s]; the same for planners that do not judge
+    judged: float
+    # configurations of the path, shape (N, n) [m], [rad]; empty without one
+    points: Array = field(default_factory=lambda: np.empty((0, 0)))
+    why: str = ""  # how the path was found, or why there is none
+
+
+def attempt_with_kineverse(
+    planner: Planner, start: Array, goals: Array, seconds: float, seed: int
+) -> Attempt:
+    path = planner.plan(start, goals, seconds=seconds, seed=seed)
+    return Attempt(path.found, path.search_seconds, path.seconds, path.points, path.why)
+
+
+def attempt_first_path(planner: Planner, start: Array, goal: Array, seconds: float, seed: int) -> Attempt:
+    """Return the attempt of our search alone: its path is neither shortened nor judged, as those of peers."""
+    from kineverse.planning.sampling_planners import RrtConnect
+
+    # The goals of the planner: the given one where it is nearest, and full turns away from there.
+    nearest = planner.space.equivalents(goal, start, most=1)
+    planner.planning_scene.set_bounds(start, nearest)
+    variants = planner.space.equivalents(nearest[0], start)
+    starts, goals = (np.ascontiguousarray(Q, dtype=np.float32) for Q in (start[None], variants))
+    begin = perf_counter()
+    found = RrtConnect(planner.checker).solve(starts, goals, seconds, seed)
+    spent = perf_counter() - begin
+    return Attempt(found.found, spent, spent, found.points.astype(float))
+
+
+@dataclass(frozen=True)
+class AttemptSummary:
+    name: str  # planner and problems
+    attempts: Sequence[Attempt]
+
+    @property
+    def solved(self) -> float:
+        """Share of attempts that found a path [%]."""
+        return 100.0 * float(np.mean([attempt.found for attempt in self.attempts]))
+
+    def times(self, judged: bool = False) -> Array:
+        """Return the times of attempts that found a path [s]; one of ∞ if there are none."""
+        times = [a.judged if judged else a.seconds for a in self.attempts if a.found]
+        return np.array(times or [np.inf])
+
+    @property
+    def median(self) -> float:
+        return float(np.median(self.times()))
+
+    @property
+    def mean(self) -> float:
+        """Mean time of what was solved [s]."""
+        return float(np.mean(self.times()))
+
+    def percentile(self, share: float) -> float:
+        """Return a percentile of the time of what was solved [s]."""
+        return float(np.percentile(self.times(), share))
+
+    def measurements(self, percentile: float = 95.0) -> Iterator[Measurement]:
+        """Yield median, mean and percentile of times, the median with the judgement, and the share solved."""
+        if any(attempt.found for attempt in self.attempts):
+            times, judged = self.times(), self.times(judged=True)
+            yield Measurement(f"{self.name}: median", "s", (self.median,))
+            yield Measurement(f"{self.name}: mean", "s", (self.mean,))
+            yield Measurement(f"{self.name}: p{percentile:g}", "s", (self.percentile(percentile),))
+            if not np.array_equal(times, judged):
+                yield Measurement(f"{self.name}: median, path judged", "s", (float(np.median(judged)),))
+        yield Measurement(f"{self.name}: solved", "%", (self.solved,))
+
+
+FOLDER = "planning_problems"  # folder of the problems on the model path
+ROBOTS = ("panda", "fetch")  # robots with problems
 
 
 @dataclass(frozen=True, eq=False)
 class PublishedProblem:
-    """Start and goal of an arm among obstacles.
-
-    Attributes
-    ----------
-    name
-        Name of the problem set, and number of the problem in it.
-    start, goal
-        Configurations, in the order of :attr:`ProblemSet.symbols` [m], [rad].
-    state
-        State of the model with the obstacles where they are, and the arm at the start.
-    objects
-        The obstacles as they are in the file: name, kind, 4×4 pose, dimensions.
-    """
-
-    name: str
-    start: Array
+    name: str  # name of the problem set, and number of the problem in it
+    start: Array  # configurations, in the order of :attr:`ProblemSet.symbols` [m], [rad]
     goal: Array
-    state: State
+    state: State  # state of the model with the obstacles where they are, and the arm at the start
     objects: Sequence[Sequence[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class ProblemSet:
-    """Problems that differ by the poses of the same obstacles.
-
-    The poses are coordinates of one model: to place the obstacles of a problem takes no edit.
-
-    Attributes
-    ----------
-    robot, name
-        Robot and name of the set.
-    model
-        Robot and obstacles, with the rules of the SRDF.
-    symbols
-        Coordinates of the arm.
-    problems
-        The problems.
-    """
-
     robot: str
-    name: str
-    model: Model
-    symbols: tuple[Symbol, ...]
+    name: str  # robot and name of the set
+    model: Model  # robot and obstacles, with the rules of the SRDF
+    symbols: tuple[Symbol, ...]  # coordinates of the arm
     problems: tuple[PublishedProblem, ...]
 
 
 def load_problem_sets(robot: str, most: int | None = None) -> Iterator[ProblemSet]:
-    """Yield the problem sets of a robot of :data:`ROBOTS`.
-
-    Parameters
-    ----------
-    robot
-        Name of the robot.
-    most
-        Largest number of problems of a set; None for all.
-
-    Raises
-    ------
-    UnknownNameError
-        If the folder ``planning_problems`` is not on the model path.
-    """
     file = locate_model(f"{FOLDER}/{robot}/{robot}_spherized.urdf").path
     content = json.loads(file.with_name("problems.json").read_text(encoding="utf-8"))
     joints = content["joints"]
@@ -125,11 +156,7 @@ def _add_obstacles(model: Model, objects: Sequence[Sequence[Any]], srdf: Path) -
 
 
 def _load_robot(file: Path, ends: Sequence[Mapping[str, float]]) -> Model:
-    """Return the robot with the limits of its joints, widened to hold given starts and goals.
-
-    Some are beyond the limits by digits of π. VAMP checks no start or goal against limits, and knows no soft
-    ones. Meshes that are only drawn are not among the files.
-    """
+    """Return the robot without drawn meshes, its limits widened to hold given starts and goals."""
     tree = ElementTree.parse(file)
     for link in tree.iterfind("link"):
         for visual in link.findall("visual"):
@@ -176,3 +203,45 @@ def _read_problem(
         values |= dict(zip(_pose_symbols(obstacle), numbers.tolist(), strict=True))
     start, goal = np.array(entry["start"]), np.array(entry["goal"])
     return PublishedProblem(name, start, goal, model.default_state() | State(values), entry["objects"])
+
+
+CHECKS_PER_RADIAN = 32.0
+"""Configurations that planners check over a motion of length 1 of all coordinates [1/rad], [1/m]."""
+FINER = 20.0  # factor by which a returned path is sampled finer than that
+
+
+class ConfigurationCheck:
+    def __init__(self, scene: Scene, symbols: Sequence[Symbol], state: StateLike | None = None) -> None:
+        self.scene, self._symbols = scene, tuple(symbols)
+        # Faster than the first contact of the scene, which asks about pairs that stand still as well.
+        self._query = scene.watch(moving=symbols, radius=0.0)
+        inputs = scene.inputs
+        whole = scene.model.default_state()
+        if state is not None:
+            whole = whole.updated(state)
+        self._values = np.array([whole[symbol] for symbol in inputs])
+        place = {symbol: k for k, symbol in enumerate(inputs)}
+        # A coordinate on which no pose depends is no input.
+        self._columns = np.array([place[s] for s in symbols if s in place], dtype=int)
+        self._kept = np.array([s in place for s in symbols], dtype=bool)
+
+    def __call__(self, q: Sequence[float] | Array) -> bool:
+        self._values[self._columns] = np.asarray(q)[self._kept]
+        self.scene.update(self._values)
+        return len(self._query()) == 0
+
+    def count_contacts(self, points: Array, density: float = FINER * CHECKS_PER_RADIAN) -> int:
+        samples, contacts = interpolate_path(points, density), 0
+        self(samples[0])
+        while (k := self._query.first_within(self._symbols, samples)) is not None:
+            samples, contacts = samples[k + 1 :], contacts + 1
+        return contacts
+
+
+def interpolate_path(points: Array, density: float) -> Array:
+    """Return configurations (N, n) along a path of straight edges, its points included."""
+    parts = [points[:1]]
+    for a, b in pairwise(points):
+        steps = max(1, int(np.ceil(density * np.linalg.norm(b - a))))
+        parts.append(a + (b - a) * (np.arange(1, steps + 1) / steps)[:, None])
+    return np.concatenate(parts)

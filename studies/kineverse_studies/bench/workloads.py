@@ -24,29 +24,15 @@ from .harness import BenchmarkSettings
 
 PR2 = ("pr2_description/robots/pr2.urdf", "pr2_description/urdf/pr2.urdf", "pr2")
 """A real PR2 from the model path or from example-robot-data, else the one that ships."""
-
 GRIPPER = "r_gripper_tool_frame"
-
 _ONE_COORDINATE = ("fixed", "revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True)
 class BenchmarkRobot:
-    """Robot of a URDF file, with one frame of interest.
-
-    Attributes
-    ----------
-    file
-        File that all libraries read.
-    model
-        Model of the file in Kineverse, without prefix.
-    frame
-        Frame of the pose and Jacobian, which are relative to the robot's root.
-    """
-
-    file: Path
-    model: Model
-    frame: str
+    file: Path  # file that all libraries read
+    model: Model  # model of the file in Kineverse, without prefix
+    frame: str  # frame of the pose and Jacobian, which are relative to the robot's root
 
     @cached_property
     def coordinates(self) -> tuple[Symbol, ...]:
@@ -55,7 +41,6 @@ class BenchmarkRobot:
 
     @cached_property
     def chain(self) -> tuple[Symbol, ...]:
-        """Coordinates that move the frame, in the order of the columns of its Jacobian."""
         return self.model.fk(self.frame).symbols
 
     @cached_property
@@ -77,12 +62,10 @@ class BenchmarkRobot:
         return np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self.coordinates)))
 
     def chain_columns(self, configurations: Array) -> Array:
-        """Return the columns of the coordinates that move the frame."""
         columns = [self.coordinates.index(symbol) for symbol in self.chain]
         return np.ascontiguousarray(configurations[:, columns])
 
     def positions(self, configurations: Array) -> dict[str, Array]:
-        """Return the positions of all joints by name, mimic joints included."""
         columns = zip(self.coordinates, configurations.T, strict=True)
         known = {symbol.path: np.array(column) for symbol, column in columns}
 
@@ -104,17 +87,7 @@ class BenchmarkRobot:
 
 
 def find_benchmark_robot(settings: BenchmarkSettings) -> BenchmarkRobot:
-    """Return the requested robot, else the first PR2 that is found.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such robot, or no such frame on it.
-    InvalidValueError
-        If a joint has other coordinates in peers than in Kineverse: planar and floating joints, and mimic
-        joints that move the frame.
-    """
-    file = _robot_file(settings.robot)
+    file = locate_model(settings.robot or _first_found(PR2)).path
     if file.suffix != ".urdf":
         raise InvalidValueError(f"Peers read URDF, and {str(file)!r} is none; give another --robot.")
     model = load(file, prefix="")
@@ -126,17 +99,6 @@ def find_benchmark_robot(settings: BenchmarkSettings) -> BenchmarkRobot:
     robot = BenchmarkRobot(file, model, settings.frame or _default_frame(model))
     _check_chain(robot)
     return robot
-
-
-def _robot_file(name: str | None) -> Path:
-    if name is not None:
-        return locate_model(name).path
-    for candidate in PR2[:-1]:
-        try:
-            return locate_model(candidate).path
-        except UnknownNameError:
-            continue
-    return locate_model(PR2[-1]).path
 
 
 def _default_frame(model: Model) -> str:
@@ -159,7 +121,6 @@ def _check_chain(robot: BenchmarkRobot) -> None:
 
 
 def _mimic_joint(model: Model, frame: str) -> str | None:
-    """Return a mimic joint that moves the frame; None if there is none."""
     above = {a.child: (name, a) for name, a in model.articulations.items()}
     while frame != WORLD:
         if frame in above:
@@ -171,13 +132,6 @@ def _mimic_joint(model: Model, frame: str) -> str | None:
 
 
 def strip_shapes(file: str | os.PathLike[str]) -> str:
-    """Return the text of a URDF file without shapes, so that no library opens meshes.
-
-    Raises
-    ------
-    KineverseError
-        If it cannot be parsed.
-    """
     try:
         root = ElementTree.parse(file).getroot()
     except ElementTree.ParseError as error:
@@ -194,35 +148,21 @@ KITCHENS = {"iai_kitchen/urdf_obj/kitchen.urdf": (0.3, 1.5), "kitchen": (0.2, 0.
 """Kitchen with meshes from the model path, else the shipped one, with the robot's position [m].
 
 The robot stands close to the counters, so that many bodies are near and few are in contact."""
-
 _WALK_STEP, _WALK_RANGE = 0.003, 0.3
 
 
 @dataclass(frozen=True)
 class KitchenRobot:
-    """Robot in a kitchen.
-
-    Attributes
-    ----------
-    name
-        Names of both.
-    model
-        Model of both, with the prefixes ``robot`` and ``kitchen``.
-    values
-        Values of ``scene().inputs``, (steps, n) [m], [rad]: a random walk of all joints of the robot.
-    """
-
     name: str
-    model: Model
+    model: Model  # model of both, with the prefixes ``robot`` and ``kitchen``
+    # values of ``scene().inputs``, (steps, n) [m], [rad]: a random walk of all joints of the robot
     values: Array
 
     @property
     def gripper(self) -> str:
-        """Frame at the end of the robot's right arm."""
         return f"robot/{GRIPPER}"
 
     def scene(self) -> Scene:
-        """Return a scene that checks pairs of a robot's and a kitchen's body only."""
         return _make_scene(self.model)
 
     def whole_scene(self) -> Scene:
@@ -231,7 +171,6 @@ class KitchenRobot:
 
 
 def make_kitchen_robot(steps: int) -> KitchenRobot:
-    """Return the first PR2 and kitchen that are found, with hulls for meshes."""
     robot, kitchen = _first_found(PR2), _first_found(tuple(KITCHENS))
     model = _on_omni_base(robot, kitchen)
     scene = _make_scene(model)
@@ -257,20 +196,14 @@ def _on_omni_base(robot: str, kitchen: str) -> Model:
         edit.include(kitchen, "kitchen")
         edit.include(robot, "robot")
         edit.apply(OmniBase(name="base", parent=WORLD, child="base"))
-        root = next(name for name, frame in model.frames.items() if _is_root(name, frame.parent))
-        edit.attach(root, "base", np.eye(4))
+        loose = (name for name, frame in model.frames.items() if frame.parent == WORLD)
+        edit.attach(next(name for name in loose if name.startswith("robot/")), "base", np.eye(4))
     return model
 
 
 def _make_scene(model: Model) -> Scene:
-    apart = (
-        Rule(f"{name}/*", f"{name}/*", why="only the robot in the kitchen") for name in ("robot", "kitchen")
-    )
-    return Scene(model, rules=apart)
-
-
-def _is_root(name: str, parent: str) -> bool:
-    return parent == WORLD and name.startswith("robot/")
+    why = "only the robot in the kitchen"
+    return Scene(model, rules=[Rule(f"{name}/*", f"{name}/*", why=why) for name in ("robot", "kitchen")])
 
 
 def _first_found(names: tuple[str, ...]) -> str:

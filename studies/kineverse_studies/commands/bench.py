@@ -6,8 +6,8 @@ import argparse
 import json
 import math
 import textwrap
-from collections.abc import Iterable
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kineverse._checks import as_count
@@ -32,35 +32,34 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("names", metavar="NAME", nargs="*", help="names of benchmarks, see --list")
-    parser.add_argument("--list", action="store_true", help="list the benchmarks and exit")
-    parser.add_argument("--quick", action="store_true", help="few rounds, for an order of magnitude")
-    parser.add_argument(
-        "--targets", action="store_true", help="also print the targets of the developers, met or missed"
-    )
-    parser.add_argument("--robot", metavar="MODEL", help="path of a URDF file, or name of a model (a PR2)")
-    parser.add_argument("--frame", metavar="FRAME", help="frame of the pose and Jacobian (a gripper)")
-    parser.add_argument(
-        "--queries", metavar="N", type=int, help="number of queries of 'planning' in kitchens (1000)"
-    )
+    add, flag = parser.add_argument, "store_true"
+    add("names", metavar="NAME", nargs="*", help="names of benchmarks, see --list")
+    add("--list", action=flag, help="list the benchmarks and exit")
+    add("--quick", action=flag, help="few rounds, for an order of magnitude")
+    add("--targets", action=flag, help="also print the targets of the developers, met or missed")
+    add("--robot", metavar="MODEL", help="path of a URDF file, or name of a model (a PR2)")
+    add("--frame", metavar="FRAME", help="frame of the pose and Jacobian (a gripper)")
+    add("--queries", metavar="N", type=int, help="number of queries of 'planning' in kitchens (1000)")
+    add("--examples", metavar="FOLDER", type=Path, help="folder of our examples (that of the checkout)")
     form = parser.add_mutually_exclusive_group()
-    form.add_argument("--json", action="store_true", help="one JSON object on standard output")
-    form.add_argument("--markdown", action="store_true", help="tables in Markdown on standard output")
+    form.add_argument("--json", action=flag, help="one JSON object on standard output")
+    form.add_argument("--markdown", action=flag, help="tables in Markdown on standard output")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure and print."""
     from kineverse_studies import bench
 
     if arguments.list:
-        print(_format_benchmarks(bench.BENCHMARKS.items(), arguments.json))
+        listing = bench.BENCHMARKS
+        table = format_table(("benchmark", "what it measures"), listing.items())
+        print(json.dumps(dict(listing), indent=2) if arguments.json else table)
         return 0
     names = bench.select_benchmarks(arguments.names)
     settings = replace(
         bench.QUICK if arguments.quick else bench.BenchmarkSettings(),
         robot=arguments.robot,
         frame=arguments.frame,
+        folder=arguments.examples,
         progress=show_progress,
     )
     if arguments.queries is not None:
@@ -71,19 +70,21 @@ def run(arguments: argparse.Namespace) -> int:
         answer = {"machine": asdict(here), "benchmarks": list(map(benchmark_to_json, results))}
         print(json.dumps(answer, indent=2, allow_nan=False))
         return 0
-    if arguments.markdown:
-        for result in bench.run_benchmarks(names, settings):
-            print(f"## {result.name}: {result.work}\n\n{benchmark_to_markdown(result)}\n", flush=True)
-            print("".join(f"- not measured: {line}\n" for line in result.missing), end="")
-        return 0
-    print(_format_machine(here), flush=True)
-    print(f"\n{RATIO_NOTE}")
+    if not arguments.markdown:
+        print(f"{_format_machine(here)}\n\n{RATIO_NOTE}", flush=True)
     missing: dict[str, None] = {}
     for result in bench.run_benchmarks(names, settings):
-        if result.measurements:
+        if arguments.markdown:
+            lines = "".join(f"- not measured: {line}\n" for line in result.missing)
+            print(
+                f"## {result.name}: {result.work}\n\n{benchmark_to_markdown(result)}\n\n{lines}",
+                end="",
+                flush=True,
+            )
+        elif result.measurements:
             print(f"\n{format_benchmark(result, arguments.targets)}", flush=True)
         missing.update(dict.fromkeys(result.missing))
-    if missing:
+    if missing and not arguments.markdown:
         print("\n" + "\n".join(["not measured here:", *(f"  {line}" for line in missing)]))
     return 0
 
@@ -118,10 +119,7 @@ def benchmark_to_json(result: BenchmarkResult) -> dict[str, Any]:
 
 
 def benchmark_to_markdown(result: BenchmarkResult) -> str:
-    """Return one table in Markdown: each contender, and how many times as long it takes as the first.
-
-    A ratio without an entry in :attr:`~.BenchmarkResult.comparisons` is left out.
-    """
+    """Return one table in Markdown: each contender, and how many times as long it takes as the first."""
     rows = []
     for m in result.measurements:
         slower = [f"{_format_speedup(c)} × {c.ours}" for c in result.comparisons if c.theirs == m.name]
@@ -133,15 +131,6 @@ def benchmark_to_markdown(result: BenchmarkResult) -> str:
 
 
 def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
-    """Return a result as tables; missing peers are listed once, after all results.
-
-    Parameters
-    ----------
-    result
-        Result of the benchmark.
-    targets
-        True to print the targets of the developers as well.
-    """
     measured = [
         (m.name, format_quantity(m.median, m.unit), format_quantity(m.best, m.unit))
         for m in result.measurements
@@ -155,14 +144,17 @@ def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
     lengths = [(_format_speedup(c), c.name) for c in known if c.unit == "x" and not c.theirs]
     if lengths:
         parts.append(format_table(("times as long", ""), lengths, "><"))
-    with_bars = [
-        (c.name, _value_or_none(c), _format_target(c), c.status)
-        for c in result.comparisons
-        if c.bar is not None
-    ]
-    if targets and with_bars:
+    if targets and (with_bars := [_target_row(c) for c in result.comparisons if c.bar is not None]):
         parts.append(format_table(("target", "", "bar", ""), with_bars, "<>><"))
     return "\n\n".join(parts)
+
+
+def _target_row(comparison: Comparison) -> tuple[str, str, str, str]:
+    value, unit, bar = comparison.value, comparison.unit, comparison.bar
+    assert bar is not None
+    found = "-" if value is None else format_quantity(value, unit)
+    target = f"{'>=' if bar.at_least else '<='} {format_quantity(bar.limit, unit)}"
+    return comparison.name, found, target, comparison.status
 
 
 def format_quantity(value: float, unit: str) -> str:
@@ -180,23 +172,6 @@ def format_quantity(value: float, unit: str) -> str:
 def _format_speedup(comparison: Comparison) -> str:
     value = math.nan if comparison.value is None else comparison.value
     return f"{value:.0f}" if abs(value) >= 1000.0 else format_number(value, 3)
-
-
-def _value_or_none(comparison: Comparison) -> str:
-    return "-" if comparison.value is None else format_quantity(comparison.value, comparison.unit)
-
-
-def _format_target(comparison: Comparison) -> str:
-    bar = comparison.bar
-    if bar is None:
-        return "-"
-    return f"{'>=' if bar.at_least else '<='} {format_quantity(bar.limit, comparison.unit)}"
-
-
-def _format_benchmarks(benchmarks: Iterable[tuple[str, str]], as_object: bool) -> str:
-    if as_object:
-        return json.dumps(dict(benchmarks), indent=2)
-    return format_table(("benchmark", "what it measures"), benchmarks)
 
 
 def _format_machine(machine: Machine) -> str:

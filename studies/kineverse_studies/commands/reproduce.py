@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,40 +29,26 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("name", metavar="NAME", nargs="?", help="name of an experiment, see --list")
-    parser.add_argument("--list", action="store_true", help="list the experiments and exit")
-    parser.add_argument("--quick", action="store_true", help="reduced experiment, in seconds")
-    parser.add_argument("--data", metavar="FOLDER", type=Path, help="folder of the recordings that it needs")
-    parser.add_argument("--model", metavar="MODEL", help="name or path of its model")
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="first seed (0)")
-    parser.add_argument("--count", metavar="N", type=int, help="number of seeds or repetitions")
-    parser.add_argument(
-        "--robot",
-        metavar="ROBOT",
-        action="append",
-        default=[],
-        help="name or path of a robot; may be given several times",
-    )
-    parser.add_argument("--processes", metavar="N", type=int, help="number of processes (cores)")
-    parser.add_argument("--world", default="kinematic", help="kinematic (the default), mujoco, or both")
-    parser.add_argument(
-        "--noise",
-        metavar="NOISE",
-        help="noise of the sensors, such as 3mm+3mm/m,0.5deg,30Hz (none: the truth)",
-    )
-    parser.add_argument("--record", metavar="FOLDER", type=Path, help="folder for a recording of each trial")
-    figure = parser.add_mutually_exclusive_group()
-    figure.add_argument(
-        "--figure",
-        metavar="FILE",
-        type=Path,
-        help="file of the figure (NAME.png; with --json, --markdown: none)",
-    )
-    figure.add_argument("--no-figure", action="store_true", help="draw nothing")
-    form = parser.add_mutually_exclusive_group()
-    form.add_argument("--json", action="store_true", help="one JSON object on standard output")
-    form.add_argument("--markdown", action="store_true", help="tables in Markdown on standard output")
+    add, flag, noise = parser.add_argument, "store_true", "3mm+3mm/m,0.5deg,30Hz"
+    add("name", metavar="NAME", nargs="?", help="name of an experiment, see --list")
+    add("--list", action=flag, help="list the experiments and exit")
+    add("--quick", action=flag, help="reduced experiment, in seconds")
+    add("--data", metavar="FOLDER", type=Path, help="folder of the recordings that it needs")
+    add("--model", metavar="MODEL", help="name or path of its model")
+    add("--seed", metavar="N", type=int, default=0, help="first seed (0)")
+    add("--count", metavar="N", type=int, help="number of seeds or repetitions")
+    robots = "name or path of a robot; may be given several times"
+    add("--robot", metavar="ROBOT", action="append", default=[], help=robots)
+    add("--processes", metavar="N", type=int, help="number of processes (cores)")
+    add("--world", default="kinematic", help="kinematic (the default), mujoco, or both")
+    add("--noise", metavar="NOISE", help=f"noise of the sensors, such as {noise} (none: the truth)")
+    add("--record", metavar="FOLDER", type=Path, help="folder for a recording of each trial")
+    figure, form = parser.add_mutually_exclusive_group(), parser.add_mutually_exclusive_group()
+    where = "file of the figure (NAME.png; with --json, --markdown: none)"
+    figure.add_argument("--figure", metavar="FILE", type=Path, help=where)
+    figure.add_argument("--no-figure", action=flag, help="draw nothing")
+    form.add_argument("--json", action=flag, help="one JSON object on standard output")
+    form.add_argument("--markdown", action=flag, help="tables in Markdown on standard output")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,27 +57,13 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse_studies.experiments.registry import PLANNED, REQUIRED_EXTRAS
 
     if arguments.list:
-        listing = dict(EXPERIMENTS)
-        print(
-            json.dumps(listing, indent=2)
-            if arguments.json
-            else format_table(("name", "about"), listing.items())
-        )
+        table = format_table(("name", "about"), EXPERIMENTS.items())
+        print(json.dumps(dict(EXPERIMENTS), indent=2) if arguments.json else table)
         return 0
     if arguments.name is None:
         raise UnknownNameError(f"Name an experiment. There are: {', '.join(EXPERIMENTS)}.")
-    options = Options(
-        quick=arguments.quick,
-        data=arguments.data,
-        model=arguments.model,
-        seed=arguments.seed,
-        count=arguments.count,
-        robot=tuple(arguments.robot),
-        processes=arguments.processes,
-        world=arguments.world,
-        noise=arguments.noise,
-        record=arguments.record,
-    )
+    given = vars(arguments) | {"robot": tuple(arguments.robot)}
+    options = Options(**{f.name: given[f.name] for f in fields(Options) if f.name in given})
     needed = REQUIRED_EXTRAS.get(arguments.name, ())
     extras = {
         "control": "control" in needed,
@@ -128,7 +101,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _save_figures(report: Report, requested: Path) -> list[Path]:
-    """Write the figure, and the further pictures beside it; return their paths."""
     paths = {requested: report.figure}
     for name, picture in report.pictures.items():
         paths[requested.with_name(f"{requested.stem}-{name}{requested.suffix}")] = picture
@@ -138,7 +110,6 @@ def _save_figures(report: Report, requested: Path) -> list[Path]:
 
 
 def format_report(report: Report, markdown: bool = False) -> str:
-    """Return a report as tables, plain ones or in Markdown."""
     title = f"# {report.title}" if markdown else report.title
     return "\n\n".join([title, *(_format_report_table(table, markdown) for table in report.tables)])
 

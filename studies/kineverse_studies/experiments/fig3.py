@@ -29,11 +29,9 @@ if TYPE_CHECKING:
 
 
 OPTIONS = ()
-
 LENGTH = 2.0
 PARTS = {"A": 0.0, "25 %": 0.25, "50 %": 0.5, "75 %": 0.75, "B": 1.0}
 """Points along the door by name, from the lower edge A to the upper edge B, as fractions of its length."""
-
 _OPENINGS = np.linspace(0.0, LENGTH, 20)
 _HANDLE = np.linspace(0.0, 0.6, 50)
 _LOCK_AT = (1.0, 2.0)
@@ -42,26 +40,13 @@ _BEFORE_CLOSED = tuple(10.0**-k for k in range(1, 9))
 
 @dataclass(frozen=True)
 class GarageDoorCurves:
-    """Curves of the three plots.
-
-    Attributes
-    ----------
-    paths
-        Paths of points in x and z by name, (20, 2) each [m].
-    unlocked
-        Upper bound of the speed by the position of the door, (50,) each.
-    published, regular
-        Speed of the upper edge per unit of a [m/m], and of the angle [m/rad], (200,) each.
-    """
-
-    paths: dict[str, Array]
-    unlocked: dict[float, Array]
-    published: Array
+    paths: dict[str, Array]  # paths of points in x and z by name, (20, 2) each [m]
+    unlocked: dict[float, Array]  # upper bound of the speed by the position of the door, (50,) each
+    published: Array  # speed of the upper edge per unit of a [m/m], and of the angle [m/rad], (200,) each
     regular: Array
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Evaluate the door and its lock at the positions of the paper."""
     published, regular = _make_door("published"), _make_door("regular")
     paths = {
         name: _edge_path(published, part, _OPENINGS)
@@ -156,7 +141,6 @@ def _unlocking_bolt(bound: CompiledFunction, a: float) -> float:
 
 
 def _slopes(model: Model, coordinates: Array) -> Array:
-    """Return the length of the derivative of the upper edge's position by the coordinate."""
     q = model.symbol("garage/door")
     position = model.fk("garage/upper_edge")[:3, 3]
     derivative = compile(position.jacobian([q]), [q]).batch(coordinates[:, None])

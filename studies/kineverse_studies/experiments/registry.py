@@ -4,69 +4,40 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
 from .report import Report
 
-WORLDS, BOTH = ("kinematic", "mujoco"), "both"
-"""Worlds of trials, and the option for all of them."""
+WORLDS, BOTH = ("kinematic", "mujoco"), "both"  # worlds of trials, and the option for all of them
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of experiments; each takes some of these.
+    """Options of experiments; each takes some of these."""
 
-    Attributes
-    ----------
-    quick
-        True for a reduced experiment, in seconds.
-    data
-        Folder of recordings; None for the default.
-    model
-        Name or path of the model; None for the default.
-    seed
-        First seed.
-    count
-        Number of seeds, repetitions or the like; None for the default.
-    robot
-        Robots by name or path; empty for the default.
-    processes
-        Number of processes; None for the number of cores.
-    world
-        ``"kinematic"``, ``"mujoco"``, or ``"both"``.
-    noise
-        Noise of the sensors, as :meth:`kineverse.worlds.Sensors.parse` reads it; None to act on the truth.
-    record
-        Folder of recordings; None for none.
-    """
-
-    quick: bool = False
-    data: Path | None = None
-    model: str | None = None
-    seed: int = 0
-    count: int | None = None
-    robot: tuple[str, ...] = ()
-    processes: int | None = None
-    world: str = WORLDS[0]
-    noise: str | None = None
-    record: Path | None = None
+    quick: bool = False  # true for a reduced experiment, in seconds
+    data: Path | None = None  # folder of recordings or robots
+    model: str | None = None  # name or path of the model; None for the default
+    seed: int = 0  # first seed
+    count: int | None = None  # number of seeds, repetitions or the like; None for the default
+    robot: tuple[str, ...] = ()  # names or paths of robots; empty for the default
+    processes: int | None = None  # number of processes; None for the number of cores
+    world: str = WORLDS[0]  # ``"kinematic"``, ``"mujoco"``, or ``"both"``
+    noise: str | None = None  # as kineverse.worlds.Sensors.parse reads it; None to act on the truth
+    record: Path | None = None  # folder of recordings, a path of the computer on which a trial runs
+    executor: Executor | None = None  # where trials run, such as dask's client.get_executor()
 
     def check(self, name: str, supported: Sequence[str]) -> None:
-        """Check that an experiment supports the options that are set.
-
-        Raises
-        ------
-        InvalidValueError
-            If one is not supported, with those that are; or for a number that is too small.
-        """
         given = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         for option in given:
-            if option not in supported:
+            if option == "executor" and "processes" not in supported:
+                raise InvalidValueError(f"The experiment '{name}' runs in one process, without an executor.")
+            if option not in supported and option != "executor":
                 takes = ", ".join(f"--{known}" for known in supported) or "none"
                 raise InvalidValueError(f"The experiment '{name}' takes no --{option}. It takes {takes}.")
         for option, least in (("seed", 0), ("count", 1), ("processes", 1)):
@@ -78,39 +49,30 @@ class Options:
 
 
 Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]
-
-EXPERIMENTS: Mapping[str, str] = MappingProxyType(
-    {
-        "fig3": "the garage door and its lock (2022 paper, Fig. 3 and Eqs. 11-13)",
-        "fig4": "a kitchen tracked from poses of its parts (2022 paper, Fig. 4; 2020 paper, IV-A)",
-        "sturm": "hinges and sliders learned from recordings of doors and drawers (--data FOLDER)",
-        "stream": "a door that a hand opens, tracked and monitored at 30 Hz with correlated errors",
-        "joint-types": "types of random hinges and sliders, with and without stated noise",
-        "kitchens": "generated kitchens, of which robots open and close all (--seed N --count 50)",
-        "table1-open": "grasped objects are opened, also by the papers' two programs (2022 paper, Table I)",
-        "table1-push": "twelve objects of a kitchen are pushed shut (both papers, Table I)",
-        "unknown-objects": "a door and a drawer whose joints nobody described are opened (--count 10)",
-        "lockbox": "parts that lock each other, opened by trends and by plans (thesis behind the 2020 paper)",
-        "ablations": "pushes and locks without augmented gradients, and with each rule of trends",
-        "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
-    }
-)
+EXPERIMENTS: Mapping[str, str] = {
+    "fig3": "the garage door and its lock (2022 paper, Fig. 3 and Eqs. 11-13)",
+    "fig4": "a kitchen tracked from poses of its parts (2022 paper, Fig. 4; 2020 paper, IV-A)",
+    "sturm": "hinges and sliders learned from recordings of doors and drawers (--data FOLDER)",
+    "stream": "a door that a hand opens, tracked and monitored at 30 Hz with correlated errors",
+    "joint-types": "types of random hinges and sliders, with and without stated noise",
+    "kitchens": "generated kitchens, of which robots open and close all (--seed N --count 50)",
+    "table1-open": "grasped objects are opened, also by the papers' two programs (2022 paper, Table I)",
+    "table1-push": "twelve objects of a kitchen are pushed shut (both papers, Table I)",
+    "unknown-objects": "a door and a drawer whose joints nobody described are opened (--count 10)",
+    "lockbox": "parts that lock each other, opened by trends and by plans (thesis behind the 2020 paper)",
+    "ablations": "pushes and locks without augmented gradients, and with each rule of trends",
+    "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
+}
 """Descriptions of experiments by name; the names are modules of this package, with dashes for underscores."""
-
-REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "ablations": ("control", "geometry"),
-        "kitchens": ("control", "geometry"),
-        "lockbox": ("control",),
-        "table1-open": ("control", "geometry"),
-        "table1-push": ("control", "geometry"),
-        "unknown-objects": ("control", "geometry"),
-    }
-)
-"""Extras without which an experiment cannot run."""
-
-PLANNED = ("kitchens", "table1-open", "unknown-objects")
-"""Experiments with a planner, which needs a C compiler."""
+REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = {  # extras without which an experiment cannot run
+    "ablations": ("control", "geometry"),
+    "kitchens": ("control", "geometry"),
+    "lockbox": ("control",),
+    "table1-open": ("control", "geometry"),
+    "table1-push": ("control", "geometry"),
+    "unknown-objects": ("control", "geometry"),
+}
+PLANNED = ("kitchens", "table1-open", "unknown-objects")  # they plan, which needs a C compiler
 
 
 def reproduce(name: str, progress: Progress | None = None, options: Options | None = None) -> Report:

@@ -15,8 +15,7 @@ from synthetic_recordings import noisy
 import kineverse as kv
 from kineverse.estimation import Family, FamilyParameter, identify, pose_covariance
 from kineverse.estimation.identification.solver import solver
-from kineverse_studies.experiments.estimation_grid.cramer_rao import compute_bound
-from kineverse_studies.experiments.estimation_grid.samples import Cell, draw_samples
+from kineverse_studies.experiments.estimation_grid.cramer_rao import Cell, compute_bound, draw_samples
 
 Array = npt.NDArray[np.float64]
 

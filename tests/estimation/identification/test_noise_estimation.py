@@ -22,8 +22,7 @@ from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.identification.result import NoiseDeviations
 from kineverse.estimation.identification.solver import solver
 from kineverse.lie import transform
-from kineverse_studies.experiments.joint_types.answers import Setting, TypeAnswer, identify_case
-from kineverse_studies.experiments.joint_types.report import report_answers
+from kineverse_studies.experiments.joint_types import Setting, TypeAnswer, identify_case, report_answers
 
 DEG = math.pi / 180
 NOISE = pose_covariance(0.005, 0.02)

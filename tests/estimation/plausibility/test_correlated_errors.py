@@ -22,7 +22,7 @@ from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.plausibility.residuals import KnownJoint, compute_residuals
 from kineverse.lie import exp_so3
-from kineverse_studies.experiments.stream.observations import (
+from kineverse_studies.experiments.stream import (
     DOOR,
     FRAMES,
     ORIENTATION,

@@ -9,7 +9,7 @@ import pytest
 from small_robot import SMALL_ROBOT
 
 from kineverse_studies.bench import BenchmarkSettings
-from kineverse_studies.bench.clutter import make_clutter
+from kineverse_studies.bench.geometry import make_clutter
 from kineverse_studies.bench.workloads import make_kitchen_robot
 
 
@@ -58,7 +58,5 @@ make_clutter_once, make_kitchen_robot_once = cache(make_clutter), cache(make_kit
 @pytest.fixture
 def clutter_made_once(monkeypatch):
     """Have the benchmark of distances make its arm and its robot once for all tests."""
-    monkeypatch.setattr("kineverse_studies.bench.measure_geometry.make_clutter", make_clutter_once)
-    monkeypatch.setattr(
-        "kineverse_studies.bench.measure_geometry.make_kitchen_robot", make_kitchen_robot_once
-    )
+    monkeypatch.setattr("kineverse_studies.bench.geometry.make_clutter", make_clutter_once)
+    monkeypatch.setattr("kineverse_studies.bench.geometry.make_kitchen_robot", make_kitchen_robot_once)

@@ -75,6 +75,7 @@ def test_output_names_the_machine_and_the_benchmarks(run, asked):
         assert word not in out
 
 
+@pytest.mark.long
 def test_missing_peers_are_named_once_at_the_end(run, asked, without):
     without("mujoco", "pinocchio", "coal", "pybullet")
     status, out, err = run("frames", "geometry", "edit")
@@ -153,6 +154,7 @@ def test_targets_are_printed_on_request(run, asked):
     assert ">= 8 x" in out
 
 
+@pytest.mark.long
 def test_bullet_prints_no_greeting():
     pytest.importorskip("pybullet")
     program = "from kineverse_studies.bench.harness import has_peer; assert has_peer('pybullet')"

@@ -15,8 +15,8 @@ from kineverse.cli.arguments import require
 from kineverse_studies.bench import BENCHMARKS, DisagreementError, run_benchmarks, select_benchmarks
 from kineverse_studies.bench.control_workloads import WORKLOADS
 from kineverse_studies.bench.harness import ProgramError, has_peer, run_program
-from kineverse_studies.bench.large_models import READERS, count_reruns, make_large_model
-from kineverse_studies.bench.reaching import ARMS
+from kineverse_studies.bench.inverse_kinematics import ARMS
+from kineverse_studies.bench.models import READERS, count_reruns, make_large_model
 from kineverse_studies.commands.bench import benchmark_to_markdown
 
 sys.path.append(str(Path(__file__).parents[3] / "tools"))
@@ -30,6 +30,7 @@ BATCH = pytest.param("batch", marks=pytest.mark.compiler)
 
 # test_control_bench.py and test_planning_bench.py run these without their long parts.
 LONG = ("control", "planning")
+SHORT = ("call", "frames", "batch", "edit", "examples")
 
 
 # Some of their rows are about robots, kitchens and examples that the minimal settings leave out.
@@ -65,20 +66,23 @@ def programs_run_once(monkeypatch):
             answers[program] = run_program(*words, cache=cache)
         return answers[program]
 
-    for name in ("import", "load", "memory"):
-        monkeypatch.setattr(f"kineverse_studies.bench.measure_{name}.run_program", run_once)
+    monkeypatch.setattr("kineverse_studies.bench.processes.run_program", run_once)
 
 
 @pytest.mark.parametrize(
-    "name", [BATCH if name == "batch" else name for name in BENCHMARKS if name not in LONG]
+    "name",
+    [
+        BATCH if name == "batch" else name if name in SHORT else pytest.param(name, marks=pytest.mark.long)
+        for name in BENCHMARKS
+        if name not in LONG
+    ],
 )
 @pytest.mark.usefixtures("programs_run_once", "clutter_made_once")
 def test_a_benchmark_measures_all_installed_peers_and_its_rows_are_documented(name, tiny, monkeypatch):
     workload = replace(WORKLOADS[tiny.examples[0]], steps=40)
-    monkeypatch.setattr("kineverse_studies.bench.measure_examples.WORKLOADS", {tiny.examples[0]: workload})
-    for module in ("measure_inverse_kinematics", "reaching"):
-        arms = {arm: ARMS[arm] for arm in ("ur5", "tiago")}  # one without a base and one with
-        monkeypatch.setattr(f"kineverse_studies.bench.{module}.ARMS", arms)
+    monkeypatch.setattr("kineverse_studies.bench.examples.WORKLOADS", {tiny.examples[0]: workload})
+    arms = {arm: ARMS[arm] for arm in ("ur5", "tiago")}  # one without a base and one with
+    monkeypatch.setattr("kineverse_studies.bench.inverse_kinematics.ARMS", arms)
     (result,) = run_benchmarks([name], tiny)
     assert result.name == name
     assert result.work
@@ -131,7 +135,7 @@ def test_a_benchmark_that_needs_a_compiler_is_left_out_without_one(tiny, monkeyp
     def measure(settings):
         require("Planning", {}, compiler=True)
 
-    monkeypatch.setattr("kineverse_studies.bench.measure_planning.measure", measure)
+    monkeypatch.setattr("kineverse_studies.bench.planning.measure_planning", measure)
     (result,) = run_benchmarks(["planning"], tiny)
     assert result.measurements == ()
     assert result.missing[0].startswith("planning is left out: Planning needs a C compiler")
@@ -186,7 +190,7 @@ def test_large_models_have_the_requested_size():
 
 
 def test_a_joint_is_replaced_in_a_copy(tiny):
-    from kineverse_studies.bench.measure_edit import replace_joint
+    from kineverse_studies.bench.models import replace_joint
     from kineverse_studies.bench.workloads import find_benchmark_robot
 
     robot = find_benchmark_robot(tiny)

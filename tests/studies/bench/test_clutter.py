@@ -7,15 +7,16 @@ import pytest
 
 from kineverse.geometry import Scene
 from kineverse_studies.bench import DisagreementError, run_benchmarks
-from kineverse_studies.bench.clutter import RADIUS, RULES, make_clutter
-from kineverse_studies.bench.measure_geometry import SearchEntry, check_distances
-from kineverse_studies.bench.peers.clutter_search import (
+from kineverse_studies.bench.geometry import (
+    RADIUS,
+    RULES,
     CoalSearch,
     KineverseSearch,
-    MujocoPairSearch,
-    MujocoSearch,
+    RobotSurroundings,
+    SearchEntry,
+    check_distances,
+    make_clutter,
 )
-from kineverse_studies.bench.peers.robot_search import BulletRobotSearch, MujocoRobotSearch, RobotSurroundings
 from kineverse_studies.bench.workloads import make_kitchen_robot
 
 
@@ -37,6 +38,8 @@ def names(search, angles):
 
 def test_peers_find_the_same_pairs(arm, scene):
     pytest.importorskip("mujoco")
+    from kineverse_studies.bench.peers.mujoco import MujocoPairSearch, MujocoSearch
+
     ours, *peers = KineverseSearch(scene), CoalSearch(scene), MujocoSearch(arm), MujocoPairSearch(arm)
     for angles in arm.angles[::8]:
         found = names(ours, angles)
@@ -61,14 +64,19 @@ def robot():
 
 def test_mujoco_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("mujoco")
+    from kineverse_studies.bench.peers.mujoco import MujocoRobotSearch
+
     ours = SearchEntry("ours", KineverseSearch(robot.scene()), 0.0)
     room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
     assert len(names(ours.search, robot.values[0])) > 20
     check_distances([ours, SearchEntry("mujoco", MujocoRobotSearch(room), 1e-5)], robot.values)
 
 
+@pytest.mark.long
 def test_bullet_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("pybullet")
+    from kineverse_studies.bench.peers.bullet import BulletRobotSearch
+
     room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
     entries = [
         SearchEntry("ours", KineverseSearch(robot.scene()), 0.0),
@@ -108,6 +116,7 @@ def test_further_boxes_keep_a_distance(arm):
     assert np.linalg.norm(many.poses[60:, :3, 3], axis=1).max() > 1.0
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("clutter_made_once")
 def test_peers_that_are_not_installed_are_reported(tiny, without):
     without("mujoco", "pybullet")

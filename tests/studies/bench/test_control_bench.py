@@ -9,13 +9,21 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse_studies.bench import measure_control, run_benchmarks
+from kineverse_studies.bench import control, run_benchmarks
+from kineverse_studies.bench.control import (
+    DOOR,
+    OPENING,
+    PERIOD,
+    STEPS,
+    ControllerLoop,
+    TimedLoop,
+    make_opening,
+    make_peer_loop,
+    peer_workload,
+)
 from kineverse_studies.bench.control_workloads import WORKLOADS, export_urdf
-from kineverse_studies.bench.controller_loop import ControllerLoop
+from kineverse_studies.bench.examples import EXAMPLES, make_example_loop
 from kineverse_studies.bench.harness import Contender
-from kineverse_studies.bench.measure_examples import EXAMPLES, make_example_loop
-from kineverse_studies.bench.opening import DOOR, OPENING, PERIOD, STEPS, make_opening, peer_workload
-from kineverse_studies.bench.timed_loop import TimedLoop
 
 pytest.importorskip("daqp")
 
@@ -32,11 +40,7 @@ def urdf_written_once(monkeypatch):
 
 def peer_loop(library, name, workload=None):
     pytest.importorskip(library)
-    if library == "pink":
-        from kineverse_studies.bench.peers.pink_control import make_pink_loop as make
-    else:
-        from kineverse_studies.bench.peers.mink_control import make_mink_loop as make
-    return make(name, workload)
+    return make_peer_loop(library, name, workload)
 
 
 @cache
@@ -67,6 +71,7 @@ def test_a_robot_opens_the_fridge_within_its_limits():
     assert dict(loop.state) == dict(start)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("library", ["pink", "mink"])
 def test_a_peer_opens_the_fridge_with_few_joints_as_with_all(library):
     opening, controller, start = opened("pr2")
@@ -104,6 +109,7 @@ def test_an_original_takes_a_step_towards_its_target(name):
     assert set(EXAMPLES) == set(WORKLOADS)
 
 
+@pytest.mark.long
 def test_our_example_starts_with_the_error_of_the_original():
     skip_without_robots()
     ours, theirs = make_example_loop(SHORT), peer_loop("mink", SHORT)
@@ -119,6 +125,7 @@ def test_our_example_starts_with_the_error_of_the_original():
     assert [c.name for c in timed.bounds(mean=1.0, worst=1.0)] == ["ours, mean", "ours, worst"]
 
 
+@pytest.mark.long
 def test_control_is_measured_without_contacts_where_coal_is_missing(tiny, monkeypatch):
     for library in ("pink", "mink"):
         pytest.importorskip(library)
@@ -126,10 +133,10 @@ def test_control_is_measured_without_contacts_where_coal_is_missing(tiny, monkey
     def refuse(opening):
         raise kv.errors.MissingDependencyError("distances need coal")
 
-    monkeypatch.setattr(measure_control, "_near_the_kitchen", refuse)
-    monkeypatch.setattr(measure_control, "STEPS", 20)
-    builds = [Contender(name, lambda: 0.1) for name in (measure_control.BUILD, measure_control.READY)]
-    monkeypatch.setattr(measure_control, "_fresh_builds", lambda: builds)
+    monkeypatch.setattr(control, "_near_the_kitchen", refuse)
+    monkeypatch.setattr(control, "TIMED_STEPS", 20)
+    builds = [Contender(name, lambda: 0.1) for name in (control.BUILD, control.READY)]
+    monkeypatch.setattr(control, "_fresh_builds", lambda: builds)
     (result,) = run_benchmarks(["control"], tiny)
     assert result.missing == ("contact slots are left out: distances need coal",)
     assert all(c.value is not None for c in result.comparisons)

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from kineverse_studies.bench import DisagreementError, Measurement
-from kineverse_studies.bench.harness import Contender, check_equal, time_calls, time_contenders
-from kineverse_studies.bench.result import Bar, Comparison, bound_median, compare_speed
+from kineverse_studies.bench.harness import (
+    Bar,
+    Comparison,
+    Contender,
+    bound_median,
+    check_equal,
+    compare_speed,
+    time_calls,
+    time_contenders,
+)
 
 
 def silent(items, what, unit):

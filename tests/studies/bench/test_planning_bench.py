@@ -10,14 +10,23 @@ import pytest
 from kineverse.errors import UnknownNameError
 from kineverse.geometry import Scene
 from kineverse.spatial import rotation_z, translation
-from kineverse_studies.bench import kitchen_queries, measure_planning
-from kineverse_studies.bench.configuration_check import ConfigurationCheck, interpolate_path
+from kineverse_studies.bench import kitchen_queries, planning
 from kineverse_studies.bench.held_planning import HeldResults
-from kineverse_studies.bench.kitchen_planning import KitchenResults, run_kitchen_queries
 from kineverse_studies.bench.kitchen_queries import CLEARANCE, make_kitchen_arm
-from kineverse_studies.bench.planning_attempts import Attempt, AttemptSummary
-from kineverse_studies.bench.planning_problems import load_problem_sets
-from kineverse_studies.bench.published_planning import FIGURES, compare_with_vamp, run_published_problems
+from kineverse_studies.bench.planning import (
+    FIGURES,
+    KitchenResults,
+    compare_with_vamp,
+    run_kitchen_queries,
+    run_published_problems,
+)
+from kineverse_studies.bench.planning_problems import (
+    Attempt,
+    AttemptSummary,
+    ConfigurationCheck,
+    interpolate_path,
+    load_problem_sets,
+)
 
 PAIR = ("lift", "posts")
 
@@ -164,7 +173,7 @@ def test_paths_of_queries_are_checked(posts, tiny):
 
 def test_ompl_finds_a_way_around_an_obstacle():
     pytest.importorskip("ompl")
-    from kineverse_studies.bench.peers.ompl_rrt_connect import OmplRrtConnect
+    from kineverse_studies.bench.peers.ompl import OmplRrtConnect
 
     def free(q):
         return abs(q[0]) > 0.2 or q[1] > 0.5
@@ -210,19 +219,19 @@ def test_the_planner_of_a_shipped_robot_is_built_where_no_other_is_found(tmp_pat
     monkeypatch.setenv("KINEVERSE_MODEL_PATH", str(tmp_path))
     built = []
     monkeypatch.setattr(
-        measure_planning, "run_program", lambda *words, cache: built.append(words) or {"seconds": 1.0}
+        planning, "run_program", lambda *words, cache: built.append(words) or {"seconds": 1.0}
     )
-    result = measure_planning.measure(tiny, parts=("build",))
+    result = planning.measure_planning(tiny, parts=("build",))
     assert {*built} == {("build_planner", "pr2 (shipped)")}
     assert [m.name for m in result.measurements] == [
-        f"pr2 (shipped): {n}" for n in (measure_planning.FIRST, measure_planning.AGAIN)
+        f"pr2 (shipped): {n}" for n in (planning.FIRST, planning.AGAIN)
     ]
 
 
 def test_missing_robots_and_peers_are_reported(tmp_path, monkeypatch, tiny, without):
     without("ompl", "vamp")
     monkeypatch.setenv("KINEVERSE_MODEL_PATH", str(tmp_path))
-    result = measure_planning.measure(tiny, parts=("published",))
+    result = planning.measure_planning(tiny, parts=("published",))
     assert any(line.startswith("vamp is not installed") for line in result.missing)
     assert any("studies[peers]' brings it" in line for line in result.missing)
     assert any("problems of panda are not on the model path" in line for line in result.missing)

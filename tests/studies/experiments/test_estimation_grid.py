@@ -9,21 +9,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from kineverse_studies.experiments.estimation_grid.cramer_rao import (
-    compute_attainable_bound,
-    compute_bound,
-    orthonormal_complement,
-)
-from kineverse_studies.experiments.estimation_grid.fits import (
+from kineverse_studies.experiments.estimation_grid import (
     SAMPLES,
-    fit_all,
+    CellResult,
     fit_cell,
     make_grid,
     make_quick_grid,
+    report_grid,
+    summarize_cells,
 )
-from kineverse_studies.experiments.estimation_grid.report import report_grid
-from kineverse_studies.experiments.estimation_grid.results import CellResult, summarize_cells
-from kineverse_studies.experiments.estimation_grid.samples import LEVER, TO_AXIS, Cell, draw_samples
+from kineverse_studies.experiments.estimation_grid.cramer_rao import (
+    LEVER,
+    TO_AXIS,
+    Cell,
+    compute_attainable_bound,
+    compute_bound,
+    draw_samples,
+    orthonormal_complement,
+)
 
 DEG = np.pi / 180
 CELLS = [
@@ -239,12 +242,3 @@ def test_report_says_which_targets_are_met(tmp_path):
     pytest.importorskip("matplotlib")
     made.figure.save(tmp_path / "grid.png")
     assert (tmp_path / "grid.png").stat().st_size > 10_000
-
-
-def test_results_are_independent_of_the_number_of_processes():
-    cells = [Cell("prismatic", 0.001, 1 * DEG, n, 0.4) for n in (5, 6)]
-    alone = fit_all(cells, 2, lambda items, what, unit: items, workers=1)
-    together = fit_all(cells, 2, lambda items, what, unit: items, workers=2)
-    for one, other in zip(alone, together, strict=True):
-        assert one.cell == other.cell
-        np.testing.assert_allclose(one.degrees, other.degrees, rtol=1e-5)

@@ -15,9 +15,13 @@ import kineverse as kv
 from kineverse.cli import main
 from kineverse.errors import ModelError
 from kineverse_studies.experiments import Options, fig4, reproduce
-from kineverse_studies.experiments.fig4.accuracy import REPORTED_MEAN, simulate_observations
-from kineverse_studies.experiments.fig4.consistency import _evaluate_consistency, cramer_rao
-from kineverse_studies.experiments.fig4.mechanisms import _coordinate_errors
+from kineverse_studies.experiments.fig4.accuracy import (
+    REPORTED_MEAN,
+    _coordinate_errors,
+    _evaluate_consistency,
+    cramer_rao,
+    simulate_observations,
+)
 from kineverse_studies.experiments.fig4.protocol import (
     LEVELS,
     FilterRun,
@@ -160,7 +164,7 @@ def test_consistency_statistics_of_known_errors(kitchen):
     assert consistent.states == (~near).sum() < truth.size
     overconfident = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound / 9)])
     assert overconfident.nees == pytest.approx(9 * consistent.nees)
-    assert "nis" not in overconfident.as_json()
+    assert "nis" not in overconfident.as_data()
 
 
 def test_lost_runs_are_counted_and_excluded():
@@ -197,6 +201,7 @@ def report(cupboard, few):
     return reproduce("fig4", options=Options(quick=True, model=str(cupboard)))
 
 
+@pytest.mark.long
 def test_report_has_all_measurements(report):
     numbers = json.loads(json.dumps(dict(report.numbers), allow_nan=False))
     assert numbers == report.numbers
@@ -247,6 +252,7 @@ def leaves(value):
     return [number for part in inside for number in leaves(part)]
 
 
+@pytest.mark.long
 def test_the_figure_is_drawn(report, tmp_path):
     pytest.importorskip("matplotlib")
     report.figure.save(tmp_path / "fig4.png")

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from kineverse.lie import inverse, rotation_angle
-from kineverse_studies.experiments.joint_types import report
-from kineverse_studies.experiments.joint_types.answers import SETTINGS, identify_cases
-from kineverse_studies.experiments.joint_types.samples import (
+from kineverse_studies.experiments import Options
+from kineverse_studies.experiments.joint_types import (
     COUNTS,
     LEVERS,
     MOVING,
     POSITIONS,
     RANGES,
+    SETTINGS,
     draw_case,
+    identify_cases,
+    report_answers,
 )
 
 
@@ -47,6 +49,6 @@ def test_relative_poses_are_those_of_the_joint_up_to_the_noise() -> None:
 
 
 def test_the_report_of_a_few_cases_has_all_settings() -> None:
-    found = report.report_answers(identify_cases(3, lambda items, what, unit: items, workers=1))
+    found = report_answers(identify_cases(3, lambda items, what, unit: items, Options(processes=1)))
     assert len(found.tables[0].rows) == len(SETTINGS)
     assert len(json.loads(json.dumps(found.numbers))["answers"][SETTINGS[0].title]) == 3

@@ -20,13 +20,16 @@ from kineverse_studies.experiments.lockbox import (
     list_explorer_jobs,
     list_planner_jobs,
     make_lockbox_report,
+    record_thesis_box,
     run_explorer,
     run_planner,
 )
-from kineverse_studies.experiments.lockbox.exhaustive_search import can_be_opened
-from kineverse_studies.experiments.lockbox.recordings import record_thesis_box
-from kineverse_studies.experiments.lockbox.systematic_search import count_systematic_tries
-from kineverse_studies.experiments.lockbox.unknown_locks import list_unknown_jobs, run_unknown
+from kineverse_studies.experiments.lockbox.unknown_locks import (
+    can_be_opened,
+    count_systematic_tries,
+    list_unknown_jobs,
+    run_unknown,
+)
 from kineverse_studies.experiments.lockbox.unlocking_runs import LOCK_RULES, run_unlocking
 
 
@@ -102,6 +105,7 @@ def test_systematic_search_finds_exactly_the_boxes_that_can_be_opened():
     assert 5 < found < 40
 
 
+@pytest.mark.long
 def test_thesis_box_is_recorded_in_three_ways(tmp_path):
     record_thesis_box(tmp_path / "runs")
     for name in ("trends", "plan", "unknown-locks"):

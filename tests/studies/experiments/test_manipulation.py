@@ -19,22 +19,34 @@ from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.worlds import read_run_recording
 from kineverse_studies.commands.reproduce import format_report
 from kineverse_studies.experiments import Options, kitchens, reproduce, table1_open, table1_push
+from kineverse_studies.experiments.execution import run_jobs
 from kineverse_studies.experiments.lockbox.unlocking_runs import RULES, run_unlocking
-from kineverse_studies.experiments.manipulation import setting, skills
+from kineverse_studies.experiments.manipulation import skills
 from kineverse_studies.experiments.manipulation.film import draw_vectors, find_telling_moment
-from kineverse_studies.experiments.manipulation.robots import check_data, find_robots
-from kineverse_studies.experiments.manipulation.setting import (
+from kineverse_studies.experiments.manipulation.skills import (
     TrialSetting,
     TrialWatch,
+    check_data,
+    find_robots,
     list_series,
     make_settings,
 )
-from kineverse_studies.experiments.manipulation.tables import make_exception_table, make_trial_tables
-from kineverse_studies.experiments.manipulation.trial_pool import run_jobs
-from kineverse_studies.experiments.manipulation.trials import Moment, Trial, count_objects, find_failure
-from kineverse_studies.experiments.table1_open.objects import OBJECTS, make_opening_setup
-from kineverse_studies.experiments.table1_open.programs import LeaderFollower, SpeedScale, open_by_program
-from kineverse_studies.experiments.table1_push.objects import find_kitchens, make_push_setup
+from kineverse_studies.experiments.manipulation.trials import (
+    Moment,
+    Trial,
+    count_objects,
+    find_failure,
+    make_exception_table,
+    make_trial_tables,
+)
+from kineverse_studies.experiments.table1_open.programs import (
+    OBJECTS,
+    LeaderFollower,
+    SpeedScale,
+    make_opening_setup,
+    open_by_program,
+)
+from kineverse_studies.experiments.table1_push import find_kitchens, make_push_setup
 
 
 def _trial(what, failure="", *, skill="open", placements=0, case="7", cpu=()):
@@ -121,7 +133,7 @@ def test_run_jobs_keeps_the_order_of_the_jobs():
         assert (len(items), what, unit) == (3, "trials", "job")
         return items
 
-    found = run_jobs(_one_job, [3, 1, 2], progress, "trials", "job", 1)
+    found = run_jobs(_one_job, [3, 1, 2], progress, "trials", "job", Options(processes=1))
     assert [t.what for t in found] == ["3", "1", "2"]
 
 
@@ -150,7 +162,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
             self.state = state
 
     monkeypatch.setattr(skills, "open_object", open_object)
-    monkeypatch.setattr(setting, "KinematicWorld", World)
+    monkeypatch.setattr(skills, "KinematicWorld", World)
     trials = kitchens.run_kitchen(kitchens.KitchenJob("kitchens/2", SHIPPED["hsr"]))
     model = kitchens.make_kitchen_with(SHIPPED["hsr"], "kitchens/2")
     objects = [str(s) for s in model.degrees_of_freedom if str(s).startswith("kitchen/")]
@@ -180,6 +192,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
     assert "larder_door" in format_report(report)
 
 
+@pytest.mark.long
 def test_leader_follower_opens_the_drawer_within_the_papers_tolerance():
     setup = make_opening_setup(SHIPPED["hsr"], OBJECTS["drawer"])
     start = setup.find_start()
@@ -216,7 +229,7 @@ def test_open_box_random_boxes_with_trends():
 
 def test_make_push_setup_opens_the_object_and_takes_the_papers_start():
     setup = make_push_setup(SHIPPED["pr2"], *find_kitchens(None), "oven door")
-    assert setup.start[setup.model.symbol("kitchen/oven_door")] == table1_push.objects.OPENED
+    assert setup.start[setup.model.symbol("kitchen/oven_door")] == table1_push.OPENED
     assert setup.start[setup.model.symbol("pr2/r_elbow_flex_joint")] == -2.1213
     assert [setup.start[setup.model.symbol(f"pr2/base/{key}")] for key in ("x", "y", "angle")] == [0, 0, 0]
     with pytest.raises(UnknownNameError, match="Did you mean 'oven door'"):
@@ -266,9 +279,9 @@ def test_opening_report_without_skill_has_the_papers_figures():
             measures={"programs": 2, "grasp_error": 5e-4, "limit_violation": 0.0},
         )
         for robot in ("hsr", "hsr (authors)")
-        for program in table1_open.report.PROGRAMS
+        for program in table1_open.PROGRAMS
     ]
-    report = table1_open.report.make_opening_report(trials, 1, 0)
+    report = table1_open.make_opening_report(trials, 1, 0)
     first = report.numbers["programs"][0]
     assert first["published_mean_ms"] == 3.3
     assert first["solve_mean_ms"] == pytest.approx(0.2)

@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse_studies.experiments.stream.observations import StreamErrors, correlated_errors
-from kineverse_studies.experiments.stream.report import make_report
-from kineverse_studies.experiments.stream.tracking import make_streams, run_trackers, summarize_trackers
+from kineverse_studies.experiments.stream import (
+    StreamErrors,
+    correlated_errors,
+    make_report,
+    make_streams,
+    run_trackers,
+    summarize_trackers,
+)
 
 MODEL = kv.load("kitchen")
 

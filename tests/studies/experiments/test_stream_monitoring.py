@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse_studies.experiments.stream.monitoring import PERIOD, measure_monitoring, repeated_motion
+from kineverse_studies.experiments.stream import PERIOD, measure_monitoring, repeated_motion
 
 
 def test_repeated_motion_is_smooth() -> None:
@@ -19,6 +19,7 @@ def test_repeated_motion_is_smooth() -> None:
     assert angles.max() == pytest.approx(1.3)
 
 
+@pytest.mark.long
 def test_monitor_on_correlated_streams() -> None:
     rows = {
         row.case: row

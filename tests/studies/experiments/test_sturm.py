@@ -13,23 +13,19 @@ from kineverse.errors import FormatError
 from kineverse.estimation.identification.solver import solver
 from kineverse.estimation.recordings import RecordedPair
 from kineverse_studies.experiments import Options, reproduce
-from kineverse_studies.experiments.sturm.classify import (
+from kineverse_studies.experiments.sturm import (
+    POSITION,
+    STATEMENTS,
+    THINNED,
+    LabelledRecording,
+    answer_statements,
     classify_recording,
     draw_recordings,
     figure_size,
+    read_labelled_recordings,
     report_recordings,
-)
-from kineverse_studies.experiments.sturm.noise_statements import (
-    STATEMENTS,
-    answer_statements,
     statement_numbers,
     statement_table,
-)
-from kineverse_studies.experiments.sturm.recordings import (
-    POSITION,
-    THINNED,
-    LabelledRecording,
-    read_labelled_recordings,
 )
 
 RNG = np.random.default_rng(0)
@@ -119,7 +115,7 @@ def test_missing_recordings_are_an_error_with_their_place(tmp_path, monkeypatch)
     with pytest.raises(FormatError, match="none of them is there"):
         read_labelled_recordings(tmp_path)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FormatError, match="sturm_tracks: there is no such folder"):
+    with pytest.raises(FormatError, match=r"^This experiment is about .*Say where they are: --data"):
         reproduce("sturm")
 
 
@@ -135,6 +131,7 @@ def test_the_command_takes_the_folder(folder, capsys):
     assert "all_poses" not in answer
 
 
+@pytest.mark.long
 def test_all_poses_are_judged_under_each_statement_of_the_noise():
     points = arc(0.4, 1.5, 25)
     pair = RecordedPair("world", "door", None, points, np.arange(len(points)))

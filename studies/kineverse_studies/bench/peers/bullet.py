@@ -1,12 +1,14 @@
-"""Pairs within a distance in Bullet."""
+"""Pairs within a distance in Bullet: an arm among boxes, and a robot in a room."""
 
 from __future__ import annotations
 
 import itertools
 from typing import Any
 
+from kineverse.geometry.shapes import Solid
 from kineverse.lie import Array, to_quaternion
-from kineverse_studies.bench.clutter import (
+from kineverse.model.body import Box, Capsule, Cylinder, Sphere
+from kineverse_studies.bench.geometry import (
     BOX_SIZE,
     CAPSULE_SIZE,
     CENTRE,
@@ -14,17 +16,15 @@ from kineverse_studies.bench.clutter import (
     LINKS,
     RADIUS,
     Clutter,
+    PairDistances,
+    RobotSurroundings,
+    solid_corners,
 )
 
-from .clutter_search import PairDistances
-
-_LINKS_PER_BODY = 100
-"""Number of boxes in one body, as Bullet limits the number of links."""
+_LINKS_PER_BODY = 100  # number of boxes in one body, as Bullet limits the number of links
 
 
 class BulletSearch:
-    """Search with Bullet's getClosestPoints of the arm and bodies with the boxes as links."""
-
     def __init__(self, clutter: Clutter) -> None:
         import pybullet
 
@@ -40,25 +40,22 @@ class BulletSearch:
             )
             for size in clutter.sizes
         ]
-        self._bodies = create_static_bodies(pybullet, boxes, clutter.poses, self._client)
+        self._bodies = _create_static_bodies(pybullet, boxes, clutter.poses, self._client)
         self._joints = list(range(LINKS))
         self.results: list[Any] = []
 
     def update(self, angles: Array) -> None:
-        """Set the joint angles."""
         rows = angles[:, None].tolist()
         self._bullet.resetJointStatesMultiDof(
             self._arm, self._joints, targetValues=rows, physicsClientId=self._client
         )
 
     def query(self) -> object:
-        """Search for pairs within the radius."""
         closest_points, arm, client = self._bullet.getClosestPoints, self._arm, self._client
         self.results = [closest_points(arm, body, RADIUS, physicsClientId=client) for body in self._bodies]
         return self.results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search, with distances [m]."""
         for contact in itertools.chain(*self.results):
             yield f"link{contact[3]}", f"box{self._bodies[contact[2]] + contact[4]}", contact[8]
 
@@ -66,17 +63,12 @@ class BulletSearch:
         self._bullet.disconnect(self._client)
 
 
-def create_static_bodies(pybullet: Any, shapes: list[int], poses: Array, client: int) -> dict[int, int]:
-    """Create static bodies of shapes at poses, (N, 3, 4) or larger, each shape a link.
-
-    Returns
-    -------
-    Index of the shape of the first link, by body.
-    """
+def _create_static_bodies(pybullet: Any, shapes: list[int], poses: Array, client: int) -> dict[int, int]:
+    """Create static bodies of shapes at poses, (N, 3, 4) or larger, each shape a link."""
     bodies = {}
     for first in range(0, len(shapes), _LINKS_PER_BODY):
         some = slice(first, first + _LINKS_PER_BODY)
-        positions, turns = poses[some, :3, 3].tolist(), xyzw_quaternions(poses[some])
+        positions, turns = poses[some, :3, 3].tolist(), _xyzw_quaternions(poses[some])
         bodies[_create_body(pybullet, shapes[some], positions, turns, None, client)] = first
     return bodies
 
@@ -103,7 +95,6 @@ def _create_body(
     axes: list[list[int]] | None,
     client: int,
 ) -> int:
-    """Create a chain of revolute links, or static links if there are no axes."""
     count, nothing, upright = len(shapes), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
     fixed, turning = pybullet.JOINT_FIXED, pybullet.JOINT_REVOLUTE
     return int(
@@ -124,7 +115,62 @@ def _create_body(
     )
 
 
-def xyzw_quaternions(poses: Array) -> list[list[float]]:
+def _xyzw_quaternions(poses: Array) -> list[list[float]]:
     """Return (x, y, z, w) of (N, 3, 4) or larger poses."""
     quaternions: list[list[float]] = to_quaternion(poses[:, :3, :3]).tolist()
     return quaternions
+
+
+class BulletRobotSearch:
+    def __init__(self, room: RobotSurroundings) -> None:
+        import pybullet
+
+        self._bullet: Any = pybullet
+        self._room = room
+        self._client = client = pybullet.connect(pybullet.DIRECT)
+        shapes = [self._shape(room.solid(k)) for k in room.others]
+        self._bodies = _create_static_bodies(pybullet, shapes, room.poses(room.others), client)
+        self._robot = {
+            pybullet.createMultiBody(1.0, self._shape(room.solid(k)), physicsClientId=client): k
+            for k in room.robot
+        }
+        self.results: list[tuple[int, int, Any]] = []
+
+    def update(self, angles: Array) -> None:
+        poses, place = self._room.update(angles), self._bullet.resetBasePositionAndOrientation
+        for body, at, turn in zip(
+            self._robot, poses[:, :, 3].tolist(), _xyzw_quaternions(poses), strict=True
+        ):
+            place(body, at, turn, physicsClientId=self._client)
+
+    def query(self) -> object:
+        closest_points, client = self._bullet.getClosestPoints, self._client
+        self.results = [
+            (index, first, closest_points(body, other, RADIUS, physicsClientId=client))
+            for body, index in self._robot.items()
+            for other, first in self._bodies.items()
+        ]
+        return self.results
+
+    def distances(self) -> PairDistances:
+        names, others = self._room.names, self._room.others
+        for index, first, contacts in self.results:
+            for contact in contacts:
+                yield names[index], names[others[first + contact[4]]], contact[8]
+
+    def _shape(self, solid: Solid) -> int:
+        bullet, shape = self._bullet, solid.surface
+        sizes: dict[str, Any]
+        if isinstance(shape, Box):
+            kind, sizes = bullet.GEOM_BOX, {"halfExtents": [edge / 2 for edge in shape.size]}
+        elif isinstance(shape, Sphere):
+            kind, sizes = bullet.GEOM_SPHERE, {"radius": shape.radius}
+        elif isinstance(shape, Capsule | Cylinder):
+            kind = bullet.GEOM_CAPSULE if isinstance(shape, Capsule) else bullet.GEOM_CYLINDER
+            sizes = {"radius": shape.radius, "height": shape.length}
+        else:
+            kind, sizes = bullet.GEOM_MESH, {"vertices": solid_corners(solid).tolist()}
+        return int(bullet.createCollisionShape(kind, physicsClientId=self._client, **sizes))
+
+    def __del__(self) -> None:
+        self._bullet.disconnect(self._client)

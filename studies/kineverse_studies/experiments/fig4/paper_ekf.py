@@ -38,42 +38,6 @@ class PaperEkf:
     - later observations: S = H Σ Hᵀ + R, K = Σ Hᵀ S⁻¹, q += K (z - h(q)), Σ = (I - K H) Σ.
 
     R is the covariance of entries in noisy poses at one configuration, see :meth:`learn_noise`.
-
-    Parameters
-    ----------
-    model
-        The model, with the limits of its coordinates.
-    frames
-        Observed frames.
-    steps
-        Number of gradient steps at the first observation. The authors' code makes one.
-    spread
-        Initial standard deviation, relative to the width of the limits. The authors' code has 1.
-    copies
-        Number of beliefs that run side by side on the same R, each on its own poses; None for one, without a
-        leading axis in its arrays.
-
-    Attributes
-    ----------
-    frames
-        Frames, in the order of their poses.
-    symbols
-        The n coordinates, by group.
-    groups
-        Coordinates of each group.
-    limits
-        Lower and upper limits of the coordinates, (n, 2).
-    function
-        Compiled h and H of each group.
-    q
-        Estimate, (n,) or (copies, n).
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such frame, with similar names.
-    ModelError
-        If a frame depends on no coordinate.
     """
 
     def __init__(
@@ -98,7 +62,6 @@ class PaperEkf:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the estimate to the start; R stays."""
         lower, upper = self.limits.T
         self.q = np.broadcast_to((lower + upper) / 2, (*self._lead, len(self.symbols))).copy()
         for group in self._groups:
@@ -108,13 +71,7 @@ class PaperEkf:
         self._started = False
 
     def learn_noise(self, poses: npt.ArrayLike) -> None:
-        """Estimate R as the covariance of noisy poses at one configuration.
-
-        Parameters
-        ----------
-        poses
-            N observations of all frames, (N, m, 4, 4).
-        """
+        """Estimate R as the covariance of noisy poses at one configuration."""
         seen = self._observed_entries(poses, np.shape(poses)[:1])
         if len(seen) < 2:
             raise InvalidValueError("One observation has no covariance; the papers take 400.")
@@ -122,15 +79,7 @@ class PaperEkf:
             group.noise = np.cov(seen[:, group.rows], rowvar=False).reshape([len(group.entries)] * 2)
 
     def predict(self, dt: float, speeds: Mapping[Symbol | str, float] | None = None) -> None:
-        """Predict the estimate by q += Δt q̇.
-
-        Parameters
-        ----------
-        dt
-            Time step [s].
-        speeds
-            Commanded velocities by symbol or name; others are zero.
-        """
+        """Predict the estimate by q += Δt q̇."""
         if not speeds:
             return
         by_name = {str(s.derivative()): i for i, s in enumerate(self.symbols)}
@@ -142,21 +91,6 @@ class PaperEkf:
             self.q[..., by_name[str(symbol)]] += dt * speed
 
     def update(self, poses: npt.ArrayLike) -> Array:
-        """Update with an observation and return the estimate.
-
-        Parameters
-        ----------
-        poses
-            Poses of the frames in the world, (m, 4, 4) or (copies, m, 4, 4).
-
-        Raises
-        ------
-        ShapeError
-            If the poses have another shape.
-        InvalidValueError
-            If they contain NaN, R is missing, S is singular (the authors' code skips such an observation), or
-            the model has no value at q. The belief does not change then.
-        """
         z = self._observed_entries(poses, self._lead)
         q, covariances = self._kalman_update(z) if self._started else self._gradient_steps(z)
         if not np.isfinite(q).all():
@@ -196,7 +130,6 @@ class PaperEkf:
         return q, covariances
 
     def _evaluate_groups(self, q: Array) -> list[tuple[_CoordinateGroup, Array, Array]]:
-        """Return each group with h and H at q."""
         if self._lead:
             values = self.function.batch(q)
         else:
@@ -205,7 +138,6 @@ class PaperEkf:
         return list(zip(self._groups, values[::2], values[1::2], strict=True))
 
     def _observed_entries(self, poses: npt.ArrayLike, lead: tuple[int, ...]) -> Array:
-        """Return the observed entries of poses, by group."""
         seen = np.asarray(poses, dtype=np.float64)
         wanted = (*lead, len(self.frames), 4, 4)
         if seen.shape != wanted:
@@ -218,11 +150,7 @@ class PaperEkf:
 
 @dataclass(eq=False)
 class _CoordinateGroup:
-    """Coordinates that share observations.
-
-    ``columns`` are indices into the filter's vector. ``entries`` are indices into all poses written row by
-    row, and ``rows`` their indices among those of all groups.
-    """
+    """Coordinates that share observations; indices of columns, of entries of all poses, and of rows."""
 
     symbols: tuple[Symbol, ...]
     columns: npt.NDArray[np.intp]

@@ -1,48 +1,39 @@
-"""Protocol of the papers: observed frames, noise, and runs of both filters."""
+"""Protocol of the papers: observed frames, noise, runs of both filters, and their times."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from time import process_time
 from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._runtime import no_collection
 from kineverse.compilation import CompiledFunction, compile
 from kineverse.errors import ModelError
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.lie import Array, exp_so3, retract, transform
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
+from kineverse_studies.experiments.registry import Progress
 
 from .paper_ekf import SPREAD, STEPS, PaperEkf
 
 Generator: TypeAlias = np.random.Generator
-
-DT = 0.05
-"""Time between two observations [s]."""
+DT = 0.05  # time between two observations [s]
 OBSERVATIONS = 25
 CONFIGURATIONS = 300
-TRAINING = 400
-"""Number of noisy observations of one configuration from which the papers' filter estimates R."""
-SHIFTING_FIRST = 7
-"""Number of drawers before the first door in the papers' order."""
+TRAINING = 400  # number of noisy observations of one configuration from which the papers' filter estimates R
+SHIFTING_FIRST = 7  # number of drawers before the first door in the papers' order
 
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Noise of a pose.
-
-    Attributes
-    ----------
-    position, orientation
-        Standard deviations of position [m] and orientation [rad], along and about a random direction, or on
-        each of the three axes.
-    """
-
     position: float
     orientation: float
 
@@ -55,33 +46,16 @@ class PoseNoise:
         return f"{100 * self.position:g} cm, {math.degrees(self.orientation):g}°"
 
 
-LEVELS = tuple(PoseNoise(0.05 * k, math.radians(7.5 * k)) for k in (1, 2, 3, 4))
-"""Levels of noise of the papers."""
+LEVELS = tuple(PoseNoise(0.05 * k, math.radians(7.5 * k)) for k in (1, 2, 3, 4))  # of the papers
 
 
 @dataclass(frozen=True)
 class ObservedModel:
-    """Model with all moving frames observed, in groups that share coordinates.
-
-    Attributes
-    ----------
-    model
-        Model.
-    frames
-        Observed frames, m, group by group.
-    sizes
-        Cumulative numbers of frames and coordinates over the groups.
-    symbols
-        Coordinates, n, group by group.
-    limits
-        Lower and upper limits, (n, 2).
-    """
-
     model: ModelView
-    frames: tuple[str, ...]
-    sizes: tuple[tuple[int, int], ...]
-    symbols: tuple[Symbol, ...]
-    limits: Array
+    frames: tuple[str, ...]  # observed frames, m, group by group
+    sizes: tuple[tuple[int, int], ...]  # cumulative numbers of frames and coordinates over the groups
+    symbols: tuple[Symbol, ...]  # coordinates, n, group by group
+    limits: Array  # lower and upper limits, (n, 2)
 
     @cached_property
     def turning(self) -> npt.NDArray[np.bool_]:
@@ -102,7 +76,6 @@ class ObservedModel:
         return rng.uniform(lower, upper, (count, len(lower)))
 
     def first(self, groups: int) -> ObservedModel:
-        """Return the scene of the first groups alone."""
         m, n = self.sizes[groups - 1]
         return ObservedModel(
             self.model, self.frames[:m], self.sizes[:groups], self.symbols[:n], self.limits[:n]
@@ -114,11 +87,6 @@ def make_observed_model(model: ModelView) -> ObservedModel:
 
     Groups of frames that share coordinates are in the model's order, except that up to seven groups without
     rotation come first, as in the papers, whose time per update jumps at the eighth group.
-
-    Raises
-    ------
-    ModelError
-        If no frame moves.
     """
     frames = [frame for frame in model.frames if model.fk(frame).symbols]
     if not frames:
@@ -153,18 +121,6 @@ def add_published_noise(
 
     a and b are N(0, σ), d and e random directions. Each of the three axes has the variance σ²/3. The errors
     are in the axes of the frame.
-
-    Parameters
-    ----------
-    poses
-        True poses, (..., 4, 4).
-    noise
-        σ of a and b.
-    rng
-        Random generator.
-    directions
-        ``"published"`` draws d and e like the authors' code over a quarter of the sphere. With the signs of a
-        and b that is half of it, and y and z have a correlation of 2/π. ``"uniform"`` draws over the sphere.
     """
     lead = poses.shape[:-2]
     shift = _directions(rng, lead, directions) * rng.normal(0, noise.position, (*lead, 1))
@@ -188,20 +144,26 @@ def _directions(rng: Generator, lead: tuple[int, ...], how: Directions) -> Array
     return np.stack([np.cos(around) * across, np.sin(around) * across, up], axis=-1)
 
 
+def simulate_observations(
+    scene: ObservedModel,
+    noise: PoseNoise,
+    seed: int,
+    configurations: int,
+    directions: Directions = "published",
+) -> tuple[Array, Array, Array]:
+    """Return true states (C, n), observations (25, C, m, 4, 4), and others to learn R (400, m, 4, 4)."""
+    rng = np.random.default_rng([seed, LEVELS.index(noise)])
+    static_poses = scene.poses(scene.configurations(rng, 1))
+    training = add_published_noise(np.repeat(static_poses, TRAINING, axis=0), noise, rng, directions)
+    truth = scene.configurations(rng, configurations)
+    true_poses = scene.poses(truth)
+    observations = [add_published_noise(true_poses, noise, rng, directions) for _ in range(OBSERVATIONS)]
+    return truth, np.stack(observations), training
+
+
 @dataclass(frozen=True)
 class FilterRun:
-    """Final estimates of a filter for C configurations.
-
-    Attributes
-    ----------
-    q, variance
-        Estimates, and their variances according to the filter, (C, n).
-    nis, dof
-        Sums of the normalised innovation squared and of its degrees of freedom over all updates except the
-        first of each configuration, whose prior is not the distribution of true states; 0 if not computed.
-    """
-
-    q: Array
+    q: Array  # estimates, and their variances according to the filter, (C, n)
     variance: Array
     nis: float = 0.0
     dof: int = 0
@@ -210,17 +172,7 @@ class FilterRun:
 def run_published(
     scene: ObservedModel, observations: Array, training: Array, steps: int = STEPS, spread: float = SPREAD
 ) -> FilterRun:
-    """Run the papers' filter on observations (25, C, m, 4, 4), with all configurations in parallel.
-
-    Parameters
-    ----------
-    scene
-        Observed model.
-    observations, training
-        Observations, and those from which R is learnt, (400, m, 4, 4).
-    steps, spread
-        See :class:`~kineverse_studies.experiments.fig4.paper_ekf.PaperEkf`.
-    """
+    """Run the papers' filter on observations (25, C, m, 4, 4), with all configurations in parallel."""
     filters = PaperEkf(scene.model, scene.frames, steps, spread, copies=observations.shape[1])
     filters.learn_noise(training)
     for poses in observations:
@@ -230,12 +182,9 @@ def run_published(
 
 
 def make_tracker(scene: ObservedModel, noise: PoseNoise) -> Tracker:
-    """Return the tracker of a scene, for noise on each axis."""
     covariance = pose_covariance(noise.position, noise.orientation)
     return Tracker(
-        scene.model,
-        [ObservedPose(frame, covariance=covariance) for frame in scene.frames],
-        process="static",
+        scene.model, [ObservedPose(frame, covariance=covariance) for frame in scene.frames], process="static"
     )
 
 
@@ -254,3 +203,81 @@ def run_proper(scene: ObservedModel, observations: Array, noise: PoseNoise) -> F
         q.append([estimate.state[s] for s in scene.symbols])
         variance.append([estimate.deviation[s] ** 2 for s in scene.symbols])
     return FilterRun(np.array(q), np.array(variance), nis, dof)
+
+
+Step: TypeAlias = Callable[[Array], None]
+REPORTED = 4.0  # upper bound of the times in the papers, with 23 degrees of freedom [ms]
+
+
+@dataclass(frozen=True)
+class Duration:
+    """Mean, deviation and median of processor times [ms], and number of updates."""
+
+    mean: float
+    sd: float
+    median: float
+    updates: int
+
+
+def time_updates_by_size(
+    scene: ObservedModel, configurations: int, progress: Progress
+) -> list[tuple[int, dict[str, Duration]]]:
+    """Return degrees of freedom and times for the first group, the first two groups, and so on."""
+    times = []
+    for groups in progress(range(1, len(scene.sizes) + 1), "fig4: time", "size"):
+        part = scene.first(groups)
+        times.append((len(part.symbols), time_updates(part, LEVELS[-1], configurations)))
+    return times
+
+
+def time_updates(scene: ObservedModel, noise: PoseNoise, configurations: int) -> dict[str, Duration]:
+    _, observations, training = simulate_observations(scene, noise, 0, configurations)
+    published = PaperEkf(scene.model, scene.frames)
+    published.learn_noise(training)
+    published.function.wait()
+    initial = make_tracker(scene, noise.on_axes)
+    initial.wait()
+
+    def start_published() -> Step:
+        published.reset()
+
+        def step(poses: Array) -> None:
+            published.predict(DT)
+            published.update(poses)
+
+        return step
+
+    def start_tracker() -> Step:
+        tracker = copy(initial)
+
+        def step(poses: Array) -> None:
+            tracker.predict(DT)
+            tracker.update_poses(poses)
+
+        return step
+
+    return {
+        "published": _time_steps(start_published, observations),
+        "proper": _time_steps(start_tracker, observations),
+    }
+
+
+def _time_steps(start: Callable[[], Step], observations: Array) -> Duration:
+    """Time steps on observations (K, C, m, 4, 4); the first of each configuration is not counted."""
+    _run_step(start(), observations[:, 0])  # fills caches
+    with no_collection():
+        times = [t for c in range(observations.shape[1]) for t in _run_step(start(), observations[:, c])]
+    milliseconds = 1e3 * np.array(times)
+    return Duration(
+        float(milliseconds.mean()), float(milliseconds.std()), float(np.median(milliseconds)), len(times)
+    )
+
+
+def _run_step(step: Step, observations: Array) -> list[float]:
+    step(observations[0])
+    times = []
+    for poses in observations[1:]:
+        before = process_time()
+        step(poses)
+        times.append(process_time() - before)
+    return times

@@ -1,13 +1,12 @@
-"""``lockbox``: boxes of parts that lock each other, opened by trends, by plans, and with unknown locks.
-
-The boxes are that of the thesis behind the 2020 paper, random ones, and the Chinese rings.
-"""
+"""``lockbox``: boxes of the thesis behind the 2020 paper, random ones, the Chinese rings, unknown locks."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from time import process_time
 from typing import Literal, TypeAlias
 
@@ -20,36 +19,66 @@ from kineverse.gallery.lockboxes import (
     draw_tangled_lockbox,
     make_lockbox_model,
     make_rings,
+    remove_locks,
 )
+from kineverse.manipulation import PartMover, Session, execute_unlocking, explore_locks
 from kineverse.reasoning import interlocks, plan_unlocking, plan_violations
 from kineverse.view.plots import Figure
-from kineverse_studies.experiments.manipulation.trial_pool import run_jobs
+from kineverse.worlds import MechanismWorld, Recorder
+from kineverse_studies.experiments.execution import run_jobs
+from kineverse_studies.experiments.manipulation.skills import make_record_folder
 from kineverse_studies.experiments.registry import Options, Progress
-from kineverse_studies.experiments.report import Report, ReportTable
+from kineverse_studies.experiments.report import Report, ReportTable, make_table
 
-from .exhaustive_search import can_be_opened
-from .figure import FIGURE_SIZE, draw_boxes
-from .recordings import record_thesis_box
 from .unknown_locks import (
     UnknownLockResult,
+    can_be_opened,
     list_unknown_jobs,
-    list_unknown_numbers,
     make_unknown_table,
     run_unknown,
 )
-from .unlocking_runs import LOCK_RULES, Rule, UnlockingRun, run_unlocking
+from .unlocking_runs import (
+    FIGURE_SIZE,
+    LOCK_RULES,
+    Rule,
+    UnlockingRun,
+    draw_boxes,
+    make_thesis_table,
+    run_unlocking,
+)
+
+_DT = 0.05
+
+
+def record_thesis_box(folder: Path) -> None:
+    make_record_folder(folder)
+    with _start(folder, "trends") as (_, recorder):
+        run = run_unlocking(THESIS, recorder=recorder)
+        recorder.write_outcome({"done": run.done, "reason": f"{run.steps} steps"})
+    with _start(folder, "plan") as (world, recorder):
+        recorder.write_outcome(execute_unlocking(world, THESIS.goal, on_step=recorder).as_data())
+    with _start(folder, "unknown-locks") as (world, recorder):
+        model = make_lockbox_model(remove_locks(THESIS), None)
+        mover = PartMover(model.snapshot(), Session(world, dt=_DT, on_step=recorder))
+        done = explore_locks(model, THESIS.goal, mover.move)
+        recorder.write_outcome({"done": done.done, "reason": f"{len(done.tries)} tries"})
+
+
+@contextmanager
+def _start(folder: Path, name: str) -> Iterator[tuple[MechanismWorld, Recorder]]:
+    world = MechanismWorld(make_lockbox_model(THESIS, None))
+    with Recorder(folder / f"thesis-{name}.mcap", world.model, {"box": "thesis", "by": name}) as recorder:
+        yield world, recorder
+
 
 OPTIONS = ("quick", "seed", "count", "processes", "record")
-
 COUNT, QUICK_COUNT = 1000, 4
 """Number of random boxes without negations; half as many have some, a tenth is for each ablation."""
 NEGATED = 0.25
 _STEPS_A_PART = 40
 _LARGEST, _LARGEST_NEGATED = 100, 40
 _ABLATED = (10, 40)
-_SMALL = 7
-"""Largest number of parts of boxes on which plans are compared with exhaustive search."""
-
+_SMALL = 7  # largest number of parts of boxes on which plans are compared with exhaustive search
 Kind: TypeAlias = Literal["monotone", "negated", "tangled", "rings"]
 KINDS: dict[Kind, str] = {
     "monotone": "& and |",
@@ -61,8 +90,6 @@ KINDS: dict[Kind, str] = {
 
 @dataclass(frozen=True, slots=True)
 class ExplorerJob:
-    """Random box that a controller opens."""
-
     parts: int
     seed: int
     negated: float
@@ -80,8 +107,6 @@ class ExplorerResult:
 
 @dataclass(frozen=True, slots=True)
 class PlannerJob:
-    """Box for which a plan is made."""
-
     kind: Kind
     parts: int
     seed: int
@@ -89,23 +114,11 @@ class PlannerJob:
 
 @dataclass(frozen=True, slots=True)
 class PlannerResult:
-    """Plan of a box.
-
-    Attributes
-    ----------
-    verdict, moves
-        Verdict, and number of moves.
-    wrong
-        True if the constraints contradict the plan, or exhaustive search the verdict.
-    reading, planning
-        CPU times of reading the interlocks and of planning [s].
-    """
-
     job: PlannerJob
-    verdict: str
+    verdict: str  # verdict, and number of moves
     moves: int
-    wrong: bool
-    reading: float
+    wrong: bool  # true if the constraints contradict the plan, or exhaustive search the verdict
+    reading: float  # CPU times of reading the interlocks and of planning [s]
     planning: float
 
 
@@ -115,30 +128,12 @@ def run(progress: Progress, options: Options) -> Report:
     if options.record is not None:
         record_thesis_box(options.record)
     thesis = {rule: run_unlocking(THESIS, rule) for rule in LOCK_RULES}
-    explored = run_jobs(
-        run_explorer,
-        list_explorer_jobs(count, options.seed, options.quick),
-        progress,
-        "lockbox",
-        "box",
-        options.processes,
-    )
-    planned = run_jobs(
-        run_planner,
-        list_planner_jobs(count, options.seed, options.quick),
-        progress,
-        "lockbox",
-        "plan",
-        options.processes,
-    )
-    unknown = run_jobs(
-        run_unknown,
-        list_unknown_jobs(count, options.seed),
-        progress,
-        "lockbox",
-        "exploration",
-        options.processes,
-    )
+    explorer_jobs = list_explorer_jobs(count, options.seed, options.quick)
+    planner_jobs = list_planner_jobs(count, options.seed, options.quick)
+    explored = run_jobs(run_explorer, explorer_jobs, progress, "lockbox", "box", options)
+    planned = run_jobs(run_planner, planner_jobs, progress, "lockbox", "plan", options)
+    unknown_jobs = list_unknown_jobs(count, options.seed)
+    unknown = run_jobs(run_unknown, unknown_jobs, progress, "lockbox", "exploration", options)
     return make_lockbox_report(thesis, explored, planned, unknown, options.seed)
 
 
@@ -156,7 +151,6 @@ def list_explorer_jobs(count: int, seed: int, quick: bool) -> list[ExplorerJob]:
 
 
 def list_planner_jobs(count: int, seed: int, quick: bool) -> list[PlannerJob]:
-    """Return the boxes to plan."""
     jobs = [PlannerJob("monotone", 10 if quick else 50, seed + k) for k in range(math.ceil(count / 10))]
     jobs += [PlannerJob("negated", 10 if quick else 30, seed + k) for k in range(math.ceil(count / 2))]
     small = range(count if quick else 10 * count)
@@ -169,7 +163,6 @@ def _spread(k: int, largest: int) -> int:
 
 
 def run_explorer(job: ExplorerJob) -> list[ExplorerResult]:
-    """Open one random box."""
     box = draw_lockbox(job.parts, job.seed, negated=job.negated)
     found = run_unlocking(box, job.rule, 400 + _STEPS_A_PART * job.parts)
     solvable: bool | None = True
@@ -180,7 +173,6 @@ def run_explorer(job: ExplorerJob) -> list[ExplorerResult]:
 
 
 def run_planner(job: PlannerJob) -> list[PlannerResult]:
-    """Plan the opening of one box, and check the plan."""
     box = _draw(job)
     model = make_lockbox_model(box, None)
     begin = process_time()
@@ -211,7 +203,6 @@ def make_lockbox_report(
     unknown: Sequence[UnknownLockResult],
     seed: int,
 ) -> Report:
-    """Return the report on explorer, planner and unknown locks."""
     groups: dict[tuple[Rule, bool], list[ExplorerResult]] = {}
     for one in explored:
         groups.setdefault((one.job.rule, bool(one.job.negated)), []).append(one)
@@ -243,13 +234,22 @@ def make_lockbox_report(
             }
             for kind, own in plans.items()
         ],
-        "unknown locks": list_unknown_numbers(unknown),
+        "unknown locks": [
+            {
+                "boxes": r.job.kind,
+                "seed": r.job.seed,
+                "tries": r.tries,
+                "depth": r.depth,
+                "breadth": r.breadth,
+            }
+            for r in unknown
+        ],
     }
     return Report(
         "lockbox",
         "Lockboxes opened by trends, plans of their opening, and unknown locks",
         (
-            _thesis_table(thesis),
+            make_thesis_table("The lockbox of the thesis", "order of the parts", thesis),
             make_explorer_table(groups),
             make_planner_table(plans),
             make_unknown_table(unknown),
@@ -259,14 +259,6 @@ def make_lockbox_report(
     )
 
 
-def _thesis_table(runs: dict[Rule, UnlockingRun]) -> ReportTable:
-    rows = tuple(
-        (LOCK_RULES[rule], "yes" if one.done else "no", one.steps, ", ".join(one.order))
-        for rule, one in runs.items()
-    )
-    return ReportTable("The lockbox of the thesis", ("trends", "opened", "steps", "order of the parts"), rows)
-
-
 def make_explorer_table(groups: dict[tuple[Rule, bool], list[ExplorerResult]]) -> ReportTable:
     """Return the table of boxes that a controller opens, by rule of trends and whether locks are negated."""
     rows: list[tuple[float | str, ...]] = []
@@ -274,16 +266,9 @@ def make_explorer_table(groups: dict[tuple[Rule, bool], list[ExplorerResult]]) -
         solvable = [r for r in own if r.solvable]
         steps = [r.run.steps for r in solvable if r.run.done]
         cpu = [1e6 * t for r in solvable for t in r.run.cpu]
-        rows.append(
-            (
-                LOCK_RULES[rule],
-                "&, |, ~" if negated else "&, |",
-                _format_parts(r.job.parts for r in own),
-                f"{len(steps)} of {len(solvable)}",
-                f"{np.median(steps):.0f}" if steps else "",
-                f"{np.median(cpu):.0f}" if cpu else "",
-            )
-        )
+        parts, opened = _format_parts(r.job.parts for r in own), f"{len(steps)} of {len(solvable)}"
+        medians = (f"{np.median(values):.0f}" if values else "" for values in (steps, cpu))
+        rows.append((LOCK_RULES[rule], "&, |, ~" if negated else "&, |", parts, opened, *medians))
     head = ("trends", "locks", "parts", "opened", "steps (median)", "CPU of a step [µs]")
     return ReportTable("Random boxes that can be opened", head, tuple(rows))
 
@@ -294,34 +279,22 @@ def _format_parts(parts: Iterable[int]) -> str:
 
 
 def make_planner_table(plans: dict[Kind, list[PlannerResult]]) -> ReportTable:
-    """Return the table of plans by kind of box."""
-    rows: list[tuple[float | str, ...]] = []
-    for kind, own in plans.items():
-        counts = [sum(p.verdict == v for p in own) for v in ("found", "refuted", "undecided")]
-        times = sorted(1e3 * p.planning for p in own)
-        reading = sorted(1e3 * p.reading for p in own)
-        rows.append(
-            (
-                KINDS[kind],
-                _format_parts(p.job.parts for p in own),
-                *counts,
-                sum(p.wrong for p in own),
-                max(p.moves for p in own),
-                f"{np.median(times):.3g}",
-                f"{times[-1]:.3g}",
-                f"{np.median(reading):.3g}",
-            )
-        )
-    head = (
-        "boxes",
-        "parts",
-        "found",
-        "refuted",
-        "undecided",
-        "wrong",
-        "moves (most)",
-        "planning [ms]",
-        "(longest)",
-        "reading locks [ms]",
+    def times(own: list[PlannerResult]) -> list[float]:
+        return [1e3 * p.planning for p in own]
+
+    return make_table(
+        "Plans, checked by constraints and exhaustive search",
+        plans.items(),
+        {
+            "boxes": lambda pair: KINDS[pair[0]],
+            "parts": lambda pair: _format_parts(p.job.parts for p in pair[1]),
+            "found": lambda pair: sum(p.verdict == "found" for p in pair[1]),
+            "refuted": lambda pair: sum(p.verdict == "refuted" for p in pair[1]),
+            "undecided": lambda pair: sum(p.verdict == "undecided" for p in pair[1]),
+            "wrong": lambda pair: sum(p.wrong for p in pair[1]),
+            "moves (most)": lambda pair: max(p.moves for p in pair[1]),
+            "planning [ms]": lambda pair: f"{np.median(times(pair[1])):.3g}",
+            "(longest)": lambda pair: f"{max(times(pair[1])):.3g}",
+            "reading locks [ms]": lambda pair: f"{np.median([1e3 * p.reading for p in pair[1]]):.3g}",
+        },
     )
-    return ReportTable("Plans, checked by constraints and exhaustive search", head, tuple(rows))

@@ -28,33 +28,16 @@ if TYPE_CHECKING:
 
 _DIRECTIONS, _ELEVATIONS = 16, (0.3, 0.55)
 _TRIAL_HEIGHT = 60
-_NEAREST = 0.035
-"""Distance within which a push has nearest points [m]."""
+_NEAREST = 0.035  # distance within which a push has nearest points [m]
 
 
 @dataclass(frozen=True, eq=False)
 class FilmRow:
-    """Row of pictures of one model.
-
-    Attributes
-    ----------
-    title
-        Title.
-    load
-        Function that returns the model; it is called when the row is drawn.
-    states
-        Values by name, one mapping for each picture.
-    labels
-        Texts of the pictures.
-    shown
-        Beginnings of the names of the bodies that have to be seen.
-    """
-
     title: str
-    load: Callable[[], Model]
-    states: Sequence[Mapping[str, float]]
-    labels: Sequence[str]
-    shown: tuple[str, ...]
+    load: Callable[[], Model]  # function that returns the model; it is called when the row is drawn
+    states: Sequence[Mapping[str, float]]  # values by name, one mapping for each picture
+    labels: Sequence[str]  # texts of the pictures
+    shown: tuple[str, ...]  # beginnings of the names of the bodies that have to be seen
 
 
 def make_film(rows: Sequence[FilmRow], size: tuple[int, int] = (420, 420)) -> Figure:
@@ -80,30 +63,24 @@ def make_film(rows: Sequence[FilmRow], size: tuple[int, int] = (420, 420)) -> Fi
     return Figure(draw, (count * size[0] * scale + 0.3, len(rows) * (size[1] * scale + 0.25)))
 
 
-def choose_moments(film: Sequence[Moment], count: int) -> list[Moment]:
-    """Return moments of a film, evenly in time, with the first and the last one."""
-    if not film:
-        return []
-    return [film[k] for k in np.linspace(0, len(film) - 1, count).round().astype(int).tolist()]
+def make_row(
+    title: str,
+    load: Callable[[], Model],
+    film: Sequence[Moment],
+    count: int,
+    label: str,
+    shown: tuple[str, ...],
+) -> FilmRow:
+    numbers = np.linspace(0, len(film) - 1, count).round().astype(int).tolist() if film else []
+    chosen = [film[k] for k in numbers]
+    return FilmRow(title, load, [m.values for m in chosen], [label.format(m) for m in chosen], shown)
 
 
 @dataclass(frozen=True, eq=False)
 class RowView:
-    """Things that a camera has to see.
-
-    Attributes
-    ----------
-    scenes
-        All bodies at some times.
-    wanted
-        Which parts have to be seen (N,).
-    points
-        Points that have to be in view (M, 3) [m].
-    """
-
-    scenes: Sequence[TriangleSoup]
-    wanted: npt.NDArray[np.bool_]
-    points: Array
+    scenes: Sequence[TriangleSoup]  # all bodies at some times
+    wanted: npt.NDArray[np.bool_]  # which parts have to be seen (N,)
+    points: Array  # points that have to be in view (M, 3) [m]
 
     @staticmethod
     def of(model: Model, states: Sequence[Mapping[str, float]], shown: Sequence[str]) -> RowView:
@@ -133,7 +110,6 @@ class RowView:
 
 
 def choose_cameras(views: Sequence[RowView], aspect: float) -> list[Camera]:
-    """Return cameras of one direction that see most of some views, for an aspect of pictures."""
     azimuths = (2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS).tolist()
     best = max(
         product(_ELEVATIONS, azimuths),
@@ -195,10 +171,7 @@ def find_telling_moment(film: Sequence[Moment]) -> tuple[float, Moment | None]:
 def draw_vectors(
     vectors: Mapping[str, tuple[Array, Array]], length: float = 0.16
 ) -> tuple[list[Drawable], Array]:
-    """Return the points p and r and the vectors of a push as parts in the world, and the ends of all (N, 3).
-
-    Vectors are drawn as directions, of a length [m].
-    """
+    """Return a push's points and vectors as parts, and their ends (N, 3); vectors have one length [m]."""
     p, apart = (np.asarray(v, dtype=float) for v in vectors["r - p"])
     arrows = {name: np.asarray(vector, dtype=float) for name, (_, vector) in vectors.items()}
     arrows["neutral"] = np.cross(arrows["push"], arrows["n"])
@@ -223,7 +196,6 @@ def _length(vector: tuple[Array, Array]) -> float:
 def _find_close_camera(
     model: Model, moment: Moment, points: Array, parts: Sequence[Drawable], aspect: float
 ) -> Camera:
-    """Return the camera near some points that sees most of some parts."""
     items = [*collect_drawables(model), *parts]
     wanted = np.arange(len(items)) >= len(items) - len(parts)
     middle = points.mean(axis=0)

@@ -1,61 +1,190 @@
-"""Skills as the experiments call them: trials of openings and of pushes in a world."""
+"""Skills as the experiments call them: robots, worlds, recordings, and trials of openings and pushes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from pathlib import Path
 from time import process_time
 from typing import Any
 
-from kineverse.errors import KineverseError
+from kineverse.errors import FormatError, InvalidValueError, KineverseError
+from kineverse.geometry import Scene
 from kineverse.grasping import find_gripper, find_handle
-from kineverse.manipulation import Outcome, Session, open_object
-from kineverse.manipulation.pushing.push_controller import Pushing
-from kineverse.manipulation.pushing.trials import try_push
-from kineverse.manipulation.robot_sources import RobotSource
+from kineverse.manipulation import Belief, Outcome, Session, TrackedBelief, TrueBelief, open_object
+from kineverse.manipulation.pushing import Pushing, push
+from kineverse.manipulation.pushing.base_placement import find_push_start
+from kineverse.manipulation.pushing.contact_pair import PushView
+from kineverse.manipulation.robot_sources import SHIPPED, RobotSource, find_robot
+from kineverse.manipulation.skill_arguments import find_object_coordinate
 from kineverse.model.model import Model
-from kineverse.state import State
-from kineverse.worlds import Judge, World
+from kineverse.state import State, StateLike
+from kineverse.worlds import Judge, KinematicWorld, MujocoWorld, Recorder, Sensors, World
+from kineverse.worlds.recorder import import_mcap
+from kineverse_studies.experiments.registry import BOTH, WORLDS, Options
 
-from .setting import TrialSetting, TrialWatch, list_series
-from .trials import Failure, Trial, find_failure
+from .trials import Failure, Moment, Trial, find_failure
 
-DT = 0.02
-"""Control period [s]."""
+_AUTHORS = {
+    "pr2 (authors)": ("pr2", "pr2/pr2_description/robots/pr2.urdf", "r_gripper_palm_link"),
+    "fetch (authors)": ("fetch", "fetch/fetch_description/robots/fetch.urdf", "gripper_link"),
+    "hsr (authors)": ("hsr", "hsrb/hsrb_description/robots/hsrb.urdf", "hand_palm_link"),
+}
+DATA_FOLDERS = ("pr2", "fetch", "hsrb", "iai_kitchen")
+
+
+def check_data(data: Path | None) -> Path | None:
+    """Return the folder of the authors' files; None if none is given."""
+    if data is None:
+        return None
+    if not data.is_dir():
+        raise InvalidValueError(
+            f"There is no folder {data} with robots. Leave --data out for the shipped ones."
+        )
+    if not any((data / name).is_dir() for name in DATA_FOLDERS):
+        raise InvalidValueError(
+            f"The folder {data} has none of {', '.join(DATA_FOLDERS)}, so nothing of the authors is in it."
+        )
+    return data
+
+
+def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[RobotSource, ...]:
+    """Return robots by name, by default those that ship, and the authors' in a folder."""
+    known = dict(SHIPPED)
+    for name, (like, file, hand) in _AUTHORS.items() if data is not None else ():
+        source = (data or Path()) / file
+        if source.is_file():
+            known[name] = replace(SHIPPED[like], name=name, source=str(source), hand=hand)
+    return tuple(find_robot(name, known) for name in tuple(names) or known)
+
+
+SettingOptions = ("world", "noise", "record")  # options of experiments that are read here
+_USUAL_STEP = 0.02  # longest step for which the worlds have their own time-outs [s]
+_FILM_STEPS = 5  # number of steps from one moment of a film to the next
+
+
+@dataclass(frozen=True)
+class TrialSetting:
+    world: str = WORLDS[0]
+    noise: str = ""
+    record: Path | None = None  # folder of recordings; None for none
+
+    def make_world(
+        self, model: Model, robot: str, state: StateLike, seed: int = 0, dt: float = _USUAL_STEP
+    ) -> World:
+        """Return the world at a state, in which nothing is held, for steps of a length [s]."""
+        kind = MujocoWorld if self.world == "mujoco" else KinematicWorld
+        sensors = Sensors.parse(self.noise) if self.noise else None
+        # Commands come at least every second step, also where an estimate is a picture old.
+        more: dict[str, Any] = {"timeout": 2.0 * dt} if dt > _USUAL_STEP else {}
+        world: World = kind(model, robot, sensors=sensors, seed=seed, **more)
+        world.reset(state)
+        return world
+
+    def make_belief(self, world: World) -> Belief:
+        """Return the belief on which a skill acts: the truth without noise, else an estimate."""
+        if not self.noise:
+            return TrueBelief()
+        return TrackedBelief(world.model, world.robot, Sensors.parse(self.noise))
+
+
+def make_record_folder(folder: Path) -> None:
+    import_mcap("mcap.writer")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FormatError(f"--record {folder}: {error.strerror}. Name a folder.") from None
+
+
+def make_settings(options: Options) -> tuple[TrialSetting, ...]:
+    noise = "" if options.noise is None else str(Sensors.parse(options.noise))
+    if options.record is not None:
+        make_record_folder(options.record)
+    worlds = WORLDS if options.world == BOTH else (options.world,)
+    return tuple(TrialSetting(world, noise, options.record) for world in worlds)
+
+
+class TrialWatch(ExitStack):
+    def __init__(
+        self, setting: TrialSetting, model: Model, about: Mapping[str, str], *, film: bool = False
+    ) -> None:
+        super().__init__()
+        self._setting, self._model, self._about, self._film = setting, model, about, film
+        self._recorder: Recorder | None = None
+        self._watchers: tuple[Callable[[Session], object], ...] = ()
+        self.session: Session | None = None
+        self.moments: list[Moment] = []
+        self.commands: list[tuple[float, dict[str, float]]] = []
+        self.view: PushView | None = None
+
+    def __enter__(self) -> TrialWatch:
+        if self._setting.record is not None:
+            name = "-".join(re.sub(r"[^\w]+", "_", word).strip("_") for word in self._about.values())
+            recorder = Recorder(self._setting.record / f"{name}.mcap", self._model, self._about)
+            self._recorder = self.enter_context(recorder)
+        return self
+
+    def open_session(self, world: World, dt: float, *watchers: Callable[[Session], object]) -> Session:
+        self._watchers, self.view = watchers, None
+        self.moments, self.commands = [], []
+        belief = self._setting.make_belief(world)
+        self.session = Session(world, dt=dt, belief=belief, on_step=self._look)
+        return self.session
+
+    def write_outcome(self, outcome: Outcome) -> None:
+        if self._recorder is not None:
+            self._recorder.write_outcome(outcome)
+
+    def _look(self, session: Session) -> None:
+        for watch in self._watchers:
+            watch(session)
+        if self.view is not None:
+            session.vectors = name_vectors(self.view)
+        if self._recorder is not None:
+            self._recorder(session)
+        if not self._film:
+            return
+        now, state = session.world.time, session.world.state
+        self.commands.append((now - session.dt, {str(s): float(v) for s, v in session.commands.items()}))
+        if session.steps % _FILM_STEPS == 0:
+            values = {str(s): float(v) for s, v in state.items()}
+            self.moments.append(Moment(now, session.phase, values, session.vectors))
+
+
+def name_vectors(view: PushView) -> dict[str, tuple[Any, Any]]:
+    """Return the vectors of a push by name, each with its origin: n, push and tangent at p, and r - p."""
+    found = {"n": view.n, "push": view.push, "tangent": view.tangent, "r - p": view.r - view.p}
+    return {name: (view.p, vector) for name, vector in found.items()}
+
+
+def list_series(commands: Iterable[tuple[float, Mapping[str, float]]]) -> dict[str, list[float]]:
+    """Return commanded speeds as series by name, 0 where a speed is not given, and ``time`` [s]."""
+    rows = list(commands)
+    names = dict.fromkeys(name for _, speeds in rows for name in speeds)
+    return {
+        "time": [time for time, _ in rows],
+        **{name: [speeds.get(name, 0.0) for _, speeds in rows] for name in names},
+    }
+
+
+DT = 0.02  # control period [s]
+_SAMPLES = 200  # of the base placement
 _PLANS = ("plan", "place", "placement")
 """Computations that are no control steps, by the first word of their names in a session."""
 
 
 @dataclass(frozen=True)
 class TrialCase:
-    """One robot at one object, in one setting.
-
-    Attributes
-    ----------
-    case
-        Kitchen, or name of the set-up.
-    robot
-        The robot.
-    what
-        Coordinate of the object.
-    setting
-        The setting.
-    seed
-        Seed of the skill's searches.
-    film
-        Whether the trial has commanded speeds as series, and a film.
-    measures
-        Further figures of the trial.
-    """
-
-    case: str
+    case: str  # kitchen, or name of the set-up
     robot: RobotSource
-    what: str
+    what: str  # coordinate of the object
     setting: TrialSetting
-    seed: int = 0
-    film: bool = False
-    measures: tuple[tuple[str, Any], ...] = ()
+    seed: int = 0  # seed of the skill's searches
+    film: bool = False  # whether the trial has commanded speeds as series, and a film
+    measures: tuple[tuple[str, Any], ...] = ()  # further figures of the trial
 
     def run(self, skill: str, model: Model, act: Callable[[TrialWatch], Outcome]) -> Trial:
         """Return the trial of a skill. Any error is a failure of the class ``other``, and is named."""
@@ -99,7 +228,6 @@ class TrialCase:
         )
 
     def fail(self, skill: str, model: Model, failure: Failure, reason: str) -> Trial:
-        """Return the trial of a skill that was not begun."""
         outcome = Outcome(False, math.nan, reason, self.setting.world, 0.0, 0, {"failure": failure})
         return self.run(skill, model, lambda watch: outcome)
 
@@ -107,21 +235,6 @@ class TrialCase:
 def open_then_close(
     case: TrialCase, model: Model, world: World, start: State, targets: tuple[float, float]
 ) -> list[Trial]:
-    """Return the trials of opening an object in a world and, if that was done, of closing it.
-
-    Closing knows the ways on which the object was opened.
-
-    Parameters
-    ----------
-    case
-        Robot, object and setting.
-    model, world
-        The model, and its world.
-    start
-        State at the beginning.
-    targets
-        Value of the open and of the closed object [m], [rad].
-    """
     world.reset(start)
     trials: list[Trial] = []
     session: Session | None = None
@@ -142,6 +255,40 @@ def open_then_close(
     return trials
 
 
+def try_push(
+    pushing: Pushing,
+    world: World,
+    start: State,
+    open_session: Callable[[], Session],
+    *,
+    seconds: float = 24.0,
+    seed: int = 0,
+    place: bool = True,
+    on_step: Callable[[Pushing], object] | None = None,
+) -> tuple[Outcome, int, str]:
+    """Push from a start; if that fails, from one that base placement finds.
+
+    Return the outcome, the number of samples of the placement, 0 without any, and why the first push failed.
+    """
+
+    def attempt(state: State) -> Outcome:
+        world.reset(state)
+        return push(
+            open_session(),
+            pushing.coordinate,
+            seconds=seconds,
+            pushing=pushing,
+            plan=not place,
+            on_step=on_step,
+        )
+
+    outcome = attempt(start)
+    if outcome or not place:
+        return outcome, 0, ""
+    found = find_push_start(pushing, start, samples=_SAMPLES, seed=seed)
+    return attempt(found.state) if found.state is not None else outcome, found.samples, outcome.reason
+
+
 def run_push_trial(
     case: TrialCase,
     model: Model,
@@ -153,78 +300,57 @@ def run_push_trial(
     steps: int = 1200,
     logic: str | None = "and",
 ) -> Trial:
-    """Return the trial of a push in a world: from a start, or from one that base placement finds.
-
-    Parameters
-    ----------
-    case
-        Robot, object and setting.
-    model, world, start
-        As for :func:`open_then_close`.
-    skill
-        Name of the push in tables.
-    dt, steps
-        Control period [s], and largest number of steps.
-    logic
-        As for :func:`.try_push`.
-    """
+    """Return the trial of a push in a world: from a start, or from one that base placement finds."""
 
     def act(watch: TrialWatch) -> Outcome:
-        judge = PushJudge(model, world, case.what, watch)
-        found = try_push(
+        bodies = find_gripper(model, world.robot).bodies
+        coordinate = find_object_coordinate(world, case.what)
+        pushing = Pushing(model, coordinate, bodies, start, target=0.0, robot=world.robot, dt=dt, logic=logic)
+        judge = PushJudge(pushing, world, watch)
+        outcome, placed, first = try_push(
+            pushing,
             world,
             start,
-            case.what,
-            dt=dt,
-            steps=steps,
+            lambda: watch.open_session(world, dt, judge),
+            seconds=steps * dt,
             seed=case.seed,
-            logic=logic,
-            open_session=lambda world, look: watch.open_session(world, dt, look, judge),
             on_step=judge.watch_controller,
         )
-        own = {"placed": found.placed, "first": found.first, "pressed": found.pressed}
-        return replace(found.outcome, measures={**found.outcome.measures, **judge.measures, **own})
+        more = {"placed": placed, "first": first, **judge.measures}
+        return replace(outcome, measures={**outcome.measures, **more})
 
     return case.run(skill, model, act)
 
 
 class PushJudge:
-    """Judge of a push, which is called after each step of its session.
-
-    Parameters
-    ----------
-    model, world
-        The model, and its world.
-    what
-        The coordinate of the object.
-    watch
-        The watch of the trial.
-    """
-
-    def __init__(self, model: Model, world: World, what: str, watch: TrialWatch) -> None:
+    def __init__(self, pushing: Pushing, world: World, watch: TrialWatch) -> None:
+        model = world.model
         try:
-            handle = find_handle(model, what).frame
+            handle = find_handle(model, pushing.coordinate).frame
         except KineverseError:
             handle = None
-        gripper = find_gripper(model, world.robot)
-        self._judge = Judge(model, world.robot, gripper, handle)
-        self._watch, self._pushing, self._force = watch, False, 0.0
+        self._judge = Judge(model, world.robot, find_gripper(model, world.robot), handle)
+        self._scene = Scene(model, rules=(*pushing.overlapping, *pushing.rules), leave_out=pushing.leave_out)
+        self._pair = self._scene.watch(pushing.pusher, pushing.object_bodies, radius=0.0)
+        self._watch, self._touching = watch, False
+        self._force = self._pressed = 0.0
         self._session: Session | None = None
 
     def watch_controller(self, pushing: Pushing) -> None:
-        """Note whether the controller pushes, and what it sees."""
-        self._pushing, self._watch.view = pushing.touching, pushing.view
+        self._touching, self._watch.view = pushing.touching, pushing.view
 
     def __call__(self, session: Session) -> None:
-        """Judge a step."""
         if session is not self._session:
-            self._session, self._pushing, self._force = session, False, 0.0
+            self._session, self._touching, self._force, self._pressed = session, False, 0.0, 0.0
             self._judge.reset()
         world = session.world
-        self._judge.update(world.state, session.commands, held=world.held, pushing=self._pushing)
+        self._judge.update(world.state, session.commands, held=world.held, pushing=self._touching)
         self._force = max(self._force, getattr(world, "peak_force", math.nan))
+        self._scene.update(world.state)
+        if len(found := self._pair()):
+            self._pressed = max(self._pressed, -float(found.distances[0]))
 
     @property
     def measures(self) -> dict[str, Any]:
-        """Measures of the judge; ``peak_force`` [N] in a world that has it."""
-        return {**self._judge.measures, "peak_force": self._force or math.nan}
+        """Measures of the judge, ``peak_force`` [N] in a world that has it, and ``pressed``, a depth [m]."""
+        return {**self._judge.measures, "peak_force": self._force or math.nan, "pressed": self._pressed}

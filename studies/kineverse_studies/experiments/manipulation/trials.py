@@ -1,26 +1,27 @@
-"""Trials of skills: what came out, why not, and how long a step took."""
+"""Trials of skills, and their tables and figures."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
 from kineverse.manipulation.outcome import Outcome
+from kineverse.view.plots import Figure
+from kineverse_studies.experiments.report import ReportTable, as_json
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 Failure: TypeAlias = Literal["", "collision", "reach", "time", "other"]
 FAILURES: tuple[Failure, ...] = get_args(Failure)
-
 _NO_DATA = ("cpu", "wall", "series", "film")
-
-PLACEMENTS = 200
-"""Number of placements that prove that an object is out of reach."""
-MOST_EXCUSED = 0.1
-"""Largest share of a robot's objects that may be out of reach without being failures."""
+PLACEMENTS = 200  # number of placements that prove that an object is out of reach
+MOST_EXCUSED = 0.1  # largest share of a robot's objects that may be out of reach without being failures
 
 # A reason says several things; the first class that it speaks of counts.
 _PATTERNS: Mapping[Failure, str] = {
@@ -32,8 +33,6 @@ _PATTERNS: Mapping[Failure, str] = {
 
 @dataclass(frozen=True, slots=True)
 class StepTimeStatistics:
-    """CPU and wall times of control steps [ms]."""
-
     count: int = 0
     mean: float = math.nan
     deviation: float = math.nan
@@ -61,74 +60,31 @@ class StepTimeStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One time of a trial.
-
-    Attributes
-    ----------
-    time
-        Time in the world [s].
-    phase
-        Phase of the skill.
-    values
-        True values of all coordinates by name.
-    vectors
-        Vectors of the controller by name, each with its origin in the world (3,).
-    """
-
-    time: float
+    time: float  # time in the world [s]
     phase: str
-    values: Mapping[str, float]
+    values: Mapping[str, float]  # true values of all coordinates by name
+    # vectors of the controller by name, each with its origin in the world (3,)
     vectors: Mapping[str, tuple[Any, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One skill of one robot at one object.
-
-    Attributes
-    ----------
-    case
-        Kitchen, or name of the set-up.
-    robot, what, skill
-        Names of the robot, the coordinate and the skill.
-    done
-        Whether it was done.
-    value
-        Value of the coordinate at the end [m], [rad].
-    failure, reason
-        Class of the failure, empty if it was done; and the words of the skill.
-    seconds, steps
-        Time in the world [s], and number of control steps.
-    cpu
-        CPU times of the steps [s].
-    wall
-        Wall times of the steps [s].
-    measures
-        Further figures by name, in SI units; those of :class:`kineverse.worlds.Judge` among them.
-    world, noise
-        Name of the world; noise of the sensors, empty if the skill acted on the truth.
-    dof
-        Number of degrees of freedom of the robot, its base included.
-    series, film
-        Series of numbers by name, and moments, for figures: they are no part of the JSON data.
-    """
-
-    case: str
-    robot: str
+    case: str  # kitchen, or name of the set-up
+    robot: str  # names of the robot, the coordinate and the skill
     what: str
     skill: str
-    done: bool
-    value: float
-    failure: Failure
+    done: bool  # whether it was done
+    value: float  # value of the coordinate at the end [m], [rad]
+    failure: Failure  # class of the failure, empty if it was done; and the words of the skill
     reason: str
-    seconds: float
+    seconds: float  # time in the world [s], and number of control steps
     steps: int
-    cpu: tuple[float, ...] = ()
-    wall: tuple[float, ...] = ()
+    cpu: tuple[float, ...] = ()  # CPU times of the steps [s]
+    wall: tuple[float, ...] = ()  # wall times of the steps [s]
     measures: Mapping[str, Any] = field(default_factory=dict)
-    world: str = "kinematic"
+    world: str = "kinematic"  # name of the world; noise of the sensors, empty if the skill acted on the truth
     noise: str = ""
-    dof: int = 0
+    dof: int = 0  # number of degrees of freedom of the robot, its base included
     series: Mapping[str, Sequence[float]] = field(default_factory=dict)
     film: Sequence[Moment] = ()
 
@@ -138,10 +94,11 @@ class Trial:
         return self.failure == "reach" and self.measures.get("placements", 0) >= PLACEMENTS
 
     def as_data(self) -> dict[str, Any]:
-        """Return the trial as JSON data."""
         data = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NO_DATA}
-        step_ms = asdict(StepTimeStatistics.from_seconds(self.cpu, self.wall))
-        return {key: as_json(value) for key, value in {**data, "step_ms": step_ms}.items()}
+        found: dict[str, Any] = as_json(
+            {**data, "step_ms": StepTimeStatistics.from_seconds(self.cpu, self.wall)}
+        )
+        return found
 
 
 def find_failure(outcome: Outcome) -> Failure:
@@ -156,18 +113,9 @@ def find_failure(outcome: Outcome) -> Failure:
 
 
 class ObjectCount(NamedTuple):
-    """Success at objects: one counts as done if all trials of it are.
+    """Success at objects: one counts as done if all trials of it are."""
 
-    Attributes
-    ----------
-    objects, done
-        Number of objects, and of those that were done.
-    excused
-        Number of objects that :data:`PLACEMENTS` placements prove to be out of reach, at most the share
-        :data:`MOST_EXCUSED` of all; others beyond that are failures.
-    """
-
-    objects: int
+    objects: int  # number of objects, and of those that were done
     done: int
     excused: int
 
@@ -179,7 +127,6 @@ class ObjectCount(NamedTuple):
 
 
 def count_objects(trials: Iterable[Trial]) -> ObjectCount:
-    """Return the success of one robot in one world."""
     by_object = group_trials(trials, "case", "what")
     done = sum(all(t.done for t in group) for group in by_object.values())
     far = sum(any(t.out_of_reach for t in group) for group in by_object.values())
@@ -187,23 +134,188 @@ def count_objects(trials: Iterable[Trial]) -> ObjectCount:
 
 
 def group_trials(trials: Iterable[Trial], *names: str) -> dict[tuple[Any, ...], list[Trial]]:
-    """Return the trials by the values of some of their attributes, in their order."""
     found: dict[tuple[Any, ...], list[Trial]] = {}
     for trial in trials:
         found.setdefault(tuple(getattr(trial, name) for name in names), []).append(trial)
     return found
 
 
-def as_json(value: Any) -> Any:
-    """Return a value as JSON data: numbers that are not finite are null, what is no data is its text."""
-    if isinstance(value, Mapping):
-        return {str(key): as_json(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [as_json(entry) for entry in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value if value is None or isinstance(value, str) else str(value)
+@dataclass(frozen=True)
+class Column:
+    key: str  # name in JSON data
+    title: str  # title with the unit
+    of: Callable[[Sequence[Trial]], Any]  # function from the trials of a row to the value
+    digits: int = 3  # significant digits of numbers that are printed
+
+    def cell(self, trials: Sequence[Trial]) -> str:
+        value = self.of(trials)
+        if isinstance(value, str):
+            return value
+        return "" if math.isnan(value) else f"{value:.{self.digits}g}" if value else "0"
+
+
+def worst(key: str, scale: float = 1.0) -> Callable[[Sequence[Trial]], float]:
+    """Return the function that finds the largest value of a measure, times a scale; NaN without any."""
+
+    def largest(trials: Sequence[Trial]) -> float:
+        found = (t.measures.get(key) for t in trials)
+        numbers = [float(v) for v in found if v is not None and not math.isnan(v)]
+        return scale * max(numbers, default=math.nan)
+
+    return largest
+
+
+def step_times(trials: Sequence[Trial]) -> StepTimeStatistics:
+    """Return the statistics of all control steps of some trials [ms]."""
+    return StepTimeStatistics.from_seconds(
+        [t for trial in trials for t in trial.cpu], [t for trial in trials for t in trial.wall]
+    )
+
+
+def _failures(kind: str) -> Callable[[Sequence[Trial]], int]:
+    return lambda trials: sum(t.failure == kind for t in trials)
+
+
+def _deepest_pair(trials: Sequence[Trial]) -> str:
+    deepest = max(trials, key=lambda t: t.measures.get("penetration") or 0.0)
+    return (
+        " and ".join(deepest.measures.get("penetrating", ())) if deepest.measures.get("penetration") else ""
+    )
+
+
+ROW = (
+    Column("robot", "robot", lambda trials: trials[0].robot),
+    Column("world", "world", lambda trials: trials[0].world),
+    Column("noise", "noise", lambda trials: trials[0].noise or "none"),
+    Column("dof", "DoF", lambda trials: trials[0].dof, 4),
+)
+"""Columns with which each table begins; their keys are attributes of trials, by which rows are grouped."""
+SUCCESS = (
+    Column("objects", "objects", lambda trials: count_objects(trials).objects, 6),
+    Column("done", "done", lambda trials: count_objects(trials).done, 6),
+    Column("excused", "out of reach", lambda trials: count_objects(trials).excused, 6),
+    Column("rate", "of those in reach [%]", lambda trials: 100 * count_objects(trials).rate, 4),
+    *(Column(kind, kind, _failures(kind), 6) for kind in FAILURES if kind),
+)
+TIMES = (
+    Column("steps", "steps", lambda trials: step_times(trials).count, 9),
+    Column("cpu_mean_ms", "CPU mean", lambda trials: step_times(trials).mean),
+    Column("cpu_sd_ms", "sd", lambda trials: step_times(trials).deviation),
+    Column("cpu_median_ms", "median", lambda trials: step_times(trials).median),
+    Column("cpu_p99_ms", "p99", lambda trials: step_times(trials).p99),
+    Column("cpu_worst_ms", "worst", lambda trials: step_times(trials).worst),
+    Column("wall_mean_ms", "wall mean", lambda trials: step_times(trials).wall),
+)
+QUALITY = (
+    Column("limit_violation", "limits violated", worst("limit_violation")),
+    Column("grasp_error_mm", "grasp error [mm]", worst("grasp_error", 1e3)),
+    Column("contact_losses", "contact losses", worst("contact_losses"), 6),
+    Column("penetration_mm", "penetration [mm]", worst("penetration", 1e3)),
+    Column("penetrating", "deepest pair", _deepest_pair),
+    Column("jitter", "jitter", worst("jitter")),
+    Column("peak_force", "force [N]", worst("peak_force")),
+)
+"""Largest values of single trials; penetration is that of the pairs that are not excepted."""
+COLUMNS = (*ROW, *SUCCESS, *TIMES, *QUALITY)  # columns of JSON data
+_LONGEST_REASON = 90
+_TIMED = (
+    "Control steps [ms]: everything from the state to the command, distance queries included, "
+    "without the world, planning and base placement"
+)
+
+
+def make_trial_tables(
+    trials: Sequence[Trial], title: str, more: Iterable[ReportTable] = ()
+) -> tuple[ReportTable, ...]:
+    """Return the tables of trials: success, times, quality, excepted pairs and failures."""
+    tables = (
+        make_group_table(title, trials, (*ROW, *SUCCESS)),
+        *more,
+        make_group_table(_TIMED, trials, (*ROW[:3], *TIMES)),
+        make_group_table("Worst of all trials", trials, (*ROW[:3], *QUALITY)),
+        make_exception_table(trials),
+        make_failure_table(trials),
+    )
+    return tuple(table for table in tables if table.rows)
+
+
+def make_group_table(
+    title: str, trials: Sequence[Trial], columns: Sequence[Column], by: Sequence[str] = ()
+) -> ReportTable:
+    """Return a row for each robot, world, noise and attribute; columns that are empty are left out."""
+    groups = group_trials(trials, *by, *(column.key for column in ROW))
+    columns = [c for c in columns if c.key != "noise" or any(t.noise for t in trials)]
+    rows = [
+        (*map(str, key[: len(by)]), *(column.cell(own) for column in columns)) for key, own in groups.items()
+    ]
+    head = (*by, *(column.title for column in columns))
+    kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    return ReportTable(
+        title, tuple(head[k] for k in kept), tuple(tuple(row[k] for k in kept) for row in rows)
+    )
+
+
+def make_exception_table(trials: Iterable[Trial]) -> ReportTable:
+    """Return the table of the pairs of bodies whose penetration does not count.
+
+    Bodies of one robot or of one piece of furniture are listed with those that they always overlap; those of
+    a gripper with the object that it grasps or pushes.
+    """
+    rows = []
+    for (robot,), own in group_trials(trials, "robot").items():
+        pairs: dict[str, dict[str, None]] = {}
+        for pair in (pair for t in own for pair in t.measures.get("excepted", ())):
+            (head, a), (other, b) = (name.partition("/")[::2] for name in pair)
+            if head == other:
+                pairs.setdefault(f"{head}: {a}", {})[b] = None
+            else:
+                pairs.setdefault("handle that is grasped or pushed", {})[f"{head}: {a}"] = None
+        rows += [(robot, body, ", ".join(others)) for body, others in pairs.items()]
+    return ReportTable("Pairs whose penetration does not count", ("robot", "body", "with"), tuple(rows))
+
+
+def make_failure_table(trials: Iterable[Trial]) -> ReportTable:
+    rows = tuple(
+        (t.case, t.robot, t.world, t.what, t.skill, t.failure, shorten_reason(t.reason))
+        for t in trials
+        if not t.done
+    )
+    head = ("case", "robot", "world", "object", "skill", "class", "reason")
+    return ReportTable("Failures", head, rows)
+
+
+def make_trial_numbers(trials: Sequence[Trial]) -> dict[str, Any]:
+    """Return the columns of all robots and worlds, failures, and all trials as JSON data."""
+    groups = group_trials(trials, *(column.key for column in ROW))
+    data = [t.as_data() for t in trials]
+    return {
+        "cpu_seconds": sum(float(t.measures.get("cpu_seconds", 0.0)) for t in trials),
+        "robots": [{c.key: as_json(c.of(own)) for c in COLUMNS} for own in groups.values()],
+        "failures": [one for one in data if not one["done"]],
+        "trials": data,
+    }
+
+
+def make_success_figure(trials: Sequence[Trial], measure: str, label: str) -> Figure:
+    def draw(canvas: Canvas) -> None:
+        axes = canvas.add_subplot()
+        robots = list(dict.fromkeys(t.robot for t in trials))
+        colors = {"": "0.7", "collision": "tab:red", "reach": "tab:blue", "time": "tab:orange", "other": "k"}
+        for failure, color in colors.items():
+            own = [t for t in trials if t.failure == failure and measure in t.measures]
+            # Points of one robot are spread by skill, so that opening and closing do not hide each other.
+            y = [robots.index(t.robot) + (0.12 if t.skill == "close" else -0.12) for t in own]
+            marker, size = ("|", 60) if not failure else ("o", 30)
+            axes.scatter(
+                [t.measures[measure] for t in own], y, c=color, s=size, marker=marker, label=failure or "done"
+            )
+        axes.set_yticks(range(len(robots)), robots)
+        axes.set_xlabel(label)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+
+    return Figure(draw, (9.0, 3.5))
+
+
+def shorten_reason(reason: str) -> str:
+    line = " ".join(reason.split())
+    return line if len(line) <= _LONGEST_REASON else f"{line[: _LONGEST_REASON - 1]}…"
