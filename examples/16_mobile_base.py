@@ -16,7 +16,6 @@ for speed, expression in robot.fk("camera")[0, 3].gradient().items():  # its x, 
 
 state = robot.default_state()
 speeds = {"base/left_wheel:velocity": 4.0, "base/right_wheel:velocity": 6.0}  # [rad/s]
-speeds = {"base/left_wheel:velocity": 4.0, "base/right_wheel:velocity": 6.0}  # [rad/s]
 for _ in range(10):
     state = robot.integrate(state, speeds, dt=0.2)
 print({str(symbol): round(state[symbol], 3) for symbol in robot.degrees_of_freedom})

@@ -1,4 +1,4 @@
-"""The architecture page: its layers are those that the linter holds, and its tree is that of the sources."""
+"""The architecture page: its layers, its tree and its modules are those of the sources, which have a good size."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import ast
 import re
 import runpy
 import tomllib
+from collections import Counter, defaultdict
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,12 @@ import kineverse as kv
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+LARGEST, SMALLEST, MOST_FILES = 650, 100, 26
+LARGE = {"kineverse.expressions.expression"}
+"""Modules above the largest size: one class that behaves like an array."""
+
+SMALL = {"kineverse.shipped.robots"}
+"""Modules below the smallest size that one other imports, and that cannot be a part of it: its layer is lower."""
 
 
 def test_the_layers_are_those_of_the_contract() -> None:
@@ -33,6 +40,57 @@ def test_the_tree_is_that_of_the_sources() -> None:
     """``python tools/source_tree.py --write`` draws it anew."""
     block = PAGE.partition("## Source tree\n\n```text\n")[2].partition("```")[0]
     assert block == runpy.run_path(str(ROOT / "tools" / "source_tree.py"))["tree"]()
+
+
+def test_the_modules_of_the_data_flow_exist() -> None:
+    table = PAGE.partition("## Data flow")[2].partition("## Values by name")[0]
+    cells = [row.split("|")[2] for row in table.splitlines() if row.startswith("| ")]
+    names = [name for cell in cells for name in re.findall(r"`([a-z_.]+)`", cell)]
+    assert len(names) > 80
+    assert [n for n in names if f"kineverse.{n}" not in _modules()] == []
+
+
+def test_modules_and_folders_have_a_good_size() -> None:
+    """Large modules are divided, and small ones belong into the module that imports them."""
+    modules = _modules()
+    importers = defaultdict(set)
+    for name, path in modules.items():
+        for imported in _imports(name, path, modules):
+            importers[imported].add(name)
+    lines = {name: len(path.read_text("utf-8").splitlines()) for name, path in modules.items()}
+    assert {name for name, n in lines.items() if n > LARGEST} == LARGE
+    small = {
+        name: importers[name]
+        for name, n in lines.items()
+        if n < SMALLEST and len(importers[name]) == 1 and name.startswith("kineverse.")
+    }
+    small = {name: by for name, by in small.items() if modules[name].stem != "__init__"}
+    assert {name: by for name, by in small.items() if name not in SMALL} == {}
+    assert small.keys() >= SMALL
+    folders = Counter(path.parent.relative_to(ROOT).as_posix() for path in modules.values())
+    assert {folder: n for folder, n in folders.items() if n > MOST_FILES} == {}
+
+
+def _modules() -> dict[str, Path]:
+    return {
+        ".".join(path.relative_to(top).with_suffix("").parts).removesuffix(".__init__"): path
+        for top in (ROOT / "src", ROOT / "studies")
+        for path in sorted(top.rglob("*.py"))
+    }
+
+
+def _imports(name: str, path: Path, modules: dict[str, Path]) -> set[str]:
+    """Return the modules that a module imports names of, or as a whole."""
+    package = name if path.stem == "__init__" else name.rpartition(".")[0]
+    imported = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            source = ".".join([*above, *([node.module] if node.module else [])])
+            imported |= {
+                whole if (whole := f"{source}.{alias.name}") in modules else source for alias in node.names
+            }
+    return imported
 
 
 def test_the_package_does_not_import_its_studies() -> None:

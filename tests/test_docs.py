@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -42,6 +44,29 @@ def test_links_within_the_repository_lead_somewhere(page: Path) -> None:
 def test_the_index_names_every_page(page: Path) -> None:
     index = ROOT / "docs" / "README.md"
     assert page == index or f"({page.name})" in index.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_names_of_the_library_on_pages_exist(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    names = set(re.findall(r"`(?:kineverse|kv)((?:\.\w+)+)", text)) - {".commands", ".NAME"}
+    assert {name for name in names if not _exists(f"kineverse{name}")} == set()
+
+
+def _exists(name: str) -> bool:
+    """Return whether a dotted name is a module, or an attribute of one."""
+    with suppress(ModuleNotFoundError):
+        import_module(name)
+        return True
+    parent, _, attribute = name.rpartition(".")
+    return bool(parent) and _exists(parent) and hasattr(_resolve(parent), attribute)
+
+
+def _resolve(name: str) -> object:
+    parent, _, attribute = name.rpartition(".")
+    with suppress(ModuleNotFoundError):
+        return import_module(name)
+    return getattr(_resolve(parent), attribute)
 
 
 def _anchors(page: Path) -> set[str]:

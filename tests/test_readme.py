@@ -1,4 +1,4 @@
-"""The README: its tour is short, and it says what the package is called.
+"""The README and the release notes: both are short, and they name the package and its version.
 
 That the tour prints what is printed below it is tested with the other pages in ``test_docs``, and that its commands run in
 ``test_documented_commands``.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tomllib
 
+from kineverse._version import __version__
 from markdown_examples import ROOT, examples
 
 README = ROOT / "README.md"
@@ -31,17 +32,21 @@ def test_the_two_commands_are_targets_of_make() -> None:
 
 def test_the_names_agree() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    text = README.read_text(encoding="utf-8")
-    assert project["name"] in text
+    assert project["name"] in README.read_text(encoding="utf-8")
+    installation = (ROOT / "docs" / "installation.md").read_text(encoding="utf-8")
     for extra in project["optional-dependencies"]:
-        assert f"`{extra}`" in text
+        assert f"`{extra}`" in installation
+    for requirement in project["dependencies"]:
+        assert requirement.partition(">")[0] in installation
 
 
-def test_every_page_of_the_docs_is_listed() -> None:
-    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"README.md"}
-    text, index = (
-        README.read_text(encoding="utf-8"),
-        (ROOT / "docs" / "README.md").read_text(encoding="utf-8"),
-    )
-    assert {name for name in pages if f"(docs/{name})" not in text} == set()
-    assert {name for name in pages if f"]({name})" not in index} == set()
+def test_the_readme_is_short_and_leads_to_the_list_of_pages() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 130
+    assert "(docs/README.md)" in text
+
+
+def test_the_release_notes_are_short_and_of_this_version() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 60
+    assert f"## {__version__.rpartition('.')[0]}" in text

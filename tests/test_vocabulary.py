@@ -7,6 +7,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,8 @@ SOURCES = {"": ROOT / "src" / "kineverse", "studies.": ROOT / "studies" / "kinev
 CLAUSE = re.compile(
     r"(What|Who|Whose|Whom|Whoever|Whatever|Whether|Where|Wherever|How|However|Which|When|Why|That|If)\b"
 )
+SECTION = re.compile(r"^(Parameters|Returns|Raises|Attributes|Yields)\n-{3,}$", re.MULTILINE)
+Definition = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 TWINS = {"lie", "spatial"}
 """Modules that have the same names on purpose: numbers and expressions."""
 
@@ -102,6 +105,43 @@ def test_functions_begin_with_a_verb_and_classes_do_not() -> None:
         and (text := ast.get_docstring(node) or "-").split()[0] in verbs | third_person
     ]
     assert not classes, "\n".join(classes)
+
+
+def test_reference_sections_belong_to_exported_names() -> None:
+    """What no face exports has one line, and units and shapes next to the field."""
+    exported = exported_names()
+    sections = [
+        f"{module}:{node.lineno}: {node.name}"
+        for module, tree in trees().items()
+        if not module.startswith("studies.")
+        for node in unexported(tree.body, exported)
+        if SECTION.search(ast.get_docstring(node) or "")
+    ]
+    assert not sections, "\n".join(sections)
+
+
+def exported_names() -> set[str]:
+    """Return the names in the face of any package or public module, and those of the bases of such classes."""
+    source = SOURCES[""]
+    packages = [init.parent.relative_to(source.parent).parts for init in source.rglob("__init__.py")]
+    modules = [import_module(".".join(parts)) for parts in packages]
+    modules += [import_module(f"kineverse.{path.stem}") for path in source.glob("[a-z]*.py")]
+    faces = [(module, name) for module in modules for name in getattr(module, "__all__", vars(module))]
+    values = [getattr(module, name) for module, name in faces]
+    bases = {base.__name__ for value in values if isinstance(value, type) for base in value.__mro__}
+    return bases | {name for _, name in faces if name[0] != "_"}
+
+
+def unexported(body: list[ast.stmt], exported: set[str] | None) -> Iterator[Definition]:
+    """Yield the definitions that are not public; all names without an underscore are if ``exported`` is None."""
+    for node in body:
+        if isinstance(node, Definition):
+            special = node.name.startswith("__")
+            public = special or (node.name[0] != "_" if exported is None else node.name in exported)
+            if not public:
+                yield node
+            is_face = public and isinstance(node, ast.ClassDef)
+            yield from unexported(node.body, None if is_face else set())
 
 
 def is_property(node: ast.FunctionDef) -> bool:

@@ -58,9 +58,9 @@ def as_entries(argument: str, given: Any, kinds: type | tuple[type, ...], wanted
     if isinstance(given, kinds):
         return (given,)
     if isinstance(given, Iterable) and not isinstance(given, str | bytes):
-        found = tuple(given)
-        if all(isinstance(entry, kinds) for entry in found):
-            return found
+        result = tuple(given)
+        if all(isinstance(entry, kinds) for entry in result):
+            return result
     raise InvalidValueError(f"{argument} takes {wanted}, not {given!r:.80}.")
 
 

@@ -51,15 +51,15 @@ def checkout(module: Path) -> Path | None:
 
 def requirements(extra: str, declared: Iterable[str]) -> list[str]:
     """Return the requirements of an extra, from lines of metadata (``coal>=3.0; extra == "geometry"``)."""
-    found = []
+    result = []
     for line in declared:
         match = _EXTRA.search(line)
         if match is not None and match["name"] == extra:
             requirement, _, marker = (line[: match.start()] + line[match.end() :]).partition(";")
-            found.append(
+            result.append(
                 f"{requirement.strip()}; {marker.strip()}" if marker.strip() else requirement.strip()
             )
-    return found
+    return result
 
 
 def _declared() -> list[str]:

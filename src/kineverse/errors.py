@@ -28,6 +28,7 @@ __all__ = [
     "SimulationError",
     "UnknownAttributeError",
     "UnknownNameError",
+    "suggest",
 ]
 
 

@@ -235,14 +235,14 @@ class State(Mapping[Symbol, float]):
     def _with(self, values: Mapping[Symbol, float], stamp: float | None, source: str | None) -> State:
         # All values have been checked already.
         every = {**self._values, **values}
-        found = State.__new__(State)
-        found._set(
+        result = State.__new__(State)
+        result._set(
             every,
             self._names if len(every) == len(self._values) else None,
             self.stamp if stamp is None else stamp,
             self.source if source is None else source,
         )
-        return found
+        return result
 
     def _unknown(self, key: object) -> KineverseError:
         symbol = _symbol(key)
@@ -285,12 +285,12 @@ class State(Mapping[Symbol, float]):
 
 def _symbols_by_name(symbols: Collection[Symbol]) -> dict[str, Symbol | None]:
     """Return the symbol of each name, None where several have it."""
-    found: dict[str, Symbol | None] = {str(s): s for s in symbols}
-    if len(found) < len(symbols):
+    result: dict[str, Symbol | None] = {str(s): s for s in symbols}
+    if len(result) < len(symbols):
         # A parameter may have the name of another symbol; then the name is ambiguous.
         counts = Counter(map(str, symbols))
-        found = {name: s if counts[name] == 1 else None for name, s in found.items()}
-    return found
+        result = {name: s if counts[name] == 1 else None for name, s in result.items()}
+    return result
 
 
 def _items(values: object) -> Iterable[tuple[Any, Any]]:
@@ -325,22 +325,7 @@ def _is_number(value: object) -> bool:
 
 
 def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
-    """Return values as a state, and raise for unknown symbols in a plain mapping.
-
-    Parameters
-    ----------
-    values
-        A state, which may have more symbols, or a mapping from symbols or names to numbers, which may not.
-    known
-        The known symbols.
-
-    Raises
-    ------
-    UnknownNameError
-        For other symbols and names.
-    DuplicateNameError
-        If a symbol has two values, by symbol and by name, or a name is that of several symbols.
-    """
+    """Return values as a state; a plain mapping with unknown symbols or two values for one is refused."""
     if isinstance(values, State):
         return values
     if not isinstance(values, Mapping):
@@ -370,13 +355,7 @@ def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
 
 
 def check_meant(state: State, known: Iterable[Symbol]) -> None:
-    """Raise for a state without a value for any symbol of a model: it belongs to another model.
-
-    Raises
-    ------
-    UnknownNameError
-        With names similar to that of the first symbol.
-    """
+    """Raise for a state without a value for any symbol of a model: it belongs to another model."""
     symbols = list(known)
     if any(state.given(symbol) is not None for symbol in symbols):
         return

@@ -255,13 +255,7 @@ def parse_symbol_name(name: str) -> tuple[str, int]:
 
 
 def check_symbols(symbols: Iterable[object]) -> Sequence[Symbol]:
-    """Return the symbols as a sequence.
-
-    Raises
-    ------
-    ExpressionError
-        If one of them is not a :class:`Symbol`.
-    """
+    """Return the symbols as a sequence, and raise for other objects."""
     if isinstance(symbols, Symbol):
         raise ExpressionError(f"A sequence of symbols is wanted: [{symbols}].")
     if isinstance(symbols, str):

@@ -160,7 +160,7 @@ BAD = {
     "out of order": (LONG + "0.2,A,1,2,3\n0.2,B,1,2,3\n0.1,A,1,2,3\n", r"line 4: 0\.1 s is earlier than line 2"),
     "twice": (LONG + "0.2,A,1,2,3\n0.2,A,1,2,3\n", r"line 3: 0\.2 s is the same time as line 2"),
     "no name": (LONG + "0,,1,2,3\n", "line 2: the name of the part is missing"),
-    "nothing seen": ("A.x,A.y,A.z\n,,\n", "nothing was observed"),
+    "nothing observed": ("A.x,A.y,A.z\n,,\n", "nothing was observed"),
     "no position": ("qx,qy,qz,qw\n0,0,0,1\n", "an orientation, but no position"),
     "nothing known": ("speed,force\n1,2\n", "no column is a position"),
     "a lacking column": ("x,y,z,q_x,qy,qz,qw\n1,2,3,0,0,0,1\n", "no column qx. Not understood: 'q_x'"),

@@ -216,7 +216,7 @@ def test_home_positions_of_ball_joints_in_loops_are_set(name):
         joint("q4", "revolute", "coupler", "rocker", pose("1 0 0 0 0 0") + Z),
     )
     # A quaternion does not follow, and nobody knows its range.
-    with pytest.raises(kv.KineverseError, match=f"has to know how far '{name.replace(':', '%3A')}/qz' goes"):
+    with pytest.raises(kv.KineverseError, match=f"needs limits of '{name.replace(':', '%3A')}/qz'"):
         model_of(text)
 
 

@@ -189,7 +189,7 @@ def test_a_free_coordinate_at_a_dead_centre_is_refused():
 
 
 def test_a_slide_needs_limits():
-    text = r"'slider-crank' has to know how far 'piston' goes.*within"
+    text = r"'slider-crank' needs limits of 'piston'.*within"
     refused(InvalidValueError, text, lambda: slider_crank(dependent=("crank", "rod")))
     for far in ((0.3, math.inf), (-math.inf, 0.3), (-math.inf, math.inf)):
         refused(
@@ -266,7 +266,7 @@ def test_a_quaternion_has_no_limits():
         edit.add_frame("driven_end", "driven", kv.translation(0, 0.25, 0))
     refused(
         InvalidValueError,
-        "Loop 'rod' has to know how far 'ball/q[xyzw]' goes",
+        "Loop 'rod' needs limits of 'ball/q[xyzw]'",
         lambda: closing(model, "rod_end", "driven_end", name="rod"),
     )
 

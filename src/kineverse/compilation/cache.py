@@ -1,4 +1,13 @@
-"""Caches on disk by content: files in a private folder, and compiled libraries by their source."""
+"""Disk caches: files in a folder of this user alone, and compiled libraries by the digest of their source.
+
+Every file ends in a digest of its content. A file that is damaged, or that others can write to, counts as
+absent. Files are renamed into place, so any number of processes can share the folder, and an interruption
+loses only the unfinished file.
+
+Code from this folder is loaded into the process, so only this user may write to it, see
+:mod:`.private_folder`. A library is loaded through the checked descriptor; one that lacks the expected
+functions is compiled again.
+"""
 
 from __future__ import annotations
 
@@ -146,14 +155,14 @@ class ContentCache:
 
     def _files(self) -> list[tuple[float, int, str]]:
         """Return the time of the last use, the size and the key of each file; remove what was left behind."""
-        found, folder = [], self.folder
+        result, folder = [], self.folder
         for name, status in folder.entries():
             if name.endswith(self._ending):
-                found.append((status.st_mtime, status.st_size, name.removesuffix(self._ending)))
+                result.append((status.st_mtime, status.st_size, name.removesuffix(self._ending)))
             elif name.startswith(UNFINISHED) and time.time() - status.st_mtime > _STALE_SECONDS:
                 if not folder.remove(name):
                     shutil.rmtree(folder.path / name, ignore_errors=True)
-        return found
+        return result
 
 
 logger = logging.getLogger("kineverse.compile")

@@ -1,4 +1,7 @@
-"""C code of vector programs and of batches: one statement per operation, on SIMD vectors of rows."""
+"""C functions of straight-line programs and of batches: of SIMD vectors, or of doubles.
+
+The statements of both are the same but for the notation of operations, a :class:`Dialect`.
+"""
 
 from __future__ import annotations
 

@@ -99,23 +99,23 @@ def make_signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | Non
     """Return the signature of a function of ``outputs``."""
     needed = set().union(*(e.symbols for e in outputs))
     if inputs is None:
-        found = Signature(tuple(sorted(needed, key=lambda s: s.sort_key)))
+        result = Signature(tuple(sorted(needed, key=lambda s: s.sort_key)))
     else:
-        found = Signature(_symbols(inputs))
-        missing = needed.difference(found.inputs)
+        result = Signature(_symbols(inputs))
+        missing = needed.difference(result.inputs)
         if missing:
             names = sorted(str(s) for s in missing)
             raise UnknownNameError(
                 f"The outputs depend on symbols that are not among the inputs: {_listed(names)}."
             )
-    if len(set(found.names)) < found.size:
-        names = sorted({n for n in found.names if found.names.count(n) > 1})
-        equal = len(set(found.inputs)) < found.size
+    if len(set(result.names)) < result.size:
+        names = sorted({n for n in result.names if result.names.count(n) > 1})
+        equal = len(set(result.inputs)) < result.size
         reason = "given twice" if equal else "the name of several symbols (of different roles or values)"
         raise DuplicateNameError(
             f"The inputs of a function have names of their own: {_listed(names)} is {reason}."
         )
-    return found
+    return result
 
 
 def as_doubles(x: Any, wanted: str) -> Array:

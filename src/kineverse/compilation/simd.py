@@ -1,4 +1,11 @@
-"""C header of SIMD vectors for one CPU: types, arithmetic, functions, and rows of a table in and out."""
+"""C source of SIMD vectors, in double or float: types, arithmetic, and rows of doubles in and out.
+
+A vector ``V`` contains the same quantity of W configurations, where W is the width of the machine's widest
+register in numbers of type ``Real``. A vector ``I`` contains whole numbers of the same size: masks, whose
+bits are all 1 or all 0, and the bits of numbers. The code is generic in W and ``Real``; intrinsics are only
+used for instructions without a notation in the vector extension. Machines without these intrinsics compute
+lane by lane. Rows are transposed in blocks of W by W numbers, and results may be written past the caches.
+"""
 
 from __future__ import annotations
 

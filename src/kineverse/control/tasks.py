@@ -318,7 +318,9 @@ class Target:
             raise InvalidValueError(f"The target '{self.name}' has to be finite.")
         if self._transform:
             if not _is_transform(value):
-                raise InvalidValueError(f"The target '{self.name}' is a transform, and this matrix is none.")
+                raise InvalidValueError(
+                    f"The target '{self.name}' takes a transform, and this matrix is not one."
+                )
             return flat[:12]
         return flat
 

@@ -97,7 +97,7 @@ class CorrelationSettings:
     stamped: bool  # True if the looks have time stamps
 
     def measure(self, residuals: Array, size: int, stamps: Array) -> float:
-        """Return the number of looks that tell as much as one, from residuals (N, 6) at times (N,)."""
+        """Return the number of looks that are worth one, from residuals (N, 6) at times (N,)."""
         correlation = ErrorCorrelation(self)
         for residual, at in zip(residuals, stamps.tolist(), strict=True):
             correlation.add(residual, size, at)
@@ -105,7 +105,7 @@ class CorrelationSettings:
 
 
 class ErrorCorrelation:
-    """Number of looks that tell as much as one look with independent errors."""
+    """Number of looks that are worth one with independent errors."""
 
     def __init__(self, settings: CorrelationSettings) -> None:
         self._stated = settings.time
@@ -155,7 +155,7 @@ class ErrorCorrelation:
         variance = a + b + 2.0 * ab + 1.0 - self._shares
         squares = np.einsum("ij,ij->i", error, error) / variance
         self._log *= 1.0 - 1.0 / _MEMORY
-        # An outlier tells nothing of the correlation.
+        # An outlier has no information about the correlation.
         self._log -= 0.5 * np.minimum(size * np.log(variance) + squares, CHI_SQUARED_6)
         inlier = squares < CHI_SQUARED_6
         self._outliers = 0 if inlier.any() else self._outliers + 1

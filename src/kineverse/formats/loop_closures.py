@@ -187,8 +187,8 @@ class LoopClosures:
         rows = array([row for rows in self._rows(loop) for row in rows.values()])
         (values,) = StateSamples(self.model, count=_LOOKED_AT).values([rows])
         gaps = np.linalg.norm(values, axis=1)
-        found: npt.NDArray[np.float64] = gaps[np.isfinite(gaps)]
-        return found
+        result: npt.NDArray[np.float64] = gaps[np.isfinite(gaps)]
+        return result
 
     def _tell(self, loop: CloseLoop, text: str) -> None:
         warn([f"{self.source}: the {self.element} '{_shown(loop.name)}' {text}."])

@@ -95,16 +95,16 @@ class UniqueNames:
 
     def replace(self, name: str, where: str, problem: str) -> str:
         """Report a problem with a name, and return the free name that the element has instead."""
-        found = self.invent(name, where)
-        self._report(where, problem, f"it is called {quote(found)}")
-        return found
+        result = self.invent(name, where)
+        self._report(where, problem, f"it is called {quote(result)}")
+        return result
 
     def invent(self, name: str, where: str, *more: str) -> str:
         """Take and return the first of several names that is free, else the first one with a number."""
         free = next((wish for wish in (name, *more) if wish not in self._owners), None)
-        found = self._numbers.first_free(name, self._owners) if free is None else free
-        self._owners[found] = where
-        return found
+        result = self._numbers.first_free(name, self._owners) if free is None else free
+        self._owners[result] = where
+        return result
 
     def __contains__(self, name: str) -> bool:
         return name in self._owners

@@ -2,7 +2,7 @@
 
 Files are located and not opened. The folders to search are few, listed in :func:`locate_resource`, and
 recursive searches end at ``MAX_DEPTH`` and ``MAX_FOLDERS``. :mod:`.root_folder` defines the folder below
-which a description may open files.
+which a description may open files. References in written files are relative to the folder of the file.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +25,7 @@ from .root_folder import (
     NOWHERE,
     Folder,
     declared_roots,
+    find_root,
     is_below,
     is_common,
     mesh_folders,
@@ -360,7 +361,7 @@ def _manifest_name(folder: Path) -> str | None:
 @lru_cache(maxsize=64)
 def _packages_below(top: Path) -> dict[str, tuple[Path, ...]]:
     """Return the packages at and below a folder, by the name of the folder and that of the manifest."""
-    found: dict[str, tuple[Path, ...]] = {}
+    result: dict[str, tuple[Path, ...]] = {}
     ahead = deque([(top, 0)])
     for _ in range(MAX_FOLDERS):
         if not ahead:
@@ -374,12 +375,12 @@ def _packages_below(top: Path) -> dict[str, tuple[Path, ...]]:
         # A folder without manifest counts if it lies directly in a workspace.
         if is_package or depth <= 1:
             for name in {folder.name, _manifest_name(folder) or folder.name}:
-                found[name] = (*found.get(name, ()), folder)
+                result[name] = (*result.get(name, ()), folder)
         if is_package or depth == MAX_DEPTH or not entries.keys().isdisjoint(_IGNORED):
             continue
         below = sorted(name for name, is_folder in entries.items() if is_folder and not name.startswith("."))
         ahead.extend((folder / name, depth + 1) for name in below)
-    return found
+    return result
 
 
 def _installed() -> Iterator[Path]:
@@ -444,3 +445,59 @@ def restrict_meshes(body: Body, root: str, where: str) -> Body:
     return replace(
         body, visuals=tuple(map(shape, body.visuals)), collisions=tuple(map(shape, body.collisions))
     )
+
+
+RemarkCallback = Callable[[str], None]
+_COMMON_PARTS = 2  # parts of a common folder, such as /home, above which a path is written as an absolute one
+
+
+def mesh_reference(mesh: Mesh, folder: Path, remark: RemarkCallback) -> str:
+    """Return the reference to a mesh from a description file in another folder.
+
+    Addresses such as ``package://`` stay if they lead to the same file from there. A mesh that is not found
+    keeps its reference.
+    """
+    if not mesh.folder or Path(mesh.folder) == folder or os.path.isabs(mesh.uri):
+        return mesh.uri
+    path = find_file(mesh)
+    if "://" not in mesh.uri:
+        if path is None:
+            return relative_path(Path(mesh.folder, mesh.uri), folder)
+        return file_reference(path, folder, remark)
+    if path is None or path == find_file(Mesh(mesh.uri, folder=str(folder), root=find_root(folder))):
+        return mesh.uri
+    remark(f"{mesh.uri} is written as a path, since that package is not found from {folder}")
+    return file_reference(path, folder, remark)
+
+
+def file_reference(path: Path, folder: Path, remark: RemarkCallback) -> str:
+    """Return a path as :func:`relative_path`, with a remark if it can only be read with a root folder."""
+    reference, root = relative_path(path, folder), find_root(folder)
+    if find_root_violation(reference, folder, root) is not None:
+        real = os.path.dirname(os.path.realpath(path))
+        common = os.path.commonpath((real, os.path.realpath(folder)))
+        wide = real if is_common(common) else common
+        remark(
+            f"the files in {path.parent} are outside of {root}: give root={wide!r} to open them from there"
+        )
+    return reference
+
+
+def find_file(file: Mesh) -> Path | None:
+    """Return the file of a mesh or texture; None if it does not exist or is outside of the root folder."""
+    try:
+        return Path(os.path.abspath(locate_mesh(file)))
+    except FormatError:
+        return None
+
+
+def relative_path(path: Path, folder: Path) -> str:
+    """Return a path relative to a folder, or the absolute path if they have nothing in common."""
+    path, folder = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
+    try:
+        common = Path(os.path.commonpath((path, folder)))
+    except ValueError:  # two drives
+        return path.as_posix()
+    if len(common.parts) <= _COMMON_PARTS and common != folder:
+        return path.as_posix()
+    return Path(os.path.relpath(path, folder)).as_posix()

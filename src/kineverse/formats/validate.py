@@ -88,13 +88,13 @@ def _find_limit_problems(model: ModelView) -> Iterator[ModelProblem]:
 def _states_within_limits(model: ModelView, samples: StateSamples) -> list[int]:
     """Return the indices of the sampled states that violate no constraint, and of the default state, 0."""
     symbols = model.symbols
-    found = [0]
+    result = [0]
     for k in range(1, samples.size) if symbols else ():
         state = State({symbol: samples.values_of(symbol)[k] for symbol in symbols})
         # Values that are not finite are the problem to find, and no violation.
         if all(isnan(violation.excess) for violation in model.violations(state)):
-            found.append(k)
-    return found
+            result.append(k)
+    return result
 
 
 def _find_open_loops(model: ModelView, samples: StateSamples, allowed: list[int]) -> Iterator[ModelProblem]:

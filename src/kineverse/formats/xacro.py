@@ -1,6 +1,10 @@
 """Templates of xacro (``robot.urdf.xacro``), expanded and read as the URDF or SDF that they are of.
 
-The ``xacro`` package expands them, in a process of its own, see :mod:`.xacro_process`.
+The ``xacro`` package expands them, in a process that does nothing else. It evaluates expressions of Python by
+``eval``, from which a lambda or a comprehension leads to all of Python. Here they are checked first:
+:func:`check_expression` allows arithmetic, comparisons, indices, literals, comprehensions and calls, but no
+attribute that begins with an underscore or leads to frames, code or types, and no lambda. Files are opened
+below the root of the description and in packages only.
 """
 
 from __future__ import annotations
@@ -74,13 +78,13 @@ def split_arguments(source: str) -> tuple[str, dict[str, str]]:
 
 def parse_arguments(words: Iterable[str]) -> dict[str, str]:
     """Return the arguments in words such as ``side:=left``."""
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     for word in words:
         name, sign, value = word.partition(":=")
         if not sign or not name:
             raise InvalidValueError(f"{word!r} is no argument of a template; write name:=value.")
-        found[name] = value
-    return found
+        result[name] = value
+    return result
 
 
 _FORBIDDEN_NODES = (ast.Lambda, ast.NamedExpr, ast.Await, ast.Yield, ast.YieldFrom)
@@ -109,19 +113,19 @@ def expand(path: str, root: str, arguments: Mapping[str, str]) -> dict[str, Any]
     import xacro  # an extra
 
     expansion = _Expansion(xacro, path, root)
-    found: dict[str, Any] = {"remarks": expansion.remarks}
+    result: dict[str, Any] = {"remarks": expansion.remarks}
     try:
         given = _Arguments(arguments)
         document = xacro.process_file(path, mappings=given)
         expansion.check_arguments(arguments, given.used)
-        found["text"] = text = document.toxml()
+        result["text"] = text = document.toxml()
         if len(text) > MAX_BYTES:
             raise FormatError(f"it expands to more than {MAX_BYTES} characters, the most that is read.")
     except RecursionError:
-        found["error"] = f"{expansion.where()}: macros or includes nest too deeply, or without end."
+        result["error"] = f"{expansion.where()}: macros or includes nest too deeply, or without end."
     except Exception as error:  # xacro raises all kinds of exceptions
-        found["error"] = f"{expansion.where()}: {_reason(error)}"
-    return found
+        result["error"] = f"{expansion.where()}: {_reason(error)}"
+    return result
 
 
 def check_expression(text: str, allowed: type[Exception]) -> None:

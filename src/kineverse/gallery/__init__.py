@@ -56,5 +56,5 @@ def find_document(name: str) -> Path:
 
 @cache
 def _summaries() -> dict[str, str]:
-    found: dict[str, str] = json.loads((_FOLDER / "summaries.json").read_text(encoding="utf-8"))
-    return found
+    result: dict[str, str] = json.loads((_FOLDER / "summaries.json").read_text(encoding="utf-8"))
+    return result

@@ -92,7 +92,7 @@ def check_frame_names(what: str, names: Iterable[str], model: ModelView) -> None
     frames = model.frames
     for name in dict.fromkeys(names):
         if not any(sign in name for sign in _WILDCARDS) and name not in frames and name != WORLD:
-            raise UnknownNameError(f"{what} '{name}', which is no frame. {suggest(name, frames, 'frame')}")
+            raise UnknownNameError(f"{what} '{name}', which is not a frame. {suggest(name, frames, 'frame')}")
 
 
 def allowed_pairs(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:

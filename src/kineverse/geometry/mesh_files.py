@@ -101,7 +101,7 @@ def _read_file(file: MeshFile) -> Faces:
     if not np.isfinite(vertices).all():
         raise FormatError(f"{file.path} has vertices that are not finite.")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise FormatError(f"{file.path} has faces between vertices that are not there.")
+        raise FormatError(f"{file.path} has faces with missing vertices.")
     vertices.flags.writeable = faces.flags.writeable = False
     return Faces(vertices, faces)
 
@@ -127,7 +127,7 @@ def load_mesh_parts(file: MeshFile) -> list[Any]:
 def _check_packing(file: MeshFile) -> None:
     """Raise OSError for archives, and for packed meshes that unpack to more than :data:`LARGEST_FILE`."""
     if file.kind in _ARCHIVES:
-        raise OSError(f"{file.path} is an archive, and no mesh. Unpack it, and name the mesh in it")
+        raise OSError(f"{file.path} is an archive, not a mesh. Unpack it, and name the mesh in it")
     if zipfile.is_zipfile(file.path):
         with zipfile.ZipFile(file.path) as packed:
             size = sum(part.file_size for part in packed.infolist())

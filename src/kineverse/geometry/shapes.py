@@ -244,7 +244,7 @@ def _parse_corners(content: bytes) -> Floats:
     try:
         return np.frombuffer(content, dtype="<f8").reshape(-1, 3)
     except ValueError as error:
-        raise FormatError("These are no corners.") from error
+        raise FormatError("These are not corners.") from error
 
 
 def _hull_solid(points: Floats) -> Solid:
@@ -361,7 +361,7 @@ def _sizes(geometry: Primitive) -> tuple[float, ...]:
             return (float(geometry.radius), float(geometry.length))
     except (TypeError, ValueError) as error:
         raise InvalidValueError(f"{geometry} has sizes that are not positive numbers [m].") from error
-    raise InvalidValueError(f"{geometry!r} is no geometry that a body can have.")
+    raise InvalidValueError(f"{geometry!r} is not a geometry of a body.")
 
 
 def solid_surface(solid: Solid) -> Faces | Primitive:

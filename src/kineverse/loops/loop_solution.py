@@ -216,7 +216,7 @@ def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, ang
         return InputDomain(-np.pi, np.pi, whole=True)
     if not (np.isfinite(lower) and np.isfinite(upper)):
         raise InvalidValueError(
-            f"Loop '{name}' has to know how far '{symbol}' goes: give it limits, or the loop within={{...}}."
+            f"Loop '{name}' needs limits of '{symbol}': give the joint limits, or the loop within={{...}}."
         )
     return InputDomain(float(lower), float(upper))
 

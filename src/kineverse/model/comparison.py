@@ -209,8 +209,8 @@ def _measure_number_distance(a: Array, b: Array) -> Array:
         off = np.abs(a - b) / np.maximum(1.0, np.maximum(np.abs(a), np.abs(b)))
     off[(a == b) | (np.isnan(a) & np.isnan(b))] = 0.0
     off[np.isnan(off)] = inf
-    found: Array = off.reshape(len(a), -1).max(axis=1, initial=0.0)
-    return found
+    result: Array = off.reshape(len(a), -1).max(axis=1, initial=0.0)
+    return result
 
 
 def measure_pose_distances(a: Array, b: Array) -> tuple[Array, Array]:
@@ -323,11 +323,11 @@ class ModelComparison:
             and c.before.parent != c.after.parent
         ]
         poses = samples.values([model.fk(c.name) for c in changes for model in (self.before, self.after)])
-        found = {}
+        result = {}
         for change, one, other in zip(changes, poses[::2], poses[1::2], strict=True):
             off = _summarize(*measure_pose_distances(one, other))
-            found[change.path] = Delta("place", change.before.parent, change.after.parent, *off)
-        return found
+            result[change.path] = Delta("place", change.before.parent, change.after.parent, *off)
+        return result
 
     def _is_redundant_record(self, change: Change) -> bool:
         """Return whether a change is the record of a fixed joint between frames of both models."""

@@ -90,10 +90,10 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
             for path in _paths_in_parent(frames[name]):
                 mask |= bits.get(path, 0)
             masks[name] = mask
-    found: dict[Symbol, tuple[str, ...]] = {}
+    result: dict[Symbol, tuple[str, ...]] = {}
     for i, symbol in enumerate(asked):
-        found[symbol] = tuple(name for name in frames if masks[name] >> i & 1)
-    return found
+        result[symbol] = tuple(name for name in frames if masks[name] >> i & 1)
+    return result
 
 
 def count_moved_bodies(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symbol, int]:
@@ -104,12 +104,12 @@ def count_moved_bodies(model: ModelView, symbols: Iterable[Symbol | str]) -> dic
 
 def _paths_in_parent(frame: Frame) -> set[str]:
     """Return the paths of the symbols that move a frame in its parent, those of gradients included."""
-    found: set[str] = set()
+    result: set[str] = set()
     for factor in frame.factors:
         if isinstance(factor, Expression):
-            found.update(s.path for s in collect_symbols(factor))
-            found.update(s.path for s in gradient_keys(factor, heuristic=False))
-    return found
+            result.update(s.path for s in collect_symbols(factor))
+            result.update(s.path for s in gradient_keys(factor, heuristic=False))
+    return result
 
 
 def _known_paths(model: ModelView) -> set[str]:
@@ -125,12 +125,12 @@ def _known_path(symbol: Symbol, known: set[str]) -> str:
 def _driven_coordinates(model: ModelView, paths: set[str]) -> set[str]:
     """Return the paths of all coordinates that move with the given ones, including these."""
     rates = model.rates
-    found = set(paths)
+    result = set(paths)
     for coordinate, row in rates.items():
         if any(speed.path in paths for speed in row):
-            found.add(coordinate.path)
+            result.add(coordinate.path)
     # A coordinate in such a row may in turn determine dependent coordinates.
     for coordinate, expression in rates.dependent.items():
-        if any(s.path in found for s in expression.symbols):
-            found.add(coordinate.path)
-    return found
+        if any(s.path in result for s in expression.symbols):
+            result.add(coordinate.path)
+    return result

@@ -1,4 +1,11 @@
-"""Integration of states at constant speeds, by a Runge-Kutta method where speeds depend on the state."""
+"""Integration of coordinates at constant speeds: q̇ = R(q) u, close to floating-point accuracy.
+
+A whole step is one compiled function with an estimate of its error: the modified midpoint rule with
+increasing numbers of substeps, extrapolated to substeps of length zero (Gragg, Bulirsch, Stoer). If the
+estimate is too large, the step is divided. Coordinates that move linearly, free ones and those with constant
+rows, are exact. Limits and other constraints are ignored; ``model.integrate(..., clip=True)`` clips
+coordinates afterwards.
+"""
 
 from __future__ import annotations
 

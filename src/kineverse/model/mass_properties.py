@@ -29,13 +29,13 @@ from .kinematics import FrameLookup, ancestors
 
 def find_masses(frame: str, bodies: Mapping[str, Body], lookup: FrameLookup) -> dict[str, list[str]]:
     """Return the bodies with mass at or below a frame, each with its ancestors and itself first."""
-    found = {}
+    result = {}
     for name, body in bodies.items():
         if body.inertia is not None and body.inertia.mass > 0:
             above = ancestors(name, lookup)
             if frame == WORLD or frame in above:
-                found[name] = above
-    return found
+                result[name] = above
+    return result
 
 
 def center_of_mass(frame: str, bodies: Mapping[str, Body], lookup: FrameLookup) -> Expression:

@@ -118,10 +118,10 @@ class ModelView(SymbolicView):
             self._catch_up()
             if self._checker is None:
                 self._checker = self._make_checker(None)
-            found = find_violations(self._checker, values, self._known(values), tolerance)
-            if isinstance(values, State) and 0 < len(found.unchecked) == len(self._checker.names):
+            result = find_violations(self._checker, values, self._known(values), tolerance)
+            if isinstance(values, State) and 0 < len(result.unchecked) == len(self._checker.names):
                 check_meant(values, self._known({}))
-            return found
+            return result
 
     def constraint_checker(self, symbols: Iterable[Symbol] | None = None) -> ConstraintChecker:
         """Return the constraints as a compiled function of a vector, for loops.

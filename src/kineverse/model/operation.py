@@ -268,14 +268,14 @@ def map_expressions(kind: str, value: Any, f: ExpressionMap) -> Any:
 
 def find_expressions(kind: str, value: Any) -> list[Expression]:
     """Return the expressions of a written value, without symbols of records."""
-    found: list[Expression] = []
+    result: list[Expression] = []
 
     def note(expression: Expression) -> Expression:
-        found.append(expression)
+        result.append(expression)
         return expression
 
     map_expressions(kind, value, note)
-    return found
+    return result
 
 
 def _map_nested(datum: Any, f: ExpressionMap) -> Any:

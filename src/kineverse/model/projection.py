@@ -105,12 +105,12 @@ class EqualityConstraints:
     def quaternions(self) -> list[list[int]]:
         """Indices of the four coordinates of each quaternion."""
         place = {s: i for i, s in enumerate(self.coordinates)}
-        found = []
+        result = []
         for record in self.articulations.values():
             four = [s for s in record.coordinates if s.path.rpartition("/")[2] in _QUATERNION]
             if len(four) == 4 and all(s in place and s in self.rates for s in four):
-                found.append([place[s] for s in four])
-        return found
+                result.append([place[s] for s in four])
+        return result
 
 
 def is_equality(constraint: Constraint) -> bool:

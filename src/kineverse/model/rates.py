@@ -1,4 +1,17 @@
-"""Rates of dependent coordinates: rows in the free velocities, and nodes that carry them in expressions."""
+"""Rates of coordinates as linear functions of speeds, q̇ = R(q) u, and nodes that carry them.
+
+A coordinate x without a row is free, ``{ẋ: 1}``. A row ``{v: expression}`` stands for ``ẋ = Σ expression·v``,
+as for the wheels of a differential drive or the angular velocity of a quaternion. In the expressions of a
+model such coordinates are *carried*: an opaque node with the value x and the row as gradient. So every
+gradient is in terms of the wheels.
+
+A coordinate may also *depend* on others, as the angles of a closed loop on its crank. Then its entry is an
+expression, which replaces the coordinate in the expressions of the model, with its gradient.
+
+Rows contain carried coordinates themselves, because accelerations need the rate of the heading in a wheel's
+row. This may be circular: the rate of a quaternion is a function of the quaternion. A carried coordinate
+therefore refers to its table and unfolds one derivative at a time.
+"""
 
 from __future__ import annotations
 
@@ -191,10 +204,10 @@ def _recompose(node: Composed, plain_part: Callable[[Expression], Expression]) -
 def collect_symbols(expression: Expression) -> set[Symbol]:
     """Return the symbols of an expression, those of overridden gradients included."""
     symbols, nodes = leaves(expression)
-    found = set(symbols)
+    result = set(symbols)
     for node in topological_order(nodes, _subjects, lambda _: False):
-        found.update(s for part in _subjects(node) for s in leaves(part)[0])
-    return found
+        result.update(s for part in _subjects(node) for s in leaves(part)[0])
+    return result
 
 
 def _subjects(node: Node) -> tuple[Expression, ...]:

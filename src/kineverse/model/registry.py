@@ -73,8 +73,8 @@ class FileFormat:
 
     def operations(self, file: FileContent) -> Iterable[tuple[str, Operation]]:
         """Yield the operations of a file, each with its tag."""
-        found: Iterable[tuple[str, Operation]] = import_entry(self.read)(file)
-        return found
+        result: Iterable[tuple[str, Operation]] = import_entry(self.read)(file)
+        return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,5 +285,5 @@ def writable_suffixes() -> tuple[str, ...]:
 def import_entry(entry: str) -> Callable[..., Any]:
     """Import the function of an entry ``"package.module:function"``."""
     module, _, name = entry.partition(":")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return found
+    result: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return result

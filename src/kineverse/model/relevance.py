@@ -154,8 +154,8 @@ class SymbolIndex:
 def _symbols_of(value: Frame | Constraint) -> Iterable[Symbol]:
     if isinstance(value, Constraint):
         return value.symbols
-    found: set[Symbol] = set()
+    result: set[Symbol] = set()
     for factor in value.factors:
         if isinstance(factor, Expression):
-            found.update(factor.symbols)
-    return found
+            result.update(factor.symbols)
+    return result

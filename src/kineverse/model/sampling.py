@@ -37,11 +37,11 @@ class StateSamples:
     @cached_property
     def _known(self) -> dict[Symbol, tuple[ModelView, float]]:
         """Model and default value of each symbol."""
-        found: dict[Symbol, tuple[ModelView, float]] = {}
+        result: dict[Symbol, tuple[ModelView, float]] = {}
         for model in self._models:
             for symbol, value in model.default_state().items():
-                found.setdefault(symbol, (model, value))
-        return found
+                result.setdefault(symbol, (model, value))
+        return result
 
     def values_of(self, symbol: Symbol) -> Array:
         """Return the values of a symbol, one for each state."""

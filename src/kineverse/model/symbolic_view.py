@@ -522,5 +522,5 @@ def cached_for_version(model: SymbolicView, key: Hashable, compute: Callable[[],
     kept = model._derived  # an edit replaces it, so that no result of an old version is entered later
     if key not in kept:
         kept[key] = compute()
-    found: Result = kept[key]
-    return found
+    result: Result = kept[key]
+    return result

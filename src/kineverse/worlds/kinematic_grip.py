@@ -121,11 +121,6 @@ class KinematicGrip:
         self._may_hold = True
 
     @property
-    def joints(self) -> tuple[Symbol, ...]:
-        """Coordinates of the fingers."""
-        return self.gripper.joints
-
-    @property
     def held(self) -> str | None:
         """Frame of the held body."""
         return None if self._hold is None else self._hold.body

@@ -82,11 +82,6 @@ class KinematicWorld:
     seed
         Seed of the sensors' noise.
 
-    Attributes
-    ----------
-    timeout
-        The parameter of this name.
-
     Raises
     ------
     MissingDependencyError

@@ -35,15 +35,6 @@ class MechanismWorld:
     jammed
         Coordinates that do not move, by symbol or name.
 
-    Attributes
-    ----------
-    model
-        The model.
-    robot
-        Prefix of what is driven: empty, for all coordinates.
-    jammed
-        Coordinates that do not move.
-
     Raises
     ------
     UnknownNameError

@@ -38,22 +38,23 @@ from .world import Contact, Observation, World
 
 PROFILE = "kineverse"  # profile in the header of a recording
 
+
+def _list_of(items: Any) -> dict[str, Any]:
+    return {"type": "array", "items": items}
+
+
+def _map_to(values: Any) -> dict[str, Any]:
+    return {"type": "object", "additionalProperties": values}
+
+
 _NUMBER: dict[str, Any] = {"type": "number"}
 _TEXT: dict[str, Any] = {"type": "string"}
-_VECTOR = {"type": "array", "items": _NUMBER}
-_NUMBERS = {"type": "object", "additionalProperties": _NUMBER}
-_POSES = {"type": "object", "additionalProperties": {"type": "array", "items": _VECTOR}}
-_CONTACT = {
-    "type": "object",
-    "properties": {
-        "a": _TEXT,
-        "b": _TEXT,
-        "point": _VECTOR,
-        "normal": _VECTOR,
-        "distance": _NUMBER,
-        "force": {"type": ["number", "null"]},
-    },
-}
+_VECTOR = _list_of(_NUMBER)
+_NUMBERS, _POSES = _map_to(_NUMBER), _map_to(_list_of(_VECTOR))
+_CONTACT: dict[str, Any] = {
+    "a": _TEXT, "b": _TEXT, "point": _VECTOR, "normal": _VECTOR, "distance": _NUMBER,
+    "force": {"type": ["number", "null"]},
+}  # fmt: skip
 _ARROW = {"type": "object", "properties": {"origin": _VECTOR, "vector": _VECTOR}}
 
 TOPICS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -61,23 +62,17 @@ TOPICS: dict[str, tuple[str, dict[str, Any]]] = {
     "/state": ("State", {"stamp": _NUMBER, "values": _NUMBERS}),
     "/belief": ("Belief", {"stamp": _NUMBER, "values": _NUMBERS, "poses": _POSES}),
     "/command": ("Command", {"stamp": _NUMBER, "speeds": _NUMBERS}),
-    "/contacts": ("Contacts", {"stamp": _NUMBER, "contacts": {"type": "array", "items": _CONTACT}}),
+    "/contacts": (
+        "Contacts", {"stamp": _NUMBER, "contacts": _list_of({"type": "object", "properties": _CONTACT})}
+    ),
     "/observation": (
         "Observation",
-        {
-            "stamp": _NUMBER,
-            "joints": _NUMBERS,
-            "poses": _POSES,
-            "touching": {"type": "array", "items": _TEXT},
-        },
+        {"stamp": _NUMBER, "joints": _NUMBERS, "poses": _POSES, "touching": _list_of(_TEXT)}
     ),
     "/phase": ("Phase", {"stamp": _NUMBER, "phase": _TEXT}),
-    "/controller": (
-        "Controller",
-        {"stamp": _NUMBER, "vectors": {"type": "object", "additionalProperties": _ARROW}},
-    ),
+    "/controller": ("Controller", {"stamp": _NUMBER, "vectors": _map_to(_ARROW)}),
     "/outcome": ("Outcome", {"done": {"type": "boolean"}, "reason": _TEXT}),
-}
+}  # fmt: skip
 """Topics, with the name of the schema and the properties of its messages."""
 
 _FLUSH = 0.5  # longest time of the world that is lost if the process is killed [s]
@@ -180,9 +175,7 @@ class Recorder:
 
     def write_contacts(self, stamp: float, contacts: Iterable[Contact]) -> None:
         """Write the contacts at a time [s]."""
-        result = [
-            {**{name: _plain(getattr(one, name)) for name in _CONTACT["properties"]}} for one in contacts
-        ]
+        result = [{name: _plain(getattr(one, name)) for name in _CONTACT} for one in contacts]
         self._write("/contacts", stamp, {"contacts": result})
 
     def write_observation(self, stamp: float, observation: Observation) -> None:

@@ -171,36 +171,19 @@ class Sensors:
 
 
 _UNITS = {
-    "mm": ("length", 1e-3),
-    "cm": ("length", 1e-2),
-    "m": ("length", 1.0),
-    "mm/m": ("slope", 1e-3),
-    "cm/m": ("slope", 1e-2),
-    "m/m": ("slope", 1.0),
-    "deg": ("angle", math.pi / 180.0),
-    "°": ("angle", math.pi / 180.0),
-    "rad": ("angle", 1.0),
-    "Hz": ("rate", 1.0),
-    "ms": ("time", 1e-3),
-    "s": ("time", 1.0),
-    "%": ("number", 1e-2),
-    "": ("number", 1.0),
-}
+    "mm": ("length", 1e-3), "cm": ("length", 1e-2), "m": ("length", 1.0), "mm/m": ("slope", 1e-3),
+    "cm/m": ("slope", 1e-2), "m/m": ("slope", 1.0), "deg": ("angle", math.pi / 180.0),
+    "°": ("angle", math.pi / 180.0), "rad": ("angle", 1.0), "Hz": ("rate", 1.0), "ms": ("time", 1e-3),
+    "s": ("time", 1.0), "%": ("number", 1e-2), "": ("number", 1.0),
+}  # fmt: skip
 """Units with their dimension and factor."""
 
 _NAMED: dict[str, tuple[str, str | None]] = {
-    "drop": ("drop", ""),
-    "outliers": ("outliers", ""),
-    "reach": ("reach", "m"),
-    "delay": ("delay", "ms"),
-    "encoders": ("encoders", ""),
-    "odometry": ("odometry", "mm/m"),
-    "turn": ("turn", "deg"),
-    "touch_gap": ("touch_gap", "mm"),
-    "touch_force": ("touch_force", ""),
-    "camera": ("camera", None),
+    "drop": ("drop", ""), "outliers": ("outliers", ""), "reach": ("reach", "m"), "delay": ("delay", "ms"),
+    "encoders": ("encoders", ""), "odometry": ("odometry", "mm/m"), "turn": ("turn", "deg"),
+    "touch_gap": ("touch_gap", "mm"), "touch_force": ("touch_force", ""), "camera": ("camera", None),
     "fov": ("field_of_view", "deg"),
-}
+}  # fmt: skip
 """Names of entries: the setting, and the unit in which it is printed; None for text."""
 
 _WORDS = {"sight": ("sight", True), "notouch": ("touch", False)}

@@ -1,9 +1,9 @@
 """Cramér-Rao bounds of joint parameters by finite differences, independent of the estimator.
 
 Seen are both poses. Unknown are the axis and its place, the child's pose, and for each observation the parent's true
-pose (6) and the joint value (1), last. With joint values as unknowns of their own this is the Cramér-Rao bound. Where
+pose (6) and the joint value (1), last. With joint values as further unknowns this is the Cramér-Rao bound. Where
 a motion is short beside the noise nobody reaches it, as there are as many unknowns as observations: the bound of joint
-values that are drawn from a Gaussian of known width is what can be reached then.
+values drawn from a Gaussian of known width is attainable then.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from synthetic_recordings import Array, Recording, transform
 STEP = 1e-5
 
 
-def direction_bound(seen: Recording, family: str, width: float | None = None) -> float:
+def direction_bound(data: Recording, family: str, width: float | None = None) -> float:
     """Return the least root mean square angle of the axis [rad]; joint values have that width, or any."""
-    covariance = covariance_bound(seen, family, width)
+    covariance = covariance_bound(data, family, width)
     return float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
 
 
-def covariance_bound(seen: Recording, family: str, width: float | None = None) -> Array:
+def covariance_bound(data: Recording, family: str, width: float | None = None) -> Array:
     """Return the least covariance: two turns of the axis, two shifts of it, the child's pose in the joint's frame."""
     shared = 10 if family == "revolute" else 8
-    deviation = np.sqrt(np.tile(np.diag(seen.covariance), 2))
+    deviation = np.sqrt(np.tile(np.diag(data.covariance), 2))
     information = np.zeros((shared, shared))
-    for k, parent in enumerate(seen.true_parent):
-        value = float(seen.values[k, 0])
-        truth = _poses(seen, family, parent, value, np.zeros(shared + 7))
+    for k, parent in enumerate(data.true_parent):
+        value = float(data.values[k, 0])
+        truth = _poses(data, family, parent, value, np.zeros(shared + 7))
         columns = []
         for i in range(shared + 7):
             change = np.zeros(shared + 7)
             change[i] = STEP
-            there, back = (_poses(seen, family, parent, value, sign * change) for sign in (1, -1))
+            there, back = (_poses(data, family, parent, value, sign * change) for sign in (1, -1))
             columns.append((_apart(there, truth) - _apart(back, truth)) / (2 * STEP))
         whitened = np.column_stack(columns) / deviation[:, None]
         if width is not None:
@@ -53,7 +53,7 @@ def covariance_bound(seen: Recording, family: str, width: float | None = None) -
     return np.linalg.inv(information + 1e-9 * np.eye(shared))
 
 
-def _poses(seen: Recording, family: str, parent: Array, value: float, change: Array) -> Array:
+def _poses(data: Recording, family: str, parent: Array, value: float, change: Array) -> Array:
     """Return both poses if the unknowns are off by so much, (2, 4, 4)."""
     turn = Rotation.from_rotvec([change[0], change[1], 0.0])
     shift, rest = (change[2:4], change[4:]) if family == "revolute" else (np.zeros(2), change[2:])
@@ -61,11 +61,11 @@ def _poses(seen: Recording, family: str, parent: Array, value: float, change: Ar
     moved = np.zeros(6)
     moved[5 if family == "revolute" else 2] = value + rest[12]
     motion = transform(Rotation.from_rotvec(moved[3:]), moved[:3])
-    child = transform(Rotation.from_rotvec(rest[3:6]), rest[:3]) @ seen.right
+    child = transform(Rotation.from_rotvec(rest[3:6]), rest[:3]) @ data.right
     there = parent.copy()
     there[:3, 3] += rest[6:9]
     there[:3, :3] = Rotation.from_rotvec(rest[9:12]).as_matrix() @ parent[:3, :3]
-    return np.stack([there, there @ seen.left @ joint @ motion @ child])
+    return np.stack([there, there @ data.left @ joint @ motion @ child])
 
 
 def _apart(poses: Array, others: Array) -> Array:

@@ -58,43 +58,43 @@ def seen_along(path: str, seed: int, rows: int, count: int = 36) -> Array:
 @pytest.mark.parametrize("rows", [6, 3], ids=["poses", "positions"])
 @pytest.mark.parametrize("path", PATHS)
 def test_a_curve_is_never_identified_as_a_joint(path: str, rows: int) -> None:
-    found = identify(None, seen_along(path, 0, rows, count=24), noise=COVARIANCE)
-    assert found.is_ambiguous or found.best.family == "curve"
+    identified = identify(None, seen_along(path, 0, rows, count=24), noise=COVARIANCE)
+    assert identified.is_ambiguous or identified.best.family == "curve"
     if path != "garage window":  # whose ellipse is nearly a circle
-        assert found.best.family == "curve"
+        assert identified.best.family == "curve"
 
 
 @pytest.mark.parametrize(("path", "rows"), [("cosine", 3), ("free hand", 3)])
 def test_a_curve_by_unknown_noise_is_never_identified_as_a_joint(path: str, rows: int) -> None:
-    found = identify(None, seen_along(path, 2, rows, count=16))
-    assert found.is_ambiguous or found.best.family == "curve"
+    identified = identify(None, seen_along(path, 2, rows, count=16))
+    assert identified.is_ambiguous or identified.best.family == "curve"
 
 
 def test_identify_of_few_poses_along_a_curve_is_ambiguous() -> None:
     for path in ("cosine", "free hand"):
-        found = identify(None, seen_along(path, 2, 6, count=9), noise=COVARIANCE)
-        assert found.is_ambiguous or found.best.family == "curve"
+        identified = identify(None, seen_along(path, 2, 6, count=9), noise=COVARIANCE)
+        assert identified.is_ambiguous or identified.best.family == "curve"
 
 
 def test_a_curve_is_found_in_any_order_and_any_unit() -> None:
-    seen = seen_along("cosine", 3, 6, count=24)
-    shuffled = np.random.default_rng(0).permutation(seen)
-    found = identify(None, shuffled, noise=COVARIANCE)
-    assert (found.best.family, found.is_ambiguous) == ("curve", False)
-    assert found.misfit == pytest.approx(1.0, abs=0.2)
+    data = seen_along("cosine", 3, 6, count=24)
+    shuffled = np.random.default_rng(0).permutation(data)
+    identified = identify(None, shuffled, noise=COVARIANCE)
+    assert (identified.best.family, identified.is_ambiguous) == ("curve", False)
+    assert identified.misfit == pytest.approx(1.0, abs=0.2)
     longer = shuffled.copy()
     longer[:, :3, 3] *= 100.0
     fit = identify(None, longer, noise=pose_covariance(100.0 * POSITION, ORIENTATION)).best
     np.testing.assert_allclose(fit.poses[:, :3, 3], longer[:, :3, 3], atol=4 * 100.0 * POSITION)
-    np.testing.assert_allclose(np.ptp(fit.range), 100.0 * np.ptp(found.best.range), rtol=0.05)
+    np.testing.assert_allclose(np.ptp(fit.range), 100.0 * np.ptp(identified.best.range), rtol=0.05)
 
 
 def test_a_curve_is_found_among_outliers() -> None:
-    seen, wrong = seen_along("cosine", 4, 6, count=20), [3, 11, 16]
-    seen[wrong, :3, 3] += [0.7, -0.5, 0.6]
-    found = identify(None, seen, noise=COVARIANCE, outliers=True)
-    assert found.best.family == "curve"
-    assert found.best.outliers == tuple(wrong)
+    data, wrong = seen_along("cosine", 4, 6, count=20), [3, 11, 16]
+    data[wrong, :3, 3] += [0.7, -0.5, 0.6]
+    identified = identify(None, data, noise=COVARIANCE, outliers=True)
+    assert identified.best.family == "curve"
+    assert identified.best.outliers == tuple(wrong)
 
 
 @pytest.mark.parametrize("rows", [6, 3])
@@ -146,31 +146,31 @@ def test_derivatives_of_a_curve_are_those_of_its_poses(rows: int) -> None:
 
 
 def test_other_families_keep_their_odds_beside_the_curve() -> None:
-    seen = recording("revolute", count=12, position=0.02, orientation=0.05, seed=5)
+    data = recording("revolute", count=12, position=0.02, orientation=0.05, seed=5)
     families = ["rigid", "prismatic", "revolute", "screw", "cylindrical", "spherical", "planar", "free"]
-    with_curve = identify(seen.parent, seen.child, noise=seen.covariance).probabilities
-    without = identify(seen.parent, seen.child, noise=seen.covariance, families=families).probabilities
+    with_curve = identify(data.parent, data.child, noise=data.covariance).probabilities
+    without = identify(data.parent, data.child, noise=data.covariance, families=families).probabilities
     for name in families:
         assert with_curve[name] / with_curve["revolute"] == pytest.approx(without[name] / without["revolute"])
 
 
 def test_a_curve_takes_five_poses() -> None:
-    seen = seen_along("cosine", 7, 6, count=4)
+    data = seen_along("cosine", 7, 6, count=4)
     with pytest.raises(InvalidValueError, match="5 poses"):
-        identify(None, seen, noise=COVARIANCE, families="curve")
-    assert "curve" not in identify(None, seen, noise=COVARIANCE).probabilities
+        identify(None, data, noise=COVARIANCE, families="curve")
+    assert "curve" not in identify(None, data, noise=COVARIANCE).probabilities
     with pytest.raises(InvalidValueError, match="not equal"):
-        identify(None, np.tile(seen[:1], (8, 1, 1)), families="curve")
+        identify(None, np.tile(data[:1], (8, 1, 1)), families="curve")
 
 
 def test_identifier_finds_the_curve_of_identify() -> None:
-    seen = np.random.default_rng(0).permutation(seen_along("cosine", 8, 6, count=22))
+    data = np.random.default_rng(0).permutation(seen_along("cosine", 8, 6, count=22))
     identifier = Identifier(noise=COVARIANCE)
-    for k, pose in enumerate(seen, start=1):
+    for k, pose in enumerate(data, start=1):
         identifier.add(None, pose)
         if k in (20, 22):
-            found = identifier.result
-            assert found.best.family == "curve"
-            assert len(found.best.joint_values) == k
-    whole = identify(None, seen, noise=COVARIANCE)
-    np.testing.assert_allclose(found.best.poses[:, :3, 3], whole.best.poses[:, :3, 3], atol=3 * POSITION)
+            identified = identifier.result
+            assert identified.best.family == "curve"
+            assert len(identified.best.joint_values) == k
+    whole = identify(None, data, noise=COVARIANCE)
+    np.testing.assert_allclose(identified.best.poses[:, :3, 3], whole.best.poses[:, :3, 3], atol=3 * POSITION)

@@ -1,4 +1,4 @@
-"""Invalid and uninformative input of identification."""
+"""Invalid, uninformative and degenerate input of identification."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from synthetic_recordings import recording
 
 import kineverse as kv
 from kineverse.estimation import Identifier, identify, pose_covariance
+from kineverse.estimation.identification import marginal_likelihood
+from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
+from kineverse.estimation.identification.observations import check_observations
 
 NOISE = pose_covariance(0.01, 0.02)
 SEEN = recording("revolute", count=6, position=0.01, orientation=0.02, seed=0)
@@ -65,34 +68,34 @@ def test_identify_refuses_invalid_covariances_and_families() -> None:
 
 @pytest.mark.parametrize("count", [2, 3, 10])
 def test_identical_poses_are_rigid_and_determine_no_axis(count: int) -> None:
-    found = identify(
+    identified = identify(
         np.tile(SEEN.parent[0], (count, 1, 1)), np.tile(SEEN.child[0], (count, 1, 1)), noise=NOISE
     )
-    assert found.best.family == "rigid"
-    assert not found["revolute"].is_determined
-    assert all(np.isfinite(fit.log_evidence) for fit in found)
+    assert identified.best.family == "rigid"
+    assert not identified["revolute"].is_determined
+    assert all(np.isfinite(fit.log_evidence) for fit in identified)
 
 
 def test_two_poses_leave_doubt() -> None:
-    found = identify(SEEN.parent[:2], SEEN.child[:2], noise=NOISE)
-    assert found.is_ambiguous or found.best.probability < 1.0
-    assert str(found)
+    identified = identify(SEEN.parent[:2], SEEN.child[:2], noise=NOISE)
+    assert identified.is_ambiguous or identified.best.probability < 1.0
+    assert str(identified)
 
 
 def test_positions_distinguish_a_circle_from_a_line() -> None:
     for family in ("revolute", "prismatic"):
-        seen = recording(family, count=25, position=0.003, orientation=0.003, seed=2)
-        found = identify(seen.parent, seen.child[:, :3, 3], noise=seen.covariance)
-        assert found.best.family == family
+        data = recording(family, count=25, position=0.003, orientation=0.003, seed=2)
+        identified = identify(data.parent, data.child[:, :3, 3], noise=data.covariance)
+        assert identified.best.family == family
         with pytest.raises(kv.errors.InvalidValueError, match="Only positions"):
-            found.best.operation("door", "body")
+            identified.best.operation("door", "body")
 
 
 def test_identify_without_parent_poses_has_the_world_as_parent() -> None:
-    seen = recording("revolute", count=15, position=0.005, orientation=0.01, seed=5)
-    known = np.linalg.inv(seen.true_parent) @ seen.child
-    found = identify(None, known, noise=seen.covariance)
-    assert found.best.family == "revolute"
+    data = recording("revolute", count=15, position=0.005, orientation=0.01, seed=5)
+    known = np.linalg.inv(data.true_parent) @ data.child
+    identified = identify(None, known, noise=data.covariance)
+    assert identified.best.family == "revolute"
 
 
 def test_a_refused_pose_leaves_an_identifier_unchanged() -> None:
@@ -112,19 +115,19 @@ def test_a_refused_pose_leaves_an_identifier_unchanged() -> None:
 @pytest.mark.parametrize("count", [2, 3])
 def test_a_fit_with_as_many_unknowns_as_measurements_is_not_determined(count: int) -> None:
     """Two positions are on a line and three on a circle, however the part moves."""
-    seen = recording("free", count=count, position=0.003, orientation=0.003, seed=2)
-    found = identify(None, seen.true_relative[:, :3, 3], noise=seen.covariance)
-    assert found.is_ambiguous
-    assert not found["prismatic" if count == 2 else "revolute"].is_determined
+    data = recording("free", count=count, position=0.003, orientation=0.003, seed=2)
+    identified = identify(None, data.true_relative[:, :3, 3], noise=data.covariance)
+    assert identified.is_ambiguous
+    assert not identified["prismatic" if count == 2 else "revolute"].is_determined
 
 
 @pytest.mark.parametrize("stated", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_repeated_observations_count_once_with_their_correlation_time(stated: bool) -> None:
     """Each observation five times, with a correlation time of five, is as good as each once."""
-    seen = recording("revolute", count=20, position=0.005, orientation=0.01, seed=6)
-    noise = seen.covariance if stated else None
-    once = identify(seen.parent, seen.child, noise=noise)
-    parents, children = np.repeat(seen.parent, 5, axis=0), np.repeat(seen.child, 5, axis=0)
+    data = recording("revolute", count=20, position=0.005, orientation=0.01, seed=6)
+    noise = data.covariance if stated else None
+    once = identify(data.parent, data.child, noise=noise)
+    parents, children = np.repeat(data.parent, 5, axis=0), np.repeat(data.child, 5, axis=0)
     five = identify(parents, children, noise=noise, correlation_time=5.0)
     sure = identify(parents, children, noise=noise)
     if not stated:
@@ -138,3 +141,44 @@ def test_repeated_observations_count_once_with_their_correlation_time(stated: bo
     for wrong in (0.5, np.nan, np.inf):
         with pytest.raises(kv.errors.InvalidValueError, match="at least 1"):
             identify(parents, children, noise=noise, correlation_time=wrong)
+
+
+LINE = np.arange(20)[:, None] * [0.0, 0.0, 1.0]
+POSITIONS = {
+    "on a line": LINE,
+    "on a short line": 1e-3 * LINE,
+    "on a long line": 1e4 * LINE,
+    "in one place": np.full((10, 3), 0.1),
+    "two": LINE[:2],
+}
+
+
+def poses(positions):
+    made = np.tile(np.eye(4), (len(positions), 1, 1))
+    made[:, :3, 3] = positions
+    return made
+
+
+@pytest.mark.parametrize("where", POSITIONS)
+@pytest.mark.parametrize("whole", [True, False], ids=["poses", "positions"])
+def test_identify_of_degenerate_positions_is_finite(where, whole):
+    data = poses(POSITIONS[where]) if whole else POSITIONS[where]
+    identified = identify(None, data, noise=pose_covariance(0.01, 0.09))
+    for fit in identified:
+        assert np.isfinite(fit.log_evidence)
+        assert np.isfinite(fit.covariance).all()
+        assert (np.diag(fit.covariance) >= 0).all()
+    if where.startswith("on a l"):
+        assert identified.best.family == "prismatic"
+    if where == "in one place":
+        assert identified.is_ambiguous or identified.best.family == "rigid"
+
+
+@pytest.mark.parametrize("family", ["revolute", "screw"])
+def test_marginal_likelihood_of_three_positions_is_finite(family):
+    data = recording("spherical", count=3, position=0.1, orientation=0.02, seed=3)
+    problem = check_observations(data.parent, data.child[:, :3, 3], data.covariance, data.covariance)
+    likeliest = marginal_likelihood.maximum_likelihood(
+        problem, [*initial_guesses(family, MotionStatistics(problem))]
+    ).solution
+    assert np.isfinite(marginal_likelihood.maximise_marginal_likelihood(problem, likeliest).log_evidence)

@@ -59,14 +59,14 @@ def test_custom_parameters_agree_with_scipys_least_squares(
         return np.asarray(function.batch(rows))
 
     true = np.array([truth[name] for name in names])
-    seen = noisy(poses(true, values), position, orientation, np.random.default_rng(3))
-    fit = identify(None, seen, noise=pose_covariance(position, orientation), families=[family]).best
+    data = noisy(poses(true, values), position, orientation, np.random.default_rng(3))
+    fit = identify(None, data, noise=pose_covariance(position, orientation), families=[family]).best
     start, spread = np.array([(u.start, u.deviation) for u in family.unknowns.values()]).T
 
     def errors(unknown: Array) -> Array:
         model = poses(unknown[: len(names)], unknown[len(names) :])
-        turned = Rotation.from_matrix(seen[:, :3, :3] @ np.swapaxes(model[:, :3, :3], 1, 2)).as_rotvec()
-        off = (seen[:, :3, 3] - model[:, :3, 3]) / position
+        turned = Rotation.from_matrix(data[:, :3, :3] @ np.swapaxes(model[:, :3, :3], 1, 2)).as_rotvec()
+        off = (data[:, :3, 3] - model[:, :3, 3]) / position
         return np.concatenate(
             [off.ravel(), turned.ravel() / orientation, (unknown[: len(names)] - start) / spread]
         )
@@ -74,13 +74,13 @@ def test_custom_parameters_agree_with_scipys_least_squares(
     best = least_squares(errors, np.concatenate([true, values]), x_scale="jac", xtol=1e-12, ftol=1e-12)
     covariance = np.linalg.inv(best.jac.T @ best.jac)[: len(names), : len(names)]
     deviations = np.sqrt(np.diag(covariance))
-    found = np.array([fit.parameters[name] for name in names])
+    result = np.array([fit.parameters[name] for name in names])
     # Joint values are integrated out instead of being estimated, which moves the optimum a little.
-    assert np.all(np.abs(found - best.x[: len(names)]) < 0.1 * deviations)
+    assert np.all(np.abs(result - best.x[: len(names)]) < 0.1 * deviations)
     np.testing.assert_allclose(fit.joint_values[:, 0], best.x[len(names) :], atol=0.2 * orientation)
     assert fit.covariance == pytest.approx(covariance, abs=0.05 * float(np.max(covariance)))
     assert [fit.deviation(name) for name in names] == pytest.approx(deviations, rel=0.05)
-    off = found - true
+    off = result - true
     assert float(off @ np.linalg.solve(covariance, off)) < 18.5  # χ² of four, once in a thousand
 
 
@@ -89,15 +89,15 @@ HINGE = Cell("revolute", POSITION, ORIENTATION, count=20, range=math.pi / 2)
 
 
 def test_hinge_agrees_with_scipys_maximum_likelihood() -> None:
-    """Beside scipy with all true poses as unknowns: 152 of them, and 240 numbers that were seen."""
+    """Compared with scipy with all true poses as unknowns: 152 of them, and 240 observed numbers."""
     samples = draw_samples(HINGE, 1, np.random.default_rng(1))
     noise = pose_covariance(POSITION, ORIENTATION)
     scale = np.array([1.0 / POSITION] * 3 + [1.0 / ORIENTATION] * 3)
     for parents, children in zip(samples.seen_parents, samples.seen_children, strict=True):
         fit = identify(parents, children, noise=noise, families=["revolute"]).best
 
-        def errors(unknown: Array, seen: tuple[Array, Array] = (parents, children)) -> Array:
-            parents, children = seen
+        def errors(unknown: Array, data: tuple[Array, Array] = (parents, children)) -> Array:
+            parents, children = data
             left, right = as_pose(unknown[:6]), as_pose(unknown[6:12])
             turns = as_pose(np.column_stack([np.zeros((20, 5)), unknown[12:32]]))
             true = parents @ as_pose(unknown[32:].reshape(20, 6))
@@ -170,10 +170,10 @@ def test_hinge_errors_agree_with_published_maximum_likelihood(count: int) -> Non
     relative = np.linalg.inv(samples.parents) @ samples.seen_children
     noise = pose_covariance(POSITION, ORIENTATION)
     degrees, metres = [], []
-    for seen, axis, point in zip(relative, samples.axis, samples.point, strict=True):
-        found = identify(None, seen, noise=noise, families=["revolute"]).best.parameters
-        degrees.append(turned_by(axis, found["axis"]))
-        metres.append(lines_apart(axis, point, found["axis"], found["point"]))
+    for data, axis, point in zip(relative, samples.axis, samples.point, strict=True):
+        result = identify(None, data, noise=noise, families=["revolute"]).best.parameters
+        degrees.append(turned_by(axis, result["axis"]))
+        metres.append(lines_apart(axis, point, result["axis"], result["point"]))
     assert np.mean(degrees) < 1.05 * 1.74
     assert np.mean(metres) < 1.05 * 0.013
 

@@ -17,7 +17,7 @@ from kineverse.estimation.identification.observations import check_observations
 
 REPEATS = 40
 
-# Family, how far it goes, position noise [m], orientation noise [rad], and how often it is seen.
+# Family, how far it goes, position noise [m], orientation noise [rad], and number of observations.
 CLEAR = [
     ("revolute", math.pi / 2, 0.03, math.radians(3.0), 20),
     pytest.param(("revolute", math.pi / 4, 0.001, math.radians(1.0), 10), marks=pytest.mark.long),
@@ -85,21 +85,21 @@ def test_errors_of_short_motions_reach_the_attainable_bound(case: tuple) -> None
 def test_a_motion_within_the_noise_is_rigid_or_ambiguous() -> None:
     """A criterion that counts joint values as parameters would say something else, with ever more poses."""
     for seed in range(3):
-        seen = recording("rigid", count=80, position=0.03, orientation=0.05, seed=seed)
-        found = identify(seen.parent, seen.child, noise=seen.covariance)
-        assert found["rigid"].probability > 0.5
+        data = recording("rigid", count=80, position=0.03, orientation=0.05, seed=seed)
+        result = identify(data.parent, data.child, noise=data.covariance)
+        assert result["rigid"].probability > 0.5
         short = recording("prismatic", count=80, position=0.03, orientation=0.02, seed=seed, extent=0.004)
-        found = identify(short.parent, short.child, noise=short.covariance)
-        assert found.is_ambiguous or found.best.family in ("rigid", "prismatic")
-        assert not found["prismatic"].is_determined
+        result = identify(short.parent, short.child, noise=short.covariance)
+        assert result.is_ambiguous or result.best.family in ("rigid", "prismatic")
+        assert not result["prismatic"].is_determined
 
 
 def test_families_are_distinguished() -> None:
     wrong = 0
     for seed in range(10):
         for family, extent in (("revolute", math.pi / 4), ("prismatic", 0.4)):
-            seen = recording(family, count=20, position=0.01, orientation=0.03, seed=seed, extent=extent)
-            wrong += identify(seen.parent, seen.child, noise=seen.covariance).best.family != family
+            data = recording(family, count=20, position=0.01, orientation=0.03, seed=seed, extent=extent)
+            wrong += identify(data.parent, data.child, noise=data.covariance).best.family != family
     assert wrong == 0
 
 
@@ -107,27 +107,27 @@ def test_rigid_evidence_agrees_with_the_integral() -> None:
     """Positions of a child that does not move, of a world that is known: a Gaussian integral in each direction."""
     random = np.random.default_rng(0)
     count, sigma = 7, 0.02
-    seen = random.normal(0.3, sigma, (count, 3))
+    data = random.normal(0.3, sigma, (count, 3))
     covariance = sigma**2 * np.eye(3)
-    problem = check_observations(None, seen, covariance, covariance)
-    found = solve_families(problem, ["rigid"])["rigid"].log_evidence
+    problem = check_observations(None, data, covariance, covariance)
+    result = solve_families(problem, ["rigid"])["rigid"].log_evidence
     grid = np.linspace(0.1, 0.5, 4001)
     expected = 0.0
     for axis in range(3):
-        off = (seen[:, axis, None] - grid) / sigma
+        off = (data[:, axis, None] - grid) / sigma
         density = np.exp(-0.5 * np.sum(off**2, axis=0)) / (math.sqrt(2 * math.pi) * sigma) ** count
         expected += math.log(np.trapezoid(density, grid))
-    assert found == pytest.approx(expected, abs=1e-6)
+    assert result == pytest.approx(expected, abs=1e-6)
 
 
 def test_range_evidence_agrees_with_the_integral_over_the_width() -> None:
     random = np.random.default_rng(1)
     values, noise = random.normal(0.0, 0.1, 30), 0.05
     motion = GroupMotion(JOINT_FAMILIES["prismatic"], 6, np.eye(4), np.eye(4))
-    found = fit_joint_ranges(motion, PerObservation(values[:, None], np.full((30, 1, 1), noise**2), 0.0))
-    assert found.deviations[0] == pytest.approx(0.1, rel=0.4)
-    about_the_mean = 30 / (found.deviations[0] ** 2 + noise**2)
-    ours = found.log_density + 0.5 * math.log(2 * math.pi / about_the_mean)
+    result = fit_joint_ranges(motion, PerObservation(values[:, None], np.full((30, 1, 1), noise**2), 0.0))
+    assert result.deviations[0] == pytest.approx(0.1, rel=0.4)
+    about_the_mean = 30 / (result.deviations[0] ** 2 + noise**2)
+    ours = result.log_density + 0.5 * math.log(2 * math.pi / about_the_mean)
     assert ours == pytest.approx(log_integral(values, noise), abs=0.1)
 
 
@@ -141,9 +141,9 @@ def log_integral(values: np.ndarray, noise: float) -> float:
 
 
 def test_noise_is_estimated_without_a_stated_covariance() -> None:
-    seen = recording("revolute", count=60, position=0.02, orientation=math.radians(4.0), seed=3)
-    found = identify(seen.parent, seen.child)
-    assert found.best.family == "revolute"
-    assert found.noise == pytest.approx((0.02, math.radians(4.0)), rel=0.35)
-    known = identify(seen.parent, seen.child, noise=pose_covariance(0.02, math.radians(4.0)))
-    assert found.best.deviation("axis.x") == pytest.approx(known.best.deviation("axis.x"), rel=0.4)
+    data = recording("revolute", count=60, position=0.02, orientation=math.radians(4.0), seed=3)
+    result = identify(data.parent, data.child)
+    assert result.best.family == "revolute"
+    assert result.noise == pytest.approx((0.02, math.radians(4.0)), rel=0.35)
+    known = identify(data.parent, data.child, noise=pose_covariance(0.02, math.radians(4.0)))
+    assert result.best.deviation("axis.x") == pytest.approx(known.best.deviation("axis.x"), rel=0.4)

@@ -1,16 +1,26 @@
-"""Kinematic graphs of known models from noisy poses."""
+"""Kinematic graphs of known models from noisy poses, and their spanning trees."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.special import logsumexp
 from synthetic_recordings import noisy
 
 import kineverse as kv
 from kineverse.estimation import identify_graph, pose_covariance
+from kineverse.estimation.identification.kinematic_graph.graph import (
+    edge_probabilities,
+    orient_tree,
+    replacement_probabilities,
+    spanning_tree,
+    split_tree,
+    tree_path,
+)
 
 Array = npt.NDArray[np.float64]
 POSITION, ORIENTATION = 0.003, 0.008
@@ -18,7 +28,7 @@ NOISE = pose_covariance(POSITION, ORIENTATION)
 SOME = ("rigid", "prismatic", "revolute", "planar", "free")
 
 
-def seen(model: kv.Model, frames: list[str], count: int, seed: int, reach: float = 1.0) -> dict[str, Array]:
+def data(model: kv.Model, frames: list[str], count: int, seed: int, reach: float = 1.0) -> dict[str, Array]:
     """Return noisy poses of frames while all coordinates move at random."""
     random = np.random.default_rng(seed)
     symbols = model.degrees_of_freedom
@@ -60,7 +70,7 @@ PARTS = ["handle", "drawer", "door", "sticker", "cart"]
 
 @pytest.fixture(scope="module")
 def poses(cart: kv.Model) -> dict[str, Array]:
-    return seen(cart, PARTS, 40, 0)
+    return data(cart, PARTS, 40, 0)
 
 
 def test_identify_graph_finds_the_tree_of_a_cart(poses: dict[str, Array]) -> None:
@@ -92,17 +102,17 @@ def test_model_of_a_graph_moves_as_the_true_model(cart: kv.Model, poses: dict[st
         ("door", "cart"),
         ("cart", "drawer"),
     ]
-    model = graph.model(prefix="seen")
-    assert {f"seen/{part}" for part in PARTS} <= set(model.frames)
-    assert model.articulations["seen/door"].kind == "floating"
+    model = graph.model(prefix="learned")
+    assert {f"learned/{part}" for part in PARTS} <= set(model.frames)
+    assert model.articulations["learned/door"].kind == "floating"
     truth = kv.compile([cart.fk("handle", "cart"), cart.fk("sticker", "cart")], cart.degrees_of_freedom)
     random = np.random.default_rng(0)
     points = random.uniform(0.0, 1.0, (40, len(cart.degrees_of_freedom)))
     for k in (0, 17):
-        values = {f"seen/{edge.child}": float(edge.fit.joint_values[k, 0]) for edge in graph.edges}
+        values = {f"learned/{edge.child}": float(edge.fit.joint_values[k, 0]) for edge in graph.edges}
         handle, sticker = truth(points[k])
-        assert np.allclose(model.fk("seen/handle", "seen/cart")(kv.State(values)), handle, atol=0.02)
-        assert np.allclose(model.fk("seen/sticker", "seen/cart")(kv.State(values)), sticker, atol=0.02)
+        assert np.allclose(model.fk("learned/handle", "learned/cart")(kv.State(values)), handle, atol=0.02)
+        assert np.allclose(model.fk("learned/sticker", "learned/cart")(kv.State(values)), sticker, atol=0.02)
 
 
 def linkage() -> kv.Model:
@@ -124,7 +134,7 @@ def linkage() -> kv.Model:
 
 
 def test_identify_graph_finds_the_loop_of_a_linkage() -> None:
-    poses = seen(linkage(), ["crank", "coupler", "rocker"], 40, 1, reach=2.0)
+    poses = data(linkage(), ["crank", "coupler", "rocker"], 40, 1, reach=2.0)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
     connected = {frozenset((e.parent, e.child)) for e in (*graph.edges, *graph.loops)}
     ring = ["world", "crank", "coupler", "rocker", "world"]
@@ -140,7 +150,7 @@ def test_a_telescope_is_connected_by_small_motions_and_few_poses_are_ambiguous(s
         edit.apply(kv.Prismatic(name="inner", parent="world", child="inner", axis=(1, 0, 0)))
         edit.apply(kv.Prismatic(name="outer", parent="inner", child="outer", axis=(1, 0, 0)))
     sure, unsure = (
-        identify_graph(seen(model, ["inner", "outer"], count, seed, reach=0.3), noise=NOISE, families=SOME)
+        identify_graph(data(model, ["inner", "outer"], count, seed, reach=0.3), noise=NOISE, families=SOME)
         for count in (40, 4)
     )
     assert [(e.parent, e.child) for e in sure.edges] == [("world", "inner"), ("inner", "outer")]
@@ -159,7 +169,7 @@ def test_a_telescope_is_connected_by_small_motions_and_few_poses_are_ambiguous(s
 def test_independent_drawers_and_doors_close_no_loop() -> None:
     kitchen = kv.load("kitchen")
     frames = ["kitchen/fridge_door_handle", "kitchen/oven_left_drawer", "kitchen/oven_right_drawer"]
-    graph = identify_graph(seen(kitchen, frames, 40, 2, reach=0.4), noise=NOISE, families=SOME)
+    graph = identify_graph(data(kitchen, frames, 40, 2, reach=0.4), noise=NOISE, families=SOME)
     assert {(e.parent, e.child) for e in graph.edges} == {("world", frame) for frame in frames}
     assert graph.loops == ()
 
@@ -208,8 +218,8 @@ def test_a_free_point_is_a_sliding_point() -> None:
     random = np.random.default_rng(0)
     places = {"fly": random.uniform(-1.0, 1.0, (30, 3)), "ant": random.uniform(-1.0, 1.0, (30, 3))}
     places["ant"][:, 2] = 0.3
-    seen = {part: place + random.normal(0.0, POSITION, place.shape) for part, place in places.items()}
-    graph = identify_graph(seen, noise=NOISE, families=SOME)
+    data = {part: place + random.normal(0.0, POSITION, place.shape) for part, place in places.items()}
+    graph = identify_graph(data, noise=NOISE, families=SOME)
     assert {(e.parent, e.child, e.fit.family) for e in graph.edges} == {
         ("world", "fly", "free"),
         ("world", "ant", "planar"),
@@ -218,8 +228,8 @@ def test_a_free_point_is_a_sliding_point() -> None:
     assert {str(s) for s in model.degrees_of_freedom} == {"fly/x", "fly/y", "fly/z", "ant/x", "ant/y"}
     for edge in graph.edges:
         values = dict(zip((f"{edge.child}/{c}" for c in "xyz"), edge.fit.joint_values[7], strict=False))
-        found = model.fk(edge.child)[:3, 3](values)
-        assert np.allclose(found, places[edge.child][7], atol=5.0 * POSITION)
+        result = model.fk(edge.child)[:3, 3](values)
+        assert np.allclose(result, places[edge.child][7], atol=5.0 * POSITION)
         everywhere = {str(x): value for x, value in model.default_state().items()} | values
         assert not model.violations(everywhere)
 
@@ -230,7 +240,7 @@ def test_identify_graph_refuses_points_only(poses: dict[str, Array]) -> None:
         identify_graph(points, noise=NOISE, world=False)
     with pytest.raises(kv.errors.InvalidValueError, match="say as_point=True"):
         identify_graph(points, noise=NOISE).edges[0].fit.operation("cart", "world")
-    # What never was seen together with a pose floats by itself.
+    # A point that was never observed together with a pose floats by itself.
     apart = {"cart": poses["cart"].copy(), "door": points["door"].copy()}
     apart["cart"][:20], apart["door"][20:] = np.nan, np.nan
     graph = identify_graph(apart, noise=NOISE, families=SOME, world=False)
@@ -265,3 +275,120 @@ def test_identify_graph_refuses_invalid_input(poses: dict[str, Array]) -> None:
     broken[5, 1, 1] = np.inf
     with pytest.raises(kv.errors.InvalidValueError, match="Pose 5"):
         identify_graph({"cart": broken}, noise=NOISE)
+
+
+Gains = dict[frozenset[int], float]
+
+
+def all_gains(count: int, spread: float, seed: int, missing: int = 0) -> Gains:
+    """Return gains of all connections but some."""
+    random = np.random.default_rng(seed)
+    gains = {frozenset(pair): float(random.normal(0.0, spread)) for pair in combinations(range(count), 2)}
+    left_out = random.permutation(len(gains))[:missing]
+    return {c: gain for k, (c, gain) in enumerate(gains.items()) if k not in left_out}
+
+
+def all_trees(gains: Gains) -> dict[tuple[frozenset[int], ...], float]:
+    """Return the logarithms of the weights of all trees, or forests of as many connections as there can be."""
+    nodes = {node for c in gains for node in c}
+    most = len(spanning_tree(nodes, gains))
+    result = {}
+    for chosen in combinations(gains, most):
+        if len(spanning_tree(nodes, {c: gains[c] for c in chosen})) == most:
+            result[chosen] = sum(gains[c] for c in chosen)
+    return result
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_spanning_tree_agrees_with_scipy(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    nodes = list(range(7))
+    gains = {frozenset(pair): float(random.uniform(1.0, 9.0)) for pair in combinations(nodes, 2)}
+    matrix = np.zeros((7, 7))
+    for connection, gain in gains.items():
+        a, b = sorted(connection)
+        matrix[a, b] = 10.0 - gain
+    wanted = minimum_spanning_tree(matrix).tocoo()
+    tree = spanning_tree(nodes, gains)
+    assert set(tree) == {frozenset(map(int, ends)) for ends in zip(wanted.row, wanted.col, strict=True)}
+    one, other = split_tree(tree[2], tree)
+    assert one | other == set(nodes)
+    way = tree_path(tree, 0, 6)
+    assert (way[0], way[-1]) == (0, 6)
+    assert all(frozenset(ends) in tree for ends in pairwise(way))
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+@pytest.mark.parametrize("spread", [0.1, 3.0, 3000.0])
+def test_edge_probabilities_agree_with_the_sum_over_all_trees(count: int, spread: float) -> None:
+    gains = all_gains(count, spread, seed=count, missing=count // 4)
+    trees = all_trees(gains)
+    total = logsumexp(list(trees.values()))
+    result = edge_probabilities(range(count), gains)
+    assert sum(result.values()) == pytest.approx(len(next(iter(trees))))
+    for connection, probability in result.items():
+        logs = [log for tree, log in trees.items() if connection in tree]
+        assert probability == pytest.approx(np.exp(logsumexp(logs) - total), rel=1e-9, abs=1e-300)
+
+
+def test_small_edge_probabilities_are_accurate() -> None:
+    # A determinant of the Laplacian would lose them: the rest of 1 is 1e-130.
+    gains = {frozenset("ab"): 300.0, frozenset("bc"): 300.0, frozenset("ac"): 0.0}
+    result = edge_probabilities("abc", gains)
+    assert result[frozenset("ac")] == pytest.approx(2.0 * np.exp(-300.0), rel=1e-12)
+
+
+def test_spanning_tree_of_an_unconnected_graph_is_a_forest() -> None:
+    gains = {frozenset("ab"): -5.0, frozenset("cd"): 1.0, frozenset("de"): 1.0, frozenset("ce"): 1.0}
+    result = edge_probabilities("abcdef", gains)
+    assert result[frozenset("ab")] == 1.0
+    assert [result[frozenset(ends)] for ends in ("cd", "de", "ce")] == pytest.approx([2 / 3] * 3)
+    tree = spanning_tree("abcdef", gains)
+    assert replacement_probabilities(frozenset("ab"), tree, gains) == {}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_replacement_probabilities_agree_with_the_sum_over_all_trees(seed: int) -> None:
+    gains = all_gains(5, 1.0, seed)
+    trees = all_trees(gains)
+    total = logsumexp(list(trees.values()))
+    best = spanning_tree(range(5), gains)
+    assert set(best) == set(max(trees, key=trees.__getitem__))
+    for connection in best:
+        one, other = split_tree(connection, best)
+        result = replacement_probabilities(connection, best, gains)
+        assert set(result) == {c for c in gains if c & one and c & other} - {connection}
+        for c, probability in result.items():
+            logs = [log for tree, log in trees.items() if c in tree and connection not in tree]
+            assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
+        assert sum(result.values()) >= 1.0 - edge_probabilities(range(5), gains)[connection] - 1e-12
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_leaves_have_one_connection(seed: int) -> None:
+    gains = all_gains(5, 2.0, seed)
+    leaves = (1, 4)
+    gains = {c: gain for c, gain in gains.items() if c != {1, 4}}
+    trees = {
+        tree: log
+        for tree, log in all_trees(gains).items()
+        if all(sum(leaf in c for c in tree) == 1 for leaf in leaves)
+    }
+    total = logsumexp(list(trees.values()))
+    best = spanning_tree(range(5), gains, leaves)
+    assert set(best) == set(max(trees, key=trees.__getitem__))
+    result = edge_probabilities(range(5), gains, leaves)
+    for connection, probability in result.items():
+        logs = [log for tree, log in trees.items() if connection in tree]
+        assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
+    for connection in best:
+        for c, probability in replacement_probabilities(connection, best, gains, leaves).items():
+            logs = [log for tree, log in trees.items() if c in tree and connection not in tree]
+            assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
+
+
+def test_orient_tree_lists_parents_before_children() -> None:
+    tree = [frozenset("ab"), frozenset("bc"), frozenset("de")]
+    roots, directed = orient_tree("bdac", "abcde", tree)
+    assert roots == ("b", "d")
+    assert directed == [("b", "a"), ("b", "c"), ("d", "e")]

@@ -25,60 +25,60 @@ from kineverse.lie import retract
     ],
 )
 def test_noise_stated_at_half_its_size_is_a_misfit(family: str, rows: int) -> None:
-    seen = recording(family, count=24, position=0.006, orientation=0.02, seed=1)
-    child = seen.child if rows == 6 else seen.child[:, :3, 3]
-    found = identify(seen.parent, child, noise=pose_covariance(0.003, 0.01))
-    assert found.is_ambiguous
-    assert found.best.family == family
-    assert found.misfit == pytest.approx(2.0, rel=0.3)
-    assert "times the stated noise: either the noise is larger" in str(found)
-    # What is known of the joint is that of the larger noise.
-    right = identify(seen.parent, child, noise=seen.covariance)[family]
-    assert found.best.deviation("axis.x") == pytest.approx(right.deviation("axis.x"), rel=0.3)
+    data = recording(family, count=24, position=0.006, orientation=0.02, seed=1)
+    child = data.child if rows == 6 else data.child[:, :3, 3]
+    identified = identify(data.parent, child, noise=pose_covariance(0.003, 0.01))
+    assert identified.is_ambiguous
+    assert identified.best.family == family
+    assert identified.misfit == pytest.approx(2.0, rel=0.3)
+    assert "times the stated noise: either the noise is larger" in str(identified)
+    # The deviations are those for the larger noise.
+    right = identify(data.parent, child, noise=data.covariance)[family]
+    assert identified.best.deviation("axis.x") == pytest.approx(right.deviation("axis.x"), rel=0.3)
 
 
 def test_a_free_motion_by_a_noise_stated_too_small_is_ambiguous() -> None:
-    seen = recording("spherical", count=20, position=0.009, orientation=0.03, seed=2)
-    found = identify(seen.parent, seen.child, noise=pose_covariance(0.003, 0.01))
-    assert found.is_ambiguous
-    assert "free" in str(found)
-    assert found.best.family == "spherical"
+    data = recording("spherical", count=20, position=0.009, orientation=0.03, seed=2)
+    identified = identify(data.parent, data.child, noise=pose_covariance(0.003, 0.01))
+    assert identified.is_ambiguous
+    assert "free" in str(identified)
+    assert identified.best.family == "spherical"
 
 
 def test_right_noise_is_no_misfit() -> None:
     misfits = []
     for seed in range(24):
         family = ("revolute", "prismatic", "screw", "rigid", "revolute", "prismatic")[seed % 6]
-        seen = recording(family, count=8 + seed % 9, position=0.01, orientation=0.03, seed=seed)
-        child = seen.child if seed % 3 else seen.child[:, :3, 3]
-        found = identify(seen.parent, child, noise=seen.covariance)
-        assert not found.reason
-        if not math.isnan(found.misfit):
-            misfits.append(found.misfit)
+        data = recording(family, count=8 + seed % 9, position=0.01, orientation=0.03, seed=seed)
+        child = data.child if seed % 3 else data.child[:, :3, 3]
+        identified = identify(data.parent, child, noise=data.covariance)
+        assert not identified.reason
+        if not math.isnan(identified.misfit):
+            misfits.append(identified.misfit)
     assert np.median(misfits) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("family", ["planar", "spherical", "cylindrical", "free"])
 def test_joints_with_several_values_are_sure_if_these_lie_on_no_curve(family: str) -> None:
-    seen = recording(family, count=16, position=0.004, orientation=0.015, seed=0)
-    found = identify(seen.parent, seen.child, noise=seen.covariance)
-    assert (found.best.family, found.is_ambiguous) == (family, False)
+    data = recording(family, count=16, position=0.004, orientation=0.015, seed=0)
+    identified = identify(data.parent, data.child, noise=data.covariance)
+    assert (identified.best.family, identified.is_ambiguous) == (family, False)
 
 
 def test_outliers_are_no_misfit() -> None:
-    seen = recording("revolute", count=30, position=0.004, orientation=0.015, seed=3)
-    child = seen.child.copy()
+    data = recording("revolute", count=30, position=0.004, orientation=0.015, seed=3)
+    child = data.child.copy()
     child[[4, 9, 22], :3, 3] += 0.4
-    assert identify(seen.parent, child, noise=seen.covariance).is_ambiguous
-    found = identify(seen.parent, child, noise=seen.covariance, outliers=True)
-    assert (found.best.family, found.is_ambiguous) == ("revolute", False)
-    assert found.misfit == pytest.approx(1.0, abs=0.2)
+    assert identify(data.parent, child, noise=data.covariance).is_ambiguous
+    identified = identify(data.parent, child, noise=data.covariance, outliers=True)
+    assert (identified.best.family, identified.is_ambiguous) == ("revolute", False)
+    assert identified.misfit == pytest.approx(1.0, abs=0.2)
 
 
 def test_identifier_says_a_misfit() -> None:
-    seen = recording("revolute", count=20, position=0.006, orientation=0.02, seed=4)
+    data = recording("revolute", count=20, position=0.006, orientation=0.02, seed=4)
     identifier = Identifier(noise=pose_covariance(0.003, 0.01))
-    for k, (a, b) in enumerate(zip(seen.parent, seen.child, strict=True), start=1):
+    for k, (a, b) in enumerate(zip(data.parent, data.child, strict=True), start=1):
         identifier.add(a, b)
         if k in (12, 20):
             assert identifier.result.is_ambiguous
@@ -89,9 +89,9 @@ def test_identifier_says_a_misfit() -> None:
 @pytest.mark.parametrize("family", JOINTS)
 @pytest.mark.parametrize("rows", [6, 3], ids=["poses", "positions"])
 def test_operation_without_limits_has_none(family: str, rows: int) -> None:
-    seen = recording(family, count=20, position=0.002, orientation=0.01, seed=5)
-    child = seen.child if rows == 6 else seen.child[:, :3, 3]
-    fit = identify(seen.parent, child, noise=seen.covariance, families=family).best
+    data = recording(family, count=20, position=0.002, orientation=0.01, seed=5)
+    child = data.child if rows == 6 else data.child[:, :3, 3]
+    fit = identify(data.parent, child, noise=data.covariance, families=family).best
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("body", parent="world", transform=np.eye(4))
@@ -113,13 +113,13 @@ def test_tail_probabilities_agree_with_scipy(freedom: float) -> None:
 @pytest.mark.parametrize("lever", [0.0, 0.5])
 @pytest.mark.parametrize("turn", [0.2, 2.0])
 def test_an_exact_hinge_is_a_hinge_and_no_curve(lever: float, turn: float) -> None:
-    """Whatever the noise is taken for, exact poses of a joint are that joint, also about its own origin."""
+    """Exact poses of a joint are that joint for any assumed noise, also about the origin of its frame."""
     hinge = kv.rotation_z(kv.position("q")) @ kv.translation(lever, 0, 0)
     poses = np.stack([hinge({"q": q}) for q in np.linspace(0, turn, 12)])
     for noise in (None, pose_covariance(1e-4, 1e-3), pose_covariance(0.005, 0.02)):
-        found = identify(None, poses, noise=noise)
-        assert found.best.family == "revolute"
-        assert not found.is_ambiguous
+        identified = identify(None, poses, noise=noise)
+        assert identified.best.family == "revolute"
+        assert not identified.is_ambiguous
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])

@@ -32,7 +32,7 @@ NOISE = pose_covariance(POSITION, ORIENTATION)
 SOME = ("rigid", "prismatic", "revolute", "planar", "free")
 
 
-def seen(model: kv.Model, frames: list[str], values: Array, seed: int) -> dict[str, Array]:
+def data(model: kv.Model, frames: list[str], values: Array, seed: int) -> dict[str, Array]:
     """Return noisy poses of frames at values (N, n) of the degrees of freedom."""
     random = np.random.default_rng(seed)
     symbols = model.degrees_of_freedom
@@ -44,7 +44,7 @@ def seen(model: kv.Model, frames: list[str], values: Array, seed: int) -> dict[s
 
 
 def left(model: kv.Model, poses: dict[str, Array]) -> float:
-    """Return χ² over its degrees of freedom, if free coordinates are what explains an observation best.
+    """Return χ² over its degrees of freedom, with the free coordinates that explain each observation best.
 
     Of every fourth observation; of 180 degrees of freedom in a ring of four, so chance makes it .7 to 1.3 in
     more than 99 % of all cases.
@@ -63,8 +63,8 @@ def left(model: kv.Model, poses: dict[str, Array]) -> float:
 
         starts = np.linspace(lower, upper, 9)
         start = min(starts, key=lambda q: float(np.sum(errors(q) ** 2)))
-        found = least_squares(errors, start, bounds=(lower, upper))
-        squares += 2.0 * found.cost
+        identified = least_squares(errors, start, bounds=(lower, upper))
+        squares += 2.0 * identified.cost
         count += 6 * len(poses) - len(start)
     return squares / count
 
@@ -110,7 +110,7 @@ def four_bar() -> kv.Model:
 
 
 def slider_crank() -> kv.Model:
-    """Return a crank, a rod, and what it pushes along a rail."""
+    """Return a crank, a rod, and a slider on a rail."""
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("stand", "world", kv.translation(0.3, -0.2, 0.5) @ kv.rpy(-0.4, 0.6, 0.8))
@@ -126,7 +126,7 @@ def slider_crank() -> kv.Model:
 
 
 def two_cylinders() -> kv.Model:
-    """Return a crank with two rods, each of which pushes something along a rail of its own."""
+    """Return a crank with two rods, each with a slider on another rail."""
     model = kv.Model()
     with model.edit() as edit:
         bar(edit, "crank", "world", 0.0, 0.2, 0.05)
@@ -150,27 +150,27 @@ def two_cylinders() -> kv.Model:
 def test_a_four_bar_is_closed_and_saved(tmp_path: Path) -> None:
     truth = four_bar()
     values = np.random.default_rng(0).uniform(0.0, 2.5, (40, 1))
-    poses = seen(truth, ["crank", "coupler", "rocker"], values, 1)
+    poses = data(truth, ["crank", "coupler", "rocker"], values, 1)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
     assert connected(graph) == ring("world", "crank", "coupler", "rocker")
-    # What closes the loop stands beside the tree, and leaves no doubt about it.
+    # The joint that closes the loop is listed next to the tree, and leaves no doubt about it.
     assert all(edge.probability > 0.99 and not edge.alternatives for edge in graph.edges)
     model = kv.Model()
     with model.edit() as edit:
-        for operation in graph.operations("seen"):
+        for operation in graph.operations("learned"):
             edit.apply(operation)
     assert len(model.degrees_of_freedom) == 1
-    assert 0.7 < left(model, {f"seen/{part}": track for part, track in poses.items()}) < 1.3
+    assert 0.7 < left(model, {f"learned/{part}": track for part, track in poses.items()}) < 1.3
     assert len(graph.model(close=False).degrees_of_freedom) == 3
     model.save(tmp_path / "linkage.kv.json")
     again = kv.load(tmp_path / "linkage.kv.json")
     q = {str(again.degrees_of_freedom[0]): 0.2}
-    assert np.array_equal(again.fk("seen/coupler")(q), model.fk("seen/coupler")(q))
+    assert np.array_equal(again.fk("learned/coupler")(q), model.fk("learned/coupler")(q))
 
 
 def test_a_slider_crank_is_closed() -> None:
     values = np.random.default_rng(1).uniform(-3.1, 3.1, (40, 1))
-    poses = seen(slider_crank(), ["crank", "rod", "slider"], values, 2)
+    poses = data(slider_crank(), ["crank", "rod", "slider"], values, 2)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
     assert connected(graph) == ring("world", "crank", "rod", "slider")
     model = graph.model()
@@ -181,7 +181,7 @@ def test_a_slider_crank_is_closed() -> None:
 def test_a_loop_can_be_closed_at_each_of_its_joints() -> None:
     """Here it is a slider, which holds other components than a hinge, in axes that are turned to suit."""
     values = np.random.default_rng(1).uniform(-1.2, 1.2, (40, 1))
-    poses = seen(slider_crank(), ["crank", "rod", "slider"], values, 2)
+    poses = data(slider_crank(), ["crank", "rod", "slider"], values, 2)
     known = {"world": exact_track(40), **check_tracks(poses, NOISE)}
     ends = [("world", "slider"), ("world", "crank"), ("crank", "rod"), ("rod", "slider")]
     closing, *others = (identify_pair(known, *both, SOME) for both in ends)
@@ -205,7 +205,7 @@ def test_a_loop_can_be_closed_at_each_of_its_joints() -> None:
 def test_loops_with_a_common_crank_are_both_closed() -> None:
     truth = two_cylinders()
     values = np.random.default_rng(2).uniform(0.7, 2.6, (50, 1))
-    poses = seen(truth, ["crank", "left_rod", "left", "right_rod", "right"], values, 3)
+    poses = data(truth, ["crank", "left_rod", "left", "right_rod", "right"], values, 3)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
     assert connected(graph) == ring("world", "crank", "left_rod", "left") | ring(
         "world", "crank", "right_rod", "right"
@@ -239,7 +239,7 @@ def test_a_loop_of_balls_is_reported_and_left_open() -> None:
             "rod_end", "rocker_end", within={"crank_hinge": (-1.5, 1.5)}, home={"rocker_hinge": 1.5}
         )
     values = np.random.default_rng(0).uniform(-1.4, 1.4, (60, 1))
-    poses = seen(truth, ["crank", "rod", "rocker"], values, 0)
+    poses = data(truth, ["crank", "rod", "rocker"], values, 0)
     graph = identify_graph(poses, noise=NOISE, families=("rigid", "revolute", "spherical", "planar", "free"))
     assert connected(graph) == ring("world", "crank", "rod", "rocker")
     with pytest.raises(kv.errors.ModelError, match="cannot depend on others, as those of a ball"):
@@ -256,16 +256,16 @@ def test_dependent_coordinates_are_resolved_transitively() -> None:
     motion = Twists(("a", "b", "c"), times, np.zeros((7, 6, 3)))
     followers.add(motion, [1], np.stack([b_by_a, b_by_c], axis=1)[:, None])
     assert followers.leading == {"a", "c"}
-    # Half of it was seen only at some of the times.
+    # Half of it was observed only at some of the times.
     some = times[2:]
     motion = Twists(("d", "c", "a"), some, np.zeros((5, 6, 3)))
     followers.add(motion, [1], np.stack([c_by_d, c_by_a], axis=1)[2:, None])
-    found = followers.resolve(twists)
-    assert np.array_equal(found.times, some)
+    identified = followers.resolve(twists)
+    assert np.array_equal(identified.times, some)
     a, b, c, d = np.moveaxis(twists.twists, 2, 0)
     by_a = a + b * (b_by_a + b_by_c * c_by_a)[:, None] + c * c_by_a[:, None]
     by_d = d + b * (b_by_c * c_by_d)[:, None] + c * c_by_d[:, None]
     wanted = {"a": by_a[2:], "d": by_d[2:]}
-    assert set(found.names) == set(wanted)
-    for k, x in enumerate(found.names):
-        assert np.allclose(found.twists[:, :, k], wanted[x])
+    assert set(identified.names) == set(wanted)
+    for k, x in enumerate(identified.names):
+        assert np.allclose(identified.twists[:, :, k], wanted[x])

@@ -15,14 +15,14 @@ from kineverse.estimation import IdentificationResult, Identifier, Outliers, ide
 TOLD = ("revolute", "prismatic", "rigid", "screw")
 
 
-def with_wrong(seen: Recording, fraction: float, seed: int) -> tuple[Array, Array]:
+def with_wrong(data: Recording, fraction: float, seed: int) -> tuple[Array, Array]:
     """Return poses of the child, some of them anywhere within two metres, and which."""
     random = np.random.default_rng(seed)
-    count = round(fraction * len(seen.child))
-    wrong = np.sort(random.choice(len(seen.child), count, replace=False))
-    child = seen.child.copy()
+    count = round(fraction * len(data.child))
+    wrong = np.sort(random.choice(len(data.child), count, replace=False))
+    child = data.child.copy()
     anywhere = transform(Rotation.random(count, random_state=random), random.uniform(-1.0, 1.0, (count, 3)))
-    child[wrong] = seen.parent[wrong] @ anywhere
+    child[wrong] = data.parent[wrong] @ anywhere
     return child, wrong
 
 
@@ -44,18 +44,18 @@ def test_identify_with_outliers_agrees_with_the_inliers_alone(
     right, off, off_without = 0, [], []
     for family in TOLD:
         for seed in range(repeats):
-            seen = seen_as(family, seed)
-            child, wrong = with_wrong(seen, fraction, seed + 100)
-            found = identify(seen.parent, child, noise=seen.covariance, outliers=True)
-            right += found.best.family == family
-            fit = found[family]
+            data = seen_as(family, seed)
+            child, wrong = with_wrong(data, fraction, seed + 100)
+            identified = identify(data.parent, child, noise=data.covariance, outliers=True)
+            right += identified.best.family == family
+            fit = identified[family]
             if family != "rigid":
                 good = np.setdiff1d(np.arange(20), wrong)
                 without = identify(
-                    seen.parent[good], child[good], noise=seen.covariance, families=[family]
+                    data.parent[good], child[good], noise=data.covariance, families=[family]
                 ).best
-                off.append(angle_between(fit.parameters["axis"], seen.axis))
-                off_without.append(angle_between(without.parameters["axis"], seen.axis))
+                off.append(angle_between(fit.parameters["axis"], data.axis))
+                off_without.append(angle_between(without.parameters["axis"], data.axis))
     assert right >= least
     assert np.sqrt(np.mean(np.square(off))) < 1.3 * np.sqrt(np.mean(np.square(off_without)))
 
@@ -71,9 +71,9 @@ def test_identify_with_outliers_agrees_with_the_inliers_alone(
     ],
 )
 def test_outliers_option_changes_nothing_without_outliers(family: str) -> None:
-    seen = seen_as(family, 3)
-    before = identify(seen.parent, seen.child, noise=seen.covariance)
-    after = identify(seen.parent, seen.child, noise=seen.covariance, outliers=True)
+    data = seen_as(family, 3)
+    before = identify(data.parent, data.child, noise=data.covariance)
+    after = identify(data.parent, data.child, noise=data.covariance, outliers=True)
     assert after.best.family == before.best.family == family
     assert after.best.outliers == ()
     one, other = before[family], after[family]
@@ -86,21 +86,21 @@ def test_outliers_option_changes_nothing_without_outliers(family: str) -> None:
 
 @pytest.fixture(scope="module")
 def hinge() -> tuple[Recording, Array, Array, IdentificationResult]:
-    seen = seen_as("revolute", 1)
-    child, wrong = with_wrong(seen, 0.2, 7)
-    return seen, child, wrong, identify(seen.parent, child, noise=seen.covariance, outliers=True)
+    data = seen_as("revolute", 1)
+    child, wrong = with_wrong(data, 0.2, 7)
+    return data, child, wrong, identify(data.parent, child, noise=data.covariance, outliers=True)
 
 
 def test_outliers_are_listed_and_ignored(hinge) -> None:
-    seen, child, wrong, found = hinge
-    fit = found.best
+    data, child, wrong, identified = hinge
+    fit = identified.best
     assert fit.outliers == tuple(wrong)
     np.testing.assert_array_equal(fit.inliers, np.setdiff1d(np.arange(20), wrong))
-    without = identify(seen.parent[fit.inliers], child[fit.inliers], noise=seen.covariance).best
+    without = identify(data.parent[fit.inliers], child[fit.inliers], noise=data.covariance).best
     np.testing.assert_allclose(fit.range, without.range, atol=1e-3)
     np.testing.assert_allclose(fit.rms, without.rms, rtol=1e-3)
     np.testing.assert_allclose(fit.covariance, without.covariance, rtol=0.02, atol=1e-9)
-    # What is wrong has the nearest place on the joint.
+    # An outlier has the nearest pose of the joint.
     assert fit.joint_values.shape == fit.deviations.shape == (20, 1)
     assert np.linalg.norm(fit.residuals[wrong], axis=1).min() > 0.2
     assert np.linalg.norm(fit.residuals[fit.inliers], axis=1).max() < 0.2
@@ -108,81 +108,81 @@ def test_outliers_are_listed_and_ignored(hinge) -> None:
 
 
 def test_evidence_includes_the_density_of_the_outliers(hinge) -> None:
-    seen, child, _, found = hinge
-    fit = found.best
-    without = identify(seen.parent[fit.inliers], child[fit.inliers], noise=seen.covariance)
+    data, child, _, identified = hinge
+    fit = identified.best
+    without = identify(data.parent[fit.inliers], child[fit.inliers], noise=data.covariance)
     usual = Outliers()
     joint_prior = 16 * math.log(1 - usual.fraction) + 4 * (
         math.log(usual.fraction) + usual.log_uniform_density
     )
     assert fit.log_evidence == pytest.approx(without["revolute"].log_evidence + joint_prior, abs=0.01)
-    # What moves freely explains everything, and what does not move cannot call almost everything wrong.
-    assert found["free"].outliers == found["rigid"].outliers == ()
-    assert found["free"].log_evidence < fit.log_evidence - 100
-    every_pose_an_inlier = identify(seen.parent, child, noise=seen.covariance)
+    # A free joint explains everything; a rigid one with outliers almost everywhere is not allowed.
+    assert identified["free"].outliers == identified["rigid"].outliers == ()
+    assert identified["free"].log_evidence < fit.log_evidence - 100
+    every_pose_an_inlier = identify(data.parent, child, noise=data.covariance)
     assert every_pose_an_inlier["free"].probability > 0.99 or every_pose_an_inlier.is_ambiguous
 
 
 @pytest.mark.parametrize("family", ["revolute", "prismatic", "rigid"])
 def test_outliers_among_positions_are_found(family: str) -> None:
     for seed in range(3):
-        seen = seen_as(family, seed, noise=(0.005, 0.03))
-        child, wrong = with_wrong(seen, 0.2, seed)
-        points = (np.linalg.inv(seen.parent) @ child)[:, :3, 3]
-        points[:] = (np.linalg.inv(seen.true_parent) @ child)[:, :3, 3]
-        found = identify(None, points, noise=pose_covariance(0.005, 0.03)[:3, :3], outliers=True)
-        assert found.best.family == family
+        data = seen_as(family, seed, noise=(0.005, 0.03))
+        child, wrong = with_wrong(data, 0.2, seed)
+        points = (np.linalg.inv(data.parent) @ child)[:, :3, 3]
+        points[:] = (np.linalg.inv(data.true_parent) @ child)[:, :3, 3]
+        identified = identify(None, points, noise=pose_covariance(0.005, 0.03)[:3, :3], outliers=True)
+        assert identified.best.family == family
         # Of a place anywhere one may happen to be on the joint.
-        assert len(set(found.best.outliers) ^ set(wrong)) <= 1
+        assert len(set(identified.best.outliers) ^ set(wrong)) <= 1
 
 
 @pytest.mark.parametrize("family", TOLD)
 def test_outliers_are_found_with_unknown_noise(family: str) -> None:
-    seen = seen_as(family, 2)
-    child, wrong = with_wrong(seen, 0.2, 2)
-    found = identify(seen.parent, child, outliers=True)
-    assert found.best.family == family
-    assert found.best.outliers == tuple(wrong)
-    assert found.noise == pytest.approx((0.01, 0.03), rel=0.5)
+    data = seen_as(family, 2)
+    child, wrong = with_wrong(data, 0.2, 2)
+    identified = identify(data.parent, child, outliers=True)
+    assert identified.best.family == family
+    assert identified.best.outliers == tuple(wrong)
+    assert identified.noise == pytest.approx((0.01, 0.03), rel=0.5)
 
 
 def test_outliers_are_found_in_millimetres() -> None:
-    seen = seen_as("revolute", 4)
-    child, wrong = with_wrong(seen, 0.2, 4)
-    parent = seen.parent.copy()
+    data = seen_as("revolute", 4)
+    child, wrong = with_wrong(data, 0.2, 4)
+    parent = data.parent.copy()
     for poses in (parent, child):
         poses[:, :3, 3] *= 1000.0
     for outliers in (True, Outliers(reach=2000.0)):
-        found = identify(parent, child, noise=pose_covariance(10.0, 0.03), outliers=outliers)
-        assert (found.best.family, found.best.outliers) == ("revolute", tuple(wrong))
+        identified = identify(parent, child, noise=pose_covariance(10.0, 0.03), outliers=outliers)
+        assert (identified.best.family, identified.best.outliers) == ("revolute", tuple(wrong))
 
 
 def test_half_of_the_observations_as_outliers_is_no_explanation() -> None:
-    """What goes round four axes in turn is no hinge of which most was seen wrong."""
+    """Motion about four axes in turn is no hinge with mostly wrong observations."""
     several = [seen_as("revolute", seed, count=5) for seed in range(4)]
     parent, child = (np.concatenate([getattr(s, part) for s in several]) for part in ("parent", "child"))
-    found = identify(parent, child, noise=several[0].covariance, outliers=True)
-    assert found["revolute"].outliers == found["rigid"].outliers == ()
-    assert found.best.family == "free"
+    identified = identify(parent, child, noise=several[0].covariance, outliers=True)
+    assert identified["revolute"].outliers == identified["rigid"].outliers == ()
+    assert identified.best.family == "free"
 
 
 def test_identifier_finds_outliers() -> None:
-    seen = seen_as("revolute", 5, count=30)
-    child, wrong = with_wrong(seen, 0.2, 5)
-    identifier = Identifier(noise=seen.covariance, outliers=True)
-    for a, b in zip(seen.parent, child, strict=True):
+    data = seen_as("revolute", 5, count=30)
+    child, wrong = with_wrong(data, 0.2, 5)
+    identifier = Identifier(noise=data.covariance, outliers=True)
+    for a, b in zip(data.parent, child, strict=True):
         identifier.add(a, b)
         if len(identifier) in (16, 23, 30):
-            found = identifier.result
-            assert found.best.family == "revolute"
-    whole = identify(seen.parent, child, noise=seen.covariance, outliers=True).best
-    assert found.best.outliers == whole.outliers == tuple(wrong)
-    assert angle_between(found.best.parameters["axis"], whole.parameters["axis"]) < 0.1 * whole.deviation(
-        "axis.x"
-    )
+            identified = identifier.result
+            assert identified.best.family == "revolute"
+    whole = identify(data.parent, child, noise=data.covariance, outliers=True).best
+    assert identified.best.outliers == whole.outliers == tuple(wrong)
+    assert angle_between(
+        identified.best.parameters["axis"], whole.parameters["axis"]
+    ) < 0.1 * whole.deviation("axis.x")
 
 
 def test_invalid_outlier_models_are_refused() -> None:
-    seen = seen_as("rigid", 0)
+    data = seen_as("rigid", 0)
     with pytest.raises(InvalidValueError, match="Outliers are True, False or Outliers"):
-        identify(seen.parent, seen.child, noise=seen.covariance, outliers=0.2)  # type: ignore[arg-type]
+        identify(data.parent, data.child, noise=data.covariance, outliers=0.2)  # type: ignore[arg-type]

@@ -25,28 +25,28 @@ from kineverse.estimation.identification.native import library
 from kineverse.estimation.identification.observations import Observations, check_observations
 from kineverse.estimation.identification.solver import solver
 
-HOW = ("both noisy", "parent known", "positions", "each with its own noise")
+HOW = ("both noisy", "parent known", "positions", "each with another noise")
 MOVING = [family for family in JOINTS if family not in ("rigid", "free")]
 
 
 def seen_as(how: str, family: str) -> Observations:
-    seen = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
-    c = seen.covariance
+    data = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
+    c = data.covariance
     if how == "both noisy":
-        return check_observations(seen.parent, seen.child, c, c)
+        return check_observations(data.parent, data.child, c, c)
     if how == "parent known":
-        return check_observations(seen.true_parent, seen.child, None, c)
+        return check_observations(data.true_parent, data.child, None, c)
     if how == "positions":
-        return check_observations(seen.parent, seen.child[:, :3, 3], c, c)
+        return check_observations(data.parent, data.child[:, :3, 3], c, c)
     factors = np.linspace(0.8, 1.3, 12)[:, None, None]
-    return check_observations(seen.parent, seen.child, factors * c, c / factors)
+    return check_observations(data.parent, data.child, factors * c, c / factors)
 
 
 def precise(family: str, whole: bool) -> Observations:
     """Return positions so precise that steps have to be led to them."""
-    seen = recording(family, count=12, position=0.001, orientation=0.1, seed=1)
-    child = seen.child if whole else seen.child[:, :3, 3]
-    result = check_observations(seen.parent, child, seen.covariance, seen.covariance)
+    data = recording(family, count=12, position=0.001, orientation=0.1, seed=1)
+    child = data.child if whole else data.child[:, :3, 3]
+    result = check_observations(data.parent, child, data.covariance, data.covariance)
     assert len(result.softened) > 1
     return result
 
@@ -58,8 +58,8 @@ def same(slow: Scored, fast: Scored, atol: float = 1e-4, log: float = 0.05) -> N
     assert other.cost == pytest.approx(one.cost, abs=log)
     assert other.joint_prior.marginal == one.joint_prior.marginal
     np.testing.assert_allclose(other.joint_prior.precision, one.joint_prior.precision, rtol=0.05)
-    seen = slice(None) if one.motion.rows == 6 else 3  # of the pose of what was seen as a position
-    np.testing.assert_allclose(other.linear.pose[:, :3, seen], one.linear.pose[:, :3, seen], atol=atol)
+    columns = slice(None) if one.motion.rows == 6 else 3  # the orientation of a point is arbitrary
+    np.testing.assert_allclose(other.linear.pose[:, :3, columns], one.linear.pose[:, :3, columns], atol=atol)
     np.testing.assert_allclose(other.residuals, one.residuals, atol=atol)
     # All of it belongs together.
     for a, b in zip(other.linear, other.motion.linearise(other.values), strict=True):
@@ -75,10 +75,10 @@ def compiled() -> None:
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
 def test_levenberg_marquardt_in_c_agrees_with_numpy(family: str, how: str) -> None:
-    seen = seen_as(how, family)
-    start = next(initial_guesses(family, MotionStatistics(seen)))
-    slow = levenberg_marquardt(seen, *start)
-    fast = solver.solve(seen, start, seen.parent, slow.joint_prior)
+    data = seen_as(how, family)
+    start = next(initial_guesses(family, MotionStatistics(data)))
+    slow = levenberg_marquardt(data, *start)
+    fast = solver.solve(data, start, data.parent, slow.joint_prior)
     assert fast.cost == pytest.approx(slow.cost, rel=1e-6, abs=1e-6)
     if slow.converged and fast.converged:
         for a, b in zip(slow.motion.linearise(slow.values), fast.motion.linearise(fast.values), strict=True):
@@ -90,15 +90,15 @@ def test_levenberg_marquardt_in_c_agrees_with_numpy(family: str, how: str) -> No
 @pytest.mark.parametrize("family", MOVING)
 @pytest.mark.parametrize("how", HOW)
 def test_marginal_steps_in_c_agree_with_numpy(family: str, how: str) -> None:
-    seen = seen_as(how, family)
-    start = next(initial_guesses(family, MotionStatistics(seen)))
-    near = levenberg_marquardt(seen, start.motion, start.values)
+    data = seen_as(how, family)
+    start = next(initial_guesses(family, MotionStatistics(data)))
+    near = levenberg_marquardt(data, start.motion, start.values)
     # C has derivatives in closed form, and numpy takes differences.
     joint_prior = JointValuePrior(
         near.values.mean(axis=0), np.full(near.motion.joints, 0.3**-2), marginal=True
     )
-    slow = levenberg_marquardt(seen, near.motion, near.values, near.parent, joint_prior, steps=1)
-    fast = solver.solve(seen, InitialGuess(near.motion, near.values), near.parent, joint_prior, steps=1)
+    slow = levenberg_marquardt(data, near.motion, near.values, near.parent, joint_prior, steps=1)
+    fast = solver.solve(data, InitialGuess(near.motion, near.values), near.parent, joint_prior, steps=1)
     assert fast.cost == pytest.approx(slow.cost, rel=1e-6, abs=1e-6)
     np.testing.assert_allclose(fast.linear.pose, slow.linear.pose, atol=1e-6)
 
@@ -119,32 +119,32 @@ def test_linearised_poses_in_c_agree_with_numpy(family: str, how: str) -> None:
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
 def test_maximum_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
-    seen = seen_as(how, family)
-    begin = [*initial_guesses(family, MotionStatistics(seen))]
-    same(marginal_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin))
+    data = seen_as(how, family)
+    begin = [*initial_guesses(family, MotionStatistics(data))]
+    same(marginal_likelihood.maximum_likelihood(data, begin), solver.maximum_likelihood(data, begin))
 
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", MOVING)
 @pytest.mark.parametrize("how", ["both noisy", "parent known"])
 def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
-    seen = seen_as(how, family)
-    near = solve_from_best_start(seen, [*initial_guesses(family, MotionStatistics(seen))])
+    data = seen_as(how, family)
+    near = solve_from_best_start(data, [*initial_guesses(family, MotionStatistics(data))])
     slow, fast = (
-        marginal_likelihood.maximise_marginal_likelihood(seen, near),
-        solver.maximise_marginal_likelihood(seen, near),
+        marginal_likelihood.maximise_marginal_likelihood(data, near),
+        solver.maximise_marginal_likelihood(data, near),
     )
     assert slow.solution.joint_prior.marginal
     same(slow, fast, atol=0.02)
     # One more observation, and the first ones are where they were.
-    part = seen.select(slice(0, 10))
+    part = data.select(slice(0, 10))
     before = marginal_likelihood.maximise_marginal_likelihood(
         part, solve_from_best_start(part, [*initial_guesses(family, MotionStatistics(part))])
     ).solution
     start = InitialGuess(before.motion, np.concatenate([before.values, slow.solution.values[10:]]))
-    parent = np.concatenate([before.parent, seen.parent[10:]])
-    given = seen, start, parent, before.joint_prior, 10
-    same(marginal_likelihood.continue_from(*given), solver.continue_from(*given), atol=0.02)
+    parent = np.concatenate([before.parent, data.parent[10:]])
+    arguments = data, start, parent, before.joint_prior, 10
+    same(marginal_likelihood.continue_from(*arguments), solver.continue_from(*arguments), atol=0.02)
 
 
 @pytest.mark.compiler
@@ -152,14 +152,14 @@ def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> No
     ("family", "whole"), [("prismatic", True), ("revolute", True), ("spherical", True), ("revolute", False)]
 )
 def test_precise_positions_in_c_agree_with_numpy(family: str, whole: bool) -> None:
-    seen = precise(family, whole)
-    begin = [*initial_guesses(family, MotionStatistics(seen))]
-    slow, fast = marginal_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin)
+    data = precise(family, whole)
+    begin = [*initial_guesses(family, MotionStatistics(data))]
+    slow, fast = marginal_likelihood.maximum_likelihood(data, begin), solver.maximum_likelihood(data, begin)
     same(slow, fast, atol=0.02)
     near = slow.solution
     same(
-        marginal_likelihood.maximise_marginal_likelihood(seen, near),
-        solver.maximise_marginal_likelihood(seen, near),
+        marginal_likelihood.maximise_marginal_likelihood(data, near),
+        solver.maximise_marginal_likelihood(data, near),
         atol=0.02,
         log=0.2,
     )
@@ -176,11 +176,13 @@ def test_c_stays_within_its_work_memory(family: str, how: str, monkeypatch: pyte
         return lent[-1][:size]
 
     monkeypatch.setattr(native._memory, "reserve", lend)
-    seen = precise(family, True) if how == "precise" else seen_as(how, family)
-    found = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
-    found = solver.maximise_marginal_likelihood(seen, found).solution
-    solver.continue_from(seen, InitialGuess(found.motion, found.values), found.parent, found.joint_prior, 2)
-    solver.evidence(found)
+    data = precise(family, True) if how == "precise" else seen_as(how, family)
+    identified = solver.maximum_likelihood(data, [*initial_guesses(family, MotionStatistics(data))]).solution
+    identified = solver.maximise_marginal_likelihood(data, identified).solution
+    solver.continue_from(
+        data, InitialGuess(identified.motion, identified.values), identified.parent, identified.joint_prior, 2
+    )
+    solver.evidence(identified)
     assert len(lent) == 4
     assert all((memory[-64:] == 12345.0).all() for memory in lent)
 
@@ -189,8 +191,8 @@ def test_c_stays_within_its_work_memory(family: str, how: str, monkeypatch: pyte
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
 def test_evidence_in_c_agrees_with_numpy(family: str, how: str) -> None:
-    seen = seen_as(how, family)
-    solution = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
+    data = seen_as(how, family)
+    solution = solver.maximum_likelihood(data, [*initial_guesses(family, MotionStatistics(data))]).solution
     parts = np.stack([0.3 * solution.covariance, 0.7 * solution.covariance])
     factors = np.array([[1.0, 1.0], [3.0, 3.0], [2.0, 0.5]])
     for weight in (1.0, 0.1):
@@ -208,14 +210,14 @@ def test_evidence_in_c_agrees_with_numpy(family: str, how: str) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", ["revolute", "planar"])
 def test_evidence_of_an_unconverged_solution_is_reduced_in_c(family: str) -> None:
-    seen = seen_as("both noisy", family)
-    near = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))])
-    reached = solver.maximise_marginal_likelihood(seen, near.solution)
+    data = seen_as("both noisy", family)
+    near = solver.maximum_likelihood(data, [*initial_guesses(family, MotionStatistics(data))])
+    reached = solver.maximise_marginal_likelihood(data, near.solution)
     early = replace(reached.solution, converged=False, cost=reached.solution.cost + 20.0)
     # Its widths have settled, so no step is taken.
     slow, fast = (
-        marginal_likelihood.maximise_marginal_likelihood(seen, early),
-        solver.maximise_marginal_likelihood(seen, early),
+        marginal_likelihood.maximise_marginal_likelihood(data, early),
+        solver.maximise_marginal_likelihood(data, early),
     )
     assert evidence_excess(early) == pytest.approx(10.0, abs=0.5)
     assert fast.log_evidence == pytest.approx(slow.log_evidence, abs=1e-6)
@@ -233,15 +235,15 @@ class Pinned(GroupMotion):
 
 @pytest.mark.compiler
 def test_a_subclass_of_a_motion_is_solved_in_numpy() -> None:
-    seen = seen_as("both noisy", "revolute")
-    start = next(initial_guesses("revolute", MotionStatistics(seen)))
+    data = seen_as("both noisy", "revolute")
+    start = next(initial_guesses("revolute", MotionStatistics(data)))
     pinned = Pinned(JOINT_FAMILIES["revolute"], 6, start.motion.left, start.motion.right)
     begin = InitialGuess(pinned, start.values)
     assert not pinned.is_plain
     assert pinned.linearise(start.values).by_parameters.shape == (12, 6, 2)
-    found = solver.maximum_likelihood(seen, [begin]).solution
-    assert found.cost == pytest.approx(levenberg_marquardt(seen, *begin).cost)
-    assert solver.evidence(found).covariance.shape == (2, 2)
+    identified = solver.maximum_likelihood(data, [begin]).solution
+    assert identified.cost == pytest.approx(levenberg_marquardt(data, *begin).cost)
+    assert solver.evidence(identified).covariance.shape == (2, 2)
 
 
 @pytest.mark.compiler
@@ -270,12 +272,12 @@ def test_linearise_refuses_joint_values_of_another_shape() -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [pytest.param("prismatic", marks=pytest.mark.long), "revolute", "planar"])
 def test_identify_without_a_compiler_agrees(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
-    fast = identify(seen.parent, seen.child, noise=seen.covariance)
+    data = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
+    fast = identify(data.parent, data.child, noise=data.covariance)
     with monkeypatch.context() as patched:
         patched.setattr(library, "_code", None)
         patched.setattr(library, "error", "there is none")
-        slow = identify(seen.parent, seen.child, noise=seen.covariance)
+        slow = identify(data.parent, data.child, noise=data.covariance)
         assert not solver.is_native
         best = slow.best
     assert fast.probabilities == pytest.approx(slow.probabilities, rel=0.02, abs=1e-4)

@@ -110,14 +110,14 @@ def test_verdict_on_correlated_observations_is_not_over_sure(kitchen: kv.Model) 
             StreamErrors(0.95, 0.95, 0.0, 0.0),
         )
         noise, poses = pose_covariance(POSITION, ORIENTATION), {FRAMES[0]: stream.poses[:, 0]}
-        found, denied = (
+        result, denied = (
             check_plausibility(
                 kitchen, poses, times=stream.times, noise=noise, families=SOME, decorrelation_time=time
             )[TAG]
             for time in (None, 0.0)
         )
         over_sure += denied.probabilities["served"] < 0.05
-        surest = max(surest, 1.0 - found.probabilities["served"])
+        surest = max(surest, 1.0 - result.probabilities["served"])
     assert over_sure >= 2
     assert surest < 0.9
 

@@ -45,12 +45,12 @@ def repair_model(model: kv.Model, report: Plausibility) -> kv.Model:
 
 def add_consistency(model: kv.Model, observations: dict[str, Array]) -> dict[str, KnownResiduals]:
     """Return the residuals with consistency tests by tag."""
-    found = find_testable_joints(model, observations, "world")
+    result = find_testable_joints(model, observations, "world")
     known = {
         "world": exact_track(len(next(iter(observations.values())))),
         **check_tracks(observations, NOISE),
     }
-    judged = {joint: KnownJoint(model, joint.child, joint.parent) for joint in found.joints}
+    judged = {joint: KnownJoint(model, joint.child, joint.parent) for joint in result.joints}
     each = {}
     for joint, served in judged.items():
         times = np.flatnonzero(known[joint.parent].observed & known[joint.child].observed)

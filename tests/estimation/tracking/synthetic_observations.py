@@ -13,12 +13,12 @@ import kineverse as kv
 
 def add_pose_noise(poses: Any, position: float, orientation: float, rng: np.random.Generator) -> Any:
     """Add noise to poses (..., 4, 4), on each axis of the observing frame."""
-    seen = np.array(poses)
-    flat = seen.reshape(-1, 4, 4)
+    data = np.array(poses)
+    flat = data.reshape(-1, 4, 4)
     flat[:, :3, 3] += position * rng.standard_normal((len(flat), 3))
     turned = Rotation.from_rotvec(orientation * rng.standard_normal((len(flat), 3))).as_matrix()
     flat[:, :3, :3] = turned @ flat[:, :3, :3]
-    return seen
+    return data
 
 
 class NoisyObserver:

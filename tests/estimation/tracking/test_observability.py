@@ -44,15 +44,15 @@ def test_covariance_of_a_redundant_arm_is_consistent(runs, off):
     observer = NoisyObserver(model, ["tip"], seed=1)
     first = make_tip_tracker(model, observer, 0.2)
     first.wait()
-    found = []
+    result = []
     for _ in range(runs):
         truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
         tracker = first.copy()
         for _ in range(6):
             estimate = tracker.update(observer(truth))
         error = np.array([estimate.state[s] - truth[str(s)] for s in tracker.symbols])
-        found.append(error @ estimate.information @ error / len(error))
-    assert np.mean(found) == pytest.approx(1.0, abs=off)
+        result.append(error @ estimate.information @ error / len(error))
+    assert np.mean(result) == pytest.approx(1.0, abs=off)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_covariance_of_a_redundant_arm_with_process_noise_is_consistent(noise, r
     observer = NoisyObserver(model, ["tip"], seed=2)
     first = make_tip_tracker(model, observer, 0.2, process_noise={f"{name}:velocity": noise for name in BENT})
     first.wait()
-    found = []
+    result = []
     for _ in range(runs):
         truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
         tracker = first.copy()
@@ -75,8 +75,8 @@ def test_covariance_of_a_redundant_arm_with_process_noise_is_consistent(noise, r
                 truth = {q: x + np.sqrt(noise * 0.1) * rng.standard_normal() for q, x in truth.items()}
             estimate = tracker.update(observer(truth), at=0.1 * step)
         error = np.array([estimate.state[s] - truth[str(s)] for s in tracker.symbols])
-        found.append(error @ estimate.information @ error / len(error))
-    assert 0.8 < np.mean(found) < 1.2
+        result.append(error @ estimate.information @ error / len(error))
+    assert 0.8 < np.mean(result) < 1.2
 
 
 def test_linear_unobservable_model_equals_a_kalman_filter_over_time():
@@ -110,8 +110,8 @@ def test_tracker_with_unobservable_directions_is_picklable():
     tracker = make_tip_tracker(model, observer, 0.2)
     truth = {name: value + 0.1 for name, value in BENT.items()}
     tracker.update(observer(truth))
-    there, seen = pickle.loads(pickle.dumps(tracker)), observer(truth)
-    here, again = tracker.update(seen), there.update(seen)
+    there, data = pickle.loads(pickle.dumps(tracker)), observer(truth)
+    here, again = tracker.update(data), there.update(data)
     np.testing.assert_allclose(again.covariance, here.covariance, rtol=1e-6)
 
 
@@ -124,11 +124,11 @@ def test_covariance_of_a_redundant_arm_with_outliers_is_consistent():
     other.wait()
     truth = {name: value + 0.1 for name, value in BENT.items()}
     for _ in range(5):
-        seen = observer(truth)
-        a, b = one.update(seen), other.update(seen)
+        data = observer(truth)
+        a, b = one.update(data), other.update(data)
     assert np.allclose(a.covariance, b.covariance, rtol=0, atol=1e-3 * np.abs(a.covariance).max())
-    seen["tip"][:3, 3] += 0.5
-    assert other.update(seen).outliers == ("tip",)
+    data["tip"][:3, 3] += 0.5
+    assert other.update(data).outliers == ("tip",)
 
 
 def test_static_updates_equal_one_batch_estimate():
@@ -142,13 +142,13 @@ def test_static_updates_equal_one_batch_estimate():
     def residuals(x):
         pose = observer.truth(dict(zip(names, x, strict=True)))[0]
         errors = [(x - [BENT[name] for name in names]) / 0.3]
-        for seen in readings:
-            turned = Rotation.from_matrix(seen[:3, :3] @ pose[:3, :3].T).as_rotvec()
-            errors += [(seen[:3, 3] - pose[:3, 3]) / 0.02, turned / np.radians(2)]
+        for data in readings:
+            turned = Rotation.from_matrix(data[:3, :3] @ pose[:3, :3].T).as_rotvec()
+            errors += [(data[:3, 3] - pose[:3, 3]) / 0.02, turned / np.radians(2)]
         return np.concatenate(errors)
 
-    for seen in readings:
-        estimate = tracker.update({"tip": seen})
+    for data in readings:
+        estimate = tracker.update({"tip": data})
     best = least_squares(residuals, list(estimate.state.values()), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     # Equal up to the mean of rotations, which averages rotation vectors to first order.
     assert np.allclose(list(estimate.state.values()), best.x, rtol=0, atol=2e-4)
@@ -166,8 +166,8 @@ def test_linear_model_keeps_its_covariance_in_unobservable_directions():
     information = np.eye(2) / 9 + 300 * np.ones((2, 2))
     assert np.allclose(estimate.covariance, np.linalg.inv(information), rtol=1e-9)
     spread = 0.1**2 * np.eye(3) + 18 * np.ones((3, 3))
-    seen = np.array([1.0, 1.2, 0.9])
-    density = -seen @ np.linalg.inv(spread) @ seen / 2 - np.linalg.slogdet(2 * np.pi * spread)[1] / 2
+    data = np.array([1.0, 1.2, 0.9])
+    density = -data @ np.linalg.inv(spread) @ data / 2 - np.linalg.slogdet(2 * np.pi * spread)[1] / 2
     assert tracker.log_evidence == pytest.approx(density, rel=1e-9)
 
 
@@ -212,8 +212,8 @@ def test_groups_with_affine_measurements_have_a_single_minimum():
     ):
         tracker = Tracker(model, observed)
         layout = tracker._layout
-        found = {group.coordinates[-1]: layout.is_affine(k) for k, group in enumerate(layout.groups)}
-        assert sorted(found.values()) == sorted(expected), observed
+        result = {group.coordinates[-1]: layout.is_affine(k) for k, group in enumerate(layout.groups)}
+        assert sorted(result.values()) == sorted(expected), observed
 
 
 def test_update_leaves_the_singularity_of_a_stretched_arm():
@@ -259,8 +259,8 @@ def test_static_record_is_dropped_when_inputs_change():
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))
     x, y, pan = model.symbol("p/x"), model.symbol("p/y"), kv.position("pan")
-    seen = ObservedExpression("bearing", np.cos(pan) * x + np.sin(pan) * y, 0.01**2)
-    tracker = Tracker(model, [seen], inputs=[pan], uncertainty={x: 3, y: 3})
+    data = ObservedExpression("bearing", np.cos(pan) * x + np.sin(pan) * y, 0.01**2)
+    tracker = Tracker(model, [data], inputs=[pan], uncertainty={x: 3, y: 3})
     for angle in (0.0, 0.5, 1.5):
         value = np.cos(angle) * 1.0 + np.sin(angle) * 2.0
         estimate = tracker.update({"bearing": value}, inputs={pan: angle})

@@ -53,7 +53,7 @@ def test_quantiles_are_those_of_chi_squared():
     ],
 )
 def test_a_group_that_jumped_is_lost_and_then_found(process, outliers):
-    """A door is opened while nothing looks, without time passing; the drawer beside it is not lost."""
+    """A door is opened unobserved, without time passing; the drawer next to it is not lost."""
     tracker = Tracker(MODEL, ["hinge", "handle", "drawer"], process=process, outliers=outliers, lost_after=5)
     observer = NoisyObserver(MODEL, ["hinge", "handle", "drawer"])
     for k in range(30):
@@ -82,20 +82,20 @@ def test_without_restarts_a_lost_group_stays_lost_and_says_so():
         estimate = tracker.update(observer({"q": 1.2}))
         assert estimate.lost is (k >= 2)
     assert estimate.state["q"] == pytest.approx(0.1, abs=0.02)
-    # What was seen counts, also if it was rejected.
+    # Observations count, also if they were rejected.
     assert estimate.outliers == ("handle",)
     assert estimate.dof == 6
     assert estimate.nis > 1000
 
 
 def test_a_wrong_model_stays_lost():
-    """The handle is seen half a metre from where the model has it: no angle explains that."""
+    """The handle is observed half a metre from where the model has it: no angle explains that."""
     tracker = Tracker(MODEL, ["hinge", "handle"], outliers=True, lost_after=4)
     observer, flags = NoisyObserver(MODEL, ["handle"]), []
     for k in range(20):
-        seen = observer({"q": 0.3 + 0.01 * k})
-        seen["handle"][2, 3] += 0.5
-        flags.append(tracker.update(seen, at=k / 30).lost)
+        data = observer({"q": 0.3 + 0.01 * k})
+        data["handle"][2, 3] += 0.5
+        flags.append(tracker.update(data, at=k / 30).lost)
     assert not any(flags[:3])
     assert all(flags[3:])
 
@@ -120,8 +120,8 @@ def test_swapped_frames_are_lost():
         NoisyObserver(MODEL, ["hinge", "handle"]),
     )
     for k in range(20):
-        seen = observer({"q": 0.4})
-        estimate = tracker.update({"hinge": seen["handle"], "handle": seen["hinge"]}, at=k / 30)
+        data = observer({"q": 0.4})
+        estimate = tracker.update({"hinge": data["handle"], "handle": data["hinge"]}, at=k / 30)
     assert estimate.lost
 
 
@@ -129,11 +129,11 @@ def test_a_single_gross_error_loses_nothing():
     tracker = Tracker(MODEL, ["hinge", "handle"], outliers=True, lost_after=2)
     observer = NoisyObserver(MODEL, ["hinge", "handle"])
     for k in range(40):
-        seen = observer({"q": 0.7})
+        data = observer({"q": 0.7})
         if k % 5 == 4:
-            for pose in seen.values():
+            for pose in data.values():
                 pose[:3, 3] += 0.8
-        estimate = tracker.update(seen, at=k / 30)
+        estimate = tracker.update(data, at=k / 30)
         assert not estimate.lost
     assert estimate.state["q"] == pytest.approx(0.7, abs=0.05)
 
@@ -195,10 +195,10 @@ def test_measurements_beyond_the_lag_or_given_twice_are_refused():
     before = tracker.estimate
     with pytest.raises(InvalidValueError, match=r"later than the lag of 0\.2 s"):
         tracker.update(observer({"a": 0.0}), at=0.3)
-    seen = observer({"a": 0.0})
-    tracker.update(seen, at=1.0)
+    data = observer({"a": 0.0})
+    tracker.update(data, at=1.0)
     with pytest.raises(InvalidValueError, match="'cart' came twice for 1 s"):
-        tracker.update(seen, at=1.0)
+        tracker.update(data, at=1.0)
     tracker.update(observer({"a": 0.0}), at=1.0)
     assert tracker.estimate.deviation["a"] < before.deviation["a"]
     with pytest.raises(InvalidValueError, match="lag="):
@@ -229,8 +229,8 @@ def test_gate_is_a_number_of_standard_deviations():
         start = {"start": {"a": 0.0}, "uncertainty": {"a": 1e-4}}
         tracker = Tracker(make_slide(), [observed], process="static", outliers=Outliers(gate=gate), **start)
         for covariance in (0.01, 0.25):
-            seen = {"z": (4.0 * np.sqrt(covariance), covariance)}
-            assert bool(tracker.copy().update(seen).outliers) is is_outlier
+            data = {"z": (4.0 * np.sqrt(covariance), covariance)}
+            assert bool(tracker.copy().update(data).outliers) is is_outlier
     with pytest.raises(InvalidValueError, match="gate"):
         Outliers(gate=0.0)
     with pytest.raises(InvalidValueError, match="Only a tracker has a gate"):
@@ -249,10 +249,10 @@ def test_recent_poses_and_a_rebuilt_tracker():
     tracker = Tracker(model, ["hinge", "handle"], keep=50)
     observer = NoisyObserver(model, ["hinge", "handle"])
     for k in range(60):
-        seen = observer({"q": 0.01 * k})
+        data = observer({"q": 0.01 * k})
         if k % 2:
-            del seen["hinge"]
-        tracker.update(seen, at=0.1 * k)
+            del data["hinge"]
+        tracker.update(data, at=0.1 * k)
     recent = tracker.recent
     assert recent.relative_to == "world"
     assert recent.times is not None
@@ -300,7 +300,7 @@ def test_late_measurements_repeat_all_that_happened():
     with model.edit() as edit:
         edit.add_frame("box", parent="cart", transform=kv.translation(kv.position("p"), 0, 0))
     looks = [(1.0, 0.1), (1.1, 0.2), (1.2, 0.4), (None, 0.6), (1.3, 0.5)]
-    found = []
+    result = []
     for order in ((0, 1, 2, 3, 4), (1, 0, 2, 3, 4), (0, 2, 3, 4, 1)):
         tracker = Tracker(model, ["box"], lag=0.5, inputs=["p"], start={"a": 0.0})
         for k in order:
@@ -314,8 +314,8 @@ def test_late_measurements_repeat_all_that_happened():
                 given["p"] = 9.0
         tracker = pickle.loads(pickle.dumps(tracker))
         estimate = tracker.update({"box": make_cart_pose(0.7)}, at=1.6)
-        found.append((estimate.state["a"], estimate.deviation["a"], estimate.log_evidence))
-    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-12)
+        result.append((estimate.state["a"], estimate.deviation["a"], estimate.log_evidence))
+    np.testing.assert_allclose(result[1:], [result[0]] * 2, rtol=1e-12)
 
 
 def test_a_measurement_is_repeated_only_within_its_time():
@@ -403,5 +403,5 @@ def test_a_reset_quaternion_is_as_uncertain_as_at_the_start():
         turns = [k for k, v in enumerate(after.tangent) if str(v).startswith("box/w")]
         np.testing.assert_allclose(np.sqrt(np.diag(after.covariance))[turns], np.pi)
         assert after.deviation["box/x"] == pytest.approx(before.deviation["box/x"])
-        found = tracker.update({"box": kv.rotation_z(1.0)()}).state
-        assert 2 * np.arctan2(found["box/qz"], found["box/qw"]) == pytest.approx(1.0, abs=1e-3)
+        result = tracker.update({"box": kv.rotation_z(1.0)()}).state
+        assert 2 * np.arctan2(result["box/qz"], result["box/qw"]) == pytest.approx(1.0, abs=1e-3)

@@ -44,10 +44,10 @@ def make_arm(tilt: object = None) -> kv.Model:
 def test_linear_model_equals_a_kalman_filter():
     a, b = kv.position("a"), kv.position("b")
     R = np.array([[0.04, 0.01], [0.01, 0.09]])
-    seen = ObservedExpression("z", kv.array([a + 2 * b, a - b]), R)
+    data = ObservedExpression("z", kv.array([a + 2 * b, a - b]), R)
     tracker = Tracker(
         make_slides(),
-        [seen],
+        [data],
         start={"a": 0.3, "b": -0.2},
         uncertainty={"a": 0.5, "b": 2.0},
         process_noise={"a:velocity": 0.02, "b:velocity": 0.3},
@@ -96,8 +96,8 @@ def test_order_of_observations_hardly_matters():
         tracker = Tracker(
             model, observed, uncertainty={"one": 0.01, "two": 0.01}, start={"one": 0.4, "two": -0.7}
         )
-        for seen in order:
-            estimate = tracker.update(seen)
+        for data in order:
+            estimate = tracker.update(data)
         results.append(np.array([estimate.state["one"], estimate.state["two"]]))
     # The remaining difference is second order in the noise, from linearisation.
     assert np.abs(results[0] - results[1]).max() < 0.02 * min(estimate.deviation.values())
@@ -112,18 +112,18 @@ def test_estimate_is_invariant_to_the_world_frame():
     here = Tracker(plain, [ObservedPose(f, covariance=covariance) for f in observer.frames])
     there = Tracker(moved, [ObservedPose(f, covariance=turn @ covariance @ turn.T) for f in observer.frames])
     for _ in range(4):
-        seen = observer({"one": 0.4, "two": -0.7})
-        a, b = here.update(seen), there.update({f: place @ T for f, T in seen.items()})
+        data = observer({"one": 0.4, "two": -0.7})
+        a, b = here.update(data), there.update({f: place @ T for f, T in data.items()})
         assert np.allclose(list(a.state.values()), list(b.state.values()), atol=1e-7)
         assert np.allclose(a.covariance, b.covariance, rtol=1e-5)
         assert a.nis == pytest.approx(b.nis, rel=1e-6)
 
 
-def residuals(x, model, seen, covariance, prior):
+def residuals(x, model, data, covariance, prior):
     """Compute whitened residuals of a state with scipy."""
     parts = [(x - prior[0]) / prior[1]]
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-    for frame, T in seen.items():
+    for frame, T in data.items():
         said = model.fk(frame)(
             {str(s): v for s, v in zip(model.symbols, x, strict=True) if s in model.fk(frame).symbols}
         )
@@ -139,19 +139,19 @@ def test_estimate_minimises_the_cost_inside_the_limits(truth):
     observer = NoisyObserver(model, ["lower", "tip"], 0.1, np.radians(10), seed=3)
     prior = np.zeros(2), np.full(2, 1.5)
     for _ in range(3):
-        seen = observer(dict(zip(("one", "two"), truth, strict=True)))
+        data = observer(dict(zip(("one", "two"), truth, strict=True)))
         tracker = Tracker(model, [ObservedPose(f, covariance=covariance) for f in observer.frames])
-        estimate = tracker.update(seen)
-        found = least_squares(
+        estimate = tracker.update(data)
+        result = least_squares(
             residuals,
             [0.0, 0.0],
             bounds=(-1.5, 1.5),
-            args=(model, seen, covariance, prior),
+            args=(model, data, covariance, prior),
             xtol=1e-12,
             ftol=1e-12,
             gtol=1e-12,
         )
-        assert [estimate.state["one"], estimate.state["two"]] == pytest.approx(found.x.tolist(), abs=2e-6)
+        assert [estimate.state["one"], estimate.state["two"]] == pytest.approx(result.x.tolist(), abs=2e-6)
 
 
 def test_jacobians_equal_finite_differences_of_residuals():
@@ -162,8 +162,8 @@ def test_jacobians_equal_finite_differences_of_residuals():
     update_step = tracker._update_step
     for _ in range(20):
         x = rng.uniform(-1.4, 1.4, 2)
-        seen = add_pose_noise(model.fk("tip")(dict(zip(("one", "two"), x, strict=True))), 0.3, 0.8, rng)
-        reading = update_step.reader.read({"tip": seen})
+        data = add_pose_noise(model.fk("tip")(dict(zip(("one", "two"), x, strict=True))), 0.3, 0.8, rng)
+        reading = update_step.reader.read({"tip": data})
 
         def error(at, reading=reading):
             return update_step.residuals.errors(
@@ -224,15 +224,15 @@ def test_limits_on_several_coordinates_hold():
 
 
 def test_limits_that_depend_on_coordinates_hold():
-    """A door limits the drawer beside it, and a bolt holds the door near zero."""
+    """A door limits the drawer next to it, and a bolt holds the door near zero."""
     model = make_slides()
     a, b = kv.position("a"), kv.position("b")
     with model.edit() as edit:
         edit.constrain("a/position", 0, a, kv.articulations.tabulated_limit(b, {0.0: 0.2, 1.0: 1.0}))
         edit.constrain("b/position", 0, b, 1)
         edit.constrain("held", *kv.articulations.position_lock(b, open_if=a < 0.9, upper=0.8))
-    seen = ObservedExpression("z", kv.array([a, b]), 0.01 * np.eye(2))
-    tracker = Tracker(model, [seen], uncertainty={"a": 10.0, "b": 10.0})
+    data = ObservedExpression("z", kv.array([a, b]), 0.01 * np.eye(2))
+    tracker = Tracker(model, [data], uncertainty={"a": 10.0, "b": 10.0})
     for _ in range(3):
         estimate = tracker.update({"z": [0.9, 0.3]})
     # The nearest point on the line a = 0.2 + 0.8 b.
@@ -270,8 +270,8 @@ def test_compiled_and_numpy_updates_agree():
         truth = {str(s): rng.choice([*fast.limits[s], rng.uniform(*fast.limits[s])]) for s in fast.symbols}
         one, other = fast.copy(), slow.copy()
         for _ in range(4):
-            seen, mask = observer.array(truth), rng.random(len(observer.frames)) < 0.7
-            a, b = one.update_poses(seen, mask), other.update_poses(seen, mask)
+            data, mask = observer.array(truth), rng.random(len(observer.frames)) < 0.7
+            a, b = one.update_poses(data, mask), other.update_poses(data, mask)
             assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-12)
             assert np.allclose(a.information, b.information, rtol=1e-12)
             assert np.allclose(a.mean, b.mean, rtol=0, atol=1e-9)
@@ -302,13 +302,13 @@ def test_compiled_and_numpy_updates_agree_on_floating_bodies(place):
     for name, turn in zip(("box", "ball"), turns, strict=True):
         truth |= dict(zip((f"{name}/q{c}" for c in "xyzw"), turn, strict=True))
     for step in range(5):
-        seen = observer(truth)
+        data = observer(truth)
         native = fast._update_step.native.update(
-            fast._now.mixture.best, fast._update_step.reader.read(seen), np.empty(0)
+            fast._now.mixture.best, fast._update_step.reader.read(data), np.empty(0)
         )
         assert native is not None
         for a, b in [
-            (fast.update(seen), slow.update(seen)),
+            (fast.update(data), slow.update(data)),
             tuple(tracker.predict(0.1, {"box/wx:velocity": 4.0 * (step == 2)}) for tracker in (fast, slow)),
         ]:
             assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-10)
@@ -328,9 +328,9 @@ def test_compiled_and_numpy_updates_agree_on_inliers():
     assert fast.wait()
     truth = {str(s): np.mean(fast.limits[s]) for s in fast.symbols}
     for step in range(4):
-        seen = observer(truth)
-        seen[observer.frames[2 * step]][:3, 3] += 1.0
-        a, b = fast.update(seen), slow.update(seen)
+        data = observer(truth)
+        data[observer.frames[2 * step]][:3, 3] += 1.0
+        a, b = fast.update(data), slow.update(data)
         assert a.outliers == b.outliers == (observer.frames[2 * step],)
         assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-9)
         assert np.allclose(a.information, b.information, rtol=1e-6)
@@ -354,13 +354,13 @@ def test_compiled_and_numpy_updates_agree_on_outliers(gross, steps, monkeypatch)
     truth = {str(s): rng.uniform(*fast.limits[s]) for s in fast.symbols}
     for step in range(steps):
         left.clear()
-        seen, mask = observer.array(truth), rng.random(len(observer.frames)) < 0.7
+        data, mask = observer.array(truth), rng.random(len(observer.frames)) < 0.7
         wrong = rng.random(len(observer.frames)) < 0.3
-        turns = Rotation.from_rotvec(gross * rng.standard_normal((len(seen), 3))).as_matrix()
-        seen[wrong, :3, 3] += gross * rng.choice([-1, 1], (wrong.sum(), 3))
-        seen[wrong, :3, :3] = turns[wrong] @ seen[wrong, :3, :3]
-        b = slow.update_poses(seen, mask)
-        a = fast.update_poses(seen, mask)
+        turns = Rotation.from_rotvec(gross * rng.standard_normal((len(data), 3))).as_matrix()
+        data[wrong, :3, 3] += gross * rng.choice([-1, 1], (wrong.sum(), 3))
+        data[wrong, :3, :3] = turns[wrong] @ data[wrong, :3, :3]
+        b = slow.update_poses(data, mask)
+        a = fast.update_poses(data, mask)
         assert step < 5 or gross < 1 or len(left) <= 2
         assert a.outliers == b.outliers
         assert a.dof == b.dof
@@ -397,16 +397,16 @@ def test_compiled_and_numpy_agree_about_groups_with_several_active_bounds(seed):
     truth = {str(s): rng.choice([-0.5, 0.5, 0.1]) for s in fast.symbols}
     at_bounds = 0
     for _ in range(4):
-        seen = {
+        data = {
             "e end": add_pose_noise(model.fk("e end")(truth), 0.1, 0.1, rng),
             "c end": rng.standard_normal(3) * 0.01
             + (model.fk("c end") @ [0.1, 0.2, 0.3, 1])({s: truth[s] for s in "abc"})[:3],
             "sum": [truth["a"] + truth["b"], truth["a"] * truth["b"]] + 0.1 * rng.standard_normal(2),
         }
-        one, other = fast.update(seen), slow.update(seen)
+        one, other = fast.update(data), slow.update(data)
         assert (
             fast._update_step.native.update(
-                fast._now.mixture.best, fast._update_step.reader.read(seen), np.empty(0)
+                fast._now.mixture.best, fast._update_step.reader.read(data), np.empty(0)
             )
             is not None
         )
@@ -476,7 +476,7 @@ def test_tracker_is_picklable():
     truth = {str(s): 0.2 for s in tracker.symbols}
     tracker.wait()
     tracker.update(observer(truth))
-    there, seen = pickle.loads(pickle.dumps(tracker)), observer(truth)
-    here, again = tracker.update(seen), there.update(seen)
+    there, data = pickle.loads(pickle.dumps(tracker)), observer(truth)
+    here, again = tracker.update(data), there.update(data)
     assert again.state == pytest.approx(dict(here.state), abs=1e-9)
     np.testing.assert_allclose(again.covariance, here.covariance, rtol=1e-9)

@@ -199,12 +199,12 @@ GOOD = {
         ({"times": [0, "1"]}, "'1' in 'times'"),
         ({"times": [0, 10**400]}, "no number|too large"),
         ({"times": [0, -1]}, "increase"),
-        ({"times": [0, float("nan")]}, "NaN is no number"),
+        ({"times": [0, float("nan")]}, "NaN is not a number"),
         ({"positions": [[0]]}, "2 rows"),
         ({"positions": [[0], [1, 2]]}, "row 1 of 'positions' has 2 numbers"),
         ({"coordinates": "a"}, "list of names"),
         ({"coordinates": ["a:velocity"]}, "derivative"),
-        ({"coordinates": ["a//b"]}, "no name of a coordinate"),
+        ({"coordinates": ["a//b"]}, "not the name of a coordinate"),
     ],
 )
 def test_files_that_are_no_trajectories_are_refused(

@@ -244,9 +244,9 @@ class CurveMotion:
 
     def retract_joints(self, values: Array, step: Array) -> Array:
         """Return joint values after a step of at most a distance of two knots, not far beyond the ends."""
-        most = self.spline.step
-        moved = values + np.clip(step, -most, most)
-        return np.asarray(np.clip(moved, self.spline.first - most, self.spline.last + most))
+        length = self.spline.step
+        moved = values + np.clip(step, -length, length)
+        return np.asarray(np.clip(moved, self.spline.first - length, self.spline.last + length))
 
     def prior(self) -> ParameterPrior:
         """Return the Gaussian prior of second differences and of the difference between the ends."""

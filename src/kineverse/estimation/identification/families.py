@@ -391,8 +391,8 @@ class FamilyMotion:
     def retract_joints(self, values: Array, step: Array) -> Array:
         """Return joint values after a step of at most a quarter of the search range, clipped to the range."""
         ranges = np.array([*self.family.joints.values()]).reshape(-1, 2)
-        most = 0.25 * (ranges[:, 1] - ranges[:, 0])
-        return np.asarray(np.clip(values + np.clip(step, -most, most), ranges[:, 0], ranges[:, 1]))
+        largest = 0.25 * (ranges[:, 1] - ranges[:, 0])
+        return np.asarray(np.clip(values + np.clip(step, -largest, largest), ranges[:, 0], ranges[:, 1]))
 
     def prior(self) -> ParameterPrior:
         """Return the Gaussian prior of the parameters."""

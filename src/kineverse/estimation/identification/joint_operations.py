@@ -182,8 +182,8 @@ def joint_operation(
         case "spherical":
             return MountedBall(**mounted)
         case "planar":
-            most = max(max(-low, high) for low, high in ranges[:2]) if limited else None
-            return Planar(**names, axis=axis, lower=None if most is None else -most, upper=most)
+            largest = max(max(-low, high) for low, high in ranges[:2]) if limited else None
+            return Planar(**names, axis=axis, lower=None if largest is None else -largest, upper=largest)
     return Floating(**names)
 
 

@@ -203,11 +203,11 @@ def _check_finite(rows: Array, part: str, label: str = "Pose") -> None:
     wrong = np.flatnonzero(~(largest <= _LARGEST))
     if not len(wrong):
         return
-    k, most = int(wrong[0]), float(largest[wrong[0]])
-    if not math.isfinite(most):
+    k, entry = int(wrong[0]), float(largest[wrong[0]])
+    if not math.isfinite(entry):
         raise InvalidValueError(f"{label} {k} of the {part} is not finite. Leave out what was not observed.")
     raise InvalidValueError(
-        f"{label} {k} of the {part} has a number of {most:.2g}. None is expected above {_LARGEST:.0g}: "
+        f"{label} {k} of the {part} has a number of {entry:.2g}. None is expected above {_LARGEST:.0g}: "
         "lengths are in metres, angles in radians."
     )
 

@@ -242,7 +242,7 @@ class Identifier:
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
             return weigh_and_check(data, {}, self._weights).result
         deferred: dict[str | Family, FamilySolution] = {}
-        # Poses of a few observations cannot tell which of them are outliers.
+        # A few observations do not determine which of them are outliers.
         growth = 2.0 if self._outliers is None else 1.0 + _MORE
         if len(observations) >= growth * self._full_count:
             self._full_count = self._noise_count = len(observations)

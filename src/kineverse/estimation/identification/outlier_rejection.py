@@ -177,8 +177,8 @@ class _InlierSearch:
     def grow(self, subset: Solution[FamilyMember], rows: RowIndices) -> _InlierHypothesis:
         """Return the hypothesis that the solution of some of the observations leads to."""
         observations = self.observations
-        apart = (observations.relative[:, None] - observations.relative[None, rows])[:, :, :3]
-        values = subset.values[np.argmin(np.sum(apart**2, axis=(2, 3)), axis=1)]
+        difference = (observations.relative[:, None] - observations.relative[None, rows])[:, :, :3]
+        values = subset.values[np.argmin(np.sum(difference**2, axis=(2, 3)), axis=1)]
         parent = observations.parent.copy()
         parent[rows] = subset.parent
         weights = np.full(len(observations), _LEAST_WEIGHT)

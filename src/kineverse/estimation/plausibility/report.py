@@ -278,5 +278,5 @@ class Plausibility:
 
     def __str__(self) -> str:
         lines = [str(verdict) for verdict in self.verdicts]
-        lines += [f"'{frame}' tells nothing: {reason}" for frame, reason in self.untested.items()]
+        lines += [f"'{frame}' is untested: {reason}" for frame, reason in self.untested.items()]
         return "\n".join(lines) or "nothing was observed"

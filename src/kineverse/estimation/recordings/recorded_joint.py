@@ -197,7 +197,7 @@ def identify_recorded_joint(
 def objects(other: Assumption, made: Assumption) -> bool:
     """Return True if the answer under another assumption is not the one under the assumption made."""
     sure = [None if one.found.is_ambiguous else one.found.best.family for one in (other, made)]
-    # A longer correlation time always tells less.
+    # A longer correlation time always leaves less information.
     is_longer = other.correlation_time != made.correlation_time
     return sure[0] != sure[1] and not (is_longer and other.found.best.family == made.found.best.family)
 
@@ -249,8 +249,8 @@ class _Comparison:
 
     def correlation_time(self, fit: Fit) -> float:
         """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
-        most = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
-        return min(most, correlation_time(_residuals_across_motion(fit), _CAUTION))
+        largest = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
+        return min(largest, correlation_time(_residuals_across_motion(fit), _CAUTION))
 
     def sufficient_rows(self, time: float, fit: Fit) -> Indices:
         """Return evenly spaced rows; more of them hold little more about errors with this time."""
@@ -289,10 +289,10 @@ class _Comparison:
             noises.append(self.assume(None, best.correlation_time, rows).noise)
         others = [self.assume(noise, best.correlation_time, rows) for noise in noises]
         known = self.assume(best.noise, best.correlation_time, rows) if stated is None else best
-        most = max(log_probability(one.found) for one in (known, *others))
+        largest = max(log_probability(one.found) for one in (known, *others))
         for other in others:
             # The families of a noise that the residuals refute are compared for a larger one.
-            if not other.found.misfit > CALIBRATED and log_probability(other.found) > most - _REFUTED:
+            if not other.found.misfit > CALIBRATED and log_probability(other.found) > largest - _REFUTED:
                 yield other
 
     def complete(self, best: Assumption, rows: Indices) -> Fit:

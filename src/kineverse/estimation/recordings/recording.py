@@ -45,9 +45,9 @@ class RecordedTrack:
         return len(self.poses)
 
 
-def spaced_indices(count: int, most: int) -> Indices:
-    """Return at most ``most`` evenly spaced numbers below ``count``, including the first and the last."""
-    return np.unique(np.linspace(0, count - 1, most).round().astype(np.intp))
+def spaced_indices(count: int, size: int) -> Indices:
+    """Return at most ``size`` evenly spaced numbers below ``count``, including the first and the last."""
+    return np.unique(np.linspace(0, count - 1, size).round().astype(np.intp))
 
 
 @dataclass(frozen=True, eq=False)

@@ -221,12 +221,12 @@ class CovarianceInflation(_CovarianceComputation):
         directions, _ = self._unobservable.directions(number, information)
         if len(directions):
             covariance = inverse_spd(information)
-            most, slopes = self._curvature(number, belief, directions, self._reader.empty())
+            largest, slopes = self._curvature(number, belief, directions, self._reader.empty())
             # Predictions become as uncertain as they are curved.
             lacking = []
             for i, slope in slopes.items():
                 variance = float(np.einsum("ij,jk,ik->", slope, covariance, slope)) / len(slope)
-                lacking.append(np.full(len(slope), max(most[i] - variance, 0.0)))
+                lacking.append(np.full(len(slope), max(largest[i] - variance, 0.0)))
             scale = self._unobservable.deviations[t]
             inverse = np.linalg.pinv(np.concatenate(list(slopes.values())) * scale, rcond=_RANK)
             inverse *= scale[:, None]
@@ -242,8 +242,8 @@ class CovarianceInflation(_CovarianceComputation):
         block = self._layout.groups[number].block
         directions, _ = self._unobservable.directions(number, belief.information[block])
         reading = record.as_measurements(self._layout, self._reader)
-        most, _ = self._curvature(number, belief, directions, reading)
-        return max(most.values()) < _LINEAR**2
+        largest, _ = self._curvature(number, belief, directions, reading)
+        return max(largest.values()) < _LINEAR**2
 
     def _curvature(
         self, number: int, belief: InformationState, directions: Array, noise: Measurements
@@ -257,7 +257,7 @@ class CovarianceInflation(_CovarianceComputation):
         as_predicted = noise._replace(values=self._reader.as_values(here))
         as_predicted.mask[measured] = True
         slopes = {i: s for i, (_, s) in self._residuals.errors(here, as_predicted, measured).items()}
-        most = dict.fromkeys(measured, 0.0)
+        largest = dict.fromkeys(measured, 0.0)
         for step in (*directions, *-directions):
             try:
                 x, _ = self._process_model.retract(number, belief.x[group.x], step, inputs)
@@ -270,5 +270,5 @@ class CovarianceInflation(_CovarianceComputation):
             for i, (error, _) in self._residuals.errors(predicted, as_predicted, measured).items():
                 curvature = error + slopes[i] @ remaining
                 if np.isfinite(curvature).all():
-                    most[i] = max(most[i], float(curvature @ curvature) / len(curvature))
-        return most, slopes
+                    largest[i] = max(largest[i], float(curvature @ curvature) / len(curvature))
+        return largest, slopes

@@ -152,9 +152,9 @@ class MergeCriterion:
     ) -> bool:
         """Return True if two candidates predict the same measurements of a group from nearby states."""
         values = self._reader.as_values(other.predicted)
-        nothing = self._reader.empty()
-        as_seen = nothing._replace(values=values, mask=~nothing.mask)
-        errors = self._residuals.errors(one.predicted, as_seen, group.observation_indices)
+        empty = self._reader.empty()
+        predicted = empty._replace(values=values, mask=~empty.mask)
+        errors = self._residuals.errors(one.predicted, predicted, group.observation_indices)
         if any(float(e @ e) >= _SAME_PREDICTION**2 for e, _ in errors.values()):
             return False
         number, here = self._layout.groups.index(group), other.belief.x[group.x]
@@ -162,16 +162,16 @@ class MergeCriterion:
         for k, x in enumerate(group.coordinates):
             if x in periods:
                 change[k] = math.remainder(change[k], periods[x])
-        # The tangent step between both states, to first order.
-        apart = np.linalg.pinv(self._process_model.basis(number, here, inputs)) @ change
-        most = _NEAR**2 * len(apart)
-        if float(apart @ other.belief.information[group.block] @ apart) < most:
+        # Between both states, to first order.
+        step = np.linalg.pinv(self._process_model.basis(number, here, inputs)) @ change
+        bound = _NEAR**2 * len(step)
+        if float(step @ other.belief.information[group.block] @ step) < bound:
             return True
-        mine, theirs = one.belief.records[number], other.belief.records[number]
-        if mine is None or theirs is None:
+        record, known = one.belief.records[number], other.belief.records[number]
+        if record is None or known is None:
             return False
-        if min(mine.count, theirs.count) > 1 and mine.branch is not theirs.branch:
+        if min(record.count, known.count) > 1 and record.branch is not known.branch:
             return False  # separate components of earlier updates
         if number not in other.covariances:
             other.covariances[number] = self._ridge_covariance.compute(number, other.belief)
-        return float(apart @ inverse_spd(other.covariances[number]) @ apart) < most
+        return float(step @ inverse_spd(other.covariances[number]) @ step) < bound

@@ -113,5 +113,5 @@ class HypothesisBank:
     def _forget(self, dt: float) -> None:
         if self._forgetting:
             kept = math.exp(-self._forgetting * dt)
-            most = max(self._logs.values())
-            self._logs = {name: kept * (log - most) for name, log in self._logs.items()}
+            largest = max(self._logs.values())
+            self._logs = {name: kept * (log - largest) for name, log in self._logs.items()}

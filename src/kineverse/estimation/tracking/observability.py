@@ -157,11 +157,11 @@ class MeanMeasurement:
         """Return the mean of both, weighted by information."""
         information = self.information + other.information
         if one.is_pose:
-            apart = pose_difference(other.value.reshape(4, 4), self.value.reshape(4, 4))
+            difference = pose_difference(other.value.reshape(4, 4), self.value.reshape(4, 4))
         else:
-            apart = wrap_difference(other.value - self.value, one.period)
-        step = np.linalg.solve(information, other.information) @ apart
-        peak = self.peak + other.peak - float(apart @ self.information @ step) / 2
+            difference = wrap_difference(other.value - self.value, one.period)
+        step = np.linalg.solve(information, other.information) @ difference
+        peak = self.peak + other.peak - float(difference @ self.information @ step) / 2
         value = retract(self.value.reshape(4, 4), step).reshape(-1) if one.is_pose else self.value + step
         return MeanMeasurement(value, information, peak)
 

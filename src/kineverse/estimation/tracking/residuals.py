@@ -92,7 +92,7 @@ class MeasurementReader:
             raise ShapeError(f"The poses are an array of shape {(count, 4, 4)}, not {checked.shape}.")
         observed = self._all if mask is None else np.ascontiguousarray(mask)
         if observed.dtype != bool or observed.shape != (count,):
-            raise ShapeError(f"mask= is an array of {count} booleans, not {mask!r:.80}.")
+            raise ShapeError(f"mask= has {count} booleans, not {mask!r:.80}.")
         values = np.ascontiguousarray(checked).reshape(-1)
         if covariances is None:
             return Measurements(values, observed, self._whitening, self._log_scale)

@@ -159,7 +159,7 @@ class Tracker:
 
     @property
     def periodic(self) -> frozenset[Symbol]:
-        """Coordinates whose turn no observation tells; it is the one nearest to the prediction."""
+        """Coordinates whose turn no observation determines; it is the one nearest to the prediction."""
         return frozenset(self._update_step.periods)
 
     @property

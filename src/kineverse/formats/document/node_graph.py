@@ -68,11 +68,11 @@ class NodeGraph:
 
     def symbol(self, ref: Any, least: int = 0) -> Symbol:
         """Return the symbol at a place of the table, of order ``least`` or more."""
-        found = self._expressions[self.check_ref(ref)]
-        if not isinstance(found, Symbol) or found.order < least:
+        result = self._expressions[self.check_ref(ref)]
+        if not isinstance(result, Symbol) or result.order < least:
             what = "the derivative of a symbol" if least else "a symbol"
             raise InvalidDocumentError(f"node {ref} should be {what}")
-        return found
+        return result
 
     def pairs(self, value: Any, least: int) -> list[tuple[Symbol, Expression]]:
         """Return pairs of symbol and expression, every symbol once."""

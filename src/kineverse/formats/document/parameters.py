@@ -117,14 +117,14 @@ def operation_parameters(operation: Operation) -> dict[str, Any]:
 
 def expressions_in_parameter(parameter: Any, writes: Mapping[Cell, Any]) -> list[Expression]:
     """Return the expressions in a parameter that :func:`encode_parameter` encodes."""
-    found: list[Expression] = []
+    result: list[Expression] = []
 
     def note(expression: Expression) -> int:
-        found.append(expression)
+        result.append(expression)
         return 0
 
     encode_parameter(parameter, writes, note)
-    return found
+    return result
 
 
 def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: int = 0) -> Any:

@@ -1,4 +1,10 @@
-"""Values of documents: bodies, constraints, frames and articulations as JSON, and back."""
+"""Values of documents as JSON: writes of operations, bodies, numbers and texts.
+
+A frame is ``{"parent": name, "factors": [...]}``, each factor a pose (its 12 numbers) or the place of an
+expression; a constraint the places of ``[lower, expression, upper]``; a rate
+``[coordinate, [[speed, ref], ...]]``. Data are texts, numbers, true, false, null and lists of these; an
+expression is ``{"expression": ref}``.
+"""
 
 from __future__ import annotations
 

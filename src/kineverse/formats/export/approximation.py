@@ -1,4 +1,9 @@
-"""Approximation of couplings by polynomials: minimax fit, and a certified bound of its deviation."""
+"""Approximation of couplings by polynomials: minimax fit with a certified bound of its error.
+
+Remez' exchange algorithm finds the polynomial on samples. Interval arithmetic then bounds its error
+everywhere: the Taylor series of the difference encloses it on each interval, and intervals are halved until
+the bound is close to the largest error at a point.
+"""
 
 from __future__ import annotations
 

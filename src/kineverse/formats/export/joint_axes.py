@@ -133,9 +133,9 @@ def _decompose_factor(factor: Expression, terms: TermGraph, offsets: bool) -> li
     try:
         if isinstance(factor, OneAxisTransform):
             amount = converter.convert(terms.term(factor.amount))
-            found = _axis_motion(factor, amount, converter, terms, offsets)
-            if found is not None:
-                return found
+            result = _axis_motion(factor, amount, converter, terms, offsets)
+            if result is not None:
+                return result
         try:
             return _split_off_motions(_matrix_entries(factor, terms, converter), converter)
         except UnrecognisedMotionError:
@@ -203,17 +203,17 @@ def _axis_motion(
             )
         ]
     polynomials, offset = sums
-    found: list[Matrix | AnyJointMotion] = []
+    result: list[Matrix | AnyJointMotion] = []
     if offset and not (offsets and polynomials):
-        found.append(OneAxisTransform(factor.direction, offset, factor.is_rotation)())
+        result.append(OneAxisTransform(factor.direction, offset, factor.is_rotation)())
         offset = 0.0
     for index, coefficients in sorted(polynomials.items()):
         whole = (offset, *coefficients)
-        found.append(
+        result.append(
             JointMotion(factor.is_rotation, factor.direction, ZERO_VECTOR, converter.variables[index], whole)
         )
         offset = 0.0
-    return found
+    return result
 
 
 def _has_only_coordinates(amount: TrigPolynomial, converter: TrigPolynomialConverter) -> bool:
@@ -322,14 +322,14 @@ def _split_off_translation(
                 slides.setdefault(powers[0][0], np.zeros(3))[i] = c.real
             else:
                 constant[i, 3] = c.real
-    found: list[Matrix | AnyJointMotion] = [constant]
+    result: list[Matrix | AnyJointMotion] = [constant]
     for index, direction in slides.items():
         length = float(np.linalg.norm(direction))
         axis = as_vector3(round_exact(direction / length))
-        found.append(JointMotion(False, axis, ZERO_VECTOR, converter.variables[index], (0.0, length)))
+        result.append(JointMotion(False, axis, ZERO_VECTOR, converter.variables[index], (0.0, length)))
     for frequencies, amplitude in waves.items():
-        found += _ellipse_motions(frequencies, amplitude, converter)
-    return found
+        result += _ellipse_motions(frequencies, amplitude, converter)
+    return result
 
 
 def _ellipse_motions(
@@ -344,7 +344,7 @@ def _ellipse_motions(
         normal = rotation_along_z(along)[:, 0]
     normal = round_exact(normal / np.linalg.norm(normal))
     u, v, _ = rotation_along_z(normal).T
-    found: list[Matrix | AnyJointMotion] = []
+    result: list[Matrix | AnyJointMotion] = []
     for sign in (1, -1):
         arm = (c @ u + sign * 1j * (c @ v)) / 2
         if abs(arm) < NOISE:
@@ -357,8 +357,8 @@ def _ellipse_motions(
             for index, w in frequencies
         ]
         back = [JointMotion(True, axis, ZERO_VECTOR, m.variable, (0.0, -m.coefficients[1])) for m in turns]
-        found += [*turns, reach, *back]
-    return found
+        result += [*turns, reach, *back]
+    return result
 
 
 def _clean_pose(pose: Matrix) -> Matrix:

@@ -267,20 +267,20 @@ class LinkTreeBuilder:
             self._refused_symbols.update(s for f in factors if isinstance(f, Expression) for s in f.symbols)
             return None
         try:
-            found = decompose_transform(
+            result = decompose_transform(
                 factors, self._terms, list(self._quaternions.values()), offsets=follows
             )
         except UnrecognisedMotionError as problem:
             self._refuse(name, factors, str(problem))
             return None
         if approximation is not None:
-            approximated = approximation.approximate(name, found)
+            approximated = approximation.approximate(name, result)
             if isinstance(approximated, str):
                 self._refuse(name, factors, approximated)
                 return None
             return approximated
         degree = self.capabilities.polynomial_degree
-        for motion in found.motions:
+        for motion in result.motions:
             if isinstance(motion, JointMotion) and (
                 motion.is_curved or len(motion.coefficients) > degree + 1
             ):
@@ -288,7 +288,7 @@ class LinkTreeBuilder:
                 self._refuse(name, factors, f"{verb} by no {_POWERS[degree]} of a coordinate")
                 self.unsupported.curved = True
                 return None
-        return found
+        return result
 
     def _refuse(self, name: str, factors: Iterable[Pose | Expression], problem: str) -> None:
         """Refuse a frame, naming the symbols that move it."""

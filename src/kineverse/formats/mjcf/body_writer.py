@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import FormatError, MissingDependencyError
-from kineverse.formats.export.mesh_paths import RemarkCallback, file_reference, find_file
 from kineverse.formats.poses import unit_quaternion
-from kineverse.formats.resource_paths import locate_mesh
+from kineverse.formats.resource_paths import RemarkCallback, file_reference, find_file, locate_mesh
 from kineverse.formats.xml_writer import Tag
 from kineverse.lie import transform
 from kineverse.model.body import (
@@ -166,12 +165,12 @@ class MjcfBodyWriter:
 
     def settings(self) -> dict[str, str | float]:
         """Return the compiler settings for inertia: MuJoCo moves no body without mass and inertia."""
-        found: dict[str, str | float] = {"balanceinertia": "true"} if self._unbalanced else {}
+        result: dict[str, str | float] = {"balanceinertia": "true"} if self._unbalanced else {}
         if self._weightless:
             # The compiler raises smaller values to these, so they must not exceed any given value.
-            found["boundmass"] = min(_SMALLEST_MASS, self._least_mass)
-            found["boundinertia"] = min(_SMALLEST_INERTIA, self._least_inertia)
-        return found
+            result["boundmass"] = min(_SMALLEST_MASS, self._least_mass)
+            result["boundinertia"] = min(_SMALLEST_INERTIA, self._least_inertia)
+        return result
 
     @property
     def massless(self) -> list[str]:

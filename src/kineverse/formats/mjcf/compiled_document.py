@@ -111,13 +111,13 @@ def _try_compile(
 def _prepare_shapes(spec: Any) -> list[Any]:
     """Make signed distance fields the meshes that they have the mass of; return the height fields."""
     kinds = mujoco_api.mujoco().mjtGeom
-    found = []
+    result = []
     for geom in spec.geoms:
         if geom.type == kinds.mjGEOM_SDF:
             geom.type = kinds.mjGEOM_MESH
         elif geom.type == kinds.mjGEOM_HFIELD:
-            found.append(geom)
-    return found
+            result.append(geom)
+    return result
 
 
 def _home(spec: Any) -> npt.NDArray[np.float64] | None:

@@ -152,14 +152,14 @@ def _object_names(node: MjcfElement, kind: str, dependent: bool | None = None) -
 
 def add_speeds(custom: Tag, joints: Iterable[JointDescription]) -> bool:
     """Add the velocity limits of joints; return True if there are any."""
-    found = False
+    result = False
     for joint in joints:
         min_velocity, max_velocity = joint.bounds.min_velocity, joint.bounds.max_velocity
         if (min_velocity, max_velocity) != (-math.inf, math.inf):
             numeric = custom.add("numeric", name=f"{SPEED_PREFIX}{joint.name}")
             numeric.attributes["data"] = format_range(min_velocity, max_velocity)
-            found = True
-    return found
+            result = True
+    return result
 
 
 def add_names(custom: Tag, key: str, kind: str, names: Iterable[str]) -> None:

@@ -1,4 +1,8 @@
-"""MJCF equalities of joints, as joints that follow others, and tendons with their lengths and couplings."""
+"""MJCF equalities of joints, as joints that follow others, and tendons with their lengths and couplings.
+
+An equality is y - y0 = Σ aₖ (x - x0)ᵏ. In the order of the file, the joint y becomes a function of x, unless
+it follows another joint already or x follows y. Those equalities stay constraints.
+"""
 
 from __future__ import annotations
 

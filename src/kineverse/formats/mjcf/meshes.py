@@ -3,6 +3,9 @@
 MuJoCo moves the origin of a mesh to its centre and rotates it to its principal axes. The inverse of the
 transform that it applies to the box gives the frame of the file, whatever its content. A file is read only if
 something depends on it: the inertia of a body that states none, or the size of a shape fitted to it.
+
+The settings in a file control the code of a plugin that makes meshes, such as ``mujoco.sdf.torus``, and it
+may crash: a torus of radius 0 does. So these meshes are made in a process of its own.
 """
 
 from __future__ import annotations

@@ -166,15 +166,15 @@ def _mesh_directory(root: MjcfElement) -> tuple[str, bool]:
 
 def _plugin_instances(root: MjcfElement) -> dict[str, MeshReference]:
     """Return the plugins that a document names, by the names of their instances."""
-    found: dict[str, MeshReference] = {}
+    result: dict[str, MeshReference] = {}
     for section in root.children:
         if section.tag != "extension":
             continue
         for plugin in section.children:
             for instance in plugin.children:
                 name = instance.attributes.get("name", "")
-                found[name] = _plugin_reference(plugin.attributes.get("plugin", ""), instance)
-    return found
+                result[name] = _plugin_reference(plugin.attributes.get("plugin", ""), instance)
+    return result
 
 
 def _plugin_reference(plugin: str, owner: MjcfElement) -> MeshReference:

@@ -1,4 +1,11 @@
-"""SDF joints: axes, gearboxes, and the spanning tree that they make."""
+"""SDF joints: axes, gearboxes, and the spanning tree of the joints.
+
+Only the elements that apply to the type of a joint are read: the axis of a fixed joint is ignored.
+
+A gearbox is θ2 = -ratio θ1, with the angle θ1 from the reference body to the parent about ``<axis>`` and the
+angle θ2 from the reference body to the child about ``<axis2>``. The hinge of the parent is another joint of
+the file. If there is no hinge of the child, the gearbox becomes that hinge.
+"""
 
 from __future__ import annotations
 

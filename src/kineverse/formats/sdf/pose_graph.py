@@ -120,8 +120,8 @@ class SdfScope:
 
     def find(self, name: str, element: Element, owner: Element) -> PoseNode:
         """Return the node that a name refers to."""
-        found = self._find(name)
-        if found is None:
+        result = self._find(name)
+        if result is None:
             available = [*self.names, *(f"{m}::{n}" for m, inner in self.inner.items() for n in inner.names)]
             reserved = name != MODEL_FRAME and _is_reserved(name)
             with self.document.locate_errors(owner):
@@ -134,7 +134,7 @@ class SdfScope:
                         else f"which does not exist in this scope. {suggest(name, available, 'name')}"
                     ),
                 )
-        return found
+        return result
 
     def has(self, name: str) -> bool:
         """Return True if a name exists in this scope."""
@@ -254,10 +254,10 @@ def find_joint_end(joint: PoseNode, role: str) -> PoseNode:
         if role == "child":
             document.refuse(element, "has the world as its child. Exchange parent and child.")
         return joint.scope.world
-    found = joint.scope.find(name, part, element)
-    if found is joint:
+    result = joint.scope.find(name, part, element)
+    if result is joint:
         document.refuse(element, f"is its own {role}.")
-    return found
+    return result
 
 
 def _attach(node: PoseNode) -> None:

@@ -106,11 +106,11 @@ class ModelNames:
         )
 
     def _ancestors(self, frame: str) -> list[str]:
-        found = []
+        result = []
         while frame != WORLD:
-            found.append(frame)
+            result.append(frame)
             frame = self._frames[frame].parent
-        return found
+        return result
 
     def _unknown(self, element: Element, said: str, what: str, known: Mapping[str, object]) -> ElementError:
         if (what, said) not in self._near and len(self._near) < _MOST_SUGGESTIONS:

@@ -123,7 +123,7 @@ class _SemanticDocument:
         return self._by_tag.pop(tag, [])
 
     def _virtual_joints(self) -> dict[str, VirtualJoint]:
-        found: dict[str, VirtualJoint] = {}
+        result: dict[str, VirtualJoint] = {}
         seen: dict[str, Element] = {}
         for element in self._elements("virtual_joint"):
             try:
@@ -133,10 +133,10 @@ class _SemanticDocument:
                 if kind not in _VIRTUAL_KINDS:
                     raise ElementError(element, f"type={quote(kind)} is none of {', '.join(_VIRTUAL_KINDS)}.")
                 child = self._names.link(element, "child_link")
-                found[name] = VirtualJoint(name, kind, required(element, "parent_frame"), child)
+                result[name] = VirtualJoint(name, kind, required(element, "parent_frame"), child)
             except ElementError as mistake:
                 self._remarks.repair(mistake, PASSED_OVER)
-        return found
+        return result
 
     def _passive_joints(self) -> tuple[str, ...]:
         found: dict[str, None] = {}
@@ -181,7 +181,7 @@ class _SemanticDocument:
         return tuple(rules)
 
     def _end_effectors(self, groups: dict[str, SrdfGroup]) -> dict[str, EndEffector]:
-        found: dict[str, EndEffector] = {}
+        result: dict[str, EndEffector] = {}
         seen: dict[str, Element] = {}
         for element in self._elements("end_effector"):
             try:
@@ -198,10 +198,10 @@ class _SemanticDocument:
                         element,
                         f"has its parent_link {quote(parent)} in its own group, which MoveIt refuses.",
                     )
-                found[name] = EndEffector(name, group, parent, above)
+                result[name] = EndEffector(name, group, parent, above)
             except ElementError as mistake:
                 self._remarks.repair(mistake, PASSED_OVER)
-        return found
+        return result
 
     def _states(self, groups: dict[str, SrdfGroup]) -> dict[str, dict[str, float]]:
         """Add the named states to their groups, and return them by name for all groups together."""

@@ -1,4 +1,10 @@
-"""URDF inertias, visuals, collisions and materials."""
+"""URDF inertias, visuals, collision shapes and materials.
+
+Specification: http://wiki.ros.org/urdf/XML/link, and urdf.xsd of ros/urdfdom for defaults. Shapes and colours
+do not affect kinematics: a shape that is missing or not supported is left out with a remark. A colour inside
+of a visual applies to that visual. A material that is only named is looked up among those of the robot, then
+among those that other visuals define.
+"""
 
 from __future__ import annotations
 

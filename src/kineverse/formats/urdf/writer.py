@@ -33,10 +33,10 @@ from kineverse.formats.description import (
 )
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
 from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
-from kineverse.formats.export.mesh_paths import mesh_reference
 from kineverse.formats.names import TakenNames
 from kineverse.formats.poses import ROTATION_TOLERANCE, rpy_angles
 from kineverse.formats.reader_warnings import collect_warnings
+from kineverse.formats.resource_paths import mesh_reference
 from kineverse.formats.xml_writer import Tag, format_xml
 from kineverse.lie import translation
 from kineverse.model.body import (

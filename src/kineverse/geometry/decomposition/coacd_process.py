@@ -108,11 +108,11 @@ def _read_hulls(target: Path, surface: CleanMesh) -> list[Floats]:
             points, sizes = np.asarray(arrays["points"], dtype=float), np.asarray(arrays["sizes"])
         hulls = np.split(points, np.cumsum(sizes)[:-1])
     except Exception as error:
-        raise DecompositionError("CoACD answered nothing that can be read.") from error
+        raise DecompositionError("CoACD's answer cannot be read.") from error
     low, high = surface.faces.vertices.min(axis=0), surface.faces.vertices.max(axis=0)
     room = 0.1 * surface.size
     if not (np.isfinite(points).all() and (points > low - room).all() and (points < high + room).all()):
-        raise DecompositionError("CoACD answered hulls that are not where the mesh is.")
+        raise DecompositionError("The hulls of CoACD are not where the mesh is.")
     return hulls
 
 

@@ -139,7 +139,7 @@ class Decomposition:
             facts["remarks"] = tuple(facts["remarks"])
             return Decomposition(hulls, **facts)
         except Exception as error:  # zip, numpy and json raise all kinds of errors for a damaged archive.
-            raise FormatError("This is no decomposition.") from error
+            raise FormatError("This is not a decomposition.") from error
 
 
 DECOMPOSITIONS = ContentCache(

@@ -184,15 +184,7 @@ class PlacementSearch:
             yield state.updated(arm | {s: state[s] + by for s, by in zip(self.base, off, strict=True)})
 
     def find_too_high(self, state: State, coordinate: Symbol, values: Array) -> str:
-        """Return why an object is out of reach above the hand along its motion; empty if it is not.
-
-        Parameters
-        ----------
-        state
-            State of everything.
-        coordinate, values
-            Coordinate of the object, and its values (N,) along the motion [m], [rad].
-        """
+        """Return why an object is out of reach above the hand at some of its values; empty if it is not."""
         moved = [b for b in self.scene.bodies_moved_by([coordinate]) if b in self.others]
         value, lowest = find_highest_passage(self.scene, moved, state, coordinate, values)
         if self._reach is None:

@@ -88,27 +88,13 @@ class Pushing:
 
     Attributes
     ----------
-    controller
-        The controller.
     overlapping
         Rules that except pairs of the robot's own bodies whose shapes overlap at the given state or at every
         one of some random states: hulls of links around a joint.
-    coordinate
-        The coordinate.
-    touching
-        Whether the pusher touches where it should.
-    losses
-        Number of contacts that were lost.
+    touching, losses
+        Whether the pusher touches where it should, and number of contacts that were lost.
     retreating
         Set it to True to take the pusher away from the object.
-    choice
-        The present contact point, and those that were given up.
-    press
-        Touch, lag and speed of the press.
-    clearance
-        Least distance at the last step of pairs that may not touch [m], infinite if none is near.
-    view
-        Points and vectors of the last step.
 
     Raises
     ------
@@ -210,7 +196,7 @@ class Pushing:
         self._anchor = TipAnchor()
         self._aside = math.inf
         self._margin = math.nan
-        self.clearance = math.inf
+        self.clearance = math.inf  # least distance at the last step of pairs that may not touch [m]
         self._seen: tuple[PushPair | None, PushPoint, Vector] | None = None
 
     def done(self, state: State, tolerance: float = 0.02) -> bool:
@@ -236,15 +222,7 @@ class Pushing:
         return self._swept[1]
 
     def find_deviation(self, state: State, deviation: Callable[[Symbol], float]) -> float:
-        """Return the standard deviation of gaps [m] at a state whose coordinates have deviations.
-
-        Parameters
-        ----------
-        state
-            The state.
-        deviation
-            Standard deviation by coordinate [m], [rad], such as that of a :class:`.Belief`.
-        """
+        """Return the standard deviation of gaps [m] at a state, by those of its coordinates [m], [rad]."""
         symbols, jacobian = self._program.tip_jacobian(state)
         normal = velocity = ZERO
         if self.choice.chosen is not None:
@@ -256,21 +234,9 @@ class Pushing:
         return math.hypot(*(rate * deviation(s) for s, rate in rates.items() if rate))
 
     def step(self, state: State, observation: Observation | None = None, deviation: float = 0.0) -> Command:
-        """Return the command for one time step at a state.
+        """Return the command for one time step at a state, or an estimate with the deviation of its gaps [m].
 
-        Parameters
-        ----------
-        state
-            The state, or an estimate.
-        observation
-            Readings of encoders and touch sensors, where the state is an estimate.
-        deviation
-            Standard deviation of gaps in the estimate [m].
-
-        Raises
-        ------
-        InfeasibleError, NotFiniteError
-            As :meth:`.Controller.step`.
+        An estimate comes with the readings of encoders and touch sensors.
         """
         with no_collection():
             return self._step(state, deviation, observation)

@@ -186,11 +186,6 @@ class JointPath:
         """Sign of the motion so far."""
         return math.copysign(1.0, self.value - self.start)
 
-    @property
-    def progress(self) -> float:
-        """Distance from the first value [m], [rad]."""
-        return abs(self.value - self.start)
-
     def project(self, pose: Array) -> float:
         """Move the value to where the part is nearest to a pose (4, 4), and return it [m], [rad].
 

@@ -219,12 +219,12 @@ def _note_brake(constraint: Constraint, brakes: dict[Symbol, Expression]) -> str
 
 def _speeds_of(constraint: Constraint, rates: Rates) -> set[Symbol]:
     """Return the free speeds of a constraint on speeds or accelerations."""
-    found: set[Symbol] = set()
+    result: set[Symbol] = set()
     for s in constraint.expression.symbols:
         if s.order:
             row = rates.row(s.position)
-            found.update([s.position.derivative()] if row is None else row)
-    return found
+            result.update([s.position.derivative()] if row is None else row)
+    return result
 
 
 @dataclass(frozen=True)
@@ -237,14 +237,14 @@ class _Gap:
 
 
 def _gaps(constraint: Constraint, rates: Rates) -> list[_Gap]:
-    found = []
+    result = []
     for sign, bound in ((-1, constraint.lower), (1, constraint.upper)):
         if not is_infinite(bound):
             distance = sign * (bound - constraint.expression)
             away = rates.over_free_speeds(distance.gradient(heuristic=False))
             away = {s: clamp_to_domains(weight) for s, weight in away.items()}
-            found.append(_Gap(sign, clamp_to_domains(distance), select_moving(away, away)))
-    return found
+            result.append(_Gap(sign, clamp_to_domains(distance), select_moving(away, away)))
+    return result
 
 
 def _position_rows(

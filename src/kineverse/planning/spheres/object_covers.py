@@ -219,7 +219,7 @@ def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]
             spheres.append((rows[: 3 * size].reshape(size, 3), rows[3 * size : 4 * size]))
             rows = rows[4 * size :]
     except (ValueError, KeyError, TypeError) as error:
-        raise FormatError("These are no spheres.") from error
+        raise FormatError("These are not spheres.") from error
     return head, spheres
 
 

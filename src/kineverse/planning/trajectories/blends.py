@@ -113,7 +113,7 @@ def round_corners(
     Raises
     ------
     ShapeError, InvalidValueError
-        For points that are no (N, n) array of finite numbers with N >= 1, or a deviation that is no number
+        For points that are not an (N, n) array of finite numbers, N >= 1, or a deviation that is not a number
         from 0 or of another shape.
     """
     polyline = np.array(points, dtype=float)

@@ -58,7 +58,7 @@ def read_trajectory_file(path: str | os.PathLike[str]) -> TrajectoryData:
     source = path.name
 
     def refuse(text: str) -> NoReturn:
-        raise FormatError(f"{source}: {text} is no number of a trajectory.")
+        raise FormatError(f"{source}: {text} is not a number.")
 
     try:
         document = json.loads(read_file(path), parse_constant=refuse)
@@ -92,7 +92,7 @@ def parse_coordinates(names: list[str], source: str) -> tuple[Symbol, ...]:
             path, order = parse_symbol_name(name)
             symbol = Symbol(path, order)
         except ExpressionError as error:
-            raise FormatError(f"{source}: {name!r:.80} is no name of a coordinate: {error}") from None
+            raise FormatError(f"{source}: {name!r:.80} is not the name of a coordinate: {error}") from None
         if order:
             raise FormatError(f"{source}: {name!r:.80} is a derivative; the columns are positions.")
         result.append(symbol)
@@ -105,7 +105,7 @@ def _numbers(values: Any, key: str, source: str) -> Array:
         raise FormatError(f"{source}: '{key}' is a list of numbers, not {values!r:.40}.")
     for value in values:
         if type(value) not in (int, float):
-            raise FormatError(f"{source}: {value!r:.40} in '{key}' is no number.")
+            raise FormatError(f"{source}: {value!r:.40} in '{key}' is not a number.")
     try:
         return np.array(values, dtype=float)
     except OverflowError:

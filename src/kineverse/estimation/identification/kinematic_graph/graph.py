@@ -106,8 +106,8 @@ def replacement_probabilities(
     missing = 1.0 - edge_probabilities(one | other, around, leaves)[connection]
     del around[connection]
     likely = edge_probabilities(one | other, around, leaves)
-    apart = {*leaves} - connection
-    across = {c: missing * p for c, p in likely.items() if c & one and c & other and not c & apart}
+    others = {*leaves} - connection
+    across = {c: missing * p for c, p in likely.items() if c & one and c & other and not c & others}
     return dict(sorted(across.items(), key=lambda pair: -pair[1]))
 
 

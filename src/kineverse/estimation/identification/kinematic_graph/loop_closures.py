@@ -211,8 +211,8 @@ def find_angles(fit: Fit) -> list[bool]:
 
 def _determine(samples: Sequence[_JointSamples], chosen: Sequence[int]) -> bool:
     """Return True if chosen joint values determine all others, by polynomials or Fourier series."""
-    most = _DEGREES.get(len(chosen), 2)
-    degrees = [d for d in product(range(most + 1), repeat=len(chosen)) if sum(d) <= most]
+    degree = _DEGREES.get(len(chosen), 2)
+    degrees = [d for d in product(range(degree + 1), repeat=len(chosen)) if sum(d) <= degree]
     each = [[samples[k].terms(d) for k, d in zip(chosen, some, strict=True)] for some in degrees]
     features = np.column_stack([np.prod(factors, axis=0) for some in each for factors in product(*some)])
     if len(features) < 2 * features.shape[1]:
@@ -443,8 +443,8 @@ def _tolerance(loop: ObservedLoop) -> float:
 
 def _rank(equations: Array, tolerance: float, whole: Array | None = None) -> int:
     values = np.linalg.svd(equations, compute_uv=False)
-    most = values if whole is None else np.linalg.svd(whole, compute_uv=False)
-    return int(np.median(np.sum(values > tolerance * np.median(most[:, 0]), axis=1)))
+    scale = values if whole is None else np.linalg.svd(whole, compute_uv=False)
+    return int(np.median(np.sum(values > tolerance * np.median(scale[:, 0]), axis=1)))
 
 
 def _choose_equations(equations: Array, count: int, eligible: Sequence[int]) -> tuple[list[int], list[int]]:

@@ -100,7 +100,7 @@ def test_log_evidence_equals_the_integral_over_joint_values() -> None:
     noise = pose_covariance(0.05, 0.1)
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[0.7, 0.03, 0.0], [1.1, -0.02, 0.05]]
-    found = log_evidence(served, compute_residuals(served, check_observations(None, poses, None, noise)))
+    result = log_evidence(served, compute_residuals(served, check_observations(None, poses, None, noise)))
 
     across = stats.norm(0.0, 0.05).logpdf(poses[:, 1:3, 3]).sum() + 6 * stats.norm(0.0, 0.1).logpdf(0.0)
     values = np.linspace(0.0, 2.0, 401)
@@ -117,7 +117,7 @@ def test_log_evidence_equals_the_integral_over_joint_values() -> None:
         each = integrate.trapezoid(prior[:, :, None] * likelihood, values, axis=1)
         total += integrate.trapezoid(each.prod(axis=1), values) / 2.0 / len(widths)
     # Laplace's method integrates the mean to some percent.
-    assert found == pytest.approx(across + np.log(total), abs=0.1)
+    assert result == pytest.approx(across + np.log(total), abs=0.1)
 
 
 def test_log_displacement_gain_equals_a_normal_density(resting: KnownResiduals) -> None:

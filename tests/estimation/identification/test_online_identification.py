@@ -23,21 +23,21 @@ from kineverse.estimation.identification.solver import solver
     ],
 )
 def test_identifier_result_agrees_with_identify_at_every_step(family: str, count: int) -> None:
-    seen = recording(family, count=count, position=0.02, orientation=0.03, seed=2)
+    data = recording(family, count=count, position=0.02, orientation=0.03, seed=2)
     solver.prepare(wait=True)
-    identifier = Identifier(noise=seen.covariance)
-    for k, (a, b) in enumerate(zip(seen.parent, seen.child, strict=True), start=1):
+    identifier = Identifier(noise=data.covariance)
+    for k, (a, b) in enumerate(zip(data.parent, data.child, strict=True), start=1):
         identifier.add(a, b)
         if k < 12:
             continue
-        found = identifier.result
+        identified = identifier.result
         if k % 6:
             continue
-        whole = identify(seen.parent[:k], seen.child[:k], noise=seen.covariance)
-        assert found.best.family == whole.best.family
-        assert found.best.log_evidence == pytest.approx(whole.best.log_evidence, abs=0.05)
-        for fit in found:
-            # What is improbable may be as probable as it was an eighth of the poses ago.
+        whole = identify(data.parent[:k], data.child[:k], noise=data.covariance)
+        assert identified.best.family == whole.best.family
+        assert identified.best.log_evidence == pytest.approx(whole.best.log_evidence, abs=0.05)
+        for fit in identified:
+            # Improbable families keep their odds until an eighth of the poses is new.
             assert fit.probability == pytest.approx(whole[fit.family].probability, abs=0.02)
             assert len(fit.joint_values) == k
             if fit.probability > 1e-4:
@@ -45,32 +45,32 @@ def test_identifier_result_agrees_with_identify_at_every_step(family: str, count
 
 
 def test_a_surprising_pose_updates_all_families() -> None:
-    seen = recording("revolute", count=41, position=0.005, orientation=0.01, seed=4)
-    identifier = Identifier(noise=seen.covariance, families=["rigid", "revolute", "cylindrical"])
-    for a, b in zip(seen.parent[:40], seen.child[:40], strict=True):
+    data = recording("revolute", count=41, position=0.005, orientation=0.01, seed=4)
+    identifier = Identifier(noise=data.covariance, families=["rigid", "revolute", "cylindrical"])
+    for a, b in zip(data.parent[:40], data.child[:40], strict=True):
         identifier.add(a, b)
         if len(identifier) > 20:
             assert identifier.result.best.family == "revolute"
     assert 1e-6 < identifier.result.probabilities["cylindrical"] < 0.01
     along = np.eye(4)
     along[2, 3] = 0.1
-    there = seen.left @ along @ np.linalg.inv(seen.left) @ seen.true_relative[40]
-    identifier.add(seen.true_parent[40], seen.true_parent[40] @ there)
+    there = data.left @ along @ np.linalg.inv(data.left) @ data.true_relative[40]
+    identifier.add(data.true_parent[40], data.true_parent[40] @ there)
     assert identifier.result.best.family == "cylindrical"
 
 
 def test_an_earlier_result_stays_unchanged() -> None:
-    seen = recording("revolute", count=9, position=0.02, orientation=0.03, seed=2)
-    c, gathered = seen.covariance, ObservationBuffer()
+    data = recording("revolute", count=9, position=0.02, orientation=0.03, seed=2)
+    c, gathered = data.covariance, ObservationBuffer()
     for k in range(9):
-        gathered.add(check_observations(seen.parent[k : k + 1], seen.child[k : k + 1], c, c, fewest=1))
+        gathered.add(check_observations(data.parent[k : k + 1], data.child[k : k + 1], c, c, fewest=1))
         if k == 4:
             five = gathered.all
     nine = gathered.all
     assert len(five) == 5
-    np.testing.assert_array_equal(five.child, seen.child[:5])
-    np.testing.assert_array_equal(nine.parent, seen.parent)
+    np.testing.assert_array_equal(five.child, data.child[:5])
+    np.testing.assert_array_equal(nine.parent, data.parent)
     np.testing.assert_array_equal(nine.child_covariance[8], c)
     with pytest.raises(ShapeError, match="do not mix"):
-        gathered.add(check_observations(None, seen.child[:1], None, c, fewest=1))
+        gathered.add(check_observations(None, data.child[:1], None, c, fewest=1))
     assert len(gathered) == 9

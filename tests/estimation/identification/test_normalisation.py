@@ -1,4 +1,4 @@
-"""Length scale: cranes, and poses in millimetres."""
+"""Invariance to frames and to the unit of length."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_recordings import JOINTS, Recording, noisy, recording
+from synthetic_recordings import JOINTS, Array, Recording, angle_between, noisy, recording, transform
 
 import kineverse as kv
 from kineverse.estimation import (
@@ -18,8 +18,9 @@ from kineverse.estimation import (
     identify,
     pose_covariance,
 )
+from kineverse.lie import skew
 
-# Wider than half a metre, so that there is no metre in what is believed of it.
+# Wider than half a metre, so that all priors scale with the data.
 LARGE = 3.0
 
 
@@ -29,15 +30,15 @@ def larger(poses: np.ndarray, factor: float) -> np.ndarray:
     return result
 
 
-def found_of(seen: Recording, factor: float, families: object = None) -> IdentificationResult:
+def found_of(data: Recording, factor: float, families: object = None) -> IdentificationResult:
     noise = pose_covariance(0.002 * factor, 0.01)
-    return identify(larger(seen.parent, factor), larger(seen.child, factor), noise=noise, families=families)
+    return identify(larger(data.parent, factor), larger(data.child, factor), noise=noise, families=families)
 
 
 @pytest.mark.parametrize("family", [*JOINTS])
 def test_identify_is_invariant_to_millimetres(family: str) -> None:
-    seen = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
-    assert found_of(seen, 1000.0).best.family == family
+    data = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
+    assert found_of(data, 1000.0).best.family == family
 
 
 @pytest.mark.parametrize(
@@ -49,9 +50,9 @@ def test_identify_is_invariant_to_millimetres(family: str) -> None:
     ],
 )
 def test_lengths_of_a_fit_scale_with_the_poses(family: str) -> None:
-    seen = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
-    small, factor = found_of(seen, LARGE), 40.0
-    large = found_of(seen, factor * LARGE)
+    data = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
+    small, factor = found_of(data, LARGE), 40.0
+    large = found_of(data, factor * LARGE)
     for one, other in zip(small, large, strict=True):
         assert other.probability == pytest.approx(one.probability, abs=1e-3)
     one, other = small.best, large.best
@@ -74,13 +75,15 @@ def test_a_crane_is_identified_as_a_hinge() -> None:
     random = np.random.default_rng(5)
     q = kv.position("q")
     boom = kv.compile([kv.translation(3, 1, 20) @ kv.rotation_z(q) @ kv.translation(40, 0, 0)])
-    seen = noisy(boom.batch(np.linspace(0.0, 0.6, 25)[:, None])[0], 0.1, 0.02, random)
-    found = identify(None, seen, noise=pose_covariance(0.1, 0.02))
-    assert found.best.family == "revolute"
-    assert not found.is_ambiguous
-    assert np.linalg.norm(found.best.parameters["point"][:2] - [3, 1]) < 4 * found.best.deviation("point.x")
+    data = noisy(boom.batch(np.linspace(0.0, 0.6, 25)[:, None])[0], 0.1, 0.02, random)
+    identified = identify(None, data, noise=pose_covariance(0.1, 0.02))
+    assert identified.best.family == "revolute"
+    assert not identified.is_ambiguous
+    assert np.linalg.norm(identified.best.parameters["point"][:2] - [3, 1]) < 4 * identified.best.deviation(
+        "point.x"
+    )
     one_by_one = Identifier(noise=pose_covariance(0.1, 0.02))
-    for pose in seen:
+    for pose in data:
         one_by_one.add(None, pose)
         if len(one_by_one) % 6 == 0:
             assert len(one_by_one.result)
@@ -95,12 +98,14 @@ def test_a_custom_family_keeps_its_metres() -> None:
     panel = kv.translation(0, 0, length * np.cos(a)) @ kv.rotation_y(a)
     gate = Family("gate", panel, {a: (0, 1.5)}, {length: FamilyParameter(start=20.0, deviation=5.0)})
     true = np.stack([panel({a: value, length: 17.0}) for value in np.linspace(0.1, 1.2, 15)])
-    seen = noisy(true, 0.05, 0.02, random)
+    data = noisy(true, 0.05, 0.02, random)
     families = ["rigid", "prismatic", "revolute", "planar", gate]
-    found = identify(None, seen, noise=pose_covariance(0.05, 0.02), families=families)
-    assert found.best.family == "gate"
-    assert found.best.parameters["length"] == pytest.approx(17.0, abs=4 * found.best.deviation("length"))
-    np.testing.assert_allclose(found.best.poses, true, atol=0.2)
+    identified = identify(None, data, noise=pose_covariance(0.05, 0.02), families=families)
+    assert identified.best.family == "gate"
+    assert identified.best.parameters["length"] == pytest.approx(
+        17.0, abs=4 * identified.best.deviation("length")
+    )
+    np.testing.assert_allclose(identified.best.poses, true, atol=0.2)
 
 
 def exact_poses(kind: str, scale: float, far: float, count: int, seed: int) -> np.ndarray:
@@ -147,3 +152,76 @@ def test_noise_beyond_what_numbers_hold_is_no_bare_error() -> None:
     for position in (1e-6, 1.0):
         assert identify(None, poses, noise=pose_covariance(position, 1e-6)).best.family == "revolute"
     assert identify(None, poses[:, :3, 3]).best.family in ("revolute", "spherical", "planar")
+
+
+# By how much differences of log evidence may change when frames are moved by half a metre: levers are within a
+# metre of the child's origin, beforehand, and errors of orientations are small to first order only.
+CHANGE = 1.0
+# Log evidence behind the best beyond which a family does not count. A slider may be a hinge several metres away,
+# and there the choice of the origin matters more.
+CHANCE = 10.0
+
+# Families and how far the child's origin is off the axis.
+CASES = [
+    ("revolute", 0.0),
+    ("revolute", 0.4),
+    ("prismatic", 0.3),
+    *(pytest.param(*case, marks=pytest.mark.long) for case in (("planar", 0.3), ("spherical", 0.0))),
+]
+
+
+def somewhere(random: np.random.Generator) -> Array:
+    return transform(Rotation.random(random_state=random), random.normal(0.0, 0.3, 3))
+
+
+def moved(poses: Array, covariance: Array, frame: Array) -> tuple[Array, Array]:
+    """Return poses of another frame in the same part, and their covariances."""
+    by = np.tile(np.eye(6), (len(poses), 1, 1))
+    by[:, :3, 3:] = -skew(poses[:, :3, :3] @ frame[:3, 3])
+    return poses @ frame, by @ covariance @ np.swapaxes(by, 1, 2)
+
+
+def elsewhere(data: Recording, of_parent: Array, of_child: Array) -> IdentificationResult:
+    parent, parent_covariance = moved(data.parent, data.covariance, of_parent)
+    child, child_covariance = moved(data.child, data.covariance, of_child)
+    return identify(parent, child, parent_covariance=parent_covariance, child_covariance=child_covariance)
+
+
+@pytest.mark.parametrize(("family", "radius"), CASES)
+def test_evidence_does_not_depend_on_the_frames_of_the_parts(family: str, radius: float) -> None:
+    data = recording(family, count=20, position=0.01, orientation=0.02, seed=4, radius=radius)
+    before = elsewhere(data, np.eye(4), np.eye(4))
+    assert before.best.family == family
+    random = np.random.default_rng(7)
+    for _ in range(2):
+        after = elsewhere(data, somewhere(random), somewhere(random))
+        assert after.best.family == family
+        for fit in before:
+            behind = before.best.log_evidence - fit.log_evidence
+            if behind < CHANCE:
+                now = after[family].log_evidence - after[fit.family].log_evidence
+                assert now == pytest.approx(behind, abs=CHANGE), fit.family
+
+
+def test_a_hinge_through_the_childs_origin_is_not_taken_for_planar() -> None:
+    """Joints of robot descriptions have such frames; a planar joint would rotate about an unknown point."""
+    data = recording("revolute", count=40, position=0.01, orientation=0.02, seed=1, radius=0.0)
+    identified = identify(data.parent, data.child, noise=data.covariance)
+    assert identified.best.family == "revolute"
+    assert identified["planar"].log_evidence < identified["revolute"].log_evidence + 1.0
+
+
+@pytest.mark.parametrize("family", ["planar", "free"])
+def test_translations_of_a_fit_are_those_of_the_childs_origin(family: str) -> None:
+    """Whichever point makes them probable: poses at joint values are the observed ones."""
+    data = recording(family, count=30, position=1e-3, orientation=1e-3, seed=2)
+    fit = identify(data.parent, data.child, noise=data.covariance)[family]
+    assert fit.family == family
+    slides = fit.motion.slides
+    np.testing.assert_allclose(fit.motion.right[:slides, 3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(fit.poses, data.true_relative, atol=0.012)
+    np.testing.assert_allclose(fit.joint_values[:, :slides].mean(axis=0), 0.0, atol=1e-12)
+    if family == "planar":
+        assert angle_between(fit.parameters["normal"], data.axis) < 0.01
+        height = data.left[:3, 2] @ (fit.parameters["reference"][:3, 3] - data.true_relative[0, :3, 3])
+        assert abs(height) < 4.0 * fit.deviation("child.z") + 1e-3

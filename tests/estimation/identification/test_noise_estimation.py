@@ -40,31 +40,33 @@ def _compiled() -> None:
 )
 @pytest.mark.sampled(2)
 def test_noise_of_any_ratio_is_estimated(family: str, position: float, orientation: float) -> None:
-    seen = recording(family, count=40, position=position, orientation=orientation * DEG, seed=1)
-    found = identify(seen.parent, seen.child)
-    assert found.best.family == family
-    assert not found.is_ambiguous
-    assert found.noise == pytest.approx((position, orientation * DEG), rel=0.35)
-    known = identify(seen.parent, seen.child, noise=pose_covariance(position, orientation * DEG))
+    measured = recording(family, count=40, position=position, orientation=orientation * DEG, seed=1)
+    identified = identify(measured.parent, measured.child)
+    assert identified.best.family == family
+    assert not identified.is_ambiguous
+    assert identified.noise == pytest.approx((position, orientation * DEG), rel=0.35)
+    known = identify(measured.parent, measured.child, noise=pose_covariance(position, orientation * DEG))
     assert known.noise is None
-    assert found.best.deviation("axis.x") == pytest.approx(known.best.deviation("axis.x"), rel=0.35)
+    assert identified.best.deviation("axis.x") == pytest.approx(known.best.deviation("axis.x"), rel=0.35)
 
 
 def test_noise_of_positions_alone_has_no_orientation() -> None:
-    seen = recording("revolute", count=40, position=0.02, orientation=DEG, seed=3)
-    found = identify(None, seen.true_relative[:, :3, 3] + np.random.default_rng(0).normal(0, 0.02, (40, 3)))
-    assert found.best.family == "revolute"
-    assert found.noise is not None
-    assert found.noise.position == pytest.approx(0.02, rel=0.3)
-    assert math.isnan(found.noise.orientation)
+    measured = recording("revolute", count=40, position=0.02, orientation=DEG, seed=3)
+    identified = identify(
+        None, measured.true_relative[:, :3, 3] + np.random.default_rng(0).normal(0, 0.02, (40, 3))
+    )
+    assert identified.best.family == "revolute"
+    assert identified.noise is not None
+    assert identified.noise.position == pytest.approx(0.02, rel=0.3)
+    assert math.isnan(identified.noise.orientation)
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute"])
 def test_evidence_is_that_of_a_sum_over_noises_with_a_solution_for_each(family: str) -> None:
-    seen = recording(family, count=12, position=0.02, orientation=0.3 * DEG, seed=5)
+    measured = recording(family, count=12, position=0.02, orientation=0.3 * DEG, seed=5)
     unknown = pose_covariance(*UNKNOWN_NOISE)
     data = prepare_data(
-        check_observations(seen.parent, seen.child, unknown, unknown), False, None, False, unit=1.0
+        check_observations(measured.parent, measured.child, unknown, unknown), False, None, False, unit=1.0
     )
     one = solve_with_inliers(data, {family: WEIGHTS[family]})[family]
     solution, spread, step = one.scored.solution, math.log(5.0), 0.1
@@ -72,7 +74,7 @@ def test_evidence_is_that_of_a_sum_over_noises_with_a_solution_for_each(family: 
     total = []
     for shift in itertools.product(axis, axis):
         logs = np.log(one.noise.factors) + shift
-        found = solver.continue_from(
+        identified = solver.continue_from(
             scale_noise(data.observations, np.exp(logs)),
             InitialGuess(solution.motion, solution.values),
             solution.parent,
@@ -80,18 +82,18 @@ def test_evidence_is_that_of_a_sum_over_noises_with_a_solution_for_each(family: 
             len(data.observations),
         )
         prior = -0.5 * float(logs @ logs) / spread**2 - math.log(math.tau * spread**2)
-        total.append(found.log_evidence + prior)
+        total.append(identified.log_evidence + prior)
     assert one.log_evidence == pytest.approx(np.logaddexp.reduce(total) + 2 * math.log(step), abs=0.05)
 
 
 @pytest.mark.compiler
 def test_unknown_noise_in_c_agrees_with_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = recording("revolute", count=8, position=0.02, orientation=0.3 * DEG, seed=5)
+    measured = recording("revolute", count=8, position=0.02, orientation=0.3 * DEG, seed=5)
     families = ["prismatic", "revolute"]
-    fast = identify(seen.parent, seen.child, families=families)
+    fast = identify(measured.parent, measured.child, families=families)
     monkeypatch.setattr(library, "_code", None)
     monkeypatch.setattr(library, "error", "there is none")
-    slow = identify(seen.parent, seen.child, families=families)
+    slow = identify(measured.parent, measured.child, families=families)
     assert slow.noise == pytest.approx(fast.noise, rel=1e-3)
     for fit in slow:
         assert fit.log_evidence == pytest.approx(fast[fit.family].log_evidence, abs=1e-2)
@@ -104,8 +106,10 @@ def test_arcs_of_positions_that_look_straight_are_solved_with_long_levers() -> N
     arc = 0.3 * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle])
     points = check_observations(None, arc + random.normal(0, 0.02, arc.shape), None, 0.02**2 * np.eye(3))
     starts = [*initial_guesses("revolute", MotionStatistics(points))]
-    found = solver.maximise_marginal_likelihood(points, solver.maximum_likelihood(points, starts).solution)
-    assert np.ptp(found.solution.values) < 2.0
+    identified = solver.maximise_marginal_likelihood(
+        points, solver.maximum_likelihood(points, starts).solution
+    )
+    assert np.ptp(identified.solution.values) < 2.0
 
 
 @pytest.mark.parametrize(
@@ -141,7 +145,7 @@ def test_the_report_counts_right_answers_and_sure_errors() -> None:
 RANDOM = np.random.default_rng(0)
 ANYWHERE = transform(Rotation.random(24, random_state=RANDOM).as_matrix(), RANDOM.uniform(-1.0, 1.0, (24, 3)))
 EQUAL = np.tile(ANYWHERE[0], (10, 1, 1))
-# Observations that tell nothing: parent and child.
+# Observations without information: parent and child.
 NOTHING = {
     "two poses": (None, ANYWHERE[:2]),
     "two positions": (None, ANYWHERE[:2, :3, 3]),
@@ -167,22 +171,22 @@ LONG = ("outliers of both", "outliers among positions")
 
 
 @pytest.mark.parametrize(
-    "what", [pytest.param(what, marks=pytest.mark.long if what in LONG else ()) for what in NOTHING]
+    "case", [pytest.param(case, marks=pytest.mark.long if case in LONG else ()) for case in NOTHING]
 )
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "stated"])
 @pytest.mark.sampled(2)
-def test_observations_that_tell_nothing_have_no_sure_answer(what: str, noise) -> None:
-    parent, child = NOTHING[what]
+def test_observations_without_information_have_no_sure_answer(case: str, noise) -> None:
+    parent, child = NOTHING[case]
     for outliers in (None, True):
-        if what.startswith("outliers") and noise is not None and outliers is None:
-            continue  # with a stated noise and no outliers such a part moves freely
-        for found in (
+        if case.startswith("outliers") and noise is not None and outliers is None:
+            continue  # with a stated noise and no outliers such a part is free
+        for identified in (
             identify(parent, child, noise=noise, outliers=outliers),
             found_online(parent, child, noise, outliers),
         ):
-            assert found.is_ambiguous
-            assert all(np.isfinite(fit.log_evidence) for fit in found)
-            assert np.isfinite(list(found.probabilities.values())).all()
+            assert identified.is_ambiguous
+            assert all(np.isfinite(fit.log_evidence) for fit in identified)
+            assert np.isfinite(list(identified.probabilities.values())).all()
 
 
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "stated"])
@@ -214,18 +218,18 @@ def test_identifier_refuses_poses_with_and_without_covariance() -> None:
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute"])
 def test_swapped_parts_have_the_same_family(family: str) -> None:
-    seen = recording(family, count=20, position=0.02, orientation=0.3 * DEG, seed=2)
-    assert identify(seen.child, seen.parent).best.family == family
+    measured = recording(family, count=20, position=0.02, orientation=0.3 * DEG, seed=2)
+    assert identify(measured.child, measured.parent).best.family == family
 
 
 def test_identifier_without_stated_noise_agrees_with_identify() -> None:
-    seen = recording("revolute", count=30, position=0.02, orientation=0.3 * DEG, seed=2)
+    measured = recording("revolute", count=30, position=0.02, orientation=0.3 * DEG, seed=2)
     identifier = Identifier(sequential=False)
-    for k, (parent, child) in enumerate(zip(seen.parent, seen.child, strict=True), start=1):
+    for k, (parent, child) in enumerate(zip(measured.parent, measured.child, strict=True), start=1):
         identifier.add(parent, child)
         if k not in (12, 13, 21, 30):
             continue
-        found, whole = identifier.result, identify(seen.parent[:k], seen.child[:k])
-        assert found.best.family == whole.best.family
-        assert found.best.probability == pytest.approx(whole.best.probability, abs=0.05)
-        assert found.noise == pytest.approx(whole.noise, rel=0.15)
+        identified, whole = identifier.result, identify(measured.parent[:k], measured.child[:k])
+        assert identified.best.family == whole.best.family
+        assert identified.best.probability == pytest.approx(whole.best.probability, abs=0.05)
+        assert identified.noise == pytest.approx(whole.noise, rel=0.15)

@@ -1,0 +1,181 @@
+"""Joint values: revolutions, and mirrored values where positions are much more precise than orientations."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from synthetic_recordings import Array, angle_between, noisy, recording, transform
+
+import kineverse as kv
+from kineverse.estimation import IdentificationResult, Identifier, identify, pose_covariance
+from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion
+from kineverse.estimation.identification.joint_values import (
+    choose_mirrored_values,
+    evaluate_each_observation,
+    mirrored_values,
+)
+from kineverse.estimation.identification.least_squares import JointValuePrior, levenberg_marquardt
+from kineverse.estimation.identification.marginal_likelihood import evidence_excess
+from kineverse.estimation.identification.observations import check_observations
+
+COVARIANCE = pose_covariance(0.002, 0.02)
+LEFT = transform(Rotation.from_rotvec([0.3, -0.4, 0.2]), (0.3, 0.1, 0.5))
+
+
+def seen_turning(turns: float, lead: float, count: int, seed: int = 0, start: float = 0.0) -> Array:
+    """Return poses of a screw with some revolutions and a pitch [m]."""
+    turn = kv.position("turn")
+    along = kv.translation(0, 0, lead / math.tau * turn)
+    pose = kv.compile([along @ kv.rotation_z(turn) @ kv.translation(0.1, 0.0, 0.0)])
+    true = LEFT @ pose.batch(start + np.linspace(0.0, turns * math.tau, count)[:, None])[0]
+    return noisy(true, 0.002, 0.02, np.random.default_rng(seed))
+
+
+def found_of(data: Array, **options: object) -> IdentificationResult:
+    return identify(None, data, noise=COVARIANCE, **options)
+
+
+@pytest.mark.parametrize("turns", [2.3, 5.0, 20.0])
+def test_revolutions_of_a_crank_are_counted(turns: float) -> None:
+    data = seen_turning(turns, 0.0, int(10 * turns))
+    fit = found_of(data, sequential=True).best
+    assert fit.family == "revolute"
+    assert np.ptp(fit.range) == pytest.approx(turns * math.tau, abs=0.1)
+    assert fit.largest_turn == pytest.approx(turns * math.tau / (len(data) - 1), abs=0.1)
+    np.testing.assert_allclose(fit.poses, data, atol=0.12)
+    # Without the order, turns are unknown.
+    assert np.ptp(found_of(data).best.range) < math.tau
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(fit.operation("crank", "world"))
+    limits = model.constraints["crank/position"]
+    assert float(limits.upper) - float(limits.lower) == pytest.approx(turns * math.tau, abs=0.1)
+
+
+@pytest.mark.parametrize("lead", [0.002, 0.005, -0.01])
+def test_the_lead_of_a_screw_is_found_by_counted_revolutions(lead: float) -> None:
+    for seed in range(3):
+        identified = found_of(seen_turning(5.0, lead, 60, seed), sequential=True)
+        assert identified.best.family == "screw"
+        axis = identified.best.parameters["axis"]
+        pitch = identified.best.parameters["pitch"] * np.sign(axis @ LEFT[:3, 2]) ** 2
+        assert abs(pitch - lead) < 4 * identified.best.deviation("pitch")
+        assert identified.best.deviation("pitch") < 3e-4
+        assert np.ptp(identified.best.range) == pytest.approx(5 * math.tau, abs=0.1)
+        assert angle_between(axis, LEFT[:3, 2]) < 0.03
+
+
+def test_less_than_a_revolution_agrees_with_unordered_poses() -> None:
+    for start in (0.0, 4.0):
+        data = seen_turning(0.9, 0.0, 30, start=start)
+        one, other = found_of(data), found_of(data, sequential=True)
+        assert one.best.family == other.best.family == "revolute"
+        for fit in one:
+            # Without order a screw may have turned anyhow to follow the noise, which pays for its turns.
+            if fit.family != "screw":
+                assert other[fit.family].log_evidence == pytest.approx(fit.log_evidence, abs=1e-6)
+        assert other["screw"].log_evidence < other["revolute"].log_evidence
+        np.testing.assert_allclose(one.best.range, other.best.range, atol=1e-6)
+
+
+def test_revolutions_are_counted_across_outliers() -> None:
+    random = np.random.default_rng(3)
+    data = seen_turning(5.0, 0.004, 80)
+    wrong = np.sort(random.choice(80, 12, replace=False))
+    data[wrong] = transform(Rotation.random(12, random_state=random), random.uniform(-1, 1, (12, 3)))
+    fit = found_of(data, sequential=True, outliers=True).best
+    assert fit.family == "screw"
+    assert fit.outliers == tuple(wrong)
+    assert np.ptp(fit.range) == pytest.approx(5 * math.tau, abs=0.2)
+    assert fit.parameters["pitch"] == pytest.approx(0.004, abs=5e-4)
+
+
+def test_revolutions_are_counted_from_positions() -> None:
+    data = seen_turning(4.0, 0.02, 60)[:, :3, 3]
+    identified = identify(None, data, noise=COVARIANCE[:3, :3], sequential=True)
+    assert identified.best.family == "screw"
+    assert identified.best.parameters["pitch"] == pytest.approx(0.02, abs=1e-3)
+    round_and_round = seen_turning(4.0, 0.0, 60)[:, :3, 3]
+    fit = identify(None, round_and_round, noise=COVARIANCE[:3, :3], sequential=True)["revolute"]
+    assert np.ptp(fit.range) == pytest.approx(4 * math.tau, abs=0.1)
+
+
+@pytest.mark.parametrize(("lead", "family"), [(0.0, "revolute"), (0.005, "screw")])
+def test_identifier_counts_revolutions(lead: float, family: str) -> None:
+    identifier = Identifier(noise=COVARIANCE)
+    for k, pose in enumerate(seen_turning(4.0, lead, 45)):
+        identifier.add(None, pose)
+        if k > 20 and k % 4 == 0:
+            assert identifier.result
+    fit = identifier.result.best
+    assert fit.family == family
+    assert np.ptp(fit.range) == pytest.approx(4 * math.tau, abs=0.1)
+
+
+@pytest.mark.parametrize("family", ["prismatic", "revolute"])
+def test_mirrored_joint_values_are_corrected(family: str) -> None:
+    data = recording(
+        family, count=40, position=1e-3, orientation=math.radians(5.0), seed=3, extent=0.4, radius=0.5
+    )
+    problem = check_observations(data.parent, data.child, data.covariance, data.covariance)
+    assert problem.softened
+    motion = GroupMotion(JOINT_FAMILIES[family], 6, data.left, data.right)
+    joint_prior = JointValuePrior(np.zeros(1), np.full(1, 0.12**-2.0), marginal=True)
+    good = levenberg_marquardt(problem, motion, data.values, data.true_parent, joint_prior)
+    parent = good.parent.copy()
+    there = evaluate_each_observation(
+        problem, good.motion, mirrored_values(good.motion, good.values, joint_prior), parent, joint_prior
+    )
+    parent[:10, :3, :3] = there.orientation[:10]
+    bad = levenberg_marquardt(
+        problem, good.motion, np.concatenate([there.values[:10], good.values[10:]]), parent, joint_prior
+    )
+    assert bad.cost > good.cost + 1.0
+    assert choose_mirrored_values(problem, bad).cost < good.cost + 0.1 * (bad.cost - good.cost)
+
+
+def test_evidence_of_an_unconverged_solution_is_reduced() -> None:
+    data = recording("planar", count=20, position=1e-3, orientation=0.05, seed=3)
+    problem = check_observations(data.parent, data.child, data.covariance, data.covariance)
+    motion = GroupMotion(JOINT_FAMILIES["planar"], 6, data.left, data.right)
+    joint_prior = JointValuePrior(np.zeros(3), np.full(3, 0.3**-2.0), marginal=True)
+    early = levenberg_marquardt(problem, motion, data.values, None, joint_prior, steps=1)
+    assert not early.converged
+    assert evidence_excess(early) > 1.0
+    late = levenberg_marquardt(problem, motion, data.values, None, joint_prior)
+    assert evidence_excess(late) == 0.0
+    # At the last step the quadratic approximation holds.
+    assert evidence_excess(replace(late, converged=False)) < 0.1
+
+
+@pytest.mark.parametrize("family", ["prismatic", "revolute"])
+def test_single_observation_agrees_with_scipys_least_squares(family: str) -> None:
+    data = recording(family, count=5, position=0.01, orientation=0.05, seed=2)
+    problem = check_observations(data.parent, data.child, data.covariance, data.covariance)
+    motion = GroupMotion(JOINT_FAMILIES[family], 6, data.left, data.right)
+    joint_prior = JointValuePrior(np.zeros(1), np.full(1, 0.2**-2.0))
+    identified = evaluate_each_observation(problem, motion, data.values, data.parent, joint_prior)
+    deviation = np.sqrt(np.diag(data.covariance))
+
+    def errors(unknown: np.ndarray, k: int) -> np.ndarray:
+        there = transform(Rotation.from_rotvec(unknown[4:]), unknown[1:4])
+        result = [unknown[:1] / 0.2]
+        for pose, true in (
+            (data.parent[k], there),
+            (data.child[k], there @ motion.linearise(unknown[None, :1]).pose[0]),
+        ):
+            turned = Rotation.from_matrix(pose[:3, :3] @ true[:3, :3].T).as_rotvec()
+            result.append(np.concatenate([pose[:3, 3] - true[:3, 3], turned]) / deviation)
+        return np.concatenate(result)
+
+    for k, parent in enumerate(data.true_parent):
+        start = [data.values[k, 0], *parent[:3, 3], *Rotation.from_matrix(parent[:3, :3]).as_rotvec()]
+        theirs = least_squares(errors, start, args=(k,))
+        assert identified.values[k, 0] == pytest.approx(theirs.x[0], abs=1e-3)
+        turned = Rotation.from_matrix(identified.orientation[k]) * Rotation.from_rotvec(theirs.x[4:]).inv()
+        assert turned.magnitude() < 1e-3
