@@ -190,7 +190,7 @@ COMMANDS = [
     Mistake("a position without its prefix", "fk kitchen world --set fridge_door=1", r"Did you mean 'kitchen/fridge_door'"),
     Mistake("a value without a name", "fk kitchen world --set 1", r"NAME=VALUE"),
     Mistake("degrees without a unit", "fk kitchen kitchen/fridge_door --set kitchen/fridge_door=30", r"\[0, 1\.571\].*30deg"),
-    Mistake("metres of an angle", "fk kitchen kitchen/fridge_door --set kitchen/fridge_door=1m", r"is an angle, and 1m is none"),
+    Mistake("metres of an angle", "fk kitchen kitchen/fridge_door --set kitchen/fridge_door=1m", r"'kitchen/fridge_door' is in rad; write 30deg or 0.5"),
     Mistake("a table with two parts", f"fit {shlex.quote(str(ROOT / 'examples' / 'poses.csv'))}", r"--child"),
     Mistake("a file that is not there", "info nofile.urdf", r"no model 'nofile\.urdf'"),
     Mistake("a page of text", f"info {shlex.quote(str(ROOT / 'README.md'))}", r"reads URDF"),
