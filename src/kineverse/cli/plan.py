@@ -69,7 +69,6 @@ examples:
 
 FOUND, NOT_FOUND = 0, 1
 _MOST_STARTS = 8
-_GOALS = 32
 _GHOSTS = 4
 
 
