@@ -78,28 +78,22 @@ def test_a_trace_is_made_once_for_each_run() -> None:
     assert len(runs) > count + 1
 
 
-def test_an_open_loop_is_refused_and_closed_anew() -> None:
+def test_a_loop_is_closed_again_when_what_it_reads_changes() -> None:
     model = build_scene("four_bar")
     read = reloaded(model)
-    longer = kv.model.AddFrame(
-        "board",
-        kv.model.Frame.from_transform("world", kv.translation(0, 0, 0.01) @ model.fk("board")),
-    )
-    before = read.snapshot()
-    advice = r"'loop four_bar'.*new CloseLoop\(\.\.\.\)"
-    with pytest.raises(kv.errors.EditError, match=advice), read.edit() as edit:
-        edit.replace("frame board", longer)
-    assert read.snapshot() == before
-    loop = read.history.operation("loop four_bar")
-    assert isinstance(loop, OpaqueOperation)
-    for other, closing in ((model, None), (read, kv.CloseLoop(**loop.parameters))):
+    below = kv.Model()
+    _include(below, to_json(model), "left")
+    board = kv.translation(0, 0, 0.01) @ model.fk("board")
+    for other, prefix in ((model, ""), (read, ""), (below, "left/")):
+        moved = kv.model.AddFrame(f"{prefix}board", kv.model.Frame.from_transform("world", board))
         with other.edit() as edit:
-            edit.replace("frame board", longer)
-            if closing is not None:
-                edit.replace("loop four_bar", closing)
-    crank = model.symbols[0]
-    pose = read.fk("rocker_end")({str(crank): 0.4})
-    np.testing.assert_allclose(pose, model.fk("rocker_end")({str(crank): 0.4}), rtol=1e-12, atol=1e-12)
+            edit.replace(f"{prefix}frame board", moved)
+    crank = str(model.symbols[0])
+    wanted = model.fk("rocker_end")({crank: 0.4})
+    for other, prefix in ((read, ""), (below, "left/")):
+        assert isinstance(other.history.operation(f"{prefix}loop four_bar"), OpaqueOperation)
+        pose = other.fk(f"{prefix}rocker_end")({f"{prefix}{crank}": 0.4})
+        np.testing.assert_allclose(pose, wanted, rtol=1e-12, atol=1e-12)
 
 
 def test_below_a_prefix_the_error_names_the_missing_prefix() -> None:

@@ -21,9 +21,9 @@ class OpaqueOperation(Operation):
     """Operation from a document, without the class of the original.
 
     While its reads are unchanged, it writes what the original wrote, to the last bit. When a read changes, it
-    is run again by its trace. Without a trace it is *frozen*: a :class:`~kineverse.loops.CloseLoop` is closed
-    again, any other change is refused. Then, or if the original branched on the changed value, replace it by an
-    operation of its class in the same edit.
+    is run again by its trace. Without a trace it is *frozen*: a loop (``kv.CloseLoop``) is closed again, any
+    other change is refused. Then, or if the original branched on the changed value, replace it by an operation
+    of its class in the same edit.
 
     Attributes
     ----------
