@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kineverse.manipulation.swept_motion import Obstacle
+from kineverse.manipulation.swept_volume import Obstacle
 
 import kineverse
 import kineverse_studies
