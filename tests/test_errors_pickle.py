@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kineverse.manipulation.swept_volume import Obstacle
 
 import kineverse
 import kineverse_studies
 from kineverse.errors import KineverseError, MissingDependencyError
 from kineverse.manipulation.outcome import SkillError
+from kineverse.manipulation.swept_volume import Obstacle
 from kineverse.symbols import position
 
 
