@@ -46,8 +46,7 @@ examples:
   kineverse convert articulations/pedal_bin bin.xml --tolerance 0.01"""
 
 STDOUT = "-"
-SHOWN = 10
-"""Number of reader warnings printed without --all."""
+SHOWN = 10  # number of reader warnings printed without --all
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -53,8 +53,7 @@ examples:
   kineverse decompose robot.urdf --links gripper_finger palm --max-hulls 8 --force
   kineverse decompose --list"""
 
-ENDINGS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb")
-"""Suffixes of mesh files."""
+ENDINGS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb")  # suffixes of mesh files
 
 WRONG_MESH, WRONG_MODEL = 1, 2
 

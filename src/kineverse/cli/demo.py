@@ -86,15 +86,12 @@ def _refuse(arguments: argparse.Namespace, options: tuple[str, ...], why: str) -
 
 
 KITCHEN, ROBOT, WORLD = "kitchen", "hsr", "kinematic"
-NOISE = "3mm+3mm/m,0.5deg,30Hz"
-"""Noise of the observed poses, unless another one is asked for."""
+NOISE = "3mm+3mm/m,0.5deg,30Hz"  # noise of the observed poses, unless another one is asked for
 _BRIEF = ("*/oven_door", "*/fridge_door", "*/sink_left_upper_drawer")
 """The objects without a page: a flap, a door and a drawer."""
 _FASTEST = 100.0
-_INTERRUPTED = 130
-"""Exit status after Ctrl-C, as of all commands."""
-_PATIENCE = 15.0
-"""Time that a browser has to show the page before the robot begins [s]."""
+_INTERRUPTED = 130  # exit status after Ctrl-C, as of all commands
+_PATIENCE = 15.0  # time that a browser has to show the page before the robot begins [s]
 
 ROBOT_OPTIONS = ("robot", "what", "world", "noise", "speed", "seed", "json")
 """Options of the robot's demo alone."""
@@ -301,10 +298,8 @@ HEAD = (
 )
 """Titles of the table of objects."""
 ALIGN = "<<>>>>>>><"
-PAGE_HEAD = ("object", "opened", "closed", "time")
-"""Titles of the table on the page."""
-_REFRESH = 0.1
-"""Least time between two states of the line of progress [s]."""
+PAGE_HEAD = ("object", "opened", "closed", "time")  # titles of the table on the page
+_REFRESH = 0.1  # least time between two states of the line of progress [s]
 _LONGEST_REASON = 100
 
 

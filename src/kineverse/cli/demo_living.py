@@ -68,12 +68,10 @@ SECONDS, STEP, SETTLED = 18.0, 1.0 / 12.0, 3.0
 
 _STRANGER = "chest"
 
-LONGEST = 3600.0
-"""The longest duration [s]."""
+LONGEST = 3600.0  # the longest duration [s]
 
 
-OPTIONS = ("stranger", "seconds")
-"""Options of the kitchen in motion alone."""
+OPTIONS = ("stranger", "seconds")  # options of the kitchen in motion alone
 
 
 def add_arguments(parser: argparse._ArgumentGroup) -> None:
@@ -215,11 +213,8 @@ def _exercise_models(model: kv.Model, path: str) -> int:
     return 1 if result.problems else 0
 
 
-SAMPLES_PER_RANGE = 65
-"""Number of samples of each range, limits included."""
-
-CHECKED_PER_RANGE = 5
-"""Number of these samples at which constraints are evaluated, limits included."""
+SAMPLES_PER_RANGE = 65  # number of samples of each range, limits included
+CHECKED_PER_RANGE = 5  # number of these samples at which constraints are evaluated, limits included
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,8 +50,7 @@ examples:
   kineverse diff home.kv.json today.kv.json --json"""
 
 EQUAL, DIFFERENT = 0, 1
-SHOWN = 20
-"""Number of differences of a kind printed without --all."""
+SHOWN = 20  # number of differences of a kind printed without --all
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -116,8 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 LONGEST = 60
-_NEGLIGIBLE = 1e-9
-"""Threshold below which a distance is printed as zero beside a larger one [m], [rad]."""
+_NEGLIGIBLE = 1e-9  # threshold below which a distance is printed as zero beside a larger one [m], [rad]
 
 
 def format_value(given: Any) -> str:

@@ -160,11 +160,8 @@ def write_results(
     return {"picture": arguments.picture, "document": arguments.document}
 
 
-_LEAST_PROBABILITY = 1e-4
-"""Less probable families are named without numbers."""
-
-_MOST_LISTED = 10
-"""Number of outliers listed."""
+_LEAST_PROBABILITY = 1e-4  # less probable families are named without numbers
+_MOST_LISTED = 10  # number of outliers listed
 
 
 def format_fit(source: str, pair: RecordedPair, learned: RecordedJoint) -> str:

@@ -218,8 +218,7 @@ def print_models() -> int:
     return print_articulations()
 
 
-CONTACT_DEPTH = 1e-5
-"""Depth below which bodies only touch, such as a drawer on its rail [m]."""
+CONTACT_DEPTH = 1e-5  # depth below which bodies only touch, such as a drawer on its rail [m]
 
 
 def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:

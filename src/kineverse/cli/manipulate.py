@@ -459,8 +459,7 @@ _MEASURE_UNITS = {
 }
 """Units of figures; others are numbers, or have the unit of what they are about."""
 
-_OF_OBJECT = ("penetration_from", "tolerance")
-"""Figures in the unit of the object's coordinate."""
+_OF_OBJECT = ("penetration_from", "tolerance")  # figures in the unit of the object's coordinate
 
 
 def _format_measure(value: Any, unit: str) -> str:

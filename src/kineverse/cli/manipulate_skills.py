@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from kineverse.worlds import World
     from kineverse.worlds.recorder import RecordedStep
 
-OPENING = 0.4
-"""Distance from shut at which closing and pushing begin [m], [rad]."""
+OPENING = 0.4  # distance from shut at which closing and pushing begin [m], [rad]
 _NEXT_STEP = (
     "Name a hand with two opposed fingers by --hand FRAME, or move the object with any body of the robot: "
     "kineverse push ... --hand BODY --to VALUE.",
@@ -203,12 +202,9 @@ def _find_pusher(
     return gripper, "", gripper.bodies
 
 
-_PLACEMENT = 60.0
-"""Largest time of the search for a place of the base [s]."""
-_SHORT = 0.1
-"""Share of a wanted opening that may be missing at the stop of a part whose joint is learned."""
-_BETWEEN_LINES = 1.0
-"""Least time between two lines on the progress of a search [s]."""
+_PLACEMENT = 60.0  # largest time of the search for a place of the base [s]
+_SHORT = 0.1  # share of a wanted opening that may be missing at the stop of a part whose joint is learned
+_BETWEEN_LINES = 1.0  # least time between two lines on the progress of a search [s]
 
 
 def grasp_object(

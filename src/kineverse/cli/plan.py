@@ -356,8 +356,7 @@ def _view(arguments: argparse.Namespace, problem: _Problem, path: Path) -> None:
         page.wait()
 
 
-_COLUMNS = 6
-"""Number of points of a path in a table."""
+_COLUMNS = 6  # number of points of a path in a table
 
 
 def print_path(arguments: argparse.Namespace, path: Path, preparation: float) -> None:

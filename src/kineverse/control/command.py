@@ -15,8 +15,7 @@ from kineverse.symbols import Symbol
 if TYPE_CHECKING:
     from kineverse.geometry.results import DistanceResult
 
-SATURATED = 1e-9
-"""Multiplier from which a bound counts as active."""
+SATURATED = 1e-9  # multiplier from which a bound counts as active
 
 
 class StepTimes(NamedTuple):

@@ -18,8 +18,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 Speeds = dict[Symbol, float]
-DEFAULT_ACCELERATION = 2.0
-"""Acceleration [m/s^2], [rad/s^2] by which speeds go to zero where none is given."""
+DEFAULT_ACCELERATION = 2.0  # acceleration [m/s^2], [rad/s^2] by which speeds go to zero where none is given
 
 _ROUNDING = 1e-9
 logger = logging.getLogger(__name__)

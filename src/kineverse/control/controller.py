@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
-_APPROACH = 2.5
-"""Relative speed of bodies up to which default radii are large enough [m/s]."""
+_APPROACH = 2.5  # relative speed of bodies up to which default radii are large enough [m/s]
 _FEASIBLE = 1e-6
 """Largest violation of a row, in its unit per second, that counts as none where the solver failed."""
 

@@ -35,8 +35,7 @@ if TYPE_CHECKING:
 
     from .clearance import Clearance
 
-_DIFFERENT = 1e-3
-"""Least difference of a coordinate of two solutions [m], [rad]."""
+_DIFFERENT = 1e-3  # least difference of a coordinate of two solutions [m], [rad]
 _EXPLAINING_STARTS = 8
 
 

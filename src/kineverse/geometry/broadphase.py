@@ -25,8 +25,7 @@ Flags: TypeAlias = npt.NDArray[np.uint8]
 MAX_BOUNDED_OBJECTS = 6000
 """Largest number of objects for which bounds are carried; only measured pairs touch their memory."""
 
-MEMORY_SLOTS = 2**13
-"""Number of measured pairs that are remembered until an object moves; a power of two."""
+MEMORY_SLOTS = 2**13  # number of measured pairs that are remembered until an object moves; a power of two
 
 _MEMORY = np.dtype([("pair", np.int64), ("numbers", np.float64, 12)])
 
@@ -165,8 +164,7 @@ class PairSelection:
         self.addresses = self.bodies.ctypes.data, self._objects.ctypes.data
 
 
-TREE_WIDTH = 8
-"""Number of children of a node of the static tree, whose boxes are tested at once."""
+TREE_WIDTH = 8  # number of children of a node of the static tree, whose boxes are tested at once
 
 
 def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floats, Indices]:
@@ -199,8 +197,7 @@ def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floa
 FURTHEST = 1e12
 """Largest distance of an object from the origin [m]; floating-point numbers are 0.1 mm apart there."""
 
-LONGEST_TRAVEL = 1e4
-"""Travel up to which bounds are exact to about 1e-12 m [m]."""
+LONGEST_TRAVEL = 1e4  # travel up to which bounds are exact to about 1e-12 m [m]
 
 PLACED, TRAVEL_EXCEEDED = -1, -2
 

@@ -133,8 +133,7 @@ def check_radius(radius: float) -> None:
         raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
 
 
-PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags
-"""Flags (B, B) of pairs of bodies, symmetric."""
+PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags  # flags (B, B) of pairs of bodies, symmetric
 
 
 class PreparedQuery:

@@ -36,8 +36,7 @@ At a distance d the error of the normal is at most √(2 · tolerance / d). A sm
 iterations. With a second tolerance below 1e-6, one depth of coal in a thousand is grossly wrong.
 """
 
-ACCURACY = 1e-4
-"""Largest error of a distance [m]; between polytopes, spheres and capsules it is 1e-8."""
+ACCURACY = 1e-4  # largest error of a distance [m]; between polytopes, spheres and capsules it is 1e-8
 
 # Below this distance the direction between the closest points consists of rounding errors [m].
 _TOUCH = 1e-6

@@ -249,8 +249,7 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
             yield item
 
 
-APART = 1e-9
-"""Largest residual of a satisfied constant row [m], [rad]."""
+APART = 1e-9  # largest residual of a satisfied constant row [m], [rad]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -65,8 +65,7 @@ def upright_signs(pose: Expression, mask: Sequence[str]) -> list[Expression]:
     return [sum((diagonal[axis] for axis in "xyz" if axis not in turning), array(0.0))]
 
 
-CLOSURE_TOLERANCE = 1e-11
-"""Largest residual of a closed loop during the analysis [m] or [rad]."""
+CLOSURE_TOLERANCE = 1e-11  # largest residual of a closed loop during the analysis [m] or [rad]
 
 _NEWTON = 30
 _SINGULAR = 1e-9

@@ -30,8 +30,7 @@ from .base_sampling import find_free_state
 from .robot_sources import SHIPPED
 
 _BASE = ("x", "y", "angle")
-_DEEPEST = 2e-4
-"""Depth below which bodies only touch at the start [m]."""
+_DEEPEST = 2e-4  # depth below which bodies only touch at the start [m]
 _RING, _RINGS, _DIRECTIONS = 0.25, 16, 12
 """Distance of rings of places [m], their number, and that of places on each."""
 

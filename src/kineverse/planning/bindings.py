@@ -31,8 +31,7 @@ LINK = np.dtype([*_BOUNDS, *_integers("pose first coarse first_shape shapes exac
 SHAPE = np.dtype([("pose", np.float64, 12), ("object", np.int64)])
 COARSE = np.dtype([("sphere", np.float32, 4), *_integers("first count")])
 
-MOST_COORDINATES = 64
-"""Largest number of coordinates, as in ``edges.c``."""
+MOST_COORDINATES = 64  # largest number of coordinates, as in edges.c
 
 BOX, CYLINDER, CAPSULE, SPHERE, HULL = range(5)
 """Kinds of obstacles."""

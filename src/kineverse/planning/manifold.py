@@ -26,14 +26,10 @@ from .bindings import ProjectionStruct, planning_functions
 from .collision_checker import CollisionChecker
 from .collision_geometry import Floats32
 
-TOLERANCE = 1e-4
-"""Largest residual of a projection in float [m], [rad]."""
-EXACT = 1e-9
-"""Largest residual of a polished configuration [m], [rad]."""
-DEVIATION = 8e-6
-"""Largest residual half way between two points of a polished path [m], [rad]."""
-_MOST_POINTS = 50_000
-"""Number of points that polishing may add to a path."""
+TOLERANCE = 1e-4  # largest residual of a projection in float [m], [rad]
+EXACT = 1e-9  # largest residual of a polished configuration [m], [rad]
+DEVIATION = 8e-6  # largest residual half way between two points of a polished path [m], [rad]
+_MOST_POINTS = 50_000  # number of points that polishing may add to a path
 _STEPS, _POLISHING = 8, 12
 _DAMPING = 1e-5
 """Damping of Newton's step where rows depend on each other, added to squares of derivatives [m²], [rad²]."""

@@ -25,8 +25,7 @@ _CANDIDATES = 12
 _BATCHES, _EDGES = 2, 2000
 """Effort for the configurations of one change of modes and for one path: numbers, so that the same seed
 leads to the same path. Each round of the search has four times as much."""
-_DEPTH = 4
-"""Largest number of changes of modes in the first round; each round allows as many more."""
+_DEPTH = 4  # largest number of changes of modes in the first round; each round allows as many more
 _SAME = 1e-4
 
 

@@ -35,10 +35,8 @@ from .sampling_planners import Roadmap
 from .start_goal import describe_barrier
 from .state_validity import describe_contacts
 
-_TASK_GOALS = 32
-"""Number of configurations that are looked for where tasks are the goal."""
-_TRIES = 2048
-"""Number of random configurations that say whether tasks are out of reach."""
+_TASK_GOALS = 32  # number of configurations that are looked for where tasks are the goal
+_TRIES = 2048  # number of random configurations that say whether tasks are out of reach
 _METHODS = ("rrt-connect", "prm")
 
 

@@ -27,8 +27,7 @@ TRIALS = 12
 TRIAL_HEIGHT = 80
 """Height of the trial pictures [pixels]: enough to show a handle, small enough to draw a dozen."""
 
-MOVING_WEIGHT = 4.0
-"""Weight of a part that moves, relative to one that does not."""
+MOVING_WEIGHT = 4.0  # weight of a part that moves, relative to one that does not
 
 
 def weigh_drawables(model: ModelView, items: Sequence[Drawable]) -> Floats:
@@ -84,8 +83,7 @@ def find_extreme_points(points: Floats) -> Floats:
 
 logger = logging.getLogger(__name__)
 
-CAMERA_TOLERANCE = 1e-3
-"""Tolerance for equal camera poses, as a fraction of the distance to the target."""
+CAMERA_TOLERANCE = 1e-3  # tolerance for equal camera poses, as a fraction of the distance to the target
 
 
 class ClientCameras:

@@ -143,14 +143,9 @@ def open_page(address: str) -> None:
 
 UNNAMED = "Kineverse"
 
-MOST = 3
-"""Most names in a title of several models."""
-
-LONGEST = 60
-"""Most characters of one of them."""
-
-SUFFIXES = (".urdf", ".xml", ".mjcf", ".sdf", ".world")
-"""Suffixes of files that declare the name of a model."""
+MOST = 3  # most names in a title of several models
+LONGEST = 60  # most characters of one of them
+SUFFIXES = (".urdf", ".xml", ".mjcf", ".sdf", ".world")  # suffixes of files that declare the name of a model
 
 NAMED_BY = {"robot": "name", "mujoco": "model", "model": "name", "world": "name"}
 """The attributes of elements of URDF, MJCF and SDF that declare the name of a model."""

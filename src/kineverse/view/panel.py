@@ -13,14 +13,9 @@ from .proximity_panel import ProximityPanel
 from .scene import ViewerScene
 from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step
 
-BEYOND = 0.2
-"""Fraction of their range by which sliders are widened on demand, to violate limits."""
-
-MOST_UNFOLDED = 100
-"""With at most so many degrees of freedom all groups are unfolded at first."""
-
-_NEGLIGIBLE = 1e-9
-"""Limits below this are 0 in labels: rounding of a file's units."""
+BEYOND = 0.2  # fraction of their range by which sliders are widened on demand, to violate limits
+MOST_UNFOLDED = 100  # with at most so many degrees of freedom all groups are unfolded at first
+_NEGLIGIBLE = 1e-9  # limits below this are 0 in labels: rounding of a file's units
 
 DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
 """The unit of angles in degrees, by unit, and the factor from radians."""

@@ -73,14 +73,9 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-SAMPLES = 2
-"""Number of computed pixels along each edge of a final one."""
-
-ARROW = 0.07
-"""Length of arrows at contacts, as a fraction of the height of the picture."""
-
-LARGEST = 64_000_000
-"""Most pixels of one picture, computed ones included."""
+SAMPLES = 2  # number of computed pixels along each edge of a final one
+ARROW = 0.07  # length of arrows at contacts, as a fraction of the height of the picture
+LARGEST = 64_000_000  # most pixels of one picture, computed ones included
 
 
 def picture(

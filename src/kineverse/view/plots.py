@@ -27,15 +27,13 @@ if TYPE_CHECKING:
     from kineverse.estimation.identification.result import Fit
 
 
-SIZE = (13.0, 5.2)
-"""Size of the picture of one joint [inch]."""
+SIZE = (13.0, 5.2)  # size of the picture of one joint [inch]
 
 SEEN, MODEL, AXIS = "0.35", "tab:blue", "tab:red"
 AXIAL_FAMILIES = ("revolute", "screw", "cylindrical")
 """Families with an axis of rotation, which has a position."""
 
-SIGMAS = 2.0
-"""Half width of drawn uncertainties, in standard deviations."""
+SIGMAS = 2.0  # half width of drawn uncertainties, in standard deviations
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from .proximity import build_arrow
 from .triangle_mesh import Floats
 from .viewer import PERIOD, Viewer
 
-GHOST: Rgba = (0.16, 0.47, 0.86, 0.35)
-"""Colour of the belief."""
+GHOST: Rgba = (0.16, 0.47, 0.86, 0.35)  # colour of the belief
 
 ARROWS: tuple[Rgba, ...] = (
     (0.86, 0.16, 0.16, 1.0),
@@ -43,8 +42,7 @@ ARROWS: tuple[Rgba, ...] = (
 ARROW_SCALE, LONGEST_ARROW = 0.25, 0.6
 """Length of the arrow of a vector of 1, and the largest length of an arrow [m]."""
 
-WAY_RADIUS = 0.008
-"""Half of the width of the way of a hand [m]."""
+WAY_RADIUS = 0.008  # half of the width of the way of a hand [m]
 
 _APART, _TURNED = 3e-3, 5e-3
 """Least difference of a belief that is shown [m], [rad]; below, the ghost would flicker on the body."""
@@ -340,8 +338,7 @@ class RunLayer:
 
 
 _MOST_ACTIVE = 4
-_AHEAD = 0.02
-"""Time by which commands are followed to find the velocity of the hand [s]."""
+_AHEAD = 0.02  # time by which commands are followed to find the velocity of the hand [s]
 
 
 class LiveRun:

@@ -31,14 +31,9 @@ from .triangle_mesh import Floats
 
 logger = logging.getLogger(__name__)
 
-PERIOD = 1.0 / 30.0
-"""Least time between two updates of the page [s]; requests in between are drawn together."""
-
-EMBEDDED_HEIGHT = 600
-"""Height of the page in a notebook [pixels]."""
-
-PANEL_WIDTH = 380
-"""Width of the controls: room for the names of joints [pixels]."""
+PERIOD = 1.0 / 30.0  # least time between two updates of the page [s]; requests in between are drawn together
+EMBEDDED_HEIGHT = 600  # height of the page in a notebook [pixels]
+PANEL_WIDTH = 380  # width of the controls: room for the names of joints [pixels]
 
 
 class Viewer:

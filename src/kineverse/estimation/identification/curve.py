@@ -47,14 +47,9 @@ from .marginal_likelihood import Scored, laplace_evidence
 from .motion_model import FamilyMember, LinearisedPoses, ParameterPrior
 from .observations import Observations
 
-CURVE = "curve"
-"""Name of the family."""
-
-LEVER = 0.25
-"""Length [m] of a rotation by one radian, in the joint value of a curve."""
-
-KNOTS = (3, 4, 5, 7, 9, 12, 16, 21)
-"""Numbers K of knots that are compared."""
+CURVE = "curve"  # name of the family
+LEVER = 0.25  # length [m] of a rotation by one radian, in the joint value of a curve
+KNOTS = (3, 4, 5, 7, 9, 12, 16, 21)  # numbers K of knots that are compared
 
 # Log prior of a number of knots, for each knot.
 _LOG_KNOT = -0.5
@@ -354,8 +349,7 @@ def _quotient(a: Array, b: Array) -> Array:
     return _product(a, b * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
-FEWEST_POSES = 5
-"""Least number of observations of a curve."""
+FEWEST_POSES = 5  # least number of observations of a curve
 
 # Largest number of knots of the first curve, steps of the solver in a round, and rounds of projection.
 _COARSE, _STEPS, _ROUNDS = 7, 6, 2

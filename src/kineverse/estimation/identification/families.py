@@ -65,11 +65,8 @@ _FAMILIES = (
 JOINT_FAMILIES: Mapping[str, JointFamily] = MappingProxyType({family.name: family for family in _FAMILIES})
 """Families by name. ``rigid`` has no joint values, and ``free`` has no parameters."""
 
-PITCHES = 0.1
-"""Prior standard deviation of a pitch [m/rad]."""
-
-REACH = 1.0
-"""Prior standard deviation of each component of a lever [m]."""
+PITCHES = 0.1  # prior standard deviation of a pitch [m/rad]
+REACH = 1.0  # prior standard deviation of each component of a lever [m]
 
 
 @dataclass(frozen=True, slots=True)

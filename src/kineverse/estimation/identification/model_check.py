@@ -52,8 +52,7 @@ from .outlier_rejection import RowIndices, densest_half, log_inlier_prior
 from .result import SURE, Fit, IdentificationResult, LazyFit, classify_inliers, project_observations
 from .solver import solver
 
-REFUTED = 1e-3
-"""Largest probability of χ² at which the noise is refuted."""
+REFUTED = 1e-3  # largest probability of χ² at which the noise is refuted
 
 CALIBRATED = 1.2
 """Largest size of the residuals relative to the stated noise that is no misfit, however many they are."""

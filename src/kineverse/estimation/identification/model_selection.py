@@ -114,8 +114,7 @@ def f_distribution_tail(ratio: float, above: float, below: float) -> float:
 
 Name = TypeVar("Name")
 
-UNSEEN = 0.05
-"""Prior probability that a prismatic or revolute joint hardly moves while it is observed."""
+UNSEEN = 0.05  # prior probability that a prismatic or revolute joint hardly moves while it is observed
 
 
 def bound_log_evidences(

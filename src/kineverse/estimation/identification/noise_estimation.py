@@ -80,8 +80,7 @@ class NoisePosterior(NamedTuple):
         return NoiseDeviations(position, orientation if len(self.logs) == 2 else math.nan)
 
 
-STATED_NOISE = NoisePosterior(np.zeros(0), np.zeros((0, 0)), 0.0)
-"""Posterior of a noise that is stated."""
+STATED_NOISE = NoisePosterior(np.zeros(0), np.zeros((0, 0)), 0.0)  # posterior of a noise that is stated
 
 
 class NoiseSolution(NamedTuple):

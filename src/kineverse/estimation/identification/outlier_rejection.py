@@ -33,8 +33,7 @@ from .motion_model import FamilyMember
 from .observations import Observations
 from .solver import solver
 
-UNEVEN = 3.0
-"""Factor by which the noise may vary between observations if its size is estimated."""
+UNEVEN = 3.0  # factor by which the noise may vary between observations if its size is estimated
 
 RowIndices: TypeAlias = "npt.NDArray[np.int_]"
 Name = TypeVar("Name")

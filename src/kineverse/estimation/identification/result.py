@@ -26,8 +26,7 @@ from .motion_model import FamilyMember, FixedMotion, MotionModel
 from .observations import Observations
 from .outlier_rejection import UNEVEN, is_inlier
 
-SURE = 0.95
-"""Least probability at which the best family is reported as identified."""
+SURE = 0.95  # least probability at which the best family is reported as identified
 
 
 class NoiseDeviations(NamedTuple):

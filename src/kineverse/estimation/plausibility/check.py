@@ -71,8 +71,7 @@ def _fits(served: KnownJoint, tracks: Mapping[str, PoseTrack], joint: TestableJo
     return float(np.median(np.sum(residuals.orthogonal**2, axis=1))) < CHI_SQUARED_6
 
 
-FALSE_ALARMS = 1e-3
-"""Default probability of rejecting a joint that is as served."""
+FALSE_ALARMS = 1e-3  # default probability of rejecting a joint that is as served
 
 
 @singularity_named()

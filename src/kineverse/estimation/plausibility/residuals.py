@@ -389,8 +389,7 @@ def _lever(pose: Array) -> Array:
     return result
 
 
-SIZES = (0.01, 0.05, 0.3)
-"""Standard deviations of a displacement, for each component of a twist [m], [rad]."""
+SIZES = (0.01, 0.05, 0.3)  # standard deviations of a displacement, for each component of a twist [m], [rad]
 
 # Prior information of joint values: a deviation of 100 [m] or [rad].
 _PRECISION = 1e-4

@@ -211,8 +211,7 @@ PROCESSES: Mapping[str, tuple[float, float]] = {"position": (0.004, 0.01), "velo
 
 They suit a kitchen door that a hand opens within 3.5 s (``kineverse reproduce stream``)."""
 
-INITIAL_SPEED_TIME = 3.0
-"""The initial variance of a speed is its process noise during this time [s]."""
+INITIAL_SPEED_TIME = 3.0  # the initial variance of a speed is its process noise during this time [s]
 
 # Relative positions between limits at which frames are sampled, in addition to the start.
 _SAMPLES = (0.2, 0.5, 0.8)

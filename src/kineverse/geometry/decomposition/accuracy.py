@@ -10,8 +10,7 @@ import numpy as np
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
 from kineverse.geometry.shapes import build_bvh, convex_hull, hull_faces
 
-SAMPLES = 4000
-"""Number of sample points on each surface and in each hull, in addition to all corners."""
+SAMPLES = 4000  # number of sample points on each surface and in each hull, in addition to all corners
 
 # Largest number of corners of the mesh that are sampled.
 _MOST_CORNERS = 20_000

@@ -15,8 +15,7 @@ from kineverse.model.body import Mesh
 
 from .accuracy import enclosed_volume, is_closed
 
-MOST_FACES = 300_000
-"""Largest number of triangles that is decomposed; more take CoACD hours and all memory."""
+MOST_FACES = 300_000  # largest number of triangles that is decomposed; more take CoACD hours and all memory
 
 # Connected parts of a mesh are decomposed one by one, up to this number.
 _MOST_PARTS = 64

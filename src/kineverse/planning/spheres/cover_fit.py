@@ -37,8 +37,7 @@ _REMOVALS, _FEW_SPHERES = 3, 12
 _PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
 """Growth of radii for the sake of the proof, as a fraction of the protrusion."""
 
-_ROUNDING = 1e-9
-"""Growth of radii for the sake of rounding, as a fraction."""
+_ROUNDING = 1e-9  # growth of radii for the sake of rounding, as a fraction
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,8 +25,7 @@ from kineverse.model.body import Mesh
 from .sphere_cover import MOST, SphereCover, check_cover_settings, cover_solids
 from .sphere_tree import SphereTree
 
-_DIGITS = 12
-"""Digits in which poses in a body differ."""
+_DIGITS = 12  # digits in which poses in a body differ
 
 
 def cover_objects(

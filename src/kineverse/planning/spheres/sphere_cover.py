@@ -16,8 +16,7 @@ from kineverse.model.body import Capsule, Sphere
 from .cover_fit import FittedSpheres, fit_spheres
 from .polytope import CoverPolytope, CoverRegion, bound_solid, solid_volume
 
-MOST = 48
-"""Default largest number of spheres of a cover."""
+MOST = 48  # default largest number of spheres of a cover
 
 PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
 """Default protrusion, as a fraction of the edge of a cube with the volume of the solid; its bounds [m]."""

@@ -18,11 +18,8 @@ from kineverse.model.velocity_constraints.speed_limits import SpeedLimits
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-RAMP = 0.5
-"""Time from rest to the full speed [s] where the model states no acceleration."""
-
-UNSTATED_SPEED = 1.0
-"""Speed [rad/s], [m/s] of coordinates for which the model states none."""
+RAMP = 0.5  # time from rest to the full speed [s] where the model states no acceleration
+UNSTATED_SPEED = 1.0  # speed [rad/s], [m/s] of coordinates for which the model states none
 
 
 class MotionLimits(NamedTuple):

@@ -95,8 +95,7 @@ class DependentCoordinates:
         return {u: slope[rows] for u, slope in known.slopes.items()}
 
 
-RANK_TOLERANCE = 0.05
-"""Smallest singular value that counts as a degree of freedom, relative to the largest."""
+RANK_TOLERANCE = 0.05  # smallest singular value that counts as a degree of freedom, relative to the largest
 
 # Degree of polynomials or Fourier series of one and of two joint values; 2 for more.
 _DEGREES = {1: 5, 2: 3}
