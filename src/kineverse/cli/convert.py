@@ -190,7 +190,6 @@ def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[st
 
 
 def _approximation_errors(saved: SaveResult) -> str:
-    """Return the largest errors of approximated frames, with their names."""
     errors = saved.errors
     furthest = max(errors, key=lambda name: errors[name].position)
     most_turned = max(errors, key=lambda name: errors[name].angle)

@@ -175,7 +175,6 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str
 
 
 def _model_meshes(name: str, arguments: argparse.Namespace) -> list[tuple[str, Mesh]]:
-    """Return the meshes to decompose of a model, each with its link."""
     with show_activity(f"reading {name}"):
         model = load_model(arguments, name)
     return [

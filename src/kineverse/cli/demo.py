@@ -79,7 +79,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _refuse(arguments: argparse.Namespace, options: tuple[str, ...], why: str) -> None:
-    """Raise InvalidValueError if any of some options is given."""
     for name in options:
         if getattr(arguments, name) not in (None, False):
             raise InvalidValueError(f"--{name} {why}; leave one of them out.")
@@ -246,7 +245,6 @@ class RobotDemo:
             self._live.show_text(text)
 
     def _begin(self, one: ArticulatedObject) -> None:
-        """Show that an object comes next."""
         self._progress.begin()
         if self._live is not None:
             self._live.captions = (self._title(one),)
@@ -256,7 +254,6 @@ class RobotDemo:
         return f"{len(self.reports) + 1} of {len(self.objects)}: {one.coordinate}"
 
     def _look(self, session: Session) -> None:
-        """Show a step."""
         runner = self._runner
         one = runner.current
         assert one is not None

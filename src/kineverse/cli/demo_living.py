@@ -144,7 +144,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _count_steps(seconds: float) -> int:
-    """Return the number of steps of a duration."""
     if not STEP <= seconds <= LONGEST:
         raise InvalidValueError(f"--seconds is between {STEP:.2g} and {LONGEST:g}, not {seconds!r}")
     return round(seconds / STEP)
@@ -172,7 +171,6 @@ def _show_sliders(arguments: argparse.Namespace) -> int:
 
 
 def _initial_state(model: kv.Model) -> dict[str, float]:
-    """Return the initial values of those symbols that the models have."""
     known = {str(symbol) for symbol in model.symbols}
     return {name: value for name, value in STATE.items() if name in known}
 

@@ -237,7 +237,6 @@ def _format_assumption(assumed: RecordedJoint | Assumption, made: RecordedJoint)
 
 
 def _format_correlation(learned: RecordedJoint, count: int) -> list[str]:
-    """Return lines on repeated rows and on correlated errors."""
     lines = []
     if learned.repeated:
         do = "row repeats" if learned.repeated == 1 else "rows repeat"
@@ -263,7 +262,6 @@ def _format_deviations(noise: ObservationNoise) -> str:
 
 
 def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
-    """Return the names and texts of the parameters of a joint, with standard deviations."""
     parts = []
     for name in ("axis", "normal"):
         if name in fit.parameters:
@@ -299,7 +297,6 @@ def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str
 
 
 def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
-    """Return a warning if revolutions may be miscounted."""
     if not pair.is_timed or fit.largest_turn < MAX_ROTATION_STEP:
         return []
     most = format_number(math.degrees(fit.largest_turn), 3)

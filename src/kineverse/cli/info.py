@@ -173,7 +173,6 @@ def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
 
 
 def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
-    """Return the number of pairs in contact, and the deepest one."""
     pair, depth = pairs[0], -pairs[0].distance
     deepest = f"{pair.a} and {pair.b}" + (
         f", {format_number(depth, 3)} m deep" if depth > CONTACT_DEPTH else ""

@@ -241,7 +241,6 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
 
 
 def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:
-    """Return the world, at the start."""
     world: World
     sensors = None if arguments.noise is None else Sensors.parse(arguments.noise)
     if arguments.world == "mujoco":
@@ -265,7 +264,6 @@ def _act(
     watchers: list[Callable[[RecordedStep], object]],
     record: str | None,
 ) -> Outcome:
-    """Run the skill, with a recording if wanted, and return its outcome."""
     belief: Belief | None = None
     error = EstimateError(scene.coordinate)
     with ExitStack() as stack:

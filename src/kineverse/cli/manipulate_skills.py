@@ -134,7 +134,6 @@ def _parse_other_positions(
 
 
 def _check_limits(model: Model, option: str, coordinate: Symbol, value: float) -> None:
-    """Raise InvalidValueError for the value of an option that is out of limits."""
     lower, upper = model.limits(coordinate)
     if not lower - 1e-9 <= value <= upper + 1e-9:
         raise InvalidValueError(
@@ -156,7 +155,6 @@ def _open_from(shut: float, lower: float, upper: float) -> float:
 
 
 def _find_free_start(model: Model, robot: PlacedRobot, state: State) -> State:
-    """Return the state with the base of a robot where it touches nothing."""
     try:
         free, contact = robot.find_free_start(model, state)
     except InvalidValueError as error:
@@ -168,7 +166,6 @@ def _find_free_start(model: Model, robot: PlacedRobot, state: State) -> State:
 
 
 def _find_coordinate(model: Model, name: str, robot: str) -> Symbol:
-    """Return the coordinate of a name, which is one of an object."""
     objects = [str(s) for s in model.degrees_of_freedom if not str(s).startswith(f"{robot}/")]
     if name.startswith(f"{robot}/"):
         raise InvalidValueError(

@@ -208,7 +208,6 @@ def run(arguments: argparse.Namespace) -> int:
 def _prepare(
     arguments: argparse.Namespace, start: Request, goal: Request, holds: list[FrameTarget], margin: float
 ) -> _Problem:
-    """Load the model and build the planner."""
     with show_activity(f"reading {arguments.model}"):
         model = load_model(arguments, arguments.model)
         standing: dict[kv.Symbol, float] = {}
@@ -396,7 +395,6 @@ def _format_time(seconds: float) -> str:
 
 
 def _format_way(path: Path) -> str:
-    """Return a table of the positions at some points of a path."""
     chosen = np.unique(np.linspace(0, len(path) - 1, _COLUMNS).round().astype(int))
     head = ["time [s]", *(format_number(float(t), 3) for t in path.times[chosen])]
     rows = [

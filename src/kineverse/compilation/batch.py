@@ -66,7 +66,6 @@ def _from_line(block: Array) -> Array:
 
 
 def _take_free_block(size: int) -> Array | None:
-    """Return a free block of this size, if there is one."""
     for _ in range(len(_free_blocks)):
         try:
             block = _free_blocks.pop(0)
@@ -238,7 +237,6 @@ class Batch:
 
 
 def _overlap(arrays: Sequence[Array]) -> bool:
-    """Return True if any of these contiguous arrays share memory."""
     spans = sorted((_address(array), array.nbytes) for array in arrays if array.nbytes)
     return any(start + size > following for (start, size), (following, _) in itertools.pairwise(spans))
 

@@ -180,11 +180,9 @@ class _Loop:
         return self._slower() if speeds is None else speeds
 
     def zeros(self) -> Speeds:
-        """Return a command to stand still."""
         return dict.fromkeys(self.last, 0.0)
 
     def step_times(self) -> DurationSummary:
-        """Summarize the durations of steps."""
         if not self._steps:
             return DurationSummary(0.0, 0.0, 0.0)
         p99 = float(np.percentile(self._durations, 99))

@@ -358,7 +358,6 @@ class Controller:
         return self._command(result.x, result.multipliers, result.iterations, times)
 
     def _command(self, x: Array, multipliers: Array, iterations: int, times: StepTimes) -> Command:
-        """Return the command of a solution, and remember it as the last one."""
         n = len(self.speeds)
         if len(self._before):
             self._before[:] = self._last
@@ -376,7 +375,6 @@ class Controller:
         )
 
     def _read(self, state: StateLike | npt.ArrayLike) -> None:
-        """Write the values of the inputs at a state."""
         if not isinstance(state, np.ndarray) and isinstance(state, Mapping):
             if not isinstance(state, State):
                 state = as_state(state, (*self.model.symbols, *self.model.speeds, *self.inputs))

@@ -219,7 +219,6 @@ class InverseKinematics:
         return [self.solve(target, starts=starts, seed=seed) for target in values]
 
     def _load(self, values: StateLike | None) -> Mapping[Symbol, float]:
-        """Write the values of all inputs, and return the assigned values by symbol."""
         assigned = {} if values is None else self._given(values)
         if isinstance(assigned, State):
             vector = (self._home | assigned).vector(self.inputs)

@@ -143,7 +143,6 @@ class ObjectTable:
         return bound
 
     def _box_to_sphere(self, boxes: Indices, spheres: Indices, between: Floats) -> Floats:
-        """Return the distances of bounding spheres from bounding boxes."""
         inside = np.einsum("kji,kj->ki", self.poses[boxes, :, :3], between)
         outside = np.maximum(np.abs(inside) - self.half[boxes], 0.0)
         distances: Floats = np.sqrt((outside**2).sum(axis=1)) - self.radius[spheres]

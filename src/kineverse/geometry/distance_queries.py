@@ -269,7 +269,6 @@ class PreparedQuery:
             collision_library.bind(self._world.table)
 
     def _select(self) -> PairSelection:
-        """Select the pairs, and make the solids of their objects."""
         world = self._world
         if self._selection is None or self._version != world.model.version:
             flags = self._selected()

@@ -254,7 +254,6 @@ class _Motion:
         return wide
 
     def exchange(self) -> None:
-        """Exchange the two branches."""
         self.a, self.b, self.tips = self.b, self.a, self.tips[::-1]
 
     def values(self, part: float) -> dict[Symbol, float]:
@@ -262,11 +261,9 @@ class _Motion:
         return {s: self.opened[s] + part * (self.closed[s] - self.opened[s]) for s in self.joints}
 
     def place(self, part: float) -> None:
-        """Place the hand at a part of the motion."""
         self.alone.place({**self._still, **self.values(part)})
 
     def gap(self, values: Mapping[Symbol, float]) -> float:
-        """Return the distance of the tips of the two branches."""
         self.alone.place({**self._still, **values})
         return self.nearest().distance
 

@@ -216,7 +216,6 @@ def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, ang
 
 
 def _domain(interval: InputDomain) -> tuple[float, float]:
-    """Return the domain of an input, widened by rounding errors."""
     if interval.whole:
         return -np.inf, np.inf
     slack = 1e-9 * max(1.0, interval.upper - interval.lower)
@@ -361,7 +360,6 @@ def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...], mos
 def _steps_of(
     samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...], most: float, part: slice
 ) -> int | None:
-    """Return the number of Newton steps that suffices at some samples."""
     tried, wanted, chosen = samples.tried[part], samples.wanted[part], list(rows)
     x, u = seed.evaluate(tried), samples.all_inputs(tried)
     for step in range(math.floor(most) + 1):

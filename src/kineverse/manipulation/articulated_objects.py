@@ -109,7 +109,6 @@ def select_objects(
 def _find_kind(
     model: ModelView, coordinate: Symbol, bodies: Sequence[str], limits: Sequence[float]
 ) -> MotionKind:
-    """Return the kind of the motion of some bodies between two limits."""
     state = model.default_state()
     samples = [state.updated({coordinate: float(v)}) for v in np.linspace(limits[0], limits[1], _SAMPLES)]
     axes: list[tuple[Array, Array]] = []

@@ -182,7 +182,6 @@ def _choose_prefix(
 
 
 def _add_base(edit: Edit, robot: str) -> None:
-    """Put a robot on an omnidirectional base."""
     model = edit.model
     inside = {name: placed for name, placed in model.frames.items() if is_of_robot(name, robot)}
     roots = [name for name, placed in inside.items() if placed.parent == WORLD]

@@ -322,7 +322,6 @@ class TrackedBelief:
         self._read = stamp
 
     def _filter_joints(self, before: Array, stamp: float) -> None:
-        """Mix readings of the encoders with the prediction by commands."""
         columns = [self._place[s] for s in self._encoded]
         variance = self.sensors.encoders**2
         if math.isinf(self._read):

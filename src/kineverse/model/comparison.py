@@ -123,7 +123,6 @@ def _is_number(value: Any) -> bool:
 
 
 def _number(value: Any) -> Any:
-    """Return a constant scalar as a number."""
     is_scalar = isinstance(value, Expression) and not value.shape
     return float(value) if is_scalar and value.is_constant else value
 
@@ -330,7 +329,6 @@ class ModelComparison:
         return result
 
     def _is_redundant_record(self, change: Change) -> bool:
-        """Return whether a change is the record of a fixed joint between frames of both models."""
         record = change.after if change.before is None else change.before
         return (
             isinstance(record, Articulation)

@@ -128,7 +128,6 @@ class CollisionChecker:
     def _place_moving(
         self, members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]], poses: Sequence[int]
     ) -> None:
-        """Collect the shapes of the moving bodies, a set for each."""
         lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
         self._costs = []

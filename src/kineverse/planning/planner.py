@@ -378,7 +378,6 @@ class Planner:
         return replace(path, modes=tuple(modes), sections=tuple(sections))
 
     def _choose_roadmap(self, method: str, holds: Sequence[Hold]) -> Roadmap | None:
-        """Return the roadmap of a method; None for trees."""
         if method not in _METHODS:
             raise InvalidValueError(f"method is {method!r}; there are {', '.join(map(repr, _METHODS))}.")
         if method == "rrt-connect":

@@ -268,7 +268,6 @@ def _find_conflict(
 
 
 def _make_invariant(graph: CellGraph, result: MoveSearchResult) -> InvariantSet:
-    """Return the states that a search has exhausted."""
     count = range(len(graph.coordinates))
 
     def region(states: int) -> Region:

@@ -225,7 +225,6 @@ class Panel:
         return float(value) * self._factor(name)
 
     def _value(self, name: str) -> float:
-        """Return the value of a slider in the units of the model."""
         return float(self._sliders[name].value) / self._factor(name)
 
     def _set(
@@ -259,7 +258,6 @@ class Panel:
         return choose_slider_range(self._limits[name], value, self._units.get(name, ""), beyond)
 
     def _fit(self, name: str, value: float) -> None:
-        """Set the range of a slider for a value."""
         _set_range(self._sliders[name], *(self._to_shown(name, end) for end in self._range(name, value)))
         self._relabel(name)
 
@@ -271,7 +269,6 @@ class Panel:
                     slider.disabled = False
 
     def _convert(self, degrees: bool) -> None:
-        """Show angles in degrees or radians."""
         with self._changing:
             self._in_degrees = degrees
             for name, slider in self._sliders.items():
@@ -310,7 +307,6 @@ class Panel:
 
 
 def _count_digits(low: float, high: float) -> int:
-    """Return the number of decimals of the steps of a range."""
     return max(0, len(f"{choose_slider_step((low, high)):.9f}".rstrip("0").partition(".")[2]))
 
 

@@ -224,7 +224,6 @@ def _list_parts(projection: FitProjection) -> list[tuple[str, Array]]:
 
 
 def _circle_outliers(axes: Axes, points: Array) -> None:
-    """Draw a ring around each outlier."""
     axes.scatter(points[:, 0], points[:, 1], s=60, facecolors="none", edgecolors=AXIS, zorder=4)
 
 

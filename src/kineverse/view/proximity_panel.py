@@ -266,7 +266,6 @@ class ProximityPanel:
         return min(self._scene.length, LONGEST_ARROW)
 
     def _draw(self, marks: ProximityMarkers) -> dict[str, Any]:
-        """Add markers to the page, and return their nodes by name."""
         scene, length = self._server.scene, self._length
         colors = np.repeat(np.round(255 * marks.colors).astype(np.uint8)[:, None], 2, axis=1)
         nodes = [

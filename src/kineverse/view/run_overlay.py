@@ -278,7 +278,6 @@ class RunLayer:
                 node.visible = frame in poses
 
     def _add_ghost(self, frame: str) -> Any:
-        """Add the shapes of a body to the page, and return the node that moves them."""
         scene = self._server.scene
         node = self._ghosts[frame] = scene.add_frame(f"{_ROOT}/ghost{len(self._ghosts)}", show_axes=False)
         color = tuple(round(255 * c) for c in GHOST[:3])

@@ -258,7 +258,6 @@ class Viewer:
         return f"<page of {self.model!r}, {'taken down' if self._stopping else self.address}>"
 
     def _repr_html_(self) -> str:
-        """Return the page as a part of a notebook."""
         if self._stopping:
             return str(element("i", "This page has been taken down."))
         return str(
@@ -368,7 +367,6 @@ class Viewer:
         self._drawn = now
 
     def _rebuild(self) -> dict[str, float]:
-        """Rebuild the page for an edited model, and return the values of its symbols."""
         model = _freeze(self.model)
         with self._change:
             # The present values, because a slider may have moved since the update was requested.
@@ -435,5 +433,4 @@ def _describe(thing: object) -> str:
 
 
 def _freeze(model: ModelView) -> ModelView:
-    """Return an immutable snapshot of a model."""
     return model.snapshot() if isinstance(model, Model) else model

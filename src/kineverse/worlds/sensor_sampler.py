@@ -248,7 +248,6 @@ class SensorSampler:
         return self._read_base
 
     def _take_picture(self, state: State, joints: dict[Symbol, float]) -> dict[str, Array]:
-        """Return the poses of the markers that are seen."""
         sensors, count = self.sensors, len(self.marked)
         # As many numbers for each picture, whatever is visible: runs with other visibility can be compared.
         normal = self._camera_noise.standard_normal((count, 10))

@@ -226,7 +226,6 @@ _ALSO = {"encoders": {"angle", "length"}}
 
 
 def _parse_quantity(text: str, entry: str) -> tuple[str, float]:
-    """Return the dimension and the value of a number with a unit."""
     match = _ENTRY.fullmatch(text)
     if match is None or match["unit"] not in _UNITS:
         raise _unreadable(entry)

@@ -297,7 +297,6 @@ def mirrored_values(motion: GroupMotion, values: Array, joint_prior: JointValueP
 
 
 def _whitening(observations: Observations) -> tuple[Array, Array]:
-    """Return the whitening of the errors of displacement and orientations, and its log volume."""
     rows, of_parent = observations.rows, observations.parent_covariance
     assert of_parent is not None  # only then does the ambiguity arise
     count, size = len(observations), 3 + rows

@@ -65,7 +65,6 @@ class _InlierHypothesis:
 
     @property
     def has_enough_inliers(self) -> bool:
-        """True if there are enough inliers to support the family."""
         return bool(self.inliers.sum() >= max(_FEWEST - 1, _SHARE * len(self.inliers) + 0.5))
 
 
@@ -149,7 +148,6 @@ class _InlierSearch:
         return motion.joints == self.observations.rows or (self.stated and bool(hypothesis.inliers.all()))
 
     def hypothesis(self, solution: Solution[FamilyMember], weights: Array | None = None) -> _InlierHypothesis:
-        """Return the hypothesis on the inliers under a solution."""
         squares, log_scale = self._whitened_errors(solution, weights)
         log_inlier = math.log(1.0 - self.outliers.fraction) - 0.5 * squares - log_scale
         log_outlier = _log_outlier_density(self.outliers, self.observations.rows)

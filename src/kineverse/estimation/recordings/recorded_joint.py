@@ -248,7 +248,6 @@ class _Comparison:
         return {fit.family: fit for fit in result if fit.family not in ("free", CURVE)}
 
     def correlation_time(self, fit: Fit) -> float:
-        """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
         largest = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
         return min(largest, correlation_time(_residuals_across_motion(fit), _CAUTION))
 
@@ -271,7 +270,6 @@ class _Comparison:
         times: dict[str, float],
         rows: Indices,
     ) -> Iterator[Assumption]:
-        """Yield the joints under other assumptions that the observations allow."""
         for time in sorted(set(times.values())):
             if time > _LONGER * best.correlation_time:
                 other = self.assume(stated, time, rows)

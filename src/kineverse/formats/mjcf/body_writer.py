@@ -77,7 +77,6 @@ class MeshFiles:
         return self._convert(mesh, file)
 
     def _convert(self, mesh: Mesh, file: Path) -> str | None:
-        """Convert a mesh to OBJ and return the reference to it."""
         try:
             triangles = find_service("read_mesh")(mesh)
         except (FormatError, MissingDependencyError, OSError) as error:
@@ -227,7 +226,6 @@ class MjcfBodyWriter:
         return mass, min(xx, yy, zz)
 
     def _shape(self, element: Tag, shape: Shape, name: str, *, is_visual: bool) -> None:
-        """Add the geom of a shape, unless MJCF has no such shape."""
         attributes = self._geometry(shape.geometry, name)
         if attributes is None:
             return

@@ -185,7 +185,6 @@ class MjcfConstraints:
         )
 
     def _tendon_dynamics(self, number: int) -> MjcfDynamics:
-        """Return the dynamics of a tendon that are not zero."""
         m = self._model
         stiffness = float(m.tendon_stiffness[number])
         shortest, longest = m.tendon_lengthspring[number].tolist()

@@ -87,7 +87,6 @@ class _HeldBodies:
 
 
 def _is_free(link: MjcfLink) -> bool:
-    """Return True if a link has a free joint."""
     return any(joint.kind == "free" for joint in link.joints)
 
 

@@ -67,7 +67,6 @@ def loop_operations(scene: MjcfScene, model_name: NameMap, followers: FollowerJo
 def _close_loop(
     closure: MjcfClosure, model_name: NameMap, home: Iterable[tuple[str, float]]
 ) -> Iterator[Operation]:
-    """Yield the operations that close a loop, with frames for ends that have none."""
     name, dependent = model_name(closure.name), closure.dependent
     pairs: list[list[str]] = []
     for k, part in enumerate((closure, *closure.more)):
@@ -237,7 +236,6 @@ def _translation(point: Vector3) -> Pose:
 
 
 def _motion_from_reference(joint: MjcfJoint) -> Pose:
-    """Return the motion of a joint from its reference to 0."""
     if joint.kind == "hinge":
         return Pose.from_matrix(axis_angle(joint.axis, -joint.reference))
     x, y, z = (-joint.reference * a for a in joint.axis)

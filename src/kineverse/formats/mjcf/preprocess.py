@@ -328,7 +328,6 @@ class MjcfPreprocessor:
         return read_tree(data, source, folder, self._root, self._on_recoverable_error)
 
     def _attached_model(self, node: MjcfElement, folder: str) -> _AttachedModel:
-        """Return the model that an element attaches, preprocessed once."""
         path = find_below_root(node, node.attributes["file"], self._root, folder)
         if path in self._open_files or len(self._open_files) >= MAX_ATTACH_DEPTH:
             node.refuse("attaches itself, directly or through others.")

@@ -186,7 +186,6 @@ class MjcfWriter:
     def _joints(
         self, body: Tag, link: LinkDescription, joints: Iterable[JointDescription | BallJointDescription]
     ) -> None:
-        """Add joints to a body, and their home position to the key."""
         free = self._freejoint_name(link)
         if free is not None:
             if link.dynamics:
@@ -239,7 +238,6 @@ class MjcfWriter:
         self._qpos += [*pose[:3, 3].tolist(), w, a, b, c]
 
     def _joint(self, body: Tag, joint: JointDescription) -> None:
-        """Add a hinge or slide to a body, with its limits and dynamics."""
         kind = "hinge" if joint.is_rotation else "slide"
         element = body.add(
             "joint", name=joint.name, type=kind, pos=_unless_zero(joint.point), axis=joint.axis
@@ -253,7 +251,6 @@ class MjcfWriter:
         self._dynamics(element, joint.name, joint.dynamics)
 
     def _dynamics(self, element: Tag, name: str, known: Mapping[str, Any]) -> None:
-        """Add the dynamics of a joint that MJCF can represent."""
         for key, attribute in _DYNAMICS.items():
             if isinstance(known.get(key), (int, float)) and known[key]:
                 element.give(attribute, float(known[key]))
@@ -305,7 +302,6 @@ class MjcfWriter:
         return tendon
 
     def _custom_elements(self) -> Tag:
-        """Return the custom elements, which MuJoCo ignores."""
         custom = Tag("custom")
         if add_speeds(custom, self._description.joints):
             self._description.remarks.append(

@@ -80,7 +80,6 @@ def read_sdf_joint(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> Res
 
 
 def _kind(element: Element) -> SdfJointType:
-    """Return the type of a joint, whatever its case."""
     name = element[1].get("type")
     if not name:
         raise ElementError(

@@ -204,7 +204,6 @@ class _SemanticDocument:
         return result
 
     def _states(self, groups: dict[str, SrdfGroup]) -> dict[str, dict[str, float]]:
-        """Add the named states to their groups, and return them by name for all groups together."""
         states: dict[str, dict[str, float]] = {}
         by_group: dict[str, dict[str, dict[str, float]]] = {}
         for element in self._elements("group_state"):
@@ -232,7 +231,6 @@ class _SemanticDocument:
         return states
 
     def _values(self, state: Element) -> dict[str, float]:
-        """Return the values of a named state by the name of the coordinate."""
         values: dict[str, float] = {}
         for part in state[2]:
             if part[0] != "joint":

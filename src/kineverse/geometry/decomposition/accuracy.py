@@ -126,7 +126,6 @@ def _sample_volume(polytope: Polytope, random: np.random.Generator) -> Floats:
 
 
 def _sample_surface(vertices: Floats, faces: Integers, count: int, random: np.random.Generator) -> Floats:
-    """Return points distributed uniformly on triangles."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     chosen = random.choice(len(areas), count, p=areas / areas.sum())

@@ -110,7 +110,6 @@ def _drop_degenerate(vertices: Floats, faces: Integers) -> Integers:
 
 
 def _connected_parts(faces: Integers, count: int) -> Integers:
-    """Return the index of the connected part of each triangle."""
     label = np.arange(count)
     while True:
         least = label[faces].min(axis=1)

@@ -324,7 +324,6 @@ class _Search:
 
     @property
     def nothing(self) -> BasePlacement:
-        """Placement that was not found."""
         none = np.zeros((0, len(self.owner.coordinates)))
         return BasePlacement(
             None, self.owner.coordinates, none, none, self.values, none, none, self.tried, self.reasons,

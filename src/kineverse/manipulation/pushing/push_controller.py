@@ -181,7 +181,6 @@ class Pushing:
         self.reset()
 
     def _hand_body(self) -> str:
-        """Return a body of the pusher that moves with its frame."""
         motion = FrameDependence(self.model, self.model.speeds)
         own = motion.moving_ancestors(self.tool.frame)
         return next((b for b in self.pusher if motion.moving_ancestors(b) == own), self.pusher[0])
@@ -326,7 +325,6 @@ class Pushing:
     def _numbers(
         self, tip: Vector, point: PushPoint, contact: PushPair | None
     ) -> tuple[PushNumbers, Array | None]:
-        """Return the numbers of the program, and the derivatives of a contact."""
         c, m, press = point.point, point.normal, self.press
         near, height = self._aside < NEAR and not self.retreating, inner_product(subtract(tip, c), m)
         standoff = _STANDOFF
@@ -354,7 +352,6 @@ class Pushing:
         return numbers, None if contact is None else self._add_contact(numbers, contact, tip)
 
     def _add_contact(self, numbers: PushNumbers, contact: PushPair, tip: Vector) -> Array:
-        """Set the numbers of a near pair of pusher and object, and return the derivatives."""
         press, thing = self.press, contact.thing
         allowed = -_JAMMED * press.depth - press.slack < contact.gap < LOST + press.slack
         numbers.free = float(self.touching and allowed)

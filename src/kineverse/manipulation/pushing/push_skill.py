@@ -257,7 +257,6 @@ class _End:
         return self._settled > 0 and not self._pushing.touching
 
     def reached(self, state: State) -> bool:
-        """Return whether the push ends at a state."""
         pushing, press = self._pushing, self._pushing.press
         rest = state[pushing.coordinate] - pushing.target
         if press.deviation > 0.0:
@@ -392,7 +391,6 @@ class _Run:
             self.act({s.derivative(): float(v) for s, v in zip(trajectory.symbols, rates, strict=True)})
 
     def retreat(self) -> None:
-        """Take the pusher away from the object."""
         self._pushing.retreating = True
         for _ in range(_RETREAT_STEPS):
             self._step("retreat")
@@ -402,7 +400,6 @@ class _Run:
         self._pushing.retreating = False
 
     def measures(self) -> dict[str, Any]:
-        """Return figures of the push."""
         pushing, force = self._pushing, self._session.peak_force
         return {
             **({} if math.isnan(force) else {"peak_force": force}),

@@ -327,7 +327,6 @@ class _OverlapJudge:
             self._overlaps.begin()
 
     def update(self) -> None:
-        """Measure the present state."""
         if self._overlaps is None:
             return
         self._scene.update(self._world.state)

@@ -264,7 +264,6 @@ def _relax(
 
 
 def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSpheres:
-    """Remove spheres that the others can replace within the aim."""
     failures = 0
     while cover.protrusion <= aim and len(cover.radii) > 1 and failures < _REMOVALS:
         # Protrusions shrink about as the number of spheres to the power -0.7.

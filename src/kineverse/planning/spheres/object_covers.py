@@ -67,7 +67,6 @@ def are_covered(items: Sequence[CollisionObject], protrusion: float | None = Non
 def _request(
     items: Sequence[CollisionObject], protrusion: float | None, most: int
 ) -> tuple[list[tuple[Solid, Floats]], str]:
-    """Return the solids of objects with their poses, and the key of their cover."""
     check_cover_settings(protrusion, most)
     if not items:
         raise InvalidValueError("There is no shape to cover.")

@@ -206,7 +206,6 @@ def _find_corners(points: Array, allowed: Array) -> npt.NDArray[np.intp]:
 
 
 def _shrink(path: BlendedPath, valid: Validity, resolution: float) -> BlendedPath:
-    """Halve blends until they are valid."""
     reach = path.reach.copy()
     open_corners = np.flatnonzero(reach > 0)
     for _ in range(_HALVINGS + 1):
