@@ -299,7 +299,11 @@ _HEAD = 1 << 16  # of a file, in which its root element begins [byte]
 
 def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> None:
     """Raise if something is missing, and name all of it with how to install it."""
-    missing = [extra for extra, needed in extras.items() if needed and not _is_installed(extra)]
+    missing = [
+        extra
+        for extra, needed in extras.items()
+        if needed and importlib.util.find_spec(MODULES[extra]) is None
+    ]
     sentences = []
     if missing:
         names = " and ".join(filter(None, [", ".join(map(repr, missing[:-1])), repr(missing[-1])]))
@@ -319,7 +323,3 @@ def needs_mujoco(model: str) -> bool:
             return is_mjcf(model, file.read(_HEAD))
     except (OSError, ValueError):
         return False
-
-
-def _is_installed(extra: str) -> bool:
-    return importlib.util.find_spec(MODULES[extra]) is not None

@@ -18,7 +18,6 @@ from kineverse.model.comparison import (
     SIGNS,
     BehaviourComparison,
     Delta,
-    LimitDifference,
     ModelComparison,
     ValueDifference,
 )
@@ -435,17 +434,16 @@ class BehaviourComparisonReport:
             "dof": {
                 "removed": self.comparison.freedoms["removed"],
                 "added": self.comparison.freedoms["added"],
-                "changed": [_limits_to_json(r) for r in self.comparison.ranges],
+                "changed": [
+                    {
+                        "name": r.name,
+                        "before": [_finite_or_none(bound) for bound in r.before],
+                        "after": [_finite_or_none(bound) for bound in r.after],
+                    }
+                    for r in self.comparison.ranges
+                ],
             },
         }
-
-
-def _limits_to_json(difference: LimitDifference) -> dict[str, Any]:
-    return {
-        "name": difference.name,
-        "before": [_finite_or_none(bound) for bound in difference.before],
-        "after": [_finite_or_none(bound) for bound in difference.after],
-    }
 
 
 def _finite_or_none(number: float) -> float | None:

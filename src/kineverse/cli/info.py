@@ -229,7 +229,9 @@ def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
     if not is_installed():
         return None
     try:
-        return _touching_pairs(model)
+        scene = Scene(model, leave_out=find_unusable_shapes(model))
+        scene.update(model.default_state())
+        return scene.pairs_within(0.0)
     except KineverseError:  # Poses that are not finite are reported separately.
         return None
 
@@ -241,12 +243,6 @@ def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
         if pair.distance < -CONTACT_DEPTH:
             text = f"in {pair.b} by {format_number(-pair.distance, 3)} m at the default state"
             yield ModelProblem("contact", pair.a, text)
-
-
-def _touching_pairs(model: ModelView) -> Sequence[DistanceResult]:
-    scene = Scene(model, leave_out=find_unusable_shapes(model))
-    scene.update(model.default_state())
-    return scene.pairs_within(0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -126,7 +126,10 @@ class Batch:
         points = self._points(x)
         rows = len(points)
         if out is None:
-            results = self._allocate(rows)
+            results = [
+                allocate_aligned(rows * size).reshape(rows, *shape)
+                for shape, size in zip(self._shapes, self._program.sizes, strict=True)
+            ]
         else:
             results = self._check_out(out, rows)
             if _overlap([points, *results]):
@@ -155,12 +158,6 @@ class Batch:
         if points.ndim != 2 or points.shape[1] != size:
             raise ShapeError(f"Expected {wanted}, not an array of shape {points.shape}.")
         return np.ascontiguousarray(points)
-
-    def _allocate(self, rows: int) -> list[Array]:
-        return [
-            allocate_aligned(rows * size).reshape(rows, *shape)
-            for shape, size in zip(self._shapes, self._program.sizes, strict=True)
-        ]
 
     def _check_out(self, out: Any, rows: int) -> list[Array]:
         given = list(out) if isinstance(out, (list, tuple)) else [out]

@@ -186,7 +186,8 @@ class Viewer:
             return
         with self._change:
             start = {**self._values, **self._quaternions.angles}
-            ranges = self._animated_ranges()
+            limits, angles = self._ranges.limits_at(self._values), self._quaternions.angles
+            ranges = select_animated(self._shown, limits, angles, self._values, self._units)
             self._stop_animation()
             self._animation = RangeAnimation(start, ranges, time.monotonic()) if motion else None
             self._request_update()
@@ -292,10 +293,6 @@ class Viewer:
             on_convert=self._request_redraw,
             degrees=degrees,
         )
-
-    def _animated_ranges(self) -> dict[str, tuple[float, float]]:
-        limits, angles = self._ranges.limits_at(self._values), self._quaternions.angles
-        return select_animated(self._shown, limits, angles, self._values, self._units)
 
     def _set_from_slider(self, name: str, value: float) -> None:
         """Take the value of a slider that a user moved; sliders of locked coordinates are moved back."""

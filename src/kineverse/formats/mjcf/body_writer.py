@@ -82,7 +82,9 @@ class MeshFiles:
         except (FormatError, MissingDependencyError, OSError) as error:
             self._remark(f"the mesh {mesh.uri} is left out: MuJoCo cannot read it, and {error}")
             return None
-        content = _to_obj(triangles.vertices, triangles.faces)
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in triangles.vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (triangles.faces + 1).tolist()]
+        content = ("\n".join(lines) + "\n").encode()
         name, count = f"{file.stem}.obj", 1
         while self._is_taken(self._mesh_folder / name, content):
             count += 1
@@ -117,12 +119,6 @@ def _is_binary_stl(path: Path) -> bool:
         return False
     count: int = struct.unpack("<I", start[-4:])[0]
     return 0 < count <= MAX_STL_FACES and size == _HEADER + _TRIANGLE * count
-
-
-def _to_obj(vertices: np.ndarray, faces: np.ndarray) -> bytes:
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
-    return ("\n".join(lines) + "\n").encode()
 
 
 VISUAL_GROUP, COLLISION_GROUP = "1", "3"

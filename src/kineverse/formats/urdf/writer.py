@@ -47,7 +47,6 @@ from kineverse.model.body import (
     Cylinder,
     Ellipsoid,
     Geometry,
-    Inertia,
     Mesh,
     Pose,
     Shape,
@@ -76,7 +75,10 @@ class UrdfBodyWriter:
         """Add the elements of a body to its link."""
         name = link.attributes["name"]
         if body.inertia is not None:
-            _add_inertia(link, body.inertia)
+            element = link.add("inertial")
+            add_origin(element, body.inertia.origin)
+            element.add("mass", value=body.inertia.mass)
+            element.add("inertia", **dict(zip(_TENSOR, body.inertia.tensor, strict=True)))
         for shape in body.visuals:
             visual = self._shape(link, "visual", shape, name)
             if visual is not None:
@@ -142,13 +144,6 @@ def add_origin(element: Tag, pose: Pose) -> None:
     matrix = pose.matrix
     rpy = rpy_angles(matrix)
     element.add("origin", xyz=matrix[:3, 3].tolist(), rpy=None if rpy == (0.0, 0.0, 0.0) else rpy)
-
-
-def _add_inertia(link: Tag, inertia: Inertia) -> None:
-    element = link.add("inertial")
-    add_origin(element, inertia.origin)
-    element.add("mass", value=inertia.mass)
-    element.add("inertia", **dict(zip(_TENSOR, inertia.tensor, strict=True)))
 
 
 URDF_CAPABILITIES = FormatCapabilities("URDF")
