@@ -174,8 +174,6 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
 
     Parameters
     ----------
-    name
-        The unknown name.
     available
         The known names.
     what

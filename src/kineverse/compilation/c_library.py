@@ -196,8 +196,6 @@ class CompilerInformation:
     ----------
     compiler
         The path of the C compiler; None if there is none and all functions are interpreted.
-    version
-        The compiler's version text.
     flags
         Flags for optimisation and arithmetic, for functions of moderate size.
     vector_unit
@@ -205,8 +203,6 @@ class CompilerInformation:
         ``none``.
     cores
         The number of cores for batches.
-    cache_folder
-        The folder of compiled libraries.
     """
 
     compiler: str | None

@@ -128,8 +128,6 @@ class CompiledFunction(Generic[Results]):
 
     Parameters
     ----------
-    outputs
-        The expressions.
     inputs
         The symbols in the order of the vector, or None.
     single

@@ -62,8 +62,6 @@ class Command:
         nothing is held.
     times
         Durations of the parts of the step.
-    iterations
-        Iterations of the solver.
     contacts
         Near pairs of bodies, nearest first; the first of them have rows.
     """

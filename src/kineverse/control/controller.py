@@ -87,10 +87,6 @@ class Controller:
 
     Attributes
     ----------
-    model
-        The model.
-    tasks
-        The tasks.
     speeds
         The speeds of commands, found from the tasks and the constraints that they meet.
     inputs

@@ -71,10 +71,6 @@ class InverseKinematics:
 
     Attributes
     ----------
-    model
-        The model.
-    tasks
-        The tasks.
     coordinates
         The coordinates that may move, found from the tasks and the constraints that they meet.
     inputs

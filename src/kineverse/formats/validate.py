@@ -197,8 +197,6 @@ class ValidationResult:
         Reader warnings: content left out or interpreted.
     faults
         Mistakes that a strict reader refuses.
-    problems
-        Problems of the model.
     strict
         True if remarks count as problems.
     """

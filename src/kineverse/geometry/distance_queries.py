@@ -144,8 +144,6 @@ class PreparedQuery:
 
     Parameters
     ----------
-    world
-        The collision world.
     choose
         Function that returns the selected pairs, for the present version of the model.
     radius

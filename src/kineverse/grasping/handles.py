@@ -82,8 +82,6 @@ def find_handles(
 
     Parameters
     ----------
-    model
-        Model of the object.
     coordinate
         Coordinate of a door, a drawer or any other mechanism.
     decomposed

@@ -41,8 +41,6 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
 
     Attributes
     ----------
-    name
-        Name of the loop.
     frame, to
         Frames to keep together. Other operations must have connected them already.
     more
@@ -268,8 +266,6 @@ class LoopConstraint(Operation, document_kind="LoopConstraint"):
 
     Attributes
     ----------
-    name
-        Name of the closure.
     frame, to
         Frames to keep together. Other operations must have connected them already.
     mask

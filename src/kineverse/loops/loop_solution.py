@@ -42,8 +42,6 @@ class SolvedLoop:
     ----------
     function
         Dependent coordinates as a function of the inputs.
-    free, dependent
-        Free and dependent coordinates.
     mobility
         Number of free coordinates in generic configurations.
     branches, branch
@@ -79,8 +77,6 @@ def solve_loop(
 
     Parameters
     ----------
-    name
-        Name of the loop for errors.
     residual
         Residual, shape (m,), zero if the loop is closed [m], [rad].
     coordinates

@@ -34,8 +34,6 @@ class ArticulatedObject:
 
     Attributes
     ----------
-    coordinate
-        The coordinate.
     kind
         ``"drawer"``: it is translated; ``"door"``: it turns about an upright axis; ``"flap"``: about a level
         one; ``"knob"``: about an axis through itself; ``"linkage"``: about an axis that moves.
@@ -56,8 +54,6 @@ def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[Articul
 
     Parameters
     ----------
-    model
-        The model.
     robot
         Prefix of a robot, which is not an object; none if empty.
 

@@ -105,8 +105,6 @@ def place_robot(
 
     Parameters
     ----------
-    model
-        The model of the furniture.
     robot
         Name of a shipped robot, or path of its description.
     at

@@ -414,8 +414,6 @@ class BehaviourComparison:
 
     Parameters
     ----------
-    before, after
-        The models.
     tolerance
         Largest difference of equal numbers [m], [rad].
 

@@ -61,8 +61,6 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
 
     Parameters
     ----------
-    model
-        The model.
     symbols
         Symbols or their names, such as the speeds of a controller.
 

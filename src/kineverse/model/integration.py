@@ -58,8 +58,6 @@ class Integrator:
 
     Parameters
     ----------
-    rates
-        Rate table.
     symbols
         Symbols of the vector of coordinates: coordinates, and parameters that rows contain.
     speeds

@@ -516,8 +516,6 @@ class ModelView(SymbolicView):
 
         Parameters
         ----------
-        path
-            Path of the file.
         tolerance
             Largest error of a frame in URDF and MJCF, in position [m] and angle [rad], guaranteed; None for
             no error.

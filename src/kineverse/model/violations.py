@@ -69,8 +69,6 @@ class ConstraintChecker:
 
     Parameters
     ----------
-    constraints
-        Constraints by name.
     symbols
         Symbols of the vector; those of all constraints if None, and then C is not compiled.
     dependent

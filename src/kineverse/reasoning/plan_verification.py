@@ -46,10 +46,6 @@ def plan_violations(model: ModelView, plan: UnlockingPlan, state: StateLike | No
 
     Parameters
     ----------
-    model
-        The model.
-    plan
-        The plan.
     state
         Positions at the start, as they were given to the planner.
     """
@@ -198,10 +194,6 @@ def refutation_gaps(model: ModelView, plan: UnlockingPlan, state: StateLike | No
 
     Parameters
     ----------
-    model
-        The model.
-    plan
-        The plan.
     state
         Positions at the start, as they were given to the planner.
     """

@@ -34,8 +34,6 @@ class UnlockingStep:
 
     Attributes
     ----------
-    coordinate
-        The coordinate.
     start, target
         Its positions before and after the move [m] or [rad].
     threshold

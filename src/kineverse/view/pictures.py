@@ -94,8 +94,6 @@ def picture(
 
     Parameters
     ----------
-    model
-        The model to draw.
     state
         Values by symbol or name [m], [rad]; the default state for the others.
     size

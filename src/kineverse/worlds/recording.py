@@ -237,8 +237,6 @@ class RunRecording:
     ----------
     path
         File that it was read from.
-    model
-        Model of the world.
     states, beliefs, commands
         True state, believed state, and commanded speeds over time.
     belief_poses

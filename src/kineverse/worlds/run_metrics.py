@@ -125,8 +125,6 @@ class Judge:
 
     Parameters
     ----------
-    model
-        Model of the world.
     robot
         Prefix of the robot.
     gripper

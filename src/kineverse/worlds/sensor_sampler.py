@@ -112,10 +112,6 @@ class SensorSampler:
 
     Parameters
     ----------
-    sensors
-        Settings.
-    model
-        Model of the world.
     robot
         Prefix of the robot; empty for a model of a robot alone.
     seed

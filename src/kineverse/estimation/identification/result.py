@@ -42,8 +42,6 @@ class Fit:
 
     Attributes
     ----------
-    family
-        Name of the family.
     probability
         Posterior probability of the family among those that were compared.
     log_evidence

@@ -67,8 +67,6 @@ class PlausibilityMonitor:
 
     Parameters
     ----------
-    model
-        The served model.
     frames
         Names of the frames that may be observed.
     noise, relative_to, families, false_alarms, outliers, decorrelation_time

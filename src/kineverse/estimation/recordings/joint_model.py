@@ -35,8 +35,6 @@ def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
     ----------
     pair
         Observed poses.
-    fit
-        Joint that was identified from them.
 
     Raises
     ------

@@ -387,8 +387,6 @@ class Tracker:
             time, up to the lag.
         commands
             Speeds during this prediction.
-        inputs
-            Values of the inputs.
         process_noise
             Process noise during this prediction, as for :meth:`predict`.
 

@@ -48,8 +48,6 @@ def parse_mjcf(
 
     Parameters
     ----------
-    text
-        Text of the document.
     source
         Name of the document in error messages.
     folder

@@ -328,8 +328,6 @@ def parse_sdf(
 
     Parameters
     ----------
-    text
-        Text of the document.
     source
         Name of the document in error messages.
     folder

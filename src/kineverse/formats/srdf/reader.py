@@ -51,8 +51,6 @@ def parse_srdf(
 
     Parameters
     ----------
-    text
-        Text of the document.
     model
         Model that contains the robot, in its present version.
     prefix

@@ -63,8 +63,6 @@ def parse_urdf(
 
     Parameters
     ----------
-    text
-        Text of the document.
     source
         Name of the document in error messages.
     folder

@@ -129,8 +129,6 @@ def decompose(
     ----------
     mesh
         A mesh; its scale is applied.
-    settings
-        Settings of the decomposition.
     limits
         Limits on time and memory.
     force

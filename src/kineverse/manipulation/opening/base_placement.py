@@ -126,8 +126,6 @@ class PlacementSearch:
     ----------
     model
         Model of the robot and of everything around it.
-    gripper
-        The gripper.
     state
         State of everything; the robot's idle coordinates keep these values.
     margin

@@ -68,8 +68,6 @@ class Pushing:
         The coordinate to change, as symbol or name.
     bodies
         Bodies of the robot that may touch the object, names or patterns: the pusher.
-    state
-        Present state.
     target
         Wanted value [m], [rad].
     robot

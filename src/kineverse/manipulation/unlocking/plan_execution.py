@@ -109,8 +109,6 @@ class ExecutedMove:
 
     Attributes
     ----------
-    step
-        The planned move.
     reached
         Position where the coordinate ended [m] or [rad].
     seconds

@@ -31,8 +31,6 @@ def record_trace(operation: Operation, model: ReadRecorder, writes: Mapping[Cell
 
     Parameters
     ----------
-    operation
-        Operation that was applied.
     model
         Model before the operation.
     writes

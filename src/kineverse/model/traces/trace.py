@@ -225,8 +225,6 @@ class Trace:
 
         Parameters
         ----------
-        model
-            Present model.
         before
             Model at the time of the trace.
 

@@ -45,8 +45,6 @@ def motion_limits(
 
     Parameters
     ----------
-    model
-        The model.
     symbols
         Coordinates that move together (n,).
     ramp

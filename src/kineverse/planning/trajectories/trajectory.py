@@ -244,8 +244,6 @@ class Trajectory:
 
         Parameters
         ----------
-        path
-            Path of the file.
         model
             Model to which the coordinates belong; None to accept all names.
 
@@ -328,8 +326,6 @@ class TrajectoryFollower:
 
     Parameters
     ----------
-    trajectory
-        The trajectory.
     gain
         Rate at which errors decay [1/s], at most 1/dt of the controller.
     weight
