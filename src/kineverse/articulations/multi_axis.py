@@ -93,8 +93,6 @@ class Universal(Joint, document_kind="Universal"):
     ------
     InvalidValueError
         For axes that are not perpendicular, with the angle between them.
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     first: AxisLike = (1.0, 0.0, 0.0)
@@ -165,8 +163,6 @@ class Ball(Joint, document_kind="Ball"):
     ------
     InvalidValueError
         For a cone or a twist outside (0, π], or a negative limit of the speed.
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     axis: AxisLike = (0.0, 0.0, 1.0)

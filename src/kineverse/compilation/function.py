@@ -216,8 +216,6 @@ class CompiledFunction(Generic[Results]):
 
         Raises
         ------
-        ShapeError
-            If ``x`` is not a vector of n numbers.
         UnknownNameError
             If a mapping lacks a symbol or has one that is not an input.
         InvalidValueError

@@ -83,8 +83,6 @@ class InverseKinematics:
     UnknownNameError
         For a task about a symbol that the model does not have, an unknown name in ``fixed``, or a scene of
         another model.
-    DuplicateNameError
-        For two tasks of one name.
     MissingDependencyError
         If the solver of quadratic programs is not installed.
     """

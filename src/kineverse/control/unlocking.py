@@ -142,8 +142,6 @@ def unlock(
 
     Raises
     ------
-    UnknownNameError
-        For names that are no degrees of freedom.
     InvalidValueError
         For no goal, and numbers that are not finite or not positive.
     """

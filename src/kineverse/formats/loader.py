@@ -120,8 +120,6 @@ def load(
 
     Raises
     ------
-    UnknownNameError
-        If there is no such model.
     FormatError
         If the file is invalid, with file, line, element and reason; or for an invalid prefix or root.
     InvalidValueError

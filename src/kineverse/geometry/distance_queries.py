@@ -222,8 +222,6 @@ class PreparedQuery:
         ------
         UnknownNameError
             If the scene was not updated yet, or the model has no such coordinate.
-        ShapeError
-            If Q has another shape.
         InvalidValueError
             If the radius is negative or NaN, or a pose is not finite.
         """

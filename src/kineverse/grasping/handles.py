@@ -86,11 +86,6 @@ def find_handles(
         Coordinate of a door, a drawer or any other mechanism.
     decomposed
         Bodies, or patterns, as for :class:`kineverse.geometry.Scene`: without them a mesh is its convex hull.
-
-    Raises
-    ------
-    UnknownNameError
-        If the model has no such coordinate.
     """
     return _search(model, coordinate, decomposed)[0]
 

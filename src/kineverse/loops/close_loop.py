@@ -277,8 +277,6 @@ class LoopConstraint(Operation, document_kind="LoopConstraint"):
     ------
     ModelError
         If the frames are connected rigidly.
-    DuplicateNameError
-        If there is an articulation of that name.
     """
 
     name: str

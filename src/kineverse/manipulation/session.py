@@ -174,8 +174,6 @@ class Session:
 
         Raises
         ------
-        UnknownNameError
-            For a name that the model does not have.
         ShapeError
             For an expression that is no number.
         """

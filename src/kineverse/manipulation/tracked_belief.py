@@ -145,8 +145,6 @@ class TrackedBelief:
 
     Raises
     ------
-    UnknownNameError
-        For a prefix, camera or marked frame that the model does not have.
     InvalidValueError
         If no marked frame moves with an object, or odometry drifts under a base that is not planar.
     """
@@ -437,11 +435,6 @@ class TrackedBelief:
         """Return the standard deviation of a coordinate at the present time [m], [rad].
 
         It is infinite for one that no marker shows, and one whose track is lost.
-
-        Raises
-        ------
-        UnknownNameError
-            For a coordinate that the state does not have.
         """
         if coordinate in self._groups:
             estimate = self._estimate

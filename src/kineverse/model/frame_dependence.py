@@ -63,11 +63,6 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
     ----------
     symbols
         Symbols or their names, such as the speeds of a controller.
-
-    Raises
-    ------
-    UnknownNameError
-        For a symbol that the model does not know.
     """
     asked = [s if isinstance(s, Symbol) else model.symbol(s) for s in symbols]
     known = _known_paths(model)

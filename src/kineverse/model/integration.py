@@ -116,8 +116,6 @@ class Integrator:
 
         Raises
         ------
-        ShapeError
-            If the vectors have other sizes.
         InvalidValueError
             For NaN and infinite numbers, or if coordinates diverge.
         """

@@ -136,11 +136,6 @@ class ConstraintChecker:
         ----------
         x
             Values of :attr:`symbols`, shape (n,).
-
-        Raises
-        ------
-        ShapeError
-            If ``x`` is not a vector of n numbers.
         """
         self._evaluator(x)
         largest, total = self._checks

@@ -119,8 +119,6 @@ class Path:
         ------
         InvalidValueError
             If the path was not found, or the model has been edited since; as :func:`.time_parameterize`.
-        ShapeError
-            For limits or deviations of another shape.
         """
         return join_sections(self._parameterize(deviation, ramp, velocity, acceleration))
 
@@ -183,8 +181,6 @@ class Path:
         ------
         InvalidValueError
             As :meth:`trajectory`.
-        FormatError
-            If the file cannot be written.
         """
         self.trajectory().save(path)
 

@@ -198,8 +198,6 @@ def plan_unlocking(
 
     Raises
     ------
-    UnknownNameError
-        For names that are no degrees of freedom.
     InvalidValueError
         For a goal beyond its limits, no goal, a number that is not finite, a budget that is not positive, or
         a parameter in the state with another value than its own.

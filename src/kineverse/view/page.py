@@ -70,8 +70,6 @@ def show(
     ------
     MissingDependencyError
         If viser is not installed.
-    UnknownNameError
-        If the state has a name that the model does not have.
     InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
     """

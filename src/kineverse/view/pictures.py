@@ -119,8 +119,6 @@ def picture(
     ------
     MissingDependencyError
         If lines are wanted and the extra ``geometry`` is not installed.
-    UnknownNameError
-        If the state names a symbol that the model does not have.
     InvalidValueError
         If the size is not that of a picture.
     """

@@ -226,11 +226,6 @@ class KinematicWorld:
         """Start again from a state, at time 0, with nothing in the gripper and all speeds zero.
 
         Coordinates without a value have their default one.
-
-        Raises
-        ------
-        UnknownNameError
-            For a symbol that the model does not have.
         """
         self._check_version()
         values = self.model.default_state().updated(_select(state, self.model))

@@ -127,8 +127,6 @@ class SensorSampler:
 
     Raises
     ------
-    UnknownNameError
-        For a prefix, camera or marked frame that the model does not have.
     InvalidValueError
         If a field of view or a line of sight is asked for, but the robot has no camera.
     """

@@ -145,13 +145,7 @@ class Fit:
         return 0.0 if joint is None else float(np.abs(np.diff(self.joint_values[self.inliers, joint])).max())
 
     def deviation(self, coordinate: str) -> float:
-        """Return the standard deviation of a coordinate.
-
-        Raises
-        ------
-        UnknownNameError
-            If there is no such coordinate.
-        """
+        """Return the standard deviation of a coordinate."""
         if coordinate not in self.coordinates:
             hint = suggest(coordinate, self.coordinates, "coordinate")
             raise UnknownNameError(f"A {self.family} fit has no coordinate {coordinate!r}. {hint}")

@@ -123,8 +123,6 @@ def check_plausibility(
 
     Raises
     ------
-    UnknownNameError
-        For a frame or a family that does not exist.
     ShapeError, InvalidValueError
         For invalid poses, covariances or times, and if a covariance is missing.
     ImplausibleError

@@ -73,11 +73,6 @@ class PlausibilityMonitor:
         As in :func:`~kineverse.estimation.check_plausibility`.
     keep
         Number of recent observations that reports use.
-
-    Raises
-    ------
-    UnknownNameError
-        For a frame that does not exist.
     """
 
     def __init__(

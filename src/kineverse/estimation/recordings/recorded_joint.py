@@ -166,8 +166,6 @@ def identify_recorded_joint(
     ------
     InvalidValueError
         If all poses are equal, or do not allow an identification.
-    UnknownNameError
-        For an unknown family.
     """
     comparison = _Comparison(pair, families, independent)
     first = comparison.assume(noise, 1.0, comparison.distinct)

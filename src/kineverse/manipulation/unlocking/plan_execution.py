@@ -63,11 +63,6 @@ class PartMover:
         """Move a coordinate to a target, and return the position where it ends [m] or [rad].
 
         It ends within the tolerance of the target, or where it has come no nearer for the patience.
-
-        Raises
-        ------
-        UnknownNameError
-            For a name that is no degree of freedom.
         """
         symbol = self.model.degree_of_freedom(coordinate)
         controller, session = self._controller(symbol), self.session

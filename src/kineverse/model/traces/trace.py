@@ -232,8 +232,6 @@ class Trace:
         ------
         UntraceableError
             If a value has changed that the operation depends on.
-        UnknownNameError
-            If the name in a query no longer exists.
         """
         old: list[QueryResult] = []
         new: list[QueryResult] = []

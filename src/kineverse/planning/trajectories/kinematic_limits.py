@@ -57,8 +57,6 @@ def motion_limits(
 
     Raises
     ------
-    UnknownNameError
-        If the model does not have a coordinate.
     InvalidValueError
         For a ramp or speed that is not positive.
     """

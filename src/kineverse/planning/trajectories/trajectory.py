@@ -51,8 +51,6 @@ class Trajectory:
 
     Raises
     ------
-    ShapeError
-        For arrays whose shapes do not match.
     InvalidValueError
         For times that do not begin at 0 or do not increase, numbers that are not finite, a symbol that is
         there twice, or one that is no coordinate.
@@ -228,13 +226,7 @@ class Trajectory:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the trajectory to a JSON file; all numbers are exact.
-
-        Raises
-        ------
-        FormatError
-            If the file cannot be written.
-        """
+        """Write the trajectory to a JSON file; all numbers are exact."""
         names = [str(symbol) for symbol in self.symbols]
         write_trajectory_file(path, TrajectoryData(names, self.times, self.positions, self.velocities))
 
@@ -251,8 +243,6 @@ class Trajectory:
         ------
         FormatError
             If the file cannot be read or is no trajectory; the message says what is wrong.
-        UnknownNameError
-            For a coordinate that the model does not have.
         """
         data, source = read_trajectory_file(path), Path(path).name
         if model is None:
