@@ -1,4 +1,19 @@
-"""Correlation of errors in time: autocorrelation time, effective sample size, and their online estimate."""
+"""Correlation of errors in time: autocorrelation time, effective sample size, and their online estimate.
+
+N observations with the integrated autocorrelation time τ are worth N / τ independent ones,
+
+    τ = 1 + 2 Σ ρ_k
+
+cut off at a lag of 3 τ (Sokal 1997), as correlations at larger lags are noise. With M lags, τ has a relative
+standard deviation of √((4 M + 2) / N).
+
+Online, a whitened error is x = c + s + w: a constant c of unknown size, a stationary process s with the
+correlation e^(-Δt/τ) and the variance σ², and white noise w with the variance 1 - σ². A Kalman filter for
+each point (σ², τ) of a grid yields their posterior. The variance of the mean of N errors is m/N, with the
+posterior mean of
+
+    m = 1 + 2 σ² Σ_l e^(-l Δt/τ) = 1 + 2 σ² / (e^(Δt/τ) - 1)
+"""
 
 from __future__ import annotations
 

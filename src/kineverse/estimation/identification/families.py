@@ -1,4 +1,12 @@
-"""Joint families: subgroups of SE(3) between parent and child, and families of a user's expression."""
+"""Joint families: subgroups of SE(3) between parent and child, and families of a user's expression.
+
+    parent_T_child = L · g(a) · R,        g(a) = translation(v(a)) · Exp(ω(a))
+
+Each joint value is one of the six components of (v, ω), and these components define the subgroup. For a
+screw, v_z also gets the pitch times ω_z. So a revolute joint rotates about the z axis of L. Of the twelve
+parameters of L and R, those without a gauge freedom remain: a motion that commutes with the subgroup can move
+from L to R, and a motion in the subgroup is a shift of joint values.
+"""
 
 from __future__ import annotations
 

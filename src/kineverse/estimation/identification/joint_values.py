@@ -1,4 +1,9 @@
-"""Joint values of a fit: prior of their range, mirrored solutions, sliding point, revolutions."""
+"""Joint values of a fit: prior of their range, mirrored solutions, sliding point, revolutions.
+
+In parent_T_child = L · translation(v) · Exp(w) · R, the translation c of R selects the point of the child that
+v translates. The likelihood does not depend on c, but the prior of v does. So this sliding point has a
+Gaussian prior around the origin of the child, and the evidence integrates over it.
+"""
 
 from __future__ import annotations
 

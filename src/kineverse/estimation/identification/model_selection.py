@@ -4,6 +4,10 @@ A joint that hardly moves looks rigid, and a point on a long lever seems to move
 of the wider family is at least that of the narrower one times the prior probability of members that look like
 it. Laplace's method misses them: it knows only the surroundings of the most likely member, which follows the
 noise.
+
+Let e be the residuals with the joint values of each observation by itself, W the inverse of their covariance,
+and ν their number less those of joint values and of determined parameters. If family and noise are right,
+χ² = Σ eᵀ W e has the mean ν, and √(χ²/ν) is the ratio of the noise to the stated one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,13 @@
-"""Process models: prediction along q̇ = R(q) u, constant velocity, default process noise."""
+"""Process models: prediction along q̇ = R(q) u, constant velocity, default process noise.
+
+With constant velocity, the acceleration is white noise with the spectral density q (Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 6.2.2):
+
+    ẋ = R(x) u,    u̇ = w,    Cov ∫ w dt = q dt
+
+No measurement depends on speeds. So an update of the state alone is exact, and for a step ξ in the tangent
+space the speeds stay Gaussian, u | ξ ~ N(m + K ξ, C).
+"""
 
 from __future__ import annotations
 
