@@ -24,8 +24,7 @@ from .joint import Joint, check_axis, check_joint_number
 from .limits import FREE, Limits, check_limits, check_speed_limit, limit_constraints
 from .single_axis import rotation_factors, unit_axis
 
-# Largest cosine between axes that count as perpendicular.
-_PERPENDICULAR = 1e-6
+_PERPENDICULAR = 1e-6  # largest cosine between axes that count as perpendicular
 
 
 @dataclass(frozen=True, kw_only=True)

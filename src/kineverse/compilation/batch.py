@@ -86,13 +86,11 @@ def _give_back(block: Array) -> None:
             break
 
 
-# Larger results are written past the caches, which they would not fit.
-_STREAMED_BYTES = 8 * 2**20
+_STREAMED_BYTES = 8 * 2**20  # larger results are written past the caches, which they would not fit
 # Seconds on one core, in all and for each instruction, as measured with gcc 12 and CasADi 3.8.
 _COMPILING, _COMPILING_ONE = 0.3, 1e-3
 _INTERPRETING, _INTERPRETING_ONE = 50e-9, 3e-9
-# Rows per call of CasADi's map.
-_MAPPED = 32
+_MAPPED = 32  # rows per call of CasADi's map
 
 BatchFunction = Callable[[int, int, int, int], int]
 

@@ -226,8 +226,7 @@ def compiler_information() -> CompilerInformation:
     )
 
 
-# Pieces per thread on average, so that the other threads take over from a delayed one.
-_PIECES = 4
+_PIECES = 4  # pieces per thread on average, so that the other threads take over from a delayed one
 # A piece has at most so many times the smallest number of rows that is worth a thread: some 20 ms.
 _LARGEST = 200
 

@@ -50,8 +50,7 @@ WantedTier: TypeAlias = Literal["auto", "interpreter", "c"]
 # Inputs and outputs count as operations too. Any program with a further operation is worth compiling: the
 # extension calls a compiled sum in a fifth of the time of CasADi's interpreter.
 _WORTH_COMPILING = 4
-# From so many operations on, which take some microseconds, a call releases the GIL.
-_LENGTHY = 5000
+_LENGTHY = 5000  # from so many operations on, which take some microseconds, a call releases the GIL
 
 
 @overload

@@ -36,8 +36,7 @@ _MESH_HULLS = ContentCache(
 _WHOLE_FILES = (".stl", ".obj", ".dae", ".ply", ".off")
 """Suffixes of mesh files whose triangles lie in no other file."""
 
-# Raise the number when the hulls of equal meshes change.
-_HULL_VERSION = 1
+_HULL_VERSION = 1  # raise the number when the hulls of equal meshes change
 
 
 def convex_hull(points: Floats) -> Any:

@@ -261,8 +261,7 @@ def _columns(parent_R_frame: Array, lever: Array) -> Array:
 # Candidate values of a single joint for each observation, and number of random initial members.
 _TRIED = 41
 _MEMBERS = 8
-# Prior standard deviation of the mean of a joint value [m] or [rad].
-_MEAN_SPREAD = 3.0
+_MEAN_SPREAD = 3.0  # prior standard deviation of the mean of a joint value [m] or [rad]
 
 
 class FamilyParameter(NamedTuple):

@@ -1,7 +1,7 @@
 """Joint values of a fit: prior of their range, mirrored solutions, sliding point, revolutions.
 
-In parent_T_child = L · translation(v) · Exp(w) · R, the translation c of R selects the point of the child that
-v translates. The likelihood does not depend on c, but the prior of v does. So this sliding point has a
+In parent_T_child = L · translation(v) · Exp(w) · R, the translation c of R selects the point of the child
+that v translates. The likelihood does not depend on c, but the prior of v does. So this sliding point has a
 Gaussian prior around the origin of the child, and the evidence integrates over it.
 """
 
@@ -104,8 +104,7 @@ def _width(values: Array, variances: Array, weight: float) -> tuple[float, float
 
 
 SLIDING_TURNS = 3
-# Step of the point at convergence [m].
-SLIDING_TOLERANCE = 1e-6
+SLIDING_TOLERANCE = 1e-6  # step of the point at convergence [m]
 
 
 def optimise_sliding_point(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
@@ -196,8 +195,7 @@ def _rotations(motion: GroupMotion, values: Array) -> Array:
 
 
 MIRROR_STEPS, MIRROR_TURNS = 6, 4
-# Least gain in log density for an exchange.
-BETTER = 1e-3
+BETTER = 1e-3  # least gain in log density for an exchange
 
 
 class SingleObservation(NamedTuple):

@@ -48,8 +48,7 @@ from .solver import solver
 
 # Number of slow cosines along a joint value: at most, and relative to the number of observations.
 _COSINES, _DENSITY = 6, 0.25
-# Size of residuals relative to the noise below which they are rounding errors.
-_EXACT = 0.1
+_EXACT = 0.1  # size of residuals relative to the noise below which they are rounding errors
 
 
 @dataclass(frozen=True)

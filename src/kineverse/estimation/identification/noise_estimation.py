@@ -34,17 +34,14 @@ more: of cranes, and in millimetres.
 """
 
 _SHARE = 1e-3
-# Standard deviation of their logarithms: a factor of 5.
-_SPREAD = math.log(5.0)
+_SPREAD = math.log(5.0)  # standard deviation of their logarithms: a factor of 5
 
 # Factors on the medians for first solutions: ratios of position to orientation noise of 1, 16 and 1/16.
 _STARTS = ((1.0, 1.0), (4.0, 0.25), (0.25, 4.0))
 # Least factor, 5 µm and 0.001°. Without it the likelihood of identical poses has no maximum.
 _ROUNDING = 1e-3
-# Logarithms of the factors of the first search.
-_COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-# Log density by which another start has to be better.
-_BETTER = 0.5
+_COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])  # logarithms of the factors of the first search
+_BETTER = 0.5  # log density by which another start has to be better
 # Largest number of Newton steps, their largest length, and the step of finite differences, in deviations.
 _STEPS, _LONGEST, _DIFFERENCE = 12, 1.5, 0.5
 # Largest number of solutions at an improved noise, and the improvement at convergence, in deviations.

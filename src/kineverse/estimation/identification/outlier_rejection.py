@@ -44,12 +44,9 @@ _CHI_SQUARED = {6: CHI_SQUARED_6, 3: 16.3}
 _ANNEALING, _FEW_STEPS = 2.0, 6
 # Largest number of rounds of reclassification, and of inlier sets that are shared between families.
 _ROUNDS, _SHARED = 5, 3
-# Index of the neighbour whose distance measures isolation.
-_NEIGHBOURS = 2
-# Smallest weight.
-_LEAST_WEIGHT = 1e-7
-# Largest number of observations for a first solution.
-_MOST = 40
+_NEIGHBOURS = 2  # index of the neighbour whose distance measures isolation
+_LEAST_WEIGHT = 1e-7  # smallest weight
+_MOST = 40  # largest number of observations for a first solution
 # Least number of observations, and least share of inliers, for which outliers can be identified.
 _FEWEST, _SHARE = 5, 0.5
 

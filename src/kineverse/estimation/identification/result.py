@@ -272,8 +272,7 @@ class IdentificationResult:
         return self._computed[k]
 
 
-# Largest standard deviation of a direction that counts as determined [rad].
-_WELL_KNOWN = math.radians(20.0)
+_WELL_KNOWN = math.radians(20.0)  # largest standard deviation of a direction that counts as determined [rad]
 
 
 def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, probability: float) -> Fit:

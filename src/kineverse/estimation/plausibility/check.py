@@ -34,8 +34,7 @@ from .e_process import SequentialTest
 from .report import JointVerdict, Plausibility, TestableJoint, find_testable_joints
 from .residuals import KnownJoint, compute_residuals
 
-# Number of observations that are compared.
-_COMPARED = 50
+_COMPARED = 50  # number of observations that are compared
 
 
 def find_exchanged_frames(

@@ -306,5 +306,4 @@ def _is_rigid(pose: Array) -> bool:
 
 
 _DIAGONAL = np.diag_indices(3)
-# Tolerance of a rotation, and the farthest position, that need no further check.
-_RIGID, _FAR = 1e-6, 1e6
+_RIGID, _FAR = 1e-6, 1e6  # tolerance of a rotation, and the farthest position, that need no further check

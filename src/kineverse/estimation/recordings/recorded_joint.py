@@ -38,18 +38,13 @@ from .recording import Indices, RecordedPair, spaced_indices
 MAX_ROTATION_STEP = 2.0
 """Largest rotation between successive poses for which revolutions are counted reliably [rad]."""
 
-# Standard deviations of the autocorrelation time that are added to its estimate.
-_CAUTION = 1.0
-# Rows within one autocorrelation time, and in total, that suffice.
-_ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100
+_CAUTION = 1.0  # standard deviations of the autocorrelation time that are added to its estimate
+_ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100  # rows within one autocorrelation time, and in total, that suffice
 # Log ratio of the probability of the observations at which one noise is refuted by another.
 _REFUTED = math.log(20.0)
-# Size of residuals that avoids a division by zero [m], [rad].
-_TINY = 1e-12
-# Factor on the size of residuals at which the noise explains them amply.
-_AMPLE = 1.5
-# Relative difference of autocorrelation times that matters.
-_LONGER = 1.1
+_TINY = 1e-12  # size of residuals that avoids a division by zero [m], [rad]
+_AMPLE = 1.5  # factor on the size of residuals at which the noise explains them amply
+_LONGER = 1.1  # relative difference of autocorrelation times that matters
 # Ratio of autocorrelation times below which residuals are as smooth as others, and above which motion is not
 # noise.
 _AS_SMOOTH, _SMOOTHER = 1.5, 3.0

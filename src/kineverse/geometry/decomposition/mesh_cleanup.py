@@ -17,10 +17,8 @@ from .accuracy import enclosed_volume, is_closed
 
 MOST_FACES = 300_000  # largest number of triangles that is decomposed; more take CoACD hours and all memory
 
-# Connected parts of a mesh are decomposed one by one, up to this number.
-_MOST_PARTS = 64
-# A mesh thinner than this part of its size has no volume.
-_FLAT = 1e-6
+_MOST_PARTS = 64  # connected parts of a mesh are decomposed one by one, up to this number
+_FLAT = 1e-6  # a mesh thinner than this part of its size has no volume
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,8 +22,7 @@ from .accuracy import Accuracy
 ERROR_OF_SIZE = 0.02  # default error, as a part of the longest edge of the mesh's bounding box
 MOST_HULLS = 32  # default of the largest number of hulls
 
-# Increased when the hulls of equal meshes and settings change.
-_VERSION = 1
+_VERSION = 1  # increased when the hulls of equal meshes and settings change
 
 
 @dataclass(frozen=True, slots=True)
