@@ -42,8 +42,7 @@ examples:
   kineverse info articulations        list of the gallery"""
 
 
-SHOWN, MISSING = 10, 3
-"""Number of reader warnings, and of meshes that cannot be read, printed."""
+SHOWN, MISSING = 10, 3  # number of reader warnings, and of meshes that cannot be read, printed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

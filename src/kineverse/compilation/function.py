@@ -35,8 +35,7 @@ from .toolchain import optimisation_level
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    # Without brackets the type of the results is Any.
-    Results = TypeVar("Results", default=Any)
+    Results = TypeVar("Results", default=Any)  # without brackets the type of the results is Any
 else:
     from typing import TypeVar
 

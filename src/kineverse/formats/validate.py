@@ -173,8 +173,7 @@ def _find_missing_meshes(model: ModelView) -> Iterator[ModelProblem]:
 
 _FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
 
-VALID, INVALID, UNREADABLE = 0, 1, 2
-"""Values of :attr:`ValidationResult.status`."""
+VALID, INVALID, UNREADABLE = 0, 1, 2  # values of ValidationResult.status
 
 
 @dataclass(frozen=True)

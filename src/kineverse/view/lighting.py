@@ -119,8 +119,7 @@ def to_display(light: Singles) -> Singles:
 _GAMMA = ((np.arange(4096) / 4095.0) ** (1 / 2.2)).astype(np.float32)
 
 
-OUTLINE, CREASE = 0.42, 0.25
-"""Darkening of the border of a part, and of a sharp edge inside of it."""
+OUTLINE, CREASE = 0.42, 0.25  # darkening of the border of a part, and of a sharp edge inside of it
 
 CREASE_COSINE = 0.75  # cosine of the smallest angle at which an edge is drawn
 

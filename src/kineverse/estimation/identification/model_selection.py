@@ -150,8 +150,7 @@ def log_probability_straight(line: Solution[FamilyMember]) -> float:
     if len(along) < 3:
         return -0.5  # any arc goes through two points
     terms = np.column_stack([np.ones_like(along), along, along**2])
-    # The residual of x² after regression on 1 and x.
-    triangle: Array = np.linalg.qr(terms)[1]
+    triangle: Array = np.linalg.qr(terms)[1]  # the residual of x² after regression on 1 and x
     bend = abs(float(triangle[2, 2]))
     axis = line.motion.left[:3, 2]
     across = np.trace(line.covariance, axis1=1, axis2=2) - axis @ line.covariance @ axis

@@ -158,8 +158,7 @@ class _NoiseSearch:
             shift *= min(1.0, _LONGEST / max(float(np.linalg.norm(shift)), 1e-12))
             best, here = int(np.argmax(density)), float(density[len(density) // 2])
             if distance > 1.0 and self.log_density((logs + shift)[None])[0] < here:
-                # The quadratic does not hold so far from here.
-                shift = stencil[best] @ width.T
+                shift = stencil[best] @ width.T  # the quadratic does not hold so far from here
             # The root is at most twice as wide as the prior in any direction.
             left, widths, right = np.linalg.svd(root @ axes / np.sqrt(bends))
             logs, root = logs + shift, left * np.minimum(widths, 2.0 * _SPREAD) @ right

@@ -25,8 +25,7 @@ _MOST_OF_ALL = 1024
 
 _NEEDLE, _LEAST_RATIO = 1e-3, 1e-4
 """Thickness of a needle relative to its length, and least thickness relative to the largest size."""
-_SMALL, _LARGE = 1e-4, 1e4
-"""Radii between which a solid is bounded as it is [m]."""
+_SMALL, _LARGE = 1e-4, 1e4  # radii between which a solid is bounded as it is [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

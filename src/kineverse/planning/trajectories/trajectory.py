@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 _JUMP = 1e-6
 """Largest difference of positions and velocities at which two trajectories are joined [rad], [m], per s."""
-_GAIN, _WEIGHT = 5.0, 100.0
-"""Gain [1/s] and weight of the goals of a follower."""
+_GAIN, _WEIGHT = 5.0, 100.0  # gain [1/s] and weight of the goals of a follower
 
 
 @dataclass(frozen=True, eq=False, repr=False)

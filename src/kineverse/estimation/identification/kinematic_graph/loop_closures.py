@@ -132,8 +132,7 @@ def build_chain(joints: Sequence[PartPair], start: str, random: np.random.Genera
     for one in joints[1:]:
         times = np.intersect1d(times, one.times)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
-    # Twists about the origin of the first part, until all joints are passed.
-    twists: list[Array] = []
+    twists: list[Array] = []  # twists about the origin of the first part, until all joints are passed
     values: list[Array] = []
     deviations: list[Array] = []
     for one in joints:
