@@ -230,7 +230,6 @@ def format_doubt(learned: RecordedJoint) -> str:
 
 
 def _format_assumption(assumed: RecordedJoint | Assumption, made: RecordedJoint) -> str:
-    """Return the noise, or the correlation time if that is what differs from the assumption made."""
     if assumed.correlation_time != made.correlation_time:
         return f"errors are alike over {format_number(assumed.correlation_time, 2)} rows"
     return f"the noise is {_format_deviations(assumed.noise)}"

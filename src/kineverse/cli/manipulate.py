@@ -119,7 +119,6 @@ class _Once(argparse.Action):
         values: str | Sequence[Any] | None,
         option_string: str | None = None,
     ) -> None:
-        """Store the value, unless there is one."""
         if getattr(namespace, self.dest) is not None:
             raise InvalidValueError(f"{option_string} is given twice; one robot moves one object.")
         setattr(namespace, self.dest, values)
@@ -365,7 +364,6 @@ class _PhaseLines:
         self._scene, self._phase = scene, ""
 
     def __call__(self, session: RecordedStep) -> None:
-        """Print the phase if it is another one."""
         if session.phase != self._phase:
             self._phase, scene = session.phase, self._scene
             value = f"{session.world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()

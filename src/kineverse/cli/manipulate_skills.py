@@ -238,7 +238,6 @@ class _SearchLines:
         self._last = -math.inf
 
     def __call__(self, text: str) -> None:
-        """Print a line, unless another one was printed just now."""
         if (now := perf_counter()) >= self._last + _BETWEEN_LINES:
             self._last = now
             print_line(f"searching: {text}")

@@ -317,7 +317,6 @@ def _moved_frame(problem: _Problem) -> str:
 
 
 def _trace(problem: _Problem, path: Path) -> Any:
-    """Return the way of the moved frame as a drawable."""
     from kineverse.view.drawables import draw_frame_path  # for start-up time
 
     states = [path.at(fraction) for fraction in np.linspace(0.0, 1.0, 60)]

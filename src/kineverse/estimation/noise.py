@@ -47,7 +47,6 @@ def pose_covariance(position: float, orientation: float) -> Array:
 
 
 CHI_SQUARED_6 = 22.5  # quantile of χ² with six degrees of freedom that is exceeded once in a thousand
-
 _ROTATION_VOLUME = 8 * math.pi**2  # volume of SO(3) in rotation vectors [rad³]
 
 

@@ -230,7 +230,6 @@ def _applied(
 
 
 def _build(source: Source, prefix: str | None) -> Iterator[tuple[str, Operation]]:
-    """Yield the operations of a model of a collection, each with its tag."""
     collection = registry.find_collection(source.collection)
     assert collection is not None  # the source was found in it
     for operation in collection.operations(source.path.name, prefix):

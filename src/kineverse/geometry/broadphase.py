@@ -22,9 +22,7 @@ from .shapes import Core
 Indices: TypeAlias = npt.NDArray[np.int32]
 Flags: TypeAlias = npt.NDArray[np.uint8]
 
-MAX_BOUNDED_OBJECTS = 6000
-"""Largest number of objects for which bounds are carried; only measured pairs touch their memory."""
-
+MAX_BOUNDED_OBJECTS = 6000  # objects for which bounds are carried; only measured pairs touch their memory
 MEMORY_SLOTS = 2**13  # number of measured pairs that are remembered until an object moves; a power of two
 
 _MEMORY = np.dtype([("pair", np.int64), ("numbers", np.float64, 12)])
@@ -193,9 +191,7 @@ def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floa
     return np.ascontiguousarray(np.concatenate(levels[::-1]).transpose(0, 2, 1)), leaves
 
 
-FURTHEST = 1e12
-"""Largest distance of an object from the origin [m]; floating-point numbers are 0.1 mm apart there."""
-
+FURTHEST = 1e12  # largest distance of an object from the origin [m], where numbers are 0.1 mm apart
 LONGEST_TRAVEL = 1e4  # travel up to which bounds are exact to about 1e-12 m [m]
 
 PLACED, TRAVEL_EXCEEDED = -1, -2

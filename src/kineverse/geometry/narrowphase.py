@@ -37,7 +37,6 @@ iterations. With a second tolerance below 1e-6, one depth of coal in a thousand 
 """
 
 ACCURACY = 1e-4  # largest error of a distance [m]; between polytopes, spheres and capsules it is 1e-8
-
 _TOUCH = 1e-6  # below this distance the direction between the closest points consists of rounding errors [m]
 # Tolerance between a distance and the gap along its normal [m], a multiple of coal's tolerance; it is
 # relative for solids above 1 m.

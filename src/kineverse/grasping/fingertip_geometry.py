@@ -268,7 +268,6 @@ class _Motion:
         return self.nearest().distance
 
     def nearest(self) -> DistanceResult:
-        """Return the nearest pair of bodies at the tips of the two branches, the first one's first."""
         result = self.scene.distances((f, g) for f in self.tips[0] for g in self.tips[1])
         return min(result, key=lambda pair: pair.distance)
 
@@ -294,7 +293,6 @@ class _Motion:
         return (first, second) if faces else None
 
     def gap_at(self, axes: Array, height: float, place: Array) -> float:
-        """Return the length between these hits, infinite if there are none."""
         hits = self.face(axes, height, place)
         return math.inf if hits is None else hits[0].distance + hits[1].distance
 

@@ -219,7 +219,6 @@ class _Solver:
     def _ranges(
         self, roots: list[Term], unknowns: list[TaylorSeries], inputs: list[TaylorSeries], rows: int
     ) -> list[list[RealInterval]]:
-        """Return the ranges of terms, in columns of some rows."""
         ranges = [s[0] for s in self._at(roots, unknowns, inputs)]
         return [ranges[k : k + rows] for k in range(0, len(ranges), rows)]
 

@@ -31,8 +31,7 @@ from .robot_sources import SHIPPED
 
 _BASE = ("x", "y", "angle")
 _DEEPEST = 2e-4  # depth below which bodies only touch at the start [m]
-_RING, _RINGS, _DIRECTIONS = 0.25, 16, 12
-"""Distance of rings of places [m], their number, and that of places on each."""
+_RING, _RINGS, _DIRECTIONS = 0.25, 16, 12  # distance of rings of places [m], their number, and places on each
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,6 @@ def _number(value: Any) -> Any:
 
 
 def _is_symbolic(a: Any, b: Any) -> bool:
-    """Return whether two parts are expressions of one shape, or an expression and a number."""
     if not any(isinstance(v, Expression) for v in (a, b)):
         return False
     return _shape(a) == _shape(b) is not None
@@ -188,7 +187,6 @@ def _measure_distance(
 
 
 def _summarize(distances: Array, angles: Array) -> tuple[float, float, tuple[float, float]]:
-    """Return the largest distance, the largest angle, and both at the first state."""
     return float(distances.max()), float(angles.max()), (float(distances[0]), float(angles[0]))
 
 

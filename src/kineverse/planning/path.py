@@ -22,8 +22,7 @@ from .state_validity import PathChecks
 from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.kinematic_limits import RAMP
 
-DEVIATION = 0.1
-"""Largest distance of a trajectory from the corners of its path, where nothing is in the way [rad], [m]."""
+DEVIATION = 0.1  # largest distance of a trajectory from the corners of a path in free space [rad], [m]
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,13 +101,11 @@ class RrtConnect:
 
 MOST_NODES = 20_000  # default largest number of nodes of a roadmap
 _DEGREE, _MOST_DEGREE = 12, 64
-_GREED = 5.0
-"""Weight of the distance to the goal in the order of the search: shortcuts make up for longer paths."""
+_GREED = 5.0  # weight of the distance to the goal in a search: shortcuts make up for longer paths
 _LEAST_BATCH = 32
 _UNKNOWN, _BLOCKED = 0, 2
 _PADDING = 64
-_VISIT = np.dtype("i8, i8, f4, f4, i4, i4")
-"""State of a node in a search: closed, seen, cost, rest, from, edge."""
+_VISIT = np.dtype("i8, i8, f4, f4, i4, i4")  # state of a node: closed, seen, cost, rest, from, edge
 
 
 class Roadmap:

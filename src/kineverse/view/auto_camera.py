@@ -19,14 +19,11 @@ from .triangle_mesh import Floats
 
 ELEVATION = 0.42
 
-FRONT = 0.62
-"""The direction preferred among equally good ones: in front of the model and a little to its left [rad]."""
+FRONT = 0.62  # preferred direction: in front of the model and a little to its left [rad]
 
 TRIALS = 12
 
-TRIAL_HEIGHT = 80
-"""Height of the trial pictures [pixels]: enough to show a handle, small enough to draw a dozen."""
-
+TRIAL_HEIGHT = 80  # height of trial pictures [pixels]: enough to show a handle, small enough for a dozen
 MOVING_WEIGHT = 4.0  # weight of a part that moves, relative to one that does not
 
 

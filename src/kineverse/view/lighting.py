@@ -14,8 +14,7 @@ from .triangle_mesh import Floats, Integers, Singles, dot_rows
 
 SHADOW_PIXELS = 1024
 
-LAMP_SHADOW = True
-"""The lamp of the page casts a shadow, which takes half of the time where software draws it."""
+LAMP_SHADOW = True  # the lamp of the page casts a shadow: half of the time if software draws it
 
 KEY_LIGHT = np.array([1.0, 0.965, 0.91]) * 1.6
 SKY_LIGHT = np.array([0.86, 0.92, 1.0]) * 0.80
@@ -120,7 +119,6 @@ _GAMMA = ((np.arange(4096) / 4095.0) ** (1 / 2.2)).astype(np.float32)
 
 
 OUTLINE, CREASE = 0.42, 0.25  # darkening of the border of a part, and of a sharp edge inside of it
-
 CREASE_COSINE = 0.75  # cosine of the smallest angle at which an edge is drawn
 
 

@@ -217,7 +217,6 @@ class Panel:
         return self._factor(name), self._unit(name)
 
     def _factor(self, name: str) -> float:
-        """Return the factor from the units of the model to the units shown."""
         unit = self._units.get(name, "")
         return DEGREES[unit][1] if self.degrees and unit in DEGREES else 1.0
 

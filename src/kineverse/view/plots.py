@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 SIZE = (13.0, 5.2)  # size of the picture of one joint [inch]
 
 SEEN, MODEL, AXIS = "0.35", "tab:blue", "tab:red"
-AXIAL_FAMILIES = ("revolute", "screw", "cylindrical")
-"""Families with an axis of rotation, which has a position."""
-
+AXIAL_FAMILIES = ("revolute", "screw", "cylindrical")  # families whose axis has a position
 SIGMAS = 2.0  # half width of drawn uncertainties, in standard deviations
 
 

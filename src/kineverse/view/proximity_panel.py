@@ -106,10 +106,7 @@ def _excluded_lines(problems: Mapping[str, str]) -> list[Html]:
 
 
 LARGEST_RADIUS = 0.5  # the largest radius on offer [m]
-
-LONGEST_ARROW = 0.2
-"""Largest length of an arrow on the page [m]: contacts are as large as hands, also in a large kitchen."""
-
+LONGEST_ARROW = 0.2  # largest length of an arrow on the page [m], also in a large kitchen
 LABELS = 8  # depths that are written beside their arrows; more would cover the scene
 
 WAITING = wrap_report(element("b", "Reading shapes …"))

@@ -39,9 +39,7 @@ ARROWS: tuple[Rgba, ...] = (
 )
 """Colours of arrows, in the order in which their names come."""
 
-ARROW_SCALE, LONGEST_ARROW = 0.25, 0.6
-"""Length of the arrow of a vector of 1, and the largest length of an arrow [m]."""
-
+ARROW_SCALE, LONGEST_ARROW = 0.25, 0.6  # length of the arrow of a vector of 1, and the largest length [m]
 WAY_RADIUS = 0.008  # half of the width of the way of a hand [m]
 
 _APART, _TURNED = 3e-3, 5e-3

@@ -211,7 +211,6 @@ class FurnitureOverlaps:
         return np.asarray(pairs[:, 0] * len(self.scene.collision_world.objects) + pairs[:, 1])
 
     def _decode(self, code: int) -> tuple[int, int]:
-        """Return the indices of both shapes of a pair."""
         return divmod(code, len(self.scene.collision_world.objects))
 
     def _owners(self, code: int) -> tuple[int, int]:

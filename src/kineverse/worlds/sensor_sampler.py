@@ -30,7 +30,6 @@ from .sensors import Sensors
 from .world import Contact, Observation
 
 _INSET = 0.9  # points lie at this fraction of the distance from the middle of a shape to its corners
-
 _MOST_SHAPES = 8  # largest number of shapes of a body whose points are tried
 
 

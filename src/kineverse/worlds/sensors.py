@@ -221,8 +221,7 @@ def _parse_entry(entry: str) -> list[tuple[str, Any]]:
     return [(name, number)]
 
 
-_ALSO = {"encoders": {"angle", "length"}}
-"""Further dimensions of entries: encoders read lengths and angles alike."""
+_ALSO = {"encoders": {"angle", "length"}}  # encoders read lengths and angles alike
 
 
 def _parse_quantity(text: str, entry: str) -> tuple[str, float]:

@@ -50,7 +50,6 @@ from .observations import Observations
 CURVE = "curve"  # name of the family
 LEVER = 0.25  # length [m] of a rotation by one radian, in the joint value of a curve
 KNOTS = (3, 4, 5, 7, 9, 12, 16, 21)  # numbers K of knots that are compared
-
 _LOG_KNOT = -0.5  # log prior of a number of knots, for each knot
 # Standard deviation of the second derivative of a curve of width 1 and length 1, and its bound for few knots.
 _CURVATURE = 20.0

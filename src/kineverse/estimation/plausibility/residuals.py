@@ -387,7 +387,6 @@ def _lever(pose: Array) -> Array:
 
 
 SIZES = (0.01, 0.05, 0.3)  # standard deviations of a displacement, for each component of a twist [m], [rad]
-
 _PRECISION = 1e-4  # prior information of joint values: a deviation of 100 [m] or [rad]
 
 

@@ -235,7 +235,6 @@ class _Comparison:
         return Assumption(noise or estimated_noise(result, self.pair), time, result)
 
     def fits_of_estimated_noise(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, Fit]:
-        """Return the fits of families that have residuals to all distinct rows."""
         # If the stated noise is too small, most observations are outliers.
         result = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
         return {fit.family: fit for fit in result if fit.family not in ("free", CURVE)}

@@ -125,8 +125,7 @@ VISUAL_GROUP, COLLISION_GROUP = "1", "3"
 """Geom groups of visuals, which viewers show, and of collision shapes, which they show on request."""
 
 _SMALLEST_MASS, _SMALLEST_INERTIA = 1e-3, 1e-6
-_NEGLIGIBLE = 1e-13
-"""Mass [kg] and moment of inertia [kg m²] below which they are zero; MuJoCo needs 1e-15 and 1e-14."""
+_NEGLIGIBLE = 1e-13  # mass [kg] and inertia [kg m²] that are zero; MuJoCo needs 1e-15 and 1e-14
 _ROUNDING = 1e-12
 
 

@@ -20,8 +20,7 @@ from .elements import ElementRemark, MjcfElement
 from .held_bodies import compute_rest_poses
 from .mujoco_api import mujoco
 
-_CLOSURE_TOLERANCE = 1e-6
-"""Largest distance between the ends of a closed loop [m], [rad]; files have six digits."""
+_CLOSURE_TOLERANCE = 1e-6  # largest distance between the ends of a loop [m], [rad]; files have six digits
 
 _IDENTITY_WXYZ = (1.0, 0.0, 0.0, 0.0)
 

@@ -58,7 +58,6 @@ class _HeldBodies:
         return self._attach_to(closure, first, second) or self._attach_to(closure, second, first)
 
     def _on_link(self, frame: str, pose: Pose) -> tuple[str, Pose]:
-        """Return the link of a link or site, and a pose of that frame in the link."""
         site = self._sites.get(frame)
         return (frame, pose) if site is None else (site.parent, compose_poses(site.pose, pose))
 

@@ -177,7 +177,6 @@ def _link(link: MjcfLink, model_name: NameMap, followers: FollowerJoints) -> Ite
 
 
 def _is_home_outside(joint: MjcfJoint, has_home: bool) -> bool:
-    """Return True if the home position of a joint in the file is outside of its limits."""
     if not has_home or joint.kind not in ("hinge", "slide") or not joint.home:
         return False
     lower, upper = joint.lower, joint.upper

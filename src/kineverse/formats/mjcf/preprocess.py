@@ -51,8 +51,7 @@ _ATTRIBUTES = {
     "hfield": ("file", "content_type", "elevation"),
 }
 _CONTROL = frozenset(("actuator", "keyframe"))
-_MAX_RESOLUTION = 200
-"""Largest parameter of a mesh that MuJoCo generates, whose number of triangles grows with its square."""
+_MAX_RESOLUTION = 200  # largest parameter of a mesh of MuJoCo, which has its square of triangles
 
 _INLINE = ("vertex", "normal", "texcoord", "face")
 _NAMES = frozenset(

@@ -43,8 +43,7 @@ MJCF_CAPABILITIES = FormatCapabilities(
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MAX_BODY_DOFS = 6
-_ARMATURE = 1e-3
-"""Armature [kg m²] or [kg] of dependent joints in links with many joints; avoids singular inertia."""
+_ARMATURE = 1e-3  # armature [kg m²] or [kg] of dependent joints in such links; avoids singular inertia
 _TIE_SOLREF, _TIE_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001)
 """Equalities of dependent joints: with MuJoCo's default, a mimic joint gives way under load."""
 _QUATERNION = ("qx", "qy", "qz", "qw")

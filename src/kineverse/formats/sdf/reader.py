@@ -290,7 +290,6 @@ class SdfModelReader:
         self._open_files.pop()
 
     def _open_urdf(self, content: bytes, source: str, folder: str) -> tuple[SdfDocument, Element]:
-        """Return a URDF as a document of SDF, and its root element."""
         warnings = ReaderWarnings(source, self._remarks, self._strict)
         model = read_urdf_as_sdf(content, source, folder, self._root, self._strict)
         return SdfDocument(source, folder, _LATEST, warnings, self._root), ("sdf", {}, [model], 1)

@@ -266,8 +266,7 @@ class _SemanticDocument:
                     self._remarks.add(element, "is ignored: SRDF does not know it.")
 
 
-MOST_GROUPS = 1000
-"""Largest number of groups: each may contain all the others, so the result grows with its square."""
+MOST_GROUPS = 1000  # each may contain all the others, so the result grows with the square
 
 PASSED_OVER = "it is passed over"
 

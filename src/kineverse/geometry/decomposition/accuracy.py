@@ -11,7 +11,6 @@ from kineverse.geometry.mesh_files import Faces, Floats, Integers
 from kineverse.geometry.shapes import build_bvh, convex_hull, hull_faces
 
 SAMPLES = 4000  # number of sample points on each surface and in each hull, in addition to all corners
-
 _MOST_CORNERS = 20_000  # largest number of corners of the mesh that are sampled
 _NEGLIGIBLE = 1e-7  # lengths below this part of the size are rounding errors
 _PAIRS = 2_000_000  # largest number of pairs of a point and a triangle in one batch, which bounds the memory

@@ -16,7 +16,6 @@ from kineverse.model.body import Mesh
 from .accuracy import enclosed_volume, is_closed
 
 MOST_FACES = 300_000  # largest number of triangles that is decomposed; more take CoACD hours and all memory
-
 _MOST_PARTS = 64  # connected parts of a mesh are decomposed one by one, up to this number
 _FLAT = 1e-6  # a mesh thinner than this part of its size has no volume
 

@@ -21,7 +21,6 @@ from .accuracy import Accuracy
 
 ERROR_OF_SIZE = 0.02  # default error, as a part of the longest edge of the mesh's bounding box
 MOST_HULLS = 32  # default of the largest number of hulls
-
 _VERSION = 1  # increased when the hulls of equal meshes and settings change
 
 

@@ -268,7 +268,6 @@ class Pushing:
         return command
 
     def _locate(self, state: State) -> tuple[Vector, PushPoint | None]:
-        """Return the tip, and the chosen contact point if there is one."""
         chosen = self.choice.chosen
         tip, point = self.surface.locate(state, chosen or 0)
         return tip, None if chosen is None else point

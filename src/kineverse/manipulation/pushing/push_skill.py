@@ -167,7 +167,6 @@ def push(
     first, begin = session.steps, world.time
 
     def skip(done: bool, reason: str, failure: str = "other", **measures: Any) -> Outcome:
-        """Return the outcome of a push that was not begun."""
         measures |= {} if done else {"failure": failure}
         steps, passed = session.steps - first, world.time - begin
         return Outcome(done, world.state[coordinate], reason, world.name, passed, steps, measures)

@@ -106,7 +106,6 @@ class _RecordingReader(TracingReader):
 
     @property
     def gave_numbers(self) -> bool:
-        """True if a query result has a number."""
         return any(isinstance(part, float) for reply in self.results for part in reply.parts)
 
     def trace(self, writes: tuple[tuple[Cell, Any], ...]) -> Trace:

@@ -24,11 +24,8 @@ from .certificate import distances, find_uncovered
 from .cover_sampling import CoverMesh, CoverStarts
 from .polytope import CoverRegion
 
-_ROUNDS, _FEW_ROUNDS, _STEPS = 14, 10, 6
-"""Power diagrams of a descent and of a short one, and steps between two of them."""
-
-_WARM, _COLD = 0.2, 0.015
-"""First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
+_ROUNDS, _FEW_ROUNDS, _STEPS = 14, 10, 6  # power diagrams of a descent and of a short one, steps between two
+_WARM, _COLD = 0.2, 0.015  # first and last temperature of the smoothed maximum, in protrusions
 
 _MOMENTUM, _SIDES = 0.6, 12
 _SAMPLES, _SAMPLES_EACH, _HARD = 300, 8, 0.6

@@ -30,9 +30,7 @@ _MANY_CORNERS, _DIRECTIONS = 200, 400
 
 _BLOCK = 80_000
 _SAMPLES = 1000
-_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)
-"""Steps of the sequence R3 (Roberts 2018), whose points fill the cube evenly."""
-
+_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)  # steps of the sequence R3 (Roberts 2018)
 _FAR = 1e9  # offset of a plane that bounds nothing
 
 

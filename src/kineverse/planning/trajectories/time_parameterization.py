@@ -32,9 +32,7 @@ _FEWEST = 4  # fewest cells of a blend
 _EXCESS = 1e-3  # error of the accelerations of cubics between knots, relative to the limits
 _MOST_PHASES = 50  # most knots of a cell
 _ROUNDING = 1e-9  # relative excess of a limit that is rounding
-
-_SHORTEST = 4 * np.finfo(float).eps
-"""Shortest time between two knots, relative to the duration: times increase."""
+_SHORTEST = 4 * np.finfo(float).eps  # shortest relative time between two knots
 
 
 def time_parameterize(

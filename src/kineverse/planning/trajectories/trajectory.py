@@ -26,8 +26,7 @@ from .trajectory_file import TrajectoryData, parse_coordinates, read_trajectory_
 if TYPE_CHECKING:
     from kineverse.control import Controller
 
-_JUMP = 1e-6
-"""Largest difference of positions and velocities at which two trajectories are joined [rad], [m], per s."""
+_JUMP = 1e-6  # largest difference of positions [rad], [m] and velocities where two are joined
 _GAIN, _WEIGHT = 5.0, 100.0  # gain [1/s] and weight of the goals of a follower
 
 

@@ -96,7 +96,6 @@ class DependentCoordinates:
 
 
 RANK_TOLERANCE = 0.05  # smallest singular value that counts as a degree of freedom, relative to the largest
-
 _DEGREES = {1: 5, 2: 3}  # degree of polynomials or Fourier series of one and of two joint values; 2 for more
 _UNEXPLAINED = 0.1  # largest unexplained share of the variance of a dependent joint value
 _WRAPPING = math.pi  # range from which on an angle is treated as periodic [rad]
