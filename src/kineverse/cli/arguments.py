@@ -36,7 +36,6 @@ from .output import format_cells, print_line
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
 
-
 _NUMBER_PATTERN = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _VALUE_PATTERN = re.compile(
     rf"(?P<sign>[-+]?)\s*(?:(?P<number>{_NUMBER_PATTERN})?\s*(?:(?P<times>\*?)\s*(?P<pi>pi|π))?)"

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from kineverse.view.skill_stills import SkillStills
     from kineverse.view.viewer import Viewer
 
-
 HELP = """\
 A robot that ships opens and closes the doors and drawers of the kitchen that ships, one after another, live
 in the browser until Ctrl-C: the robot and the true kitchen, what it believes of it from noisy poses, and what

@@ -28,7 +28,6 @@ from .pages import check_file_path, handle_interrupts, page_options, print_addre
 if TYPE_CHECKING:
     from living_kitchen.track import TrackingQuality
 
-
 MODELS = ("kitchen", "pr2")
 
 STATE = {
@@ -62,14 +61,12 @@ STATE = {
 EYE, TARGET, VIEW = (-3.5, 4.9, 2.75), (0.2, 0.0, 0.8), 0.66
 """The initial camera [m], [rad]: over the corner of the island, along the open doors."""
 
-
 SECONDS, STEP, SETTLED = 18.0, 1.0 / 12.0, 3.0
 """Duration and time step without a browser, and the time from which the quality counts [s]."""
 
 _STRANGER = "chest"
 
 LONGEST = 3600.0  # the longest duration [s]
-
 
 OPTIONS = ("stranger", "seconds")  # options of the kitchen in motion alone
 

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from kineverse.estimation import Fit, IdentificationResult
     from kineverse.estimation.recordings import Assumption, RecordedJoint, RecordedPair
 
-
 HELP = """\
 The table is text, with a head that names its columns: time, part, x, y, z and qx, qy, qz, qw (or roll,
 pitch, yaw, or rx, ry, rz, a rotation vector), in m, rad and s unless a unit follows as in "x [mm]". There is

@@ -41,7 +41,6 @@ examples:
   kineverse info pr2 --json
   kineverse info articulations        list of the gallery"""
 
-
 SHOWN, MISSING = 10, 3  # number of reader warnings, and of meshes that cannot be read, printed
 
 

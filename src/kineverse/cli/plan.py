@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.planning import Path
 
-
 HELP = """\
 A goal is values of coordinates (NAME=VALUE), poses of frames, or a state of an SRDF. FRAME@FRAME brings a
 frame to another one, in all directions or some (FRAME@FRAME:xyz, :xyz,rx,ry), FRAME@FRAME+X,Y,Z to a place

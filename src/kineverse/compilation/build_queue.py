@@ -55,7 +55,6 @@ kill -KILL $guard
 exit $status
 """
 
-
 BuildCallback: TypeAlias = Callable[["BuildJob"], object]
 
 

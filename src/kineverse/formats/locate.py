@@ -22,7 +22,6 @@ _DEPTH = 6
 _LISTED = 6
 _LONGEST = 200
 
-
 GALLERY = "articulations"  # first part of the names of the scenes that ship, one for each articulation
 
 

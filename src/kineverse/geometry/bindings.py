@@ -32,7 +32,6 @@ _ARRAYS = (
     "corners", "corner_count", "edges", "radii", "round", "tip", "memory",
 )  # fmt: skip
 
-
 _SEVERAL, _MANY = 2, 16
 """Objects of a body from which on near pairs are found by the boxes of bodies, and pairs of bodies for each
 object up to which they are; otherwise objects are swept."""

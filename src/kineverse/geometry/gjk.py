@@ -122,7 +122,6 @@ def _spread_directions(count: int) -> Floats:
 
 _DIRECTIONS = _spread_directions(240)
 
-
 _STEPS = 200
 _CONVERGED, _ACCEPTED = 1e-11, 1e-7
 """Tolerances of the two bounds: to converge, and to accept when no step improves any more. They are absolute

@@ -51,7 +51,6 @@ _SMALL, _ENLARGED, _LARGEST = 5e-3, 0.1, 1e3
 _MAX_CONTACTS = 256
 _POINT_RADIUS = 1e-7  # radius of the ball that represents a point [m]
 
-
 Witness: TypeAlias = tuple[Floats, Floats, Floats]
 """Closest points of two solids and the unit normal from the first to the second, each (3,), in the world."""
 

@@ -71,7 +71,6 @@ _NEWTON = 30
 _SINGULAR = 1e-9
 _WELL_CONDITIONED = 1e10  # condition of JJᵀ or JᵀJ up to which no singular values are needed
 
-
 MOST_EFFORT = 150_000.0  # budget for the analysis of one loop, about ten seconds; usual loops take a fifth
 
 

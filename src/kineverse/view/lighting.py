@@ -22,7 +22,6 @@ GROUND_LIGHT = np.array([0.84, 0.80, 0.75]) * 0.50
 
 WHITE_LEVEL = 1.75  # the radiance that is displayed as pure white
 
-
 PICTURE_BACKGROUND = (np.array([0.93, 0.945, 0.96]), np.array([0.70, 0.745, 0.80]))
 """Display colours of the background of pictures, at the lower and the upper edge, in [0, 1]."""
 
@@ -117,10 +116,8 @@ def to_display(light: Singles) -> Singles:
 
 _GAMMA = ((np.arange(4096) / 4095.0) ** (1 / 2.2)).astype(np.float32)
 
-
 OUTLINE, CREASE = 0.42, 0.25  # darkening of the border of a part, and of a sharp edge inside of it
 CREASE_COSINE = 0.75  # cosine of the smallest angle at which an edge is drawn
-
 
 DEPTH_STEP = 0.02  # smallest step of depth that is outlined, as a fraction of the distance
 

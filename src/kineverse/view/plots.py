@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from kineverse.estimation.identification.result import Fit
 
-
 SIZE = (13.0, 5.2)  # size of the picture of one joint [inch]
 
 SEEN, MODEL, AXIS = "0.35", "tab:blue", "tab:red"

@@ -23,7 +23,6 @@ from .triangle_mesh import Floats
 
 UNLIMITED_RANGE = {"rad": np.pi, "m": 2.0, "": 2.0}  # half of the range of a slider without limits [rad], [m]
 
-
 STANDSTILL_SPEED = 1e-6  # largest speed at standstill [rad/s], [m/s]; locks are as sharp as their logic
 
 

@@ -26,7 +26,6 @@ from .state_space import CoordinateGroup, Layout
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
 
-
 # Largest distance between initial values of an angle [rad].
 _SPACING = math.pi / 2
 _MOST_STARTS = 32

@@ -39,7 +39,6 @@ from .state_space import Layout
 if TYPE_CHECKING:
     from .gaussian_sum_filter import UpdateStep
 
-
 Speeds: TypeAlias = Mapping[Symbol, float]
 
 # Largest displacement in one Runge-Kutta step; the error is below 1e-8.

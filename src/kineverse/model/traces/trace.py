@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from kineverse.expressions.substitution import Substitution
     from kineverse.symbols import Symbol
 
-
 GradientPath = tuple[tuple["Symbol", bool], ...]
 
 
