@@ -67,6 +67,7 @@ class PushRegrasp:
             self._seconds = _LONGER * result.steps * session.dt + _SETTLING
 
     def _plan(self, start: State) -> str:
+        """Plan the path to a start, and return why there is none."""
         motion, state = self.motion, self.motion.session.state
         self.approach = motion.approaches.plan(state, start, seconds=_PLANNING)
         if self.approach.trajectory is None:
