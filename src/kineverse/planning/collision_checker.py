@@ -109,7 +109,6 @@ class CollisionChecker:
         return [(item, solid, offset @ item.shape.origin.matrix) for item, solid in items]
 
     def _place_static(self, dependence: FrameDependence) -> None:
-        """Collect the obstacles of the world."""
         world = self.scene.collision_world
         self._static = np.array(
             [k for k, o in enumerate(world.objects) if not dependence.moves(o.body)], dtype=int

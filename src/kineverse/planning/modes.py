@@ -231,7 +231,6 @@ class ModeSearch:
         return before | self._touching[node.mode]
 
     def _reach_goal(self, node: _Node) -> ModeSegment | None:
-        """Search a segment to the goal within the mode of a node."""
         still, mode = self._still[node.mode], self._modes[node.mode]
         touching = self._touching_around(node) | self._scene.touching_pairs(self._tasks)
         if self._ends is not None:

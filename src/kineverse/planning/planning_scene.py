@@ -266,7 +266,6 @@ class PlanningScene:
         optimize: bool,
         asked: float,
     ) -> Path:
-        """Search a path between checked ends."""
         targets = np.ascontiguousarray(variants, dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched, until = perf_counter(), checked_by(working_seconds(), seconds)

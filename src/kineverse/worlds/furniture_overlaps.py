@@ -142,7 +142,6 @@ class FurnitureOverlaps:
         return np.where(self.counting[tuple(found.body_indices.T)], allowed, math.inf)
 
     def _allow(self) -> None:
-        """Set the allowances from the depths at the start."""
         depths = dict.fromkeys(self._by_default, math.inf)
         made_so = np.zeros_like(self.counting)
         for code, depth in self._depths.items():

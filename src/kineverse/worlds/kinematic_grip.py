@@ -181,7 +181,6 @@ class KinematicGrip:
         return np.minimum(back, np.abs(step)) * np.sign(step)
 
     def _try_to_hold(self) -> None:
-        """Begin the hold of an object that is between the fingers."""
         motion = self._motion
         pairs, index = motion.find_near(max(self._near, TOUCH))
         touched: list[dict[int, tuple[float, int]]] = [{}, {}]

@@ -255,7 +255,6 @@ class KinematicWorld:
         self._time = end
 
     def _move(self, speeds: Array, time: float) -> None:
-        """Move robot and objects with constant speeds of the robot."""
         motion, grip = self._motion, self._grip
         arm, start, reach = speeds.copy(), motion.q.copy(), 0.0
         arm[self._finger] = 0.0

@@ -340,7 +340,6 @@ class MujocoWorld:
         return f"{' and '.join(bad)} are no numbers, or beyond 1e10" if bad else ""
 
     def _break_off(self, qpos: Array, problem: str) -> None:
-        """Go back to positions, and raise SimulationError."""
         engine, data, now = mujoco(), self._data, self.time
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, 0.0, 0.0
         engine.mj_forward(self._compiled, data)

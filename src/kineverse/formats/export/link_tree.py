@@ -336,7 +336,6 @@ class LinkTreeBuilder:
     def _link(
         self, name: str, found: MotionChain, independent: Mapping[Symbol, tuple[str, int]], joints: TakenNames
     ) -> LinkDescription:
-        """Return the link of a frame, with a joint for each of its motions."""
         record = self._articulation_of(name)
         label = self._articulations.get(name, name)
         follows = None

@@ -164,7 +164,6 @@ def _mesh_directory(root: MjcfElement) -> tuple[str, bool]:
 
 
 def _plugin_instances(root: MjcfElement) -> dict[str, MeshReference]:
-    """Return the plugins that a document names, by the names of their instances."""
     result: dict[str, MeshReference] = {}
     for section in root.children:
         if section.tag != "extension":
@@ -240,7 +239,6 @@ def check_element_count(root: MjcfElement, attached: Mapping[str, int]) -> int:
 
 
 def _count(node: MjcfElement) -> int:
-    """Return the number of copies that an element makes."""
     product = 1
     for word in node.attributes.get("count", "1").split():
         try:

@@ -346,7 +346,6 @@ class GroupResolver:
         return members
 
     def _add(self, members: _Members, part: Element, group: Element) -> None:
-        """Add the joints and links that one child of a group stands for."""
         names, tag = self._names, part[0]
         if tag == "joint":
             self._add_joint(members, part)

@@ -170,7 +170,6 @@ def to_urdf(
 
 
 def _check_read_back(content: bytes, path: Path) -> None:
-    """Read the text of a file as a model."""
     model = Model()
     try:
         with collect_warnings(), model.edit() as edit, no_collection():
