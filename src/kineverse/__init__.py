@@ -95,24 +95,4 @@ _PACKAGES = (
 )
 """Packages and modules of the face; a name that several have is that of the last one."""
 
-lazy_face(
-    __name__,
-    {
-        ".": " ".join(_PACKAGES),
-        ".articulations": "Continuous Fixed Floating Limits Planar Prismatic Revolute",
-        ".compilation": "CompiledFunction compile",
-        ".errors": "KineverseError",
-        ".expressions": "Expression array",
-        ".expressions.functions": "clip maximum minimum norm where",
-        ".expressions.piecewise": "spline",
-        ".formats": "load shipped_models",
-        ".loops": "CloseLoop",
-        ".model": "Constraint Model Operation",
-        ".spatial": "axis_angle inverse quaternion rotation_x rotation_y rotation_z "
-        "rpy transform translation",
-        ".state": "State StateLike",
-        ".symbols": "Symbol parameter position velocity",
-        ".view": "show",
-    },
-    below=_list_names_below,
-)
+lazy_face(__name__, below=_list_names_below)

@@ -53,11 +53,14 @@ def _restore_error(
 
 
 class UnknownNameError(KineverseError, KeyError):
-    """A frame, symbol, constraint, tag or model of that name does not exist."""
+    """A frame, symbol, constraint, tag or model of that name does not exist.
+
+    Everything that takes a name raises it, and lists similar names.
+    """
 
 
 class DuplicateNameError(KineverseError, ValueError):
-    """A name, tag or constraint is in use already."""
+    """A name, tag or constraint is in use already: of a frame or articulation for each new one."""
 
 
 class ShapeError(KineverseError, ValueError):
@@ -174,8 +177,6 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
 
     Parameters
     ----------
-    name
-        The unknown name.
     available
         The known names.
     what

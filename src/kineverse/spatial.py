@@ -361,8 +361,6 @@ def quaternion(
 
     Raises
     ------
-    ShapeError
-        For another number of components.
     InvalidValueError
         For a constant quaternion of length zero, or infinite.
     """
@@ -534,13 +532,7 @@ def adjoint(a_T_b: ExpressionLike) -> Expression:
 
 
 def as_transform(a_T_b: ExpressionLike) -> Expression:
-    """Return the argument as an expression of shape (4, 4).
-
-    Raises
-    ------
-    ShapeError
-        If it has another shape.
-    """
+    """Return the argument as an expression of shape (4, 4)."""
     t = as_expression(a_T_b)
     if t.shape != (4, 4):
         raise ShapeError(f"A transform is a 4×4 matrix, not of shape {t.shape}.")

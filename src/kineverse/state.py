@@ -284,7 +284,6 @@ class State(Mapping[Symbol, float]):
 
 
 def _symbols_by_name(symbols: Collection[Symbol]) -> dict[str, Symbol | None]:
-    """Return the symbol of each name, None where several have it."""
     result: dict[str, Symbol | None] = {str(s): s for s in symbols}
     if len(result) < len(symbols):
         # A parameter may have the name of another symbol; then the name is ambiguous.

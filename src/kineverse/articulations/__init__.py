@@ -54,18 +54,4 @@ if TYPE_CHECKING:
         Transmission as Transmission,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".bases": "Ackermann Base DifferentialDrive Mecanum OmniBase",
-        ".joint": "Fixed Joint OneAxisMotion OneDofJoint",
-        ".limits": "Limits",
-        ".locks": "position_lock speed_lock tabulated_limit",
-        ".mechanisms": "DeskLamp DoorWithHandle Faucet FoldingDoor GarageDoor Latch Mechanism "
-        "Microwave PedalBin "
-        "PistonAndRod Ratchet ScissorLift ScrewAndNut",
-        ".multi_axis": "Ball Floating Planar Universal",
-        ".single_axis": "Continuous Cylindrical Prismatic Revolute Screw",
-        ".transmissions": "Cam Gearbox RackAndPinion Transmission",
-    },
-)
+lazy_face(__name__)

@@ -210,8 +210,6 @@ class Ackermann(Base, document_kind="Ackermann"):
     ------
     InvalidValueError
         For a wheelbase that is not positive, or a steering angle outside (0, π/2).
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     wheelbase: float
@@ -289,8 +287,6 @@ class Mecanum(Base, document_kind="Mecanum"):
     ------
     InvalidValueError
         For lengths that are not positive, or another number of wheels than four.
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     radius: float

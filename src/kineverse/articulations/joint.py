@@ -138,13 +138,7 @@ class Joint(PlacedOperation):
         )
 
     def check_free(self, model: ReadRecorder) -> None:
-        """Check that the names of the articulation and of its child are free.
-
-        Raises
-        ------
-        DuplicateNameError
-            If one is taken.
-        """
+        """Check that the names of the articulation and of its child are free."""
         self.check_names(model, [self.child])
 
 

@@ -24,8 +24,7 @@ from .joint import Joint, check_axis, check_joint_number
 from .limits import FREE, Limits, check_limits, check_speed_limit, limit_constraints
 from .single_axis import rotation_factors, unit_axis
 
-# Largest cosine between axes that count as perpendicular.
-_PERPENDICULAR = 1e-6
+_PERPENDICULAR = 1e-6  # largest cosine between axes that count as perpendicular
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +92,6 @@ class Universal(Joint, document_kind="Universal"):
     ------
     InvalidValueError
         For axes that are not perpendicular, with the angle between them.
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     first: AxisLike = (1.0, 0.0, 0.0)
@@ -165,8 +162,6 @@ class Ball(Joint, document_kind="Ball"):
     ------
     InvalidValueError
         For a cone or a twist outside (0, π], or a negative limit of the speed.
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     axis: AxisLike = (0.0, 0.0, 1.0)

@@ -57,8 +57,6 @@ class Screw(OneDofJoint, document_kind="Screw"):
     ------
     InvalidValueError
         For a pitch of 0 or NaN.
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     pitch: float
@@ -95,11 +93,6 @@ class Cylindrical(Joint, document_kind="Cylindrical"):
         Direction in the joint's frame, of any length but zero.
     slide, turn
         Limits of s and of φ.
-
-    Raises
-    ------
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     axis: AxisLike = (1.0, 0.0, 0.0)

@@ -33,12 +33,8 @@ class Transmission(OneAxisMotion):
 
     Raises
     ------
-    UnknownNameError
-        For a driver that does not exist, with similar names.
     InvalidValueError
         For a driver without a position or with several coordinates, or a constant one.
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     driver: str | Expression

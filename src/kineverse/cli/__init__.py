@@ -7,9 +7,4 @@ from kineverse._lazy import lazy_face
 if TYPE_CHECKING:
     from .command_line import main as main
 
-lazy_face(
-    __name__,
-    {
-        ".command_line": "main",
-    },
-)
+lazy_face(__name__)

@@ -36,7 +36,6 @@ from .output import format_cells, print_line
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
 
-
 _NUMBER_PATTERN = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _VALUE_PATTERN = re.compile(
     rf"(?P<sign>[-+]?)\s*(?:(?P<number>{_NUMBER_PATTERN})?\s*(?:(?P<times>\*?)\s*(?P<pi>pi|π))?)"
@@ -299,7 +298,11 @@ _HEAD = 1 << 16  # of a file, in which its root element begins [byte]
 
 def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> None:
     """Raise if something is missing, and name all of it with how to install it."""
-    missing = [extra for extra, needed in extras.items() if needed and not _is_installed(extra)]
+    missing = [
+        extra
+        for extra, needed in extras.items()
+        if needed and importlib.util.find_spec(MODULES[extra]) is None
+    ]
     sentences = []
     if missing:
         names = " and ".join(filter(None, [", ".join(map(repr, missing[:-1])), repr(missing[-1])]))
@@ -319,7 +322,3 @@ def needs_mujoco(model: str) -> bool:
             return is_mjcf(model, file.read(_HEAD))
     except (OSError, ValueError):
         return False
-
-
-def _is_installed(extra: str) -> bool:
-    return importlib.util.find_spec(MODULES[extra]) is not None

@@ -275,7 +275,6 @@ def make_parser(name: str | None = None) -> argparse.ArgumentParser:
 
 
 def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
-    """Parse the arguments of the command line."""
     name = next((word for word in words if not word.startswith("-")), None)
     # A leading space tells argparse that -30deg, -pi/2 or -1e-3 is a value and no option.
     words = [f" {word}" if _NEGATIVE_VALUE.match(word) else word for word in words]
@@ -308,7 +307,6 @@ def _list_summaries() -> dict[str, str]:
 
 
 def _suggest_command(name: str, added: Iterable[str]) -> str:
-    """Return advice on a command that does not exist."""
     from kineverse.formats.locate import shipped_models  # for start-up time
 
     if name in shipped_models() or os.path.exists(name):

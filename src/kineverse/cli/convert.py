@@ -46,8 +46,7 @@ examples:
   kineverse convert articulations/pedal_bin bin.xml --tolerance 0.01"""
 
 STDOUT = "-"
-SHOWN = 10
-"""Number of reader warnings printed without --all."""
+SHOWN = 10  # number of reader warnings printed without --all
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -191,7 +190,6 @@ def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[st
 
 
 def _approximation_errors(saved: SaveResult) -> str:
-    """Return the largest errors of approximated frames, with their names."""
     errors = saved.errors
     furthest = max(errors, key=lambda name: errors[name].position)
     most_turned = max(errors, key=lambda name: errors[name].angle)

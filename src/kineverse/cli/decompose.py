@@ -53,8 +53,7 @@ examples:
   kineverse decompose robot.urdf --links gripper_finger palm --max-hulls 8 --force
   kineverse decompose --list"""
 
-ENDINGS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb")
-"""Suffixes of mesh files."""
+ENDINGS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb")  # suffixes of mesh files
 
 WRONG_MESH, WRONG_MODEL = 1, 2
 
@@ -176,7 +175,6 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str
 
 
 def _model_meshes(name: str, arguments: argparse.Namespace) -> list[tuple[str, Mesh]]:
-    """Return the meshes to decompose of a model, each with its link."""
     with show_activity(f"reading {name}"):
         model = load_model(arguments, name)
     return [

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from kineverse.view.skill_stills import SkillStills
     from kineverse.view.viewer import Viewer
 
-
 HELP = """\
 A robot that ships opens and closes the doors and drawers of the kitchen that ships, one after another, live
 in the browser until Ctrl-C: the robot and the true kitchen, what it believes of it from noisy poses, and what
@@ -79,22 +78,18 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _refuse(arguments: argparse.Namespace, options: tuple[str, ...], why: str) -> None:
-    """Raise InvalidValueError if any of some options is given."""
     for name in options:
         if getattr(arguments, name) not in (None, False):
             raise InvalidValueError(f"--{name} {why}; leave one of them out.")
 
 
 KITCHEN, ROBOT, WORLD = "kitchen", "hsr", "kinematic"
-NOISE = "3mm+3mm/m,0.5deg,30Hz"
-"""Noise of the observed poses, unless another one is asked for."""
+NOISE = "3mm+3mm/m,0.5deg,30Hz"  # noise of the observed poses, unless another one is asked for
 _BRIEF = ("*/oven_door", "*/fridge_door", "*/sink_left_upper_drawer")
 """The objects without a page: a flap, a door and a drawer."""
 _FASTEST = 100.0
-_INTERRUPTED = 130
-"""Exit status after Ctrl-C, as of all commands."""
-_PATIENCE = 15.0
-"""Time that a browser has to show the page before the robot begins [s]."""
+_INTERRUPTED = 130  # exit status after Ctrl-C, as of all commands
+_PATIENCE = 15.0  # time that a browser has to show the page before the robot begins [s]
 
 ROBOT_OPTIONS = ("robot", "what", "world", "noise", "speed", "seed", "json")
 """Options of the robot's demo alone."""
@@ -249,7 +244,6 @@ class RobotDemo:
             self._live.show_text(text)
 
     def _begin(self, one: ArticulatedObject) -> None:
-        """Show that an object comes next."""
         self._progress.begin()
         if self._live is not None:
             self._live.captions = (self._title(one),)
@@ -259,7 +253,6 @@ class RobotDemo:
         return f"{len(self.reports) + 1} of {len(self.objects)}: {one.coordinate}"
 
     def _look(self, session: Session) -> None:
-        """Show a step."""
         runner = self._runner
         one = runner.current
         assert one is not None
@@ -301,10 +294,8 @@ HEAD = (
 )
 """Titles of the table of objects."""
 ALIGN = "<<>>>>>>><"
-PAGE_HEAD = ("object", "opened", "closed", "time")
-"""Titles of the table on the page."""
-_REFRESH = 0.1
-"""Least time between two states of the line of progress [s]."""
+PAGE_HEAD = ("object", "opened", "closed", "time")  # titles of the table on the page
+_REFRESH = 0.1  # least time between two states of the line of progress [s]
 _LONGEST_REASON = 100
 
 

@@ -28,7 +28,6 @@ from .pages import check_file_path, handle_interrupts, page_options, print_addre
 if TYPE_CHECKING:
     from living_kitchen.track import TrackingQuality
 
-
 MODELS = ("kitchen", "pr2")
 
 STATE = {
@@ -62,18 +61,14 @@ STATE = {
 EYE, TARGET, VIEW = (-3.5, 4.9, 2.75), (0.2, 0.0, 0.8), 0.66
 """The initial camera [m], [rad]: over the corner of the island, along the open doors."""
 
-
 SECONDS, STEP, SETTLED = 18.0, 1.0 / 12.0, 3.0
 """Duration and time step without a browser, and the time from which the quality counts [s]."""
 
 _STRANGER = "chest"
 
-LONGEST = 3600.0
-"""The longest duration [s]."""
+LONGEST = 3600.0  # the longest duration [s]
 
-
-OPTIONS = ("stranger", "seconds")
-"""Options of the kitchen in motion alone."""
+OPTIONS = ("stranger", "seconds")  # options of the kitchen in motion alone
 
 
 def add_arguments(parser: argparse._ArgumentGroup) -> None:
@@ -146,7 +141,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _count_steps(seconds: float) -> int:
-    """Return the number of steps of a duration."""
     if not STEP <= seconds <= LONGEST:
         raise InvalidValueError(f"--seconds is between {STEP:.2g} and {LONGEST:g}, not {seconds!r}")
     return round(seconds / STEP)
@@ -174,7 +168,6 @@ def _show_sliders(arguments: argparse.Namespace) -> int:
 
 
 def _initial_state(model: kv.Model) -> dict[str, float]:
-    """Return the initial values of those symbols that the models have."""
     known = {str(symbol) for symbol in model.symbols}
     return {name: value for name, value in STATE.items() if name in known}
 
@@ -215,11 +208,8 @@ def _exercise_models(model: kv.Model, path: str) -> int:
     return 1 if result.problems else 0
 
 
-SAMPLES_PER_RANGE = 65
-"""Number of samples of each range, limits included."""
-
-CHECKED_PER_RANGE = 5
-"""Number of these samples at which constraints are evaluated, limits included."""
+SAMPLES_PER_RANGE = 65  # number of samples of each range, limits included
+CHECKED_PER_RANGE = 5  # number of these samples at which constraints are evaluated, limits included
 
 
 @dataclass(frozen=True, slots=True)

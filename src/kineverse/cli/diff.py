@@ -18,7 +18,6 @@ from kineverse.model.comparison import (
     SIGNS,
     BehaviourComparison,
     Delta,
-    LimitDifference,
     ModelComparison,
     ValueDifference,
 )
@@ -50,8 +49,7 @@ examples:
   kineverse diff home.kv.json today.kv.json --json"""
 
 EQUAL, DIFFERENT = 0, 1
-SHOWN = 20
-"""Number of differences of a kind printed without --all."""
+SHOWN = 20  # number of differences of a kind printed without --all
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -116,8 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 LONGEST = 60
-_NEGLIGIBLE = 1e-9
-"""Threshold below which a distance is printed as zero beside a larger one [m], [rad]."""
+_NEGLIGIBLE = 1e-9  # threshold below which a distance is printed as zero beside a larger one [m], [rad]
 
 
 def format_value(given: Any) -> str:
@@ -437,17 +434,16 @@ class BehaviourComparisonReport:
             "dof": {
                 "removed": self.comparison.freedoms["removed"],
                 "added": self.comparison.freedoms["added"],
-                "changed": [_limits_to_json(r) for r in self.comparison.ranges],
+                "changed": [
+                    {
+                        "name": r.name,
+                        "before": [_finite_or_none(bound) for bound in r.before],
+                        "after": [_finite_or_none(bound) for bound in r.after],
+                    }
+                    for r in self.comparison.ranges
+                ],
             },
         }
-
-
-def _limits_to_json(difference: LimitDifference) -> dict[str, Any]:
-    return {
-        "name": difference.name,
-        "before": [_finite_or_none(bound) for bound in difference.before],
-        "after": [_finite_or_none(bound) for bound in difference.after],
-    }
 
 
 def _finite_or_none(number: float) -> float | None:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from kineverse.estimation import Fit, IdentificationResult
     from kineverse.estimation.recordings import Assumption, RecordedJoint, RecordedPair
 
-
 HELP = """\
 The table is text, with a head that names its columns: time, part, x, y, z and qx, qy, qz, qw (or roll,
 pitch, yaw, or rx, ry, rz, a rotation vector), in m, rad and s unless a unit follows as in "x [mm]". There is
@@ -160,11 +159,8 @@ def write_results(
     return {"picture": arguments.picture, "document": arguments.document}
 
 
-_LEAST_PROBABILITY = 1e-4
-"""Less probable families are named without numbers."""
-
-_MOST_LISTED = 10
-"""Number of outliers listed."""
+_LEAST_PROBABILITY = 1e-4  # less probable families are named without numbers
+_MOST_LISTED = 10  # number of outliers listed
 
 
 def format_fit(source: str, pair: RecordedPair, learned: RecordedJoint) -> str:
@@ -233,14 +229,12 @@ def format_doubt(learned: RecordedJoint) -> str:
 
 
 def _format_assumption(assumed: RecordedJoint | Assumption, made: RecordedJoint) -> str:
-    """Return the noise, or the correlation time if that is what differs from the assumption made."""
     if assumed.correlation_time != made.correlation_time:
         return f"errors are alike over {format_number(assumed.correlation_time, 2)} rows"
     return f"the noise is {_format_deviations(assumed.noise)}"
 
 
 def _format_correlation(learned: RecordedJoint, count: int) -> list[str]:
-    """Return lines on repeated rows and on correlated errors."""
     lines = []
     if learned.repeated:
         do = "row repeats" if learned.repeated == 1 else "rows repeat"
@@ -266,7 +260,6 @@ def _format_deviations(noise: ObservationNoise) -> str:
 
 
 def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
-    """Return the names and texts of the parameters of a joint, with standard deviations."""
     parts = []
     for name in ("axis", "normal"):
         if name in fit.parameters:
@@ -302,7 +295,6 @@ def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str
 
 
 def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
-    """Return a warning if revolutions may be miscounted."""
     if not pair.is_timed or fit.largest_turn < MAX_ROTATION_STEP:
         return []
     most = format_number(math.degrees(fit.largest_turn), 3)

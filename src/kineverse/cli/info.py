@@ -41,9 +41,7 @@ examples:
   kineverse info pr2 --json
   kineverse info articulations        list of the gallery"""
 
-
-SHOWN, MISSING = 10, 3
-"""Number of reader warnings, and of meshes that cannot be read, printed."""
+SHOWN, MISSING = 10, 3  # number of reader warnings, and of meshes that cannot be read, printed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -173,7 +171,6 @@ def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
 
 
 def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
-    """Return the number of pairs in contact, and the deepest one."""
     pair, depth = pairs[0], -pairs[0].distance
     deepest = f"{pair.a} and {pair.b}" + (
         f", {format_number(depth, 3)} m deep" if depth > CONTACT_DEPTH else ""
@@ -218,8 +215,7 @@ def print_models() -> int:
     return print_articulations()
 
 
-CONTACT_DEPTH = 1e-5
-"""Depth below which bodies only touch, such as a drawer on its rail [m]."""
+CONTACT_DEPTH = 1e-5  # depth below which bodies only touch, such as a drawer on its rail [m]
 
 
 def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
@@ -231,7 +227,9 @@ def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
     if not is_installed():
         return None
     try:
-        return _touching_pairs(model)
+        scene = Scene(model, leave_out=find_unusable_shapes(model))
+        scene.update(model.default_state())
+        return scene.pairs_within(0.0)
     except KineverseError:  # Poses that are not finite are reported separately.
         return None
 
@@ -243,12 +241,6 @@ def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
         if pair.distance < -CONTACT_DEPTH:
             text = f"in {pair.b} by {format_number(-pair.distance, 3)} m at the default state"
             yield ModelProblem("contact", pair.a, text)
-
-
-def _touching_pairs(model: ModelView) -> Sequence[DistanceResult]:
-    scene = Scene(model, leave_out=find_unusable_shapes(model))
-    scene.update(model.default_state())
-    return scene.pairs_within(0.0)
 
 
 @dataclass(frozen=True, slots=True)

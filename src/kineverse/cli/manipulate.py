@@ -119,7 +119,6 @@ class _Once(argparse.Action):
         values: str | Sequence[Any] | None,
         option_string: str | None = None,
     ) -> None:
-        """Store the value, unless there is one."""
         if getattr(namespace, self.dest) is not None:
             raise InvalidValueError(f"{option_string} is given twice; one robot moves one object.")
         setattr(namespace, self.dest, values)
@@ -241,7 +240,6 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
 
 
 def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:
-    """Return the world, at the start."""
     world: World
     sensors = None if arguments.noise is None else Sensors.parse(arguments.noise)
     if arguments.world == "mujoco":
@@ -265,7 +263,6 @@ def _act(
     watchers: list[Callable[[RecordedStep], object]],
     record: str | None,
 ) -> Outcome:
-    """Run the skill, with a recording if wanted, and return its outcome."""
     belief: Belief | None = None
     error = EstimateError(scene.coordinate)
     with ExitStack() as stack:
@@ -367,7 +364,6 @@ class _PhaseLines:
         self._scene, self._phase = scene, ""
 
     def __call__(self, session: RecordedStep) -> None:
-        """Print the phase if it is another one."""
         if session.phase != self._phase:
             self._phase, scene = session.phase, self._scene
             value = f"{session.world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()
@@ -459,8 +455,7 @@ _MEASURE_UNITS = {
 }
 """Units of figures; others are numbers, or have the unit of what they are about."""
 
-_OF_OBJECT = ("penetration_from", "tolerance")
-"""Figures in the unit of the object's coordinate."""
+_OF_OBJECT = ("penetration_from", "tolerance")  # figures in the unit of the object's coordinate
 
 
 def _format_measure(value: Any, unit: str) -> str:

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from kineverse.worlds import World
     from kineverse.worlds.recorder import RecordedStep
 
-OPENING = 0.4
-"""Distance from shut at which closing and pushing begin [m], [rad]."""
+OPENING = 0.4  # distance from shut at which closing and pushing begin [m], [rad]
 _NEXT_STEP = (
     "Name a hand with two opposed fingers by --hand FRAME, or move the object with any body of the robot: "
     "kineverse push ... --hand BODY --to VALUE.",
@@ -135,7 +134,6 @@ def _parse_other_positions(
 
 
 def _check_limits(model: Model, option: str, coordinate: Symbol, value: float) -> None:
-    """Raise InvalidValueError for the value of an option that is out of limits."""
     lower, upper = model.limits(coordinate)
     if not lower - 1e-9 <= value <= upper + 1e-9:
         raise InvalidValueError(
@@ -157,7 +155,6 @@ def _open_from(shut: float, lower: float, upper: float) -> float:
 
 
 def _find_free_start(model: Model, robot: PlacedRobot, state: State) -> State:
-    """Return the state with the base of a robot where it touches nothing."""
     try:
         free, contact = robot.find_free_start(model, state)
     except InvalidValueError as error:
@@ -169,7 +166,6 @@ def _find_free_start(model: Model, robot: PlacedRobot, state: State) -> State:
 
 
 def _find_coordinate(model: Model, name: str, robot: str) -> Symbol:
-    """Return the coordinate of a name, which is one of an object."""
     objects = [str(s) for s in model.degrees_of_freedom if not str(s).startswith(f"{robot}/")]
     if name.startswith(f"{robot}/"):
         raise InvalidValueError(
@@ -203,12 +199,9 @@ def _find_pusher(
     return gripper, "", gripper.bodies
 
 
-_PLACEMENT = 60.0
-"""Largest time of the search for a place of the base [s]."""
-_SHORT = 0.1
-"""Share of a wanted opening that may be missing at the stop of a part whose joint is learned."""
-_BETWEEN_LINES = 1.0
-"""Least time between two lines on the progress of a search [s]."""
+_PLACEMENT = 60.0  # largest time of the search for a place of the base [s]
+_SHORT = 0.1  # share of a wanted opening that may be missing at the stop of a part whose joint is learned
+_BETWEEN_LINES = 1.0  # least time between two lines on the progress of a search [s]
 
 
 def grasp_object(
@@ -245,7 +238,6 @@ class _SearchLines:
         self._last = -math.inf
 
     def __call__(self, text: str) -> None:
-        """Print a line, unless another one was printed just now."""
         if (now := perf_counter()) >= self._last + _BETWEEN_LINES:
             self._last = now
             print_line(f"searching: {text}")

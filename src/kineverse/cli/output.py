@@ -97,7 +97,6 @@ class _SafeStream:
                 raise OSError(error.errno, error.strerror, "standard output") from None
 
     def writelines(self, lines: Any) -> None:
-        """Write several texts."""
         for line in lines:
             self.write(line)
 

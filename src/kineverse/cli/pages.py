@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
 class _Page(Protocol):
     @property
-    def address(self) -> str:
-        """URL with the token of the page."""
-        ...  # pragma: no cover
+    def address(self) -> str: ...  # pragma: no cover
 
 
 def add_page_options(parser: argparse.ArgumentParser) -> None:

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.planning import Path
 
-
 HELP = """\
 A goal is values of coordinates (NAME=VALUE), poses of frames, or a state of an SRDF. FRAME@FRAME brings a
 frame to another one, in all directions or some (FRAME@FRAME:xyz, :xyz,rx,ry), FRAME@FRAME+X,Y,Z to a place
@@ -208,7 +207,6 @@ def run(arguments: argparse.Namespace) -> int:
 def _prepare(
     arguments: argparse.Namespace, start: Request, goal: Request, holds: list[FrameTarget], margin: float
 ) -> _Problem:
-    """Load the model and build the planner."""
     with show_activity(f"reading {arguments.model}"):
         model = load_model(arguments, arguments.model)
         standing: dict[kv.Symbol, float] = {}
@@ -318,7 +316,6 @@ def _moved_frame(problem: _Problem) -> str:
 
 
 def _trace(problem: _Problem, path: Path) -> Any:
-    """Return the way of the moved frame as a drawable."""
     from kineverse.view.drawables import draw_frame_path  # for start-up time
 
     states = [path.at(fraction) for fraction in np.linspace(0.0, 1.0, 60)]
@@ -356,8 +353,7 @@ def _view(arguments: argparse.Namespace, problem: _Problem, path: Path) -> None:
         page.wait()
 
 
-_COLUMNS = 6
-"""Number of points of a path in a table."""
+_COLUMNS = 6  # number of points of a path in a table
 
 
 def print_path(arguments: argparse.Namespace, path: Path, preparation: float) -> None:
@@ -397,7 +393,6 @@ def _format_time(seconds: float) -> str:
 
 
 def _format_way(path: Path) -> str:
-    """Return a table of the positions at some points of a path."""
     chosen = np.unique(np.linspace(0, len(path) - 1, _COLUMNS).round().astype(int))
     head = ["time [s]", *(format_number(float(t), 3) for t in path.times[chosen])]
     rows = [

@@ -123,7 +123,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _objects(model: kv.Model, arguments: argparse.Namespace) -> dict[str, Sequence[CollisionObject]]:
-    """Return the collision objects of each of the wanted links."""
     import_coal()
     source = CollisionObjects((), ("*",) if arguments.decomposed else (), ())
     source.synchronize(model)

@@ -202,7 +202,6 @@ def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:
 
 
 def _read_trajectory(arguments: argparse.Namespace, model: ModelView) -> Trajectory | None:
-    """Return the trajectory that is to be played, if there is one."""
     if arguments.play is None:
         return None
 
@@ -229,7 +228,6 @@ def _write_picture(
     near: float | None,
     motion: RunRecording | Trajectory | None,
 ) -> int:
-    """Write a picture of the state, and print what it cannot show."""
     from kineverse.view.run_overlay import RecordedScene  # for start-up time
 
     options: dict[str, Any] = {"collisions": arguments.collisions, "near": near}

@@ -12,11 +12,4 @@ if TYPE_CHECKING:
     from .evaluator import Evaluator as Evaluator
     from .function import CompiledFunction as CompiledFunction, compile as compile
 
-lazy_face(
-    __name__,
-    {
-        ".c_library": "CompilerInformation compiler_information",
-        ".evaluator": "Evaluator",
-        ".function": "CompiledFunction compile",
-    },
-)
+lazy_face(__name__)

@@ -66,7 +66,6 @@ def _from_line(block: Array) -> Array:
 
 
 def _take_free_block(size: int) -> Array | None:
-    """Return a free block of this size, if there is one."""
     for _ in range(len(_free_blocks)):
         try:
             block = _free_blocks.pop(0)
@@ -87,13 +86,11 @@ def _give_back(block: Array) -> None:
             break
 
 
-# Larger results are written past the caches, which they would not fit.
-_STREAMED_BYTES = 8 * 2**20
+_STREAMED_BYTES = 8 * 2**20  # larger results are written past the caches, which they would not fit
 # Seconds on one core, in all and for each instruction, as measured with gcc 12 and CasADi 3.8.
 _COMPILING, _COMPILING_ONE = 0.3, 1e-3
 _INTERPRETING, _INTERPRETING_ONE = 50e-9, 3e-9
-# Rows per call of CasADi's map.
-_MAPPED = 32
+_MAPPED = 32  # rows per call of CasADi's map
 
 BatchFunction = Callable[[int, int, int, int], int]
 
@@ -127,7 +124,10 @@ class Batch:
         points = self._points(x)
         rows = len(points)
         if out is None:
-            results = self._allocate(rows)
+            results = [
+                allocate_aligned(rows * size).reshape(rows, *shape)
+                for shape, size in zip(self._shapes, self._program.sizes, strict=True)
+            ]
         else:
             results = self._check_out(out, rows)
             if _overlap([points, *results]):
@@ -156,12 +156,6 @@ class Batch:
         if points.ndim != 2 or points.shape[1] != size:
             raise ShapeError(f"Expected {wanted}, not an array of shape {points.shape}.")
         return np.ascontiguousarray(points)
-
-    def _allocate(self, rows: int) -> list[Array]:
-        return [
-            allocate_aligned(rows * size).reshape(rows, *shape)
-            for shape, size in zip(self._shapes, self._program.sizes, strict=True)
-        ]
 
     def _check_out(self, out: Any, rows: int) -> list[Array]:
         given = list(out) if isinstance(out, (list, tuple)) else [out]
@@ -238,7 +232,6 @@ class Batch:
 
 
 def _overlap(arrays: Sequence[Array]) -> bool:
-    """Return True if any of these contiguous arrays share memory."""
     spans = sorted((_address(array), array.nbytes) for array in arrays if array.nbytes)
     return any(start + size > following for (start, size), (following, _) in itertools.pairwise(spans))
 

@@ -33,8 +33,7 @@ logger = logging.getLogger("kineverse.compile")
 MAXIMUM_WAITING = 256
 # Time of the processor for each program that the compiler starts [s]; what else runs makes no difference.
 TIME_LIMIT = 120
-# For a compiler that waits for something [s].
-_WALL_LIMIT = 3600.0
+_WALL_LIMIT = 3600.0  # for a compiler that waits for something [s]
 
 # What the system says where a file cannot be written for lack of room.
 _ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
@@ -55,7 +54,6 @@ status=$?
 kill -KILL $guard
 exit $status
 """
-
 
 BuildCallback: TypeAlias = Callable[["BuildJob"], object]
 

@@ -196,8 +196,6 @@ class CompilerInformation:
     ----------
     compiler
         The path of the C compiler; None if there is none and all functions are interpreted.
-    version
-        The compiler's version text.
     flags
         Flags for optimisation and arithmetic, for functions of moderate size.
     vector_unit
@@ -205,8 +203,6 @@ class CompilerInformation:
         ``none``.
     cores
         The number of cores for batches.
-    cache_folder
-        The folder of compiled libraries.
     """
 
     compiler: str | None
@@ -230,8 +226,7 @@ def compiler_information() -> CompilerInformation:
     )
 
 
-# Pieces per thread on average, so that the other threads take over from a delayed one.
-_PIECES = 4
+_PIECES = 4  # pieces per thread on average, so that the other threads take over from a delayed one
 # A piece has at most so many times the smallest number of rows that is worth a thread: some 20 ms.
 _LARGEST = 200
 

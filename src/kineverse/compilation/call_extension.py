@@ -309,7 +309,6 @@ PyMODINIT_FUNC PyInit_kineverse_native(void) {
 }
 """
 
-
 # The capacity of the extension for outputs.
 MOST_OUTPUTS = 256
 _EXTENSION_NAME = "kineverse_native"

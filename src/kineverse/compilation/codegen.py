@@ -202,7 +202,6 @@ class _Statements:
                 self._circle[step.op][step.arguments[0]] = value
 
     def text(self) -> str:
-        """Return the body of the function."""
         part, type_ = self._part, self._dialect.type
         lines = [f"const {type_} v{value} = store[{slot}];" for value, slot in part.loads.items()]
         lines += [self._define(value) for value in part.values if value not in self._defined]

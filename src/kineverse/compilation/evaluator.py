@@ -122,11 +122,6 @@ class Evaluator(metaclass=ABCMeta):
         ----------
         x
             The input, which is copied to :attr:`input`; the present content of :attr:`input` if None.
-
-        Raises
-        ------
-        ShapeError
-            If ``x`` is not a vector of n numbers.
         """
         if x is not None:
             try:

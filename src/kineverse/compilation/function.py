@@ -35,8 +35,7 @@ from .toolchain import optimisation_level
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    # Without brackets the type of the results is Any.
-    Results = TypeVar("Results", default=Any)
+    Results = TypeVar("Results", default=Any)  # without brackets the type of the results is Any
 else:
     from typing import TypeVar
 
@@ -50,8 +49,7 @@ WantedTier: TypeAlias = Literal["auto", "interpreter", "c"]
 # Inputs and outputs count as operations too. Any program with a further operation is worth compiling: the
 # extension calls a compiled sum in a fifth of the time of CasADi's interpreter.
 _WORTH_COMPILING = 4
-# From so many operations on, which take some microseconds, a call releases the GIL.
-_LENGTHY = 5000
+_LENGTHY = 5000  # from so many operations on, which take some microseconds, a call releases the GIL
 
 
 @overload
@@ -128,8 +126,6 @@ class CompiledFunction(Generic[Results]):
 
     Parameters
     ----------
-    outputs
-        The expressions.
     inputs
         The symbols in the order of the vector, or None.
     single
@@ -218,8 +214,6 @@ class CompiledFunction(Generic[Results]):
 
         Raises
         ------
-        ShapeError
-            If ``x`` is not a vector of n numbers.
         UnknownNameError
             If a mapping lacks a symbol or has one that is not an input.
         InvalidValueError

@@ -37,8 +37,7 @@ static inline double first_larger(double x, double y) { return x >= y || y != y 
 #define fmax(x, y) first_larger(x, y)
 """
 
-# Raise the number when other source is generated from the same program.
-SINGLE_KIND = "single 2"
+SINGLE_KIND = "single 2"  # raise the number when other source is generated from the same program
 
 # From so many constants on, an output is initialised from a table: compile time grows with statements.
 _TABLE = 64

@@ -25,13 +25,4 @@ if TYPE_CHECKING:
     )
     from .unlocking import unlock as unlock
 
-lazy_face(
-    __name__,
-    {
-        ".command": "Command",
-        ".controller": "Controller",
-        ".ik_solver": "IkResult InverseKinematics inverse_kinematics",
-        ".tasks": "Goal Hold Keep Target Task look_at same_orientation same_pose same_position",
-        ".unlocking": "unlock",
-    },
-)
+lazy_face(__name__)

@@ -20,8 +20,7 @@ from .position_program import PositionProgram
 from .qp import QpSolver
 
 _SLOTS, _RADIUS = 24, 0.1
-_LONGEST = 0.2
-"""Largest step of a coordinate [m], [rad], since contact rows are valid only nearby."""
+_LONGEST = 0.2  # largest step of a coordinate [m], [rad], since contact rows are valid only nearby
 _SAMPLES = 16
 
 

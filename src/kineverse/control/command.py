@@ -15,8 +15,7 @@ from kineverse.symbols import Symbol
 if TYPE_CHECKING:
     from kineverse.geometry.results import DistanceResult
 
-SATURATED = 1e-9
-"""Multiplier from which a bound counts as active."""
+SATURATED = 1e-9  # multiplier from which a bound counts as active
 
 
 class StepTimes(NamedTuple):
@@ -63,8 +62,6 @@ class Command:
         nothing is held.
     times
         Durations of the parts of the step.
-    iterations
-        Iterations of the solver.
     contacts
         Near pairs of bodies, nearest first; the first of them have rows.
     """

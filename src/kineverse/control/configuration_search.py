@@ -18,15 +18,12 @@ if TYPE_CHECKING:
     from .clearance import Clearance
 
 STEPS, _CLEARING_STEPS, _LAST_STEPS = 40, 60, 200
-_PATIENCE = 5
-"""Number of steps after which the errors have to be smaller."""
+_PATIENCE = 5  # number of steps after which the errors have to be smaller
 PROGRESS = 0.9**2
 _SETTLED, _SHORTEST = 1 - 1e-9, 1e-7
 _HALVINGS, _APPROACHES = 8, 8
-_COLLIDING = 1e9
-"""Smallest penalty of an overlap, above all weighted sums of squares."""
-_EXACT_WEIGHT = 1e4
-"""Weight of equalities and violated constraints, relative to goals that are out of reach."""
+_COLLIDING = 1e9  # smallest penalty of an overlap, above all weighted sums of squares
+_EXACT_WEIGHT = 1e4  # weight of equalities and violated constraints, relative to goals that are out of reach
 
 
 class SearchEnd(NamedTuple):

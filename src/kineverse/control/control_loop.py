@@ -18,8 +18,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 Speeds = dict[Symbol, float]
-DEFAULT_ACCELERATION = 2.0
-"""Acceleration [m/s^2], [rad/s^2] by which speeds go to zero where none is given."""
+DEFAULT_ACCELERATION = 2.0  # acceleration [m/s^2], [rad/s^2] by which speeds go to zero where none is given
 
 _ROUNDING = 1e-9
 logger = logging.getLogger(__name__)
@@ -181,11 +180,9 @@ class _Loop:
         return self._slower() if speeds is None else speeds
 
     def zeros(self) -> Speeds:
-        """Return a command to stand still."""
         return dict.fromkeys(self.last, 0.0)
 
     def step_times(self) -> DurationSummary:
-        """Summarize the durations of steps."""
         if not self._steps:
             return DurationSummary(0.0, 0.0, 0.0)
         p99 = float(np.percentile(self._durations, 99))

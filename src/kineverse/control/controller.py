@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
-_APPROACH = 2.5
-"""Relative speed of bodies up to which default radii are large enough [m/s]."""
+_APPROACH = 2.5  # relative speed of bodies up to which default radii are large enough [m/s]
 _FEASIBLE = 1e-6
 """Largest violation of a row, in its unit per second, that counts as none where the solver failed."""
 
@@ -88,10 +87,6 @@ class Controller:
 
     Attributes
     ----------
-    model
-        The model.
-    tasks
-        The tasks.
     speeds
         The speeds of commands, found from the tasks and the constraints that they meet.
     inputs
@@ -359,7 +354,6 @@ class Controller:
         return self._command(result.x, result.multipliers, result.iterations, times)
 
     def _command(self, x: Array, multipliers: Array, iterations: int, times: StepTimes) -> Command:
-        """Return the command of a solution, and remember it as the last one."""
         n = len(self.speeds)
         if len(self._before):
             self._before[:] = self._last
@@ -377,7 +371,6 @@ class Controller:
         )
 
     def _read(self, state: StateLike | npt.ArrayLike) -> None:
-        """Write the values of the inputs at a state."""
         if not isinstance(state, np.ndarray) and isinstance(state, Mapping):
             if not isinstance(state, State):
                 state = as_state(state, (*self.model.symbols, *self.model.speeds, *self.inputs))

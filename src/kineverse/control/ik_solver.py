@@ -35,8 +35,7 @@ if TYPE_CHECKING:
 
     from .clearance import Clearance
 
-_DIFFERENT = 1e-3
-"""Least difference of a coordinate of two solutions [m], [rad]."""
+_DIFFERENT = 1e-3  # least difference of a coordinate of two solutions [m], [rad]
 _EXPLAINING_STARTS = 8
 
 
@@ -72,10 +71,6 @@ class InverseKinematics:
 
     Attributes
     ----------
-    model
-        The model.
-    tasks
-        The tasks.
     coordinates
         The coordinates that may move, found from the tasks and the constraints that they meet.
     inputs
@@ -88,8 +83,6 @@ class InverseKinematics:
     UnknownNameError
         For a task about a symbol that the model does not have, an unknown name in ``fixed``, or a scene of
         another model.
-    DuplicateNameError
-        For two tasks of one name.
     MissingDependencyError
         If the solver of quadratic programs is not installed.
     """
@@ -220,7 +213,6 @@ class InverseKinematics:
         return [self.solve(target, starts=starts, seed=seed) for target in values]
 
     def _load(self, values: StateLike | None) -> Mapping[Symbol, float]:
-        """Write the values of all inputs, and return the assigned values by symbol."""
         assigned = {} if values is None else self._given(values)
         if isinstance(assigned, State):
             vector = (self._home | assigned).vector(self.inputs)

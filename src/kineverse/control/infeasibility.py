@@ -24,8 +24,7 @@ from .velocity_program import VelocityProgram
 if TYPE_CHECKING:
     from .contact_constraints import ContactSlots
 
-_WEIGHT = 1e6
-"""Weight of squared violations, relative to the squared distance from the point to be near to."""
+_WEIGHT = 1e6  # weight of squared violations, relative to the squared distance from the point to be near to
 _HARD_WEIGHT = 1e4
 _SHORTEST = 1e-12
 

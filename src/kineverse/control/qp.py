@@ -19,10 +19,8 @@ from kineverse.errors import InvalidValueError, MissingDependencyError, ShapeErr
 Vector = NDArray[np.float64]
 Status = Literal["solved", "infeasible", "failed"]
 
-SOFT_WEIGHT = 1e6
-"""Default weight of the squared violation of a soft row."""
-_FEASIBLE = 1e-8**2
-"""Largest squared violation of the hard rows, relative to 1 plus the square of [x; A x]."""
+SOFT_WEIGHT = 1e6  # default weight of the squared violation of a soft row
+_FEASIBLE = 1e-8**2  # largest squared violation of the hard rows, relative to 1 plus the square of [x; A x]
 _SOFT, _EQUALITY = 8, 5
 _INFINITY = 1e8
 """Bounds beyond are none in warm starts: far from all speeds and lengths, but near enough for doubles."""

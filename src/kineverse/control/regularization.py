@@ -25,10 +25,8 @@ from .tasks import Goal
 _SAMPLES = 16
 _IMMOVABLE = 1e-5
 """Root mean square of a gradient, relative to the largest one of equalities, below which it is rounding."""
-_SHIFT = 1e-6
-"""Step of finite differences, in units of coordinates."""
-_LEAST_SHARE = 0.01
-"""Smallest default weight of a speed, so that damping stays positive."""
+_SHIFT = 1e-6  # step of finite differences, in units of coordinates
+_LEAST_SHARE = 0.01  # smallest default weight of a speed, so that damping stays positive
 
 
 @dataclass(frozen=True)

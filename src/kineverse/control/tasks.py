@@ -22,8 +22,7 @@ from kineverse.model.constraint import Constraint
 from kineverse.spatial import as_transform, inverse, log_so3, unit_vector
 from kineverse.symbols import Symbol, parameter
 
-_LONGEST = 100
-"""Largest number of characters of an expression in a message."""
+_LONGEST = 100  # largest number of characters of an expression in a message
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,13 +35,10 @@ from .tasks import Goal
 Way: TypeAlias = Literal[1, -1]
 Claims: TypeAlias = dict[tuple[Symbol, Way], Expression]
 
-_SHUT = 1e-6
-"""Speed [m/s] or distance [m] up to which a lock counts as shut."""
+_SHUT = 1e-6  # speed [m/s] or distance [m] up to which a lock counts as shut
 _TINY = 1e-9
-_DAMPING = 0.01
-"""Weight of the speeds of keys, so that one that nothing needs any more stops."""
-_SWEEPS = 3
-"""Passes of demand over locks that depend on each other in circles; one is enough for others."""
+_DAMPING = 0.01  # weight of the speeds of keys, so that one that nothing needs any more stops
+_SWEEPS = 3  # passes of demand over locks that depend on each other in circles; one is enough for others
 
 
 @dataclass(frozen=True)
@@ -145,8 +142,6 @@ def unlock(
 
     Raises
     ------
-    UnknownNameError
-        For names that are no degrees of freedom.
     InvalidValueError
         For no goal, and numbers that are not finite or not positive.
     """

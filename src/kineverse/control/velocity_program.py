@@ -42,8 +42,7 @@ RECOVERY_WEIGHT = 1e3
 INWARDS = 1e-3
 """Distance inside of a bound at which recovery aims, so that it ends at the bound and not near it."""
 POSTURE_GAIN = 0.5
-REACHED = 0.1
-"""Speed by which goals are reached below which the posture fades [unit/s]."""
+REACHED = 0.1  # speed by which goals are reached below which the posture fades [unit/s]
 
 
 class VelocityProgram:

@@ -42,14 +42,4 @@ if TYPE_CHECKING:
         Tracker as Tracker,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".identification": "Family FamilyParameter Fit IdentificationResult Identifier identify",
-        ".identification.kinematic_graph.graph": "KinematicEdge KinematicGraph RigidBody identify_graph",
-        ".noise": "pose_covariance",
-        ".plausibility": "ImplausibleError JointVerdict Plausibility PlausibilityMonitor check_plausibility",
-        ".tracking": "Estimate HypothesisBank ObservedExpression ObservedPose "
-        "ObservedPosition Outliers Tracker",
-    },
-)
+lazy_face(__name__)

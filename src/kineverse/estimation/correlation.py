@@ -1,4 +1,19 @@
-"""Correlation of errors in time: autocorrelation time, effective sample size, and their online estimate."""
+"""Correlation of errors in time: autocorrelation time, effective sample size, and their online estimate.
+
+N observations with the integrated autocorrelation time τ are worth N / τ independent ones,
+
+    τ = 1 + 2 Σ ρ_k
+
+cut off at a lag of 3 τ (Sokal 1997), as correlations at larger lags are noise. With M lags, τ has a relative
+standard deviation of √((4 M + 2) / N).
+
+Online, a whitened error is x = c + s + w: a constant c of unknown size, a stationary process s with the
+correlation e^(-Δt/τ) and the variance σ², and white noise w with the variance 1 - σ². A Kalman filter for
+each point (σ², τ) of a grid yields their posterior. The variance of the mean of N errors is m/N, with the
+posterior mean of
+
+    m = 1 + 2 σ² Σ_l e^(-l Δt/τ) = 1 + 2 σ² / (e^(Δt/τ) - 1)
+"""
 
 from __future__ import annotations
 
@@ -14,12 +29,9 @@ from .noise import CHI_SQUARED_6
 LEAST_EFFECTIVE = 8
 """Least effective sample size; residuals of a joint that is slightly wrong are one long wave."""
 
-# Least number of rows to estimate a correlation from.
-_LEAST_COUNT = 20
-# Least size of a component relative to the largest.
-_SHARE = 0.2
-# Cut-off of the sum, in autocorrelation times.
-_WINDOW = 3
+_LEAST_COUNT = 20  # least number of rows to estimate a correlation from
+_SHARE = 0.2  # least size of a component relative to the largest
+_WINDOW = 3  # cut-off of the sum, in autocorrelation times
 # Number of first lags, and their mean correlation in standard deviations, below which errors are independent.
 _FIRST, _CHANCE = 5, 2.5
 
@@ -81,12 +93,10 @@ LONGEST_TIME, LONGEST_LOOKS = 1.0, 30.0
 
 _SHARES = np.array([0.03, 0.1, 0.25, 0.5, 0.75, 0.95])
 _FRACTIONS = np.array([1.0 / 30.0, 0.1, 1.0 / 3.0, 1.0])
-# Variance of the offset, and its growth per longest correlation time.
-_OFFSET, _DRIFT = 30.0**2, 0.01
+_OFFSET, _DRIFT = 30.0**2, 0.01  # variance of the offset, and its growth per longest correlation time
 # Prior probability of independent errors, and the number of looks after which the past is forgotten.
 _INDEPENDENT, _MEMORY = 0.8, 600.0
-# Successive outliers after which the offset is taken as new.
-_JUMP = 5
+_JUMP = 5  # successive outliers after which the offset is taken as new
 
 
 @dataclass(frozen=True)

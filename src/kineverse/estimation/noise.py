@@ -46,11 +46,8 @@ def pose_covariance(position: float, orientation: float) -> Array:
     return np.diag([position**2] * 3 + [orientation**2] * 3)
 
 
-CHI_SQUARED_6 = 22.5
-"""Quantile of χ² with six degrees of freedom that is exceeded once in a thousand."""
-
-# Volume of SO(3) in rotation vectors [rad³].
-_ROTATION_VOLUME = 8 * math.pi**2
+CHI_SQUARED_6 = 22.5  # quantile of χ² with six degrees of freedom that is exceeded once in a thousand
+_ROTATION_VOLUME = 8 * math.pi**2  # volume of SO(3) in rotation vectors [rad³]
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,4 @@ if TYPE_CHECKING:
     from .gradient import total_derivative as total_derivative
     from .graph import gradient_keys as gradient_keys, lower as lower
 
-lazy_face(
-    __name__,
-    {
-        ".expression": "Expression ExpressionLike array as_expression",
-        ".gradient": "total_derivative",
-        ".graph": "gradient_keys lower",
-    },
-)
+lazy_face(__name__)

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 
 Axis: TypeAlias = int | tuple[int, ...] | None
 
-# To the type checker numpy's functions return arrays of numbers.
-np: Any = numpy
+np: Any = numpy  # to the type checker numpy's functions return arrays of numbers
 
 
 class ArrayMethods:

@@ -257,8 +257,7 @@ def floor_divide(a: ExpressionLike, b: ExpressionLike) -> Expression:
         by_zero = binary(ca.OP_EQ, denominator, 0.0)
         infinite = binary(ca.OP_IF_ELSE_ZERO, by_zero, sign(numerator) * math.inf)
         whole = binary(ca.OP_IF_ELSE_ZERO, unary(ca.OP_NOT, by_zero), whole) + infinite
-    # Last, as sums lose the sign of 0.
-    return binary(ca.OP_COPYSIGN, whole, numerator)
+    return binary(ca.OP_COPYSIGN, whole, numerator)  # last, as sums lose the sign of 0
 
 
 def remainder(a: ExpressionLike, b: ExpressionLike) -> Expression:

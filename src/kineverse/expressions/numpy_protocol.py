@@ -74,7 +74,6 @@ _UFUNCS: dict[Any, Callable[..., Any]] = {
     np.not_equal: lambda a, b: as_expression(a) != as_expression(b),
 }
 
-
 # Functions that version 2 of numpy added.
 _LATER_UFUNCS: dict[str, Callable[..., Any]] = {
     "vecdot": c.vecdot,

@@ -13,14 +13,4 @@ if TYPE_CHECKING:
     from .srdf import read_srdf as read_srdf
     from .validate import ValidationResult as ValidationResult, validate_file as validate_file
 
-lazy_face(
-    __name__,
-    {
-        ".": "urdf",
-        ".document": "document_hash from_bytes to_bytes",
-        ".loader": "load",
-        ".locate": "locate_model shipped_models",
-        ".srdf": "read_srdf",
-        ".validate": "ValidationResult validate_file",
-    },
-)
+lazy_face(__name__)

@@ -120,8 +120,6 @@ def load(
 
     Raises
     ------
-    UnknownNameError
-        If there is no such model.
     FormatError
         If the file is invalid, with file, line, element and reason; or for an invalid prefix or root.
     InvalidValueError
@@ -232,7 +230,6 @@ def _applied(
 
 
 def _build(source: Source, prefix: str | None) -> Iterator[tuple[str, Operation]]:
-    """Yield the operations of a model of a collection, each with its tag."""
     collection = registry.find_collection(source.collection)
     assert collection is not None  # the source was found in it
     for operation in collection.operations(source.path.name, prefix):

@@ -22,7 +22,6 @@ _DEPTH = 6
 _LISTED = 6
 _LONGEST = 200
 
-
 GALLERY = "articulations"  # first part of the names of the scenes that ship, one for each articulation
 
 
@@ -181,7 +180,6 @@ def _similar(name: str, files: list[str]) -> str:
 
 
 def _alike(name: str, files: list[str]) -> list[str]:
-    """Return similar names of models: spelt alike, or with the name in their path."""
     wanted = name.casefold().strip("/ ")
     paths = sorted({_stem(f) for f in files})
     ends = Counter(_end(p) for p in paths)

@@ -26,8 +26,7 @@ def check_prefix(prefix: object) -> None:
         ) from None
 
 
-NameMap: TypeAlias = Callable[[str], str]
-"""Function that returns the name in the model for a name in a description."""
+NameMap: TypeAlias = Callable[[str], str]  # returns the name in the model for a name in a description
 
 NameFaultHandler: TypeAlias = Callable[[str, str, str], None]
 """Handler of an invalid name, called with place, problem and replacement; raises in a strict reader."""

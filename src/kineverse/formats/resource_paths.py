@@ -252,7 +252,6 @@ def declared_folders() -> Iterator[str]:
 
 
 def _inside(uri: str, text: str) -> list[str]:
-    """Return the parts of a path in a package."""
     parts = [part for part in re.split(r"[/\\]", text) if part not in ("", ".")]
     depth = 0
     for part in parts:

@@ -18,10 +18,7 @@ from .xml_reader import quote
 Folder: TypeAlias = "str | os.PathLike[str]"
 
 ROOT = "KINEVERSE_ROOT"  # environment variable with folders whose files any description may open
-
-MESH_FOLDERS = ("meshes", "mesh", "assets")
-"""Names of the folders of meshes that may lie next to the folder of a description."""
-
+MESH_FOLDERS = ("meshes", "mesh", "assets")  # folders of meshes that may lie next to that of a description
 NOWHERE = ""  # root of a text without a folder; no path lies below it
 
 _REPOSITORY = (".git", ".hg")

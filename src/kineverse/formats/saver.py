@@ -101,7 +101,6 @@ def _checked(tolerance: object) -> float | None:
 
 
 def _named(target: Path, error: FormatError) -> FormatError:
-    """Return an error with the name of the file in front, unless it is there already."""
     text = str(error)
     return (
         error if text.startswith(f"{target.name} ") else FormatError(f"{target.name} is not written. {text}")

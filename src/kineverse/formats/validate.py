@@ -173,8 +173,7 @@ def _find_missing_meshes(model: ModelView) -> Iterator[ModelProblem]:
 
 _FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
 
-VALID, INVALID, UNREADABLE = 0, 1, 2
-"""Values of :attr:`ValidationResult.status`."""
+VALID, INVALID, UNREADABLE = 0, 1, 2  # values of ValidationResult.status
 
 
 @dataclass(frozen=True)
@@ -197,8 +196,6 @@ class ValidationResult:
         Reader warnings: content left out or interpreted.
     faults
         Mistakes that a strict reader refuses.
-    problems
-        Problems of the model.
     strict
         True if remarks count as problems.
     """

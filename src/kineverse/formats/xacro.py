@@ -173,7 +173,6 @@ class _Expansion:
         self._keep_places()
 
     def where(self) -> str:
-        """Return file, line and element of the failure."""
         file, line = getattr(self._failed, "place", (self._path, 0))
         tag = getattr(self._failed, "tagName", "")
         parts = [

@@ -24,9 +24,7 @@ from .reader_warnings import ReaderWarnings
 from .xml_reader import TEXT, Element, ElementError, abbreviate, find_child, quote
 
 LARGEST = 1e50  # largest magnitude of coordinates, positions, and factors between positions
-
-SMALLEST = 1e-50
-"""Smallest factor between positions except 0: with a smaller one, limits of a follower are out of reach."""
+SMALLEST = 1e-50  # smallest factor between positions except 0; below, limits of a follower are out of reach
 
 _MAX_LENGTH = 1000
 

@@ -27,13 +27,7 @@ def names() -> tuple[str, ...]:
 
 
 def summary(name: str) -> str:
-    """Return the summary of a scene in one line.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such scene, with similar names.
-    """
+    """Return the summary of a scene in one line."""
     try:
         return _summaries()[name]
     except KeyError:
@@ -43,13 +37,7 @@ def summary(name: str) -> str:
 
 
 def find_document(name: str) -> Path:
-    """Return the path of the document of a scene.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such scene, with similar names.
-    """
+    """Return the path of the document of a scene."""
     summary(name)
     return _FOLDER / f"{name}.kv.json"
 

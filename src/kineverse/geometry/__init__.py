@@ -16,13 +16,4 @@ if TYPE_CHECKING:
     )
     from .scene import Scene as Scene
 
-lazy_face(
-    __name__,
-    {
-        ".collision_filter": "RULES Rule rules_as_data",
-        ".distance_expressions": "PairDistance",
-        ".distance_queries": "PreparedQuery",
-        ".results": "DistanceResult DistanceResults NearestPoint RayHit",
-        ".scene": "Scene",
-    },
-)
+lazy_face(__name__)

@@ -32,7 +32,6 @@ _ARRAYS = (
     "corners", "corner_count", "edges", "radii", "round", "tip", "memory",
 )  # fmt: skip
 
-
 _SEVERAL, _MANY = 2, 16
 """Objects of a body from which on near pairs are found by the boxes of bodies, and pairs of bodies for each
 object up to which they are; otherwise objects are swept."""
@@ -271,7 +270,6 @@ class _TableBinding:
         self.reserve(256)
 
     def rebuild_tree(self, table: ObjectTable) -> None:
-        """Rebuild the tree of the static objects."""
         static = np.arange(table.moving, table.count, dtype=np.int32)
         self.boxes, self.leaves = build_static_tree(table.low, table.high, static)
         self.struct.boxes, self.struct.leaves = self.boxes.ctypes.data, self.leaves.ctypes.data
@@ -279,7 +277,6 @@ class _TableBinding:
         table.static_changed = False
 
     def reserve(self, count: int) -> None:
-        """Allocate buffers for a number of pairs."""
         self.pairs = np.empty((count, 2), dtype=np.int32)
         self.lows = np.empty(count)
         self.distances, self.witnesses = np.empty(count), np.empty((count, 9))
@@ -315,7 +312,6 @@ class _TableBinding:
         return known
 
     def take(self, ranked: RankedPairs) -> None:
-        """Copy ranked pairs into the buffers of results."""
         kept = len(ranked[2])
         if kept > self.query.room:
             self.reserve(2 * kept)
@@ -352,7 +348,6 @@ class _NeighbourBinding:
         self.reserve(1024)
 
     def reserve(self, count: int) -> None:
-        """Allocate a list for a number of pairs, which are searched again."""
         self._pairs = np.empty((count, 2), dtype=np.int32)
         self._struct.pairs, self._struct.room, self._struct.resets = self._pairs.ctypes.data, count, -1
 

@@ -22,11 +22,8 @@ from .shapes import Core
 Indices: TypeAlias = npt.NDArray[np.int32]
 Flags: TypeAlias = npt.NDArray[np.uint8]
 
-MAX_BOUNDED_OBJECTS = 6000
-"""Largest number of objects for which bounds are carried; only measured pairs touch their memory."""
-
-MEMORY_SLOTS = 2**13
-"""Number of measured pairs that are remembered until an object moves; a power of two."""
+MAX_BOUNDED_OBJECTS = 6000  # objects for which bounds are carried; only measured pairs touch their memory
+MEMORY_SLOTS = 2**13  # number of measured pairs that are remembered until an object moves; a power of two
 
 _MEMORY = np.dtype([("pair", np.int64), ("numbers", np.float64, 12)])
 
@@ -144,7 +141,6 @@ class ObjectTable:
         return bound
 
     def _box_to_sphere(self, boxes: Indices, spheres: Indices, between: Floats) -> Floats:
-        """Return the distances of bounding spheres from bounding boxes."""
         inside = np.einsum("kji,kj->ki", self.poses[boxes, :, :3], between)
         outside = np.maximum(np.abs(inside) - self.half[boxes], 0.0)
         distances: Floats = np.sqrt((outside**2).sum(axis=1)) - self.radius[spheres]
@@ -165,8 +161,7 @@ class PairSelection:
         self.addresses = self.bodies.ctypes.data, self._objects.ctypes.data
 
 
-TREE_WIDTH = 8
-"""Number of children of a node of the static tree, whose boxes are tested at once."""
+TREE_WIDTH = 8  # number of children of a node of the static tree, whose boxes are tested at once
 
 
 def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floats, Indices]:
@@ -196,11 +191,8 @@ def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floa
     return np.ascontiguousarray(np.concatenate(levels[::-1]).transpose(0, 2, 1)), leaves
 
 
-FURTHEST = 1e12
-"""Largest distance of an object from the origin [m]; floating-point numbers are 0.1 mm apart there."""
-
-LONGEST_TRAVEL = 1e4
-"""Travel up to which bounds are exact to about 1e-12 m [m]."""
+FURTHEST = 1e12  # largest distance of an object from the origin [m], where numbers are 0.1 mm apart
+LONGEST_TRAVEL = 1e4  # travel up to which bounds are exact to about 1e-12 m [m]
 
 PLACED, TRAVEL_EXCEEDED = -1, -2
 

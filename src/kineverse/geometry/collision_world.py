@@ -390,7 +390,6 @@ class _NearestByBodies:
             self.update(k, distances[k])
 
     def update(self, k: int, distance: float) -> None:
-        """Enter a measured distance."""
         key = self._keys[k]
         self._least[key] = min(self._least.get(key, math.inf), distance)
 

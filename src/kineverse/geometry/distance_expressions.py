@@ -33,8 +33,6 @@ class PairDistance:
 
     Attributes
     ----------
-    a, b
-        The bodies.
     expression
         The signed distance [m], a scalar. Value and gradient are exact for up-to-date parameters.
     point_a, point_b

@@ -133,8 +133,7 @@ def check_radius(radius: float) -> None:
         raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
 
 
-PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags
-"""Flags (B, B) of pairs of bodies, symmetric."""
+PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags  # flags (B, B) of pairs of bodies, symmetric
 
 
 class PreparedQuery:
@@ -145,8 +144,6 @@ class PreparedQuery:
 
     Parameters
     ----------
-    world
-        The collision world.
     choose
         Function that returns the selected pairs, for the present version of the model.
     radius
@@ -225,8 +222,6 @@ class PreparedQuery:
         ------
         UnknownNameError
             If the scene was not updated yet, or the model has no such coordinate.
-        ShapeError
-            If Q has another shape.
         InvalidValueError
             If the radius is negative or NaN, or a pose is not finite.
         """
@@ -270,7 +265,6 @@ class PreparedQuery:
             collision_library.bind(self._world.table)
 
     def _select(self) -> PairSelection:
-        """Select the pairs, and make the solids of their objects."""
         world = self._world
         if self._selection is None or self._version != world.model.version:
             flags = self._selected()

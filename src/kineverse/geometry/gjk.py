@@ -15,8 +15,7 @@ import numpy as np
 from .mesh_files import Faces, Floats
 from .shapes import Core, Solid
 
-PlacedSolid: TypeAlias = tuple[Solid, Floats, Floats]
-"""Convex solid with its (3, 3) rotation and (3,) position in the world."""
+PlacedSolid: TypeAlias = tuple[Solid, Floats, Floats]  # convex solid, its (3, 3) rotation and (3,) position
 
 _ROUNDS, _SETS, _STARTS = 80, 8, 2
 
@@ -122,7 +121,6 @@ def _spread_directions(count: int) -> Floats:
 
 
 _DIRECTIONS = _spread_directions(240)
-
 
 _STEPS = 200
 _CONVERGED, _ACCEPTED = 1e-11, 1e-7

@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-_NODE_BYTES = 2048
-"""Size of a node in addition to its triangles [bytes]: it takes trimesh about as long as these."""
+_NODE_BYTES = 2048  # size of a node beyond its triangles [bytes]: trimesh takes about as long for it
 
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}

@@ -28,8 +28,7 @@ from .mesh_expansion import expanded_size
 Floats: TypeAlias = npt.NDArray[np.float64]
 Integers: TypeAlias = npt.NDArray[np.int64]
 
-LARGEST_FILE = 256 * 2**20
-"""Largest mesh file that is read [bytes]; descriptions are not trusted with memory."""
+LARGEST_FILE = 256 * 2**20  # largest mesh file that is read [bytes]; descriptions are not trusted with memory
 
 _ARCHIVES = (".zip", ".gz", ".bz2", ".tgz", ".xz")
 

@@ -36,11 +36,8 @@ At a distance d the error of the normal is at most √(2 · tolerance / d). A sm
 iterations. With a second tolerance below 1e-6, one depth of coal in a thousand is grossly wrong.
 """
 
-ACCURACY = 1e-4
-"""Largest error of a distance [m]; between polytopes, spheres and capsules it is 1e-8."""
-
-# Below this distance the direction between the closest points consists of rounding errors [m].
-_TOUCH = 1e-6
+ACCURACY = 1e-4  # largest error of a distance [m]; between polytopes, spheres and capsules it is 1e-8
+_TOUCH = 1e-6  # below this distance the direction between the closest points consists of rounding errors [m]
 # Tolerance between a distance and the gap along its normal [m], a multiple of coal's tolerance; it is
 # relative for solids above 1 m.
 _GAP_TOLERANCE = 3 * DEPTH_TOLERANCE
@@ -52,9 +49,7 @@ _APART_OF_RADIUS = 0.1
 # suit decimetres [m].
 _SMALL, _ENLARGED, _LARGEST = 5e-3, 0.1, 1e3
 _MAX_CONTACTS = 256
-# Radius of the ball that represents a point [m].
-_POINT_RADIUS = 1e-7
-
+_POINT_RADIUS = 1e-7  # radius of the ball that represents a point [m]
 
 Witness: TypeAlias = tuple[Floats, Floats, Floats]
 """Closest points of two solids and the unit normal from the first to the second, each (3,), in the world."""

@@ -159,7 +159,6 @@ class _UnchangedPoses:
         self._known = {WORLD: True}
 
     def contains(self, name: str) -> bool:
-        """Return True if the pose of a frame is unchanged."""
         path = []
         while name not in self._known:
             path.append(name)

@@ -22,8 +22,7 @@ from .narrowphase import ACCURACY, distance_to_point
 from .results import NearestPoint, RayHit
 from .shapes import Hull, Primitive, Solid
 
-RayEntry = tuple[float, Floats]
-"""Distance along the ray [m], and the outward normal at the point of entry."""
+RayEntry = tuple[float, Floats]  # distance along the ray [m], and the outward normal at the point of entry
 
 _PARALLEL = 1e-14
 

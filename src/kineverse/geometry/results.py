@@ -19,8 +19,6 @@ class DistanceResult:
 
     Attributes
     ----------
-    a, b
-        The bodies.
     distance
         Smallest distance between their shapes [m]; in penetration, minus the length of the shortest
         translation that separates them.

@@ -15,8 +15,7 @@ from .broadphase import Flags
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
 
-_ROOM = 64
-"""Number of samples whose poses are kept at a time."""
+_ROOM = 64  # number of samples whose poses are kept at a time
 
 
 class SampledMotion:

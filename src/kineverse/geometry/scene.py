@@ -115,8 +115,6 @@ class Scene:
         ------
         UnknownNameError
             If a value is missing, or the model has no symbol of that name.
-        ShapeError
-            If a vector has another length.
         InvalidValueError
             If a value is NaN, or a pose is not finite or 1e12 m away; the message names the bodies. Then all
             poses stay as they were.
@@ -373,11 +371,6 @@ class Scene:
         """Return the bodies whose pose in the world depends on some symbols, in the order of the model.
 
         A wheel's speed moves the whole robot; the crank of a closed loop moves all dependent links.
-
-        Raises
-        ------
-        UnknownNameError
-            For a symbol that the model does not know.
         """
         motion = FrameDependence(self.model, _as_list(symbols))
         return tuple(body for body in self.bodies if motion.moves(body))

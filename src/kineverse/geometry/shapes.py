@@ -33,11 +33,8 @@ _MESH_HULLS = ContentCache(
     logging.getLogger("kineverse.geometry"),
     "The hull of a mesh %s %s and counts as absent.",
 )
-_WHOLE_FILES = (".stl", ".obj", ".dae", ".ply", ".off")
-"""Suffixes of mesh files whose triangles lie in no other file."""
-
-# Raise the number when the hulls of equal meshes change.
-_HULL_VERSION = 1
+_WHOLE_FILES = (".stl", ".obj", ".dae", ".ply", ".off")  # suffixes of files without further files
+_HULL_VERSION = 1  # raise the number when the hulls of equal meshes change
 
 
 def convex_hull(points: Floats) -> Any:

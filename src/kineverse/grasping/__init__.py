@@ -13,11 +13,4 @@ if TYPE_CHECKING:
     )
     from .handles import Handle as Handle, find_handle as find_handle, find_handles as find_handles
 
-lazy_face(
-    __name__,
-    {
-        ".grasp_sampling": "Grasp sample_grasps",
-        ".gripper_detection": "Gripper find_gripper find_grippers",
-        ".handles": "Handle find_handle find_handles",
-    },
-)
+lazy_face(__name__)

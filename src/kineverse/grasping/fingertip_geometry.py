@@ -254,7 +254,6 @@ class _Motion:
         return wide
 
     def exchange(self) -> None:
-        """Exchange the two branches."""
         self.a, self.b, self.tips = self.b, self.a, self.tips[::-1]
 
     def values(self, part: float) -> dict[Symbol, float]:
@@ -262,16 +261,13 @@ class _Motion:
         return {s: self.opened[s] + part * (self.closed[s] - self.opened[s]) for s in self.joints}
 
     def place(self, part: float) -> None:
-        """Place the hand at a part of the motion."""
         self.alone.place({**self._still, **self.values(part)})
 
     def gap(self, values: Mapping[Symbol, float]) -> float:
-        """Return the distance of the tips of the two branches."""
         self.alone.place({**self._still, **values})
         return self.nearest().distance
 
     def nearest(self) -> DistanceResult:
-        """Return the nearest pair of bodies at the tips of the two branches, the first one's first."""
         result = self.scene.distances((f, g) for f in self.tips[0] for g in self.tips[1])
         return min(result, key=lambda pair: pair.distance)
 
@@ -297,7 +293,6 @@ class _Motion:
         return (first, second) if faces else None
 
     def gap_at(self, axes: Array, height: float, place: Array) -> float:
-        """Return the length between these hits, infinite if there are none."""
         hits = self.face(axes, height, place)
         return math.inf if hits is None else hits[0].distance + hits[1].distance
 

@@ -216,7 +216,6 @@ def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> 
 
 _MOST_LISTED = 6
 _LARGEST = 0.5  # diagonal of the box around a finger that is too large for one [m]
-
 _STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))  # for shapes that cannot be read
 
 

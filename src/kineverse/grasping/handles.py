@@ -82,17 +82,10 @@ def find_handles(
 
     Parameters
     ----------
-    model
-        Model of the object.
     coordinate
         Coordinate of a door, a drawer or any other mechanism.
     decomposed
         Bodies, or patterns, as for :class:`kineverse.geometry.Scene`: without them a mesh is its convex hull.
-
-    Raises
-    ------
-    UnknownNameError
-        If the model has no such coordinate.
     """
     return _search(model, coordinate, decomposed)[0]
 
@@ -151,7 +144,7 @@ def _search_anew(
     links = {name: _link(model, name) for name in scene.bodies}
     own = [links[f] for f in poses if motion.moving_ancestors(f)[-1] == links[f]]
     further = [links[f] for f in poses if links[f] not in own]  # such as the lever on a door
-    still = [part for part in parts if part.body not in poses and not _moves(model, part.body)]
+    still = [part for part in parts if part.body not in poses and not model.speeds_of(part.body)]
     rated = []
     for link in dict.fromkeys((*own, *further)):
         body = [part for part in parts if links[part.body] == link]
@@ -176,10 +169,6 @@ def _link(model: ModelView, frame: str) -> str:
     """Return the first frame from a frame upwards that moves in its parent, or the topmost one."""
     path = path_to_root(model, frame)
     return next((f for f in path if model.speeds_of(f, model.frames[f].parent)), path[-1])
-
-
-def _moves(model: ModelView, frame: str) -> bool:
-    return bool(model.speeds_of(frame))
 
 
 def _open_a_little(model: ModelView, symbol: Symbol) -> tuple[State, State, bool]:

@@ -186,7 +186,6 @@ def _at(function: Callable[[float], float], x: float, otherwise: float) -> float
 
 
 def _cosine(a: RealInterval, peak: float) -> RealInterval:
-    """Return the range of the cosine of x - peak."""
     low, high = a[0] - peak, a[1] - peak
     if not high - low < 2 * math.pi or max(abs(low), abs(high)) > 1e6:
         return -1.0, 1.0

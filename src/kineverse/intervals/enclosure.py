@@ -128,7 +128,6 @@ class _Solver:
         self._last: tuple[list[RealInterval], _Box | None] | None = None
 
     def enclose(self, inputs: list[TaylorSeries]) -> list[TaylorSeries]:
-        """Return the series of the unknowns, from those of the inputs."""
         n = len(self._function.unknowns)
         if not all(math.isfinite(low) and math.isfinite(high) for (low, high), *_ in inputs):
             return [_UNKNOWN] * n
@@ -220,7 +219,6 @@ class _Solver:
     def _ranges(
         self, roots: list[Term], unknowns: list[TaylorSeries], inputs: list[TaylorSeries], rows: int
     ) -> list[list[RealInterval]]:
-        """Return the ranges of terms, in columns of some rows."""
         ranges = [s[0] for s in self._at(roots, unknowns, inputs)]
         return [ranges[k : k + rows] for k in range(0, len(ranges), rows)]
 
@@ -260,7 +258,6 @@ _RATIONAL: dict[object, Callable[..., TaylorSeries]] = {
 
 
 def _step(term: Term, args: list[TaylorSeries]) -> TaylorSeries:
-    """Return the series of a step from those of its arguments."""
     op = term.op
     if op in _RATIONAL:
         return _RATIONAL[op](*args)
@@ -297,7 +294,6 @@ def _enclose_truth(excess: RealInterval, contrast: float) -> RealInterval:
 def _piecewise(
     periodic: bool, knots: tuple[float, ...], pieces: tuple[tuple[float, ...], ...], x: TaylorSeries
 ) -> TaylorSeries:
-    """Return the series of a piecewise polynomial, over all pieces that the argument meets."""
     low, high = x[0]
     if periodic:
         period = knots[-1] - knots[0]

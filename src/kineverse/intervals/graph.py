@@ -24,10 +24,8 @@ from kineverse.expressions.piecewise import Piecewise
 from kineverse.logic import Less
 from kineverse.symbols import Symbol
 
-SHARP_CONTRAST = 1e7
-"""The contrast [per unit] from which on the ramp of ``less`` is neglected, and ``less`` is a step."""
-SATURATED = 20.0
-"""An argument from which on tanh is 1 to the last bit."""
+SHARP_CONTRAST = 1e7  # contrast [per unit] from which on the ramp of less is neglected: it is a step
+SATURATED = 20.0  # an argument from which on tanh is 1 to the last bit
 
 _IMPLICIT = "implicit"
 DOMAINS: dict[int, tuple[float, float]] = {

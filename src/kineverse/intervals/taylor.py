@@ -29,8 +29,7 @@ from .arithmetic import (
 
 TaylorSeries: TypeAlias = tuple[RealInterval, ...]
 
-TAYLOR_ORDER = 5
-"""The highest power of a series."""
+TAYLOR_ORDER = 5  # the highest power of a series
 
 ONE_INTERVAL: RealInterval = (1.0, 1.0)
 _UNBOUNDED: TaylorSeries = (REALS,)

@@ -8,10 +8,4 @@ if TYPE_CHECKING:
     from .close_loop import CloseLoop as CloseLoop, LoopConstraint as LoopConstraint
     from .loop_solution import SolvedLoop as SolvedLoop, solve_loop as solve_loop
 
-lazy_face(
-    __name__,
-    {
-        ".close_loop": "CloseLoop LoopConstraint",
-        ".loop_solution": "SolvedLoop solve_loop",
-    },
-)
+lazy_face(__name__)

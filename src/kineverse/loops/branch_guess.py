@@ -24,8 +24,7 @@ from kineverse.symbols import Symbol
 from .branches import FIRST_STEP, continue_solution
 from .equations import Equations
 
-FEW = 3
-"""Largest number of inputs with all products as basis, and samples on a grid."""
+FEW = 3  # largest number of inputs with all products as basis, and samples on a grid
 
 MARGIN = 0.2
 """Margin of the domain beyond each limit: relative to the range, and at least this value [m], [rad].

@@ -88,10 +88,8 @@ def _distance(a: Array, b: Array, angles: npt.NDArray[np.bool_]) -> float:
 
 
 _SHORTEST = 1e-5
-FIRST_STEP = 1 / 16
-"""First step of a continuation, as a fraction of the line."""
-_LITTLE = 0.5
-"""Change of ∂r/∂x over a whole line, relative to itself, up to which its end is on the same branch."""
+FIRST_STEP = 1 / 16  # first step of a continuation, as a fraction of the line
+_LITTLE = 0.5  # relative change of ∂r/∂x over a whole line up to which its end is on the same branch
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,6 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
 
     Attributes
     ----------
-    name
-        Name of the loop.
     frame, to
         Frames to keep together. Other operations must have connected them already.
     more
@@ -249,8 +247,7 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
             yield item
 
 
-APART = 1e-9
-"""Largest residual of a satisfied constant row [m], [rad]."""
+APART = 1e-9  # largest residual of a satisfied constant row [m], [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,8 +266,6 @@ class LoopConstraint(Operation, document_kind="LoopConstraint"):
 
     Attributes
     ----------
-    name
-        Name of the closure.
     frame, to
         Frames to keep together. Other operations must have connected them already.
     mask
@@ -282,8 +277,6 @@ class LoopConstraint(Operation, document_kind="LoopConstraint"):
     ------
     ModelError
         If the frames are connected rigidly.
-    DuplicateNameError
-        If there is an articulation of that name.
     """
 
     name: str

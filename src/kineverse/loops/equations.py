@@ -65,17 +65,13 @@ def upright_signs(pose: Expression, mask: Sequence[str]) -> list[Expression]:
     return [sum((diagonal[axis] for axis in "xyz" if axis not in turning), array(0.0))]
 
 
-CLOSURE_TOLERANCE = 1e-11
-"""Largest residual of a closed loop during the analysis [m] or [rad]."""
+CLOSURE_TOLERANCE = 1e-11  # largest residual of a closed loop during the analysis [m] or [rad]
 
 _NEWTON = 30
 _SINGULAR = 1e-9
-_WELL_CONDITIONED = 1e10
-"""Bound on the condition of JJᵀ or JᵀJ up to which no singular value decomposition is needed."""
+_WELL_CONDITIONED = 1e10  # condition of JJᵀ or JᵀJ up to which no singular values are needed
 
-
-MOST_EFFORT = 150_000.0
-"""Budget for the analysis of one loop, about ten seconds. Loops of usual size take a fifth of it."""
+MOST_EFFORT = 150_000.0  # budget for the analysis of one loop, about ten seconds; usual loops take a fifth
 
 
 @dataclass

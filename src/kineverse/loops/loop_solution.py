@@ -21,20 +21,14 @@ from .branch_guess import BranchGuess, BranchSamples, InputDomain, format_point,
 from .branches import continue_solution, find_branches, find_nearest_closed
 from .equations import CLOSURE_TOLERANCE, Equations, WorkBudget, find_periodic
 
-RANK = 1e-7
-"""Singular value relative to the largest one, below which a direction counts as free."""
-
-_SMALL = 1e-3
-"""Smallest length of bars [m] with derivatives above rounding errors."""
+RANK = 1e-7  # singular value relative to the largest one, below which a direction counts as free
+_SMALL = 1e-3  # smallest length of bars [m] with derivatives above rounding errors
 
 _DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
 _MORE_STEPS = 4
 _STEPS = (1, 2, 3, 4, 5, 6, 8, 10)
-_FEW = 16
-"""Number of samples that a guess is tried at first."""
-
-_PARTS = (1.0, 0.6, 0.3, 0.1, 0.03)
-"""Fractions of the margin to try, largest first."""
+_FEW = 16  # number of samples that a guess is tried at first
+_PARTS = (1.0, 0.6, 0.3, 0.1, 0.03)  # fractions of the margin to try, largest first
 
 _BEFORE_MEETING, _BEFORE_ENDING = 0.9, 1 - 1e-4
 """Usable fraction of the path through the margin, up to a singularity or the end of an earlier loop."""
@@ -48,8 +42,6 @@ class SolvedLoop:
     ----------
     function
         Dependent coordinates as a function of the inputs.
-    free, dependent
-        Free and dependent coordinates.
     mobility
         Number of free coordinates in generic configurations.
     branches, branch
@@ -85,8 +77,6 @@ def solve_loop(
 
     Parameters
     ----------
-    name
-        Name of the loop for errors.
     residual
         Residual, shape (m,), zero if the loop is closed [m], [rad].
     coordinates
@@ -222,7 +212,6 @@ def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, ang
 
 
 def _domain(interval: InputDomain) -> tuple[float, float]:
-    """Return the domain of an input, widened by rounding errors."""
     if interval.whole:
         return -np.inf, np.inf
     slack = 1e-9 * max(1.0, interval.upper - interval.lower)
@@ -367,7 +356,6 @@ def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...], mos
 def _steps_of(
     samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...], most: float, part: slice
 ) -> int | None:
-    """Return the number of Newton steps that suffices at some samples."""
     tried, wanted, chosen = samples.tried[part], samples.wanted[part], list(rows)
     x, u = seed.evaluate(tried), samples.all_inputs(tried)
     for step in range(math.floor(most) + 1):

@@ -30,19 +30,4 @@ if TYPE_CHECKING:
         explore_locks as explore_locks,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".articulated_objects": "ArticulatedObject find_articulated_objects",
-        ".belief": "Belief TrueBelief",
-        ".open_close": "OpenCloseReport OpenCloseRunner",
-        ".opening": "BasePlacement PlacementSearch open_object",
-        ".outcome": "Outcome SkillError",
-        ".pushing": "push",
-        ".robot_placement": "PlacedRobot place_robot",
-        ".session": "Session",
-        ".tracked_belief": "TrackedBelief",
-        ".unknown_objects": "open_unknown",
-        ".unlocking": "LockExploration PartMover UnlockingExecution execute_unlocking explore_locks",
-    },
-)
+lazy_face(__name__)

@@ -34,8 +34,6 @@ class ArticulatedObject:
 
     Attributes
     ----------
-    coordinate
-        The coordinate.
     kind
         ``"drawer"``: it is translated; ``"door"``: it turns about an upright axis; ``"flap"``: about a level
         one; ``"knob"``: about an axis through itself; ``"linkage"``: about an axis that moves.
@@ -56,8 +54,6 @@ def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[Articul
 
     Parameters
     ----------
-    model
-        The model.
     robot
         Prefix of a robot, which is not an object; none if empty.
 
@@ -109,7 +105,6 @@ def select_objects(
 def _find_kind(
     model: ModelView, coordinate: Symbol, bodies: Sequence[str], limits: Sequence[float]
 ) -> MotionKind:
-    """Return the kind of the motion of some bodies between two limits."""
     state = model.default_state()
     samples = [state.updated({coordinate: float(v)}) for v in np.linspace(limits[0], limits[1], _SAMPLES)]
     axes: list[tuple[Array, Array]] = []

@@ -36,13 +36,7 @@ class Belief(Protocol):
         """
 
     def deviation(self, coordinate: Symbol) -> float:
-        """Return the standard deviation of a coordinate [m], [rad]; 0 if it is known exactly.
-
-        Raises
-        ------
-        UnknownNameError
-            For a coordinate that the state does not have.
-        """
+        """Return the standard deviation of a coordinate [m], [rad]; 0 if it is known exactly."""
 
 
 class TrueBelief:
@@ -59,13 +53,7 @@ class TrueBelief:
         return self._state
 
     def deviation(self, coordinate: Symbol) -> float:
-        """Return 0.
-
-        Raises
-        ------
-        UnknownNameError
-            For a coordinate that the state of the last update does not have.
-        """
+        """Return 0."""
         check_believed(self._state, coordinate)
         return 0.0
 

@@ -26,8 +26,6 @@ class OpenCloseReport:
 
     Attributes
     ----------
-    object
-        The object.
     opened, closed
         Outcomes; None for what was not begun.
     estimate_error

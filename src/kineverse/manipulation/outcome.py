@@ -22,8 +22,6 @@ class Outcome:
         Value of the coordinate at the end, in the world's truth [m], [rad].
     reason
         Why it is done, or what prevented it.
-    world
-        Name of the world.
     seconds
         Time in the world [s].
     steps

@@ -30,10 +30,8 @@ from .base_sampling import find_free_state
 from .robot_sources import SHIPPED
 
 _BASE = ("x", "y", "angle")
-_DEEPEST = 2e-4
-"""Depth below which bodies only touch at the start [m]."""
-_RING, _RINGS, _DIRECTIONS = 0.25, 16, 12
-"""Distance of rings of places [m], their number, and that of places on each."""
+_DEEPEST = 2e-4  # depth below which bodies only touch at the start [m]
+_RING, _RINGS, _DIRECTIONS = 0.25, 16, 12  # distance of rings of places [m], their number, and places on each
 
 
 @dataclass(frozen=True)
@@ -106,8 +104,6 @@ def place_robot(
 
     Parameters
     ----------
-    model
-        The model of the furniture.
     robot
         Name of a shipped robot, or path of its description.
     at
@@ -183,7 +179,6 @@ def _choose_prefix(
 
 
 def _add_base(edit: Edit, robot: str) -> None:
-    """Put a robot on an omnidirectional base."""
     model = edit.model
     inside = {name: placed for name, placed in model.frames.items() if is_of_robot(name, robot)}
     roots = [name for name, placed in inside.items() if placed.parent == WORLD]

@@ -98,8 +98,7 @@ _FETCH_START = {
     "wrist_flex_joint": 1.66,
     "torso_lift_joint": 0.2,
 }
-# The papers' torso joint; it follows the arm's lift.
-_HSR_START = {"arm_lift_joint": 0.4}
+_HSR_START = {"arm_lift_joint": 0.4}  # the papers' torso joint; it follows the arm's lift
 
 SHIPPED: Mapping[str, RobotSource] = MappingProxyType(
     {

@@ -77,8 +77,6 @@ class Session:
 
     Parameters
     ----------
-    world
-        The world.
     dt
         Time of a step [s].
     belief
@@ -96,8 +94,6 @@ class Session:
         Source of the state.
     start
         The true state at the begin of the session.
-    state
-        The believed state.
     commands
         The speeds of the last step.
     command
@@ -178,8 +174,6 @@ class Session:
 
         Raises
         ------
-        UnknownNameError
-            For a name that the model does not have.
         ShapeError
             For an expression that is no number.
         """

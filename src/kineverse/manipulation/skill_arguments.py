@@ -13,9 +13,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import World
 
-TOLERANCE = 0.02
-"""Distance from a limit within which an object is open or shut, unless its range is short [m], [rad]."""
-
+TOLERANCE = 0.02  # distance from a limit at which an object is open or shut, in a long range [m], [rad]
 _FIXED = 1e-9  # range of a coordinate up to which it counts as fixed [m], [rad]
 _LEAST_TOLERANCE, _SHARE = 1e-3, 0.02  # least tolerance between limits [m], [rad], and share of the distance
 

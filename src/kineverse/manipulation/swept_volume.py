@@ -32,7 +32,6 @@ from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
 from .outcome import SkillError
 
 STEP = 5e-4  # longest distance of a point of the object between two places where it is checked [m]
-
 _COARSE = 32  # number of parts of a path whose lengths are measured
 _MOST_PLACES = 100_000
 _TURNED = 1e-6  # change of an entry of a rotation from which on a body has turned

@@ -145,8 +145,6 @@ class TrackedBelief:
 
     Raises
     ------
-    UnknownNameError
-        For a prefix, camera or marked frame that the model does not have.
     InvalidValueError
         If no marked frame moves with an object, or odometry drifts under a base that is not planar.
     """
@@ -322,7 +320,6 @@ class TrackedBelief:
         self._read = stamp
 
     def _filter_joints(self, before: Array, stamp: float) -> None:
-        """Mix readings of the encoders with the prediction by commands."""
         columns = [self._place[s] for s in self._encoded]
         variance = self.sensors.encoders**2
         if math.isinf(self._read):
@@ -438,11 +435,6 @@ class TrackedBelief:
         """Return the standard deviation of a coordinate at the present time [m], [rad].
 
         It is infinite for one that no marker shows, and one whose track is lost.
-
-        Raises
-        ------
-        UnknownNameError
-            For a coordinate that the state does not have.
         """
         if coordinate in self._groups:
             estimate = self._estimate

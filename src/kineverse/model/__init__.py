@@ -44,23 +44,4 @@ if TYPE_CHECKING:
         Violations as Violations,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".articulation": "Articulation",
-        ".basic_operations": "AddFrame Attach Constrain Override SetData SetRate",
-        ".body": "Body Box Capsule Cone Cylinder Ellipsoid Inertia Mesh Pose Shape Sphere",
-        ".comparison": "BehaviourComparison compare_models",
-        ".constraint": "Constraint",
-        ".changes": "Change Diff",
-        ".edit": "Edit",
-        ".frame": "WORLD Frame",
-        ".frame_dependence": "count_moved_bodies moved_frames",
-        ".integration": "Integrator",
-        ".model": "Model Snapshot",
-        ".operation": "Operation Writes",
-        ".rates": "Rates",
-        ".read_recorder": "ReadRecorder",
-        ".violations": "ConstraintChecker Violation Violations",
-    },
-)
+lazy_face(__name__)

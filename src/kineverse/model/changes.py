@@ -98,8 +98,7 @@ def find_moved_tags(before: Sequence[str], after: Sequence[str], among: Containe
 
 def _longest_in_order(places: Sequence[int], wanted: Sequence[bool]) -> set[int]:
     """Return the indices of a longest increasing part that has all that are wanted, which increase."""
-    # What stands still leaves room for the others only in between.
-    kept: set[int] = set()
+    kept: set[int] = set()  # what stands still leaves room for the others only in between
     low, start = -1, 0
     for end in (*(i for i, is_wanted in enumerate(wanted) if is_wanted), len(places)):
         high = places[end] if end < len(places) else max(places, default=0) + 1
@@ -112,8 +111,7 @@ def _longest_in_order(places: Sequence[int], wanted: Sequence[bool]) -> set[int]
 
 
 def _longest(places: Sequence[int]) -> set[int]:
-    # ends[k]: the least end of an increasing part of k + 1 places.
-    ends: list[int] = []
+    ends: list[int] = []  # ends[k]: the least end of an increasing part of k + 1 places
     lengths: list[int] = []
     for place in places:
         length = bisect_left(ends, place)

@@ -123,13 +123,11 @@ def _is_number(value: Any) -> bool:
 
 
 def _number(value: Any) -> Any:
-    """Return a constant scalar as a number."""
     is_scalar = isinstance(value, Expression) and not value.shape
     return float(value) if is_scalar and value.is_constant else value
 
 
 def _is_symbolic(a: Any, b: Any) -> bool:
-    """Return whether two parts are expressions of one shape, or an expression and a number."""
     if not any(isinstance(v, Expression) for v in (a, b)):
         return False
     return _shape(a) == _shape(b) is not None
@@ -189,7 +187,6 @@ def _measure_distance(
 
 
 def _summarize(distances: Array, angles: Array) -> tuple[float, float, tuple[float, float]]:
-    """Return the largest distance, the largest angle, and both at the first state."""
     return float(distances.max()), float(angles.max()), (float(distances[0]), float(angles[0]))
 
 
@@ -330,7 +327,6 @@ class ModelComparison:
         return result
 
     def _is_redundant_record(self, change: Change) -> bool:
-        """Return whether a change is the record of a fixed joint between frames of both models."""
         record = change.after if change.before is None else change.before
         return (
             isinstance(record, Articulation)
@@ -416,8 +412,6 @@ class BehaviourComparison:
 
     Parameters
     ----------
-    before, after
-        The models.
     tolerance
         Largest difference of equal numbers [m], [rad].
 

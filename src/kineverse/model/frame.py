@@ -58,8 +58,6 @@ class Frame:
 
         Raises
         ------
-        ShapeError
-            If a transform is not 4×4.
         InvalidValueError
             If a constant one is not rigid.
         """

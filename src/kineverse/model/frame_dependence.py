@@ -61,20 +61,12 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
 
     Parameters
     ----------
-    model
-        The model.
     symbols
         Symbols or their names, such as the speeds of a controller.
-
-    Raises
-    ------
-    UnknownNameError
-        For a symbol that the model does not know.
     """
     asked = [s if isinstance(s, Symbol) else model.symbol(s) for s in symbols]
     known = _known_paths(model)
-    # One bit for each symbol, in the masks of coordinates and of frames.
-    bits: dict[str, int] = {}
+    bits: dict[str, int] = {}  # one bit for each symbol, in the masks of coordinates and of frames
     for i, symbol in enumerate(asked):
         for path in _driven_coordinates(model, {_known_path(symbol, known)}):
             bits[path] = bits.get(path, 0) | 1 << i

@@ -73,7 +73,6 @@ class History:
             self._fill(entries)
 
     def _fill(self, entries: Iterable[HistoryEntry]) -> None:
-        """Insert operations that have been applied, in their order."""
         cells, reading, head = self.cells, self.reading, self.head
         for i, given in enumerate(entries):
             # New places, because the entries may come from several models.
@@ -276,7 +275,6 @@ class History:
             self._mark_readers(cell, old.writes.get(cell, ABSENT), new.writes.get(cell, ABSENT), new.place)
 
     def _apply(self, entry: HistoryEntry) -> HistoryEntry:
-        """Apply an operation at its place, and return its entry with its reads and writes."""
         self.runs += 1
         tag = entry.tag
         reads = Reads()

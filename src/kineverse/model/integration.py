@@ -42,8 +42,7 @@ Vector: TypeAlias = npt.NDArray[np.float64]
 
 # Substeps of the modified midpoint rule; the extrapolation over their squares is of order 12.
 _SUBSTEPS = (2, 4, 6, 8, 10, 12)
-# Longest step: its product with the rate of a coordinate [m], [rad].
-_LONGEST = 0.5
+_LONGEST = 0.5  # longest step: its product with the rate of a coordinate [m], [rad]
 # Error tolerance of a step relative to the coordinates, and smallest step relative to the whole time.
 _ERROR = 1e-13
 _SHORTEST = 1e-9
@@ -58,8 +57,6 @@ class Integrator:
 
     Parameters
     ----------
-    rates
-        Rate table.
     symbols
         Symbols of the vector of coordinates: coordinates, and parameters that rows contain.
     speeds
@@ -118,8 +115,6 @@ class Integrator:
 
         Raises
         ------
-        ShapeError
-            If the vectors have other sizes.
         InvalidValueError
             For NaN and infinite numbers, or if coordinates diverge.
         """

@@ -72,12 +72,10 @@ class _Moment:
         self.nodes: frozenset[Node] = NO_NODES
 
     def sum(self) -> SX:
-        """Return the moment, 3×1."""
         constant = ca.SX(ca.sparsify(ca.DM(self.constant)))
         return constant if self.moving is None else self.moving + constant
 
     def transform(self, factor: Pose | Expression) -> None:
-        """Express the moment in the parent of a transform."""
         if isinstance(factor, Pose):
             matrix = factor.matrix
             self.constant = matrix[:3, :3] @ self.constant + self.mass * matrix[:3, 3]
@@ -97,7 +95,6 @@ class _Moment:
         self.constant = np.zeros(3)
 
     def add(self, other: _Moment) -> None:
-        """Add the moment of another subtree in the same frame."""
         self.mass += other.mass
         self.constant = self.constant + other.constant
         self.nodes = self.nodes | other.nodes

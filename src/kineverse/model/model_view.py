@@ -212,13 +212,7 @@ class ModelView(SymbolicView):
         return lower, upper
 
     def symbol(self, name: str) -> Symbol:
-        """Return the symbol of a name; its coordinate is a free or dependent coordinate of the model.
-
-        Raises
-        ------
-        UnknownNameError
-            With similar names.
-        """
+        """Return the symbol of a name; its coordinate is a free or dependent coordinate of the model."""
         path, order = parse_symbol_name(name)
         coordinates = (*self.symbols, *self.rates.dependent)
         for known in coordinates:
@@ -239,13 +233,7 @@ class ModelView(SymbolicView):
         )
 
     def degree_of_freedom(self, name: Symbol | str) -> Symbol:
-        """Return the degree of freedom of a name.
-
-        Raises
-        ------
-        UnknownNameError
-            With similar names.
-        """
+        """Return the degree of freedom of a name."""
         known = {str(s): s for s in self.degrees_of_freedom}
         if str(name) not in known:
             raise UnknownNameError(
@@ -516,8 +504,6 @@ class ModelView(SymbolicView):
 
         Parameters
         ----------
-        path
-            Path of the file.
         tolerance
             Largest error of a frame in URDF and MJCF, in position [m] and angle [rad], guaranteed; None for
             no error.

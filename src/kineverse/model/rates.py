@@ -316,7 +316,6 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         return tuple(result.items())
 
     def _combine(self, row: Iterable[tuple[Symbol, Expression]]) -> dict[Symbol, Expression]:
-        """Return a row over free speeds."""
         result: dict[Symbol, Expression] = {}
         for speed, factor in row:
             inner: Mapping[Symbol, ExpressionLike] = self._rows.get(speed.position, {speed: 1.0})

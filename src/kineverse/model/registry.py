@@ -176,8 +176,7 @@ _SERVICES = {
 }
 """Readers and writers of files, and the reader of meshes."""
 
-_SCHEMES: dict[str, str] = {}
-"""Readers of addresses ``scheme:…``, with the signature of :func:`include_source`."""
+_SCHEMES: dict[str, str] = {}  # readers of addresses scheme:…, with the signature of include_source
 
 Service: TypeAlias = Literal["include", "save", "read_mesh"]
 

@@ -16,8 +16,7 @@ from kineverse.symbols import Symbol
 
 from .model_view import ModelView
 
-REACH = np.pi
-"""Half width of the range of a symbol without limits, around its default value [rad], [m] and their rates."""
+REACH = np.pi  # half width of the range of a symbol without limits, about its default [rad], [m] and rates
 
 
 class StateSamples:

@@ -311,13 +311,7 @@ class SymbolicView:
     # -- kinematics ----------------------------------------------------------------------------------------
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
-        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates.
-
-        Raises
-        ------
-        UnknownNameError
-            If a frame does not exist, with similar names.
-        """
+        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates."""
         with self._lock:
             self._settle()
             known = self._poses.get((frame, relative_to))
@@ -440,8 +434,6 @@ class SymbolicView:
 
         Raises
         ------
-        UnknownNameError
-            If the frame does not exist, with similar names.
         ModelError
             If none of the bodies has a mass, with their names.
         """
@@ -482,11 +474,6 @@ class SymbolicView:
         coordinates of a joint in its own order. A dependent coordinate, as of a mimic joint or a closed loop,
         is replaced by those that determine it. Pass them to :func:`kineverse.compile` for input vectors in
         this order instead of sorted by name.
-
-        Raises
-        ------
-        UnknownNameError
-            If a frame does not exist, with similar names.
         """
         with self._lock:
             self._settle()

@@ -69,8 +69,6 @@ class ConstraintChecker:
 
     Parameters
     ----------
-    constraints
-        Constraints by name.
     symbols
         Symbols of the vector; those of all constraints if None, and then C is not compiled.
     dependent
@@ -138,11 +136,6 @@ class ConstraintChecker:
         ----------
         x
             Values of :attr:`symbols`, shape (n,).
-
-        Raises
-        ------
-        ShapeError
-            If ``x`` is not a vector of n numbers.
         """
         self._evaluator(x)
         largest, total = self._checks

@@ -19,14 +19,4 @@ if TYPE_CHECKING:
         time_parameterize as time_parameterize,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".manifold": "FrameHold",
-        ".modes": "Mode",
-        ".path": "Path",
-        ".planner": "Planner",
-        ".trajectories": "BlendedPath MotionLimits Trajectory TrajectoryFollower motion_limits round_corners "
-        "time_parameterize",
-    },
-)
+lazy_face(__name__)

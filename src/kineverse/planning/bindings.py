@@ -31,14 +31,9 @@ LINK = np.dtype([*_BOUNDS, *_integers("pose first coarse first_shape shapes exac
 SHAPE = np.dtype([("pose", np.float64, 12), ("object", np.int64)])
 COARSE = np.dtype([("sphere", np.float32, 4), *_integers("first count")])
 
-MOST_COORDINATES = 64
-"""Largest number of coordinates, as in ``edges.c``."""
-
-BOX, CYLINDER, CAPSULE, SPHERE, HULL = range(5)
-"""Kinds of obstacles."""
-
-FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY, TOO_LONG = range(5)
-"""Outcomes of a search."""
+MOST_COORDINATES = 64  # largest number of coordinates, as in edges.c
+BOX, CYLINDER, CAPSULE, SPHERE, HULL = range(5)  # kinds of obstacles
+FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY, TOO_LONG = range(5)  # outcomes of a search
 
 
 class ObstacleSetStruct(ctypes.Structure):

@@ -30,23 +30,19 @@ from kineverse.symbols import Symbol
 from .bindings import CheckerStruct, ObstacleSetStruct, planning_functions
 from .collision_geometry import Floats32, LinkTable, ObstacleSet
 
-BodyPairs: TypeAlias = frozenset[frozenset[str]]
-"""Pairs of bodies, {a, b} each."""
+BodyPairs: TypeAlias = frozenset[frozenset[str]]  # pairs of bodies, {a, b} each
 
 PairTables: TypeAlias = tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32], npt.NDArray[np.int32]]
 """Checked pairs: flags of links and bodies of the world, rows of two links, and of a link and a set."""
 
-RESOLUTION = 32.0
-"""Samples of an edge for each unit of its length, [1/rad] and [1/m]."""
+RESOLUTION = 32.0  # samples of an edge for each unit of its length, [1/rad] and [1/m]
 FINENESS = 2000.0
 """Samples of a unit of a coordinate by which a condition switches, such as that of a lock [1/rad], [1/m]."""
 _SAME = 1e-4
-_ROUNDING = 2.5e-7
-"""Error of a pose in single precision, as a fraction of its distance from the origin."""
+_ROUNDING = 2.5e-7  # error of a pose in single precision, as a fraction of its distance from the origin
 _SWITCHES = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_IF_ELSE_ZERO}
 _placements = itertools.count()
-LEAST_INFLATION = 2e-4
-"""Growth of spheres below which a collision between two samples counts as one [m]."""
+LEAST_INFLATION = 2e-4  # growth of spheres below which a collision between two samples counts as one [m]
 
 
 class LateCheckError(NoSolutionError):
@@ -113,7 +109,6 @@ class CollisionChecker:
         return [(item, solid, offset @ item.shape.origin.matrix) for item, solid in items]
 
     def _place_static(self, dependence: FrameDependence) -> None:
-        """Collect the obstacles of the world."""
         world = self.scene.collision_world
         self._static = np.array(
             [k for k, o in enumerate(world.objects) if not dependence.moves(o.body)], dtype=int
@@ -132,7 +127,6 @@ class CollisionChecker:
     def _place_moving(
         self, members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]], poses: Sequence[int]
     ) -> None:
-        """Collect the shapes of the moving bodies, a set for each."""
         lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
         self._costs = []

@@ -75,13 +75,10 @@ def box_corners(low: Iterable[float], high: Iterable[float]) -> Array:
     return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
 
 
-_SAME_PLANE = 6
-"""Digits in which planes of a hull differ."""
-_ALIGNED = 1e-5
-"""Largest distance of a shape from the one along the axes that stands for it [m]."""
+_SAME_PLANE = 6  # digits in which planes of a hull differ
+_ALIGNED = 1e-5  # largest distance of a shape from the one along the axes that stands for it [m]
 _COSTS = np.array([2.0, 3.0, 1.5, 1.0, 0.0])
-_EMPTY = 1e30
-"""Coordinate of the boxes that fill the last chunk: nothing meets them."""
+_EMPTY = 1e30  # coordinate of the boxes that fill the last chunk: nothing meets them
 
 Floats32 = npt.NDArray[np.float32]
 

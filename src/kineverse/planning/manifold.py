@@ -26,17 +26,12 @@ from .bindings import ProjectionStruct, planning_functions
 from .collision_checker import CollisionChecker
 from .collision_geometry import Floats32
 
-TOLERANCE = 1e-4
-"""Largest residual of a projection in float [m], [rad]."""
-EXACT = 1e-9
-"""Largest residual of a polished configuration [m], [rad]."""
-DEVIATION = 8e-6
-"""Largest residual half way between two points of a polished path [m], [rad]."""
-_MOST_POINTS = 50_000
-"""Number of points that polishing may add to a path."""
+TOLERANCE = 1e-4  # largest residual of a projection in float [m], [rad]
+EXACT = 1e-9  # largest residual of a polished configuration [m], [rad]
+DEVIATION = 8e-6  # largest residual half way between two points of a polished path [m], [rad]
+_MOST_POINTS = 50_000  # number of points that polishing may add to a path
 _STEPS, _POLISHING = 8, 12
-_DAMPING = 1e-5
-"""Damping of Newton's step where rows depend on each other, added to squares of derivatives [m²], [rad²]."""
+_DAMPING = 1e-5  # damping of Newton's step where rows depend on each other [m²], [rad²]
 _ROWS = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -193,7 +188,6 @@ def hold_targets(holds: Sequence[Hold]) -> Array:
 
 
 def _is_number(hold: Hold) -> bool:
-    """Return True if the target of a hold consists of numbers."""
     return isinstance(hold.target, int | float) or not as_expression(hold.target).symbols
 
 

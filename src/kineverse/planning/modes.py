@@ -25,8 +25,7 @@ _CANDIDATES = 12
 _BATCHES, _EDGES = 2, 2000
 """Effort for the configurations of one change of modes and for one path: numbers, so that the same seed
 leads to the same path. Each round of the search has four times as much."""
-_DEPTH = 4
-"""Largest number of changes of modes in the first round; each round allows as many more."""
+_DEPTH = 4  # largest number of changes of modes in the first round; each round allows as many more
 _SAME = 1e-4
 
 
@@ -232,7 +231,6 @@ class ModeSearch:
         return before | self._touching[node.mode]
 
     def _reach_goal(self, node: _Node) -> ModeSegment | None:
-        """Search a segment to the goal within the mode of a node."""
         still, mode = self._still[node.mode], self._modes[node.mode]
         touching = self._touching_around(node) | self._scene.touching_pairs(self._tasks)
         if self._ends is not None:

@@ -22,8 +22,7 @@ from .state_validity import PathChecks
 from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.kinematic_limits import RAMP
 
-DEVIATION = 0.1
-"""Largest distance of a trajectory from the corners of its path, where nothing is in the way [rad], [m]."""
+DEVIATION = 0.1  # largest distance of a trajectory from the corners of a path in free space [rad], [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +118,6 @@ class Path:
         ------
         InvalidValueError
             If the path was not found, or the model has been edited since; as :func:`.time_parameterize`.
-        ShapeError
-            For limits or deviations of another shape.
         """
         return join_sections(self._parameterize(deviation, ramp, velocity, acceleration))
 
@@ -183,8 +180,6 @@ class Path:
         ------
         InvalidValueError
             As :meth:`trajectory`.
-        FormatError
-            If the file cannot be written.
         """
         self.trajectory().save(path)
 

@@ -18,15 +18,11 @@ from .state_validity import PathChecks
 from .trajectories import BlendedPath, Trajectory, round_corners, time_parameterize
 from .trajectories.kinematic_limits import MotionLimits
 
-RESIDUAL = 1e-5
-"""Largest residual of holds on rounded corners [m], [rad]."""
-_SAGITTA = 1e-4
-"""Distance between a blend and the chords that are checked in its place [m], [rad]."""
-_SAME = 1e-5
-"""Distance below which two points count as one [rad], [m]."""
+RESIDUAL = 1e-5  # largest residual of holds on rounded corners [m], [rad]
+_SAGITTA = 1e-4  # distance between a blend and the chords that are checked in its place [m], [rad]
+_SAME = 1e-5  # distance below which two points count as one [rad], [m]
 _ROUNDS, _LAST_ROUNDS = 8, 4
-_STEP = 0.02
-"""Largest distance of samples of a trajectory [rad], [m]."""
+_STEP = 0.02  # largest distance of samples of a trajectory [rad], [m]
 
 
 class PathSection(NamedTuple):

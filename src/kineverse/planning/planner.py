@@ -35,10 +35,8 @@ from .sampling_planners import Roadmap
 from .start_goal import describe_barrier
 from .state_validity import describe_contacts
 
-_TASK_GOALS = 32
-"""Number of configurations that are looked for where tasks are the goal."""
-_TRIES = 2048
-"""Number of random configurations that say whether tasks are out of reach."""
+_TASK_GOALS = 32  # number of configurations that are looked for where tasks are the goal
+_TRIES = 2048  # number of random configurations that say whether tasks are out of reach
 _METHODS = ("rrt-connect", "prm")
 
 
@@ -380,7 +378,6 @@ class Planner:
         return replace(path, modes=tuple(modes), sections=tuple(sections))
 
     def _choose_roadmap(self, method: str, holds: Sequence[Hold]) -> Roadmap | None:
-        """Return the roadmap of a method; None for trees."""
         if method not in _METHODS:
             raise InvalidValueError(f"method is {method!r}; there are {', '.join(map(repr, _METHODS))}.")
         if method == "rrt-connect":

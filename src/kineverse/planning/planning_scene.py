@@ -37,15 +37,13 @@ from .state_validity import PathChecks, SceneJudge, describe_contacts
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
-_JUDGED = 0.5
-"""Longest step between judged configurations of a path that is certified [rad], [m]."""
+_JUDGED = 0.5  # longest step between judged configurations of a path that is certified [rad], [m]
 _TOO_FAR = (
     "A path was found to a goal that is {:.4g} away, but to check it takes longer than the time given. Give "
     "more seconds=, or nearer goals."
 )
 _MOST_MANIFOLDS = 16
-_SAME = 1e-5
-"""Difference of lengths that is rounding [rad], [m]."""
+_SAME = 1e-5  # difference of lengths that is rounding [rad], [m]
 
 
 class PlanningScene:
@@ -268,7 +266,6 @@ class PlanningScene:
         optimize: bool,
         asked: float,
     ) -> Path:
-        """Search a path between checked ends."""
         targets = np.ascontiguousarray(variants, dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched, until = perf_counter(), checked_by(working_seconds(), seconds)
@@ -351,8 +348,7 @@ def _are_apart(model: ModelView, a: str, b: str) -> bool:
 
 
 _SAMPLES = 64
-_APART = 1e-4
-"""Distance beyond the margin at which bodies do not just rest on each other [m]."""
+_APART = 1e-4  # distance beyond the margin at which bodies do not just rest on each other [m]
 
 
 def find_overlapping_pairs(scene: Scene, space: PlanningSpace) -> tuple[Rule, ...]:

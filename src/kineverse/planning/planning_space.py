@@ -23,15 +23,12 @@ from kineverse.symbols import Symbol
 from .bindings import MOST_COORDINATES
 
 _WILDCARDS = "*?["
-_LARGEST = 1e6
-"""Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
+_LARGEST = 1e6  # largest coordinate of a configuration [rad], [m]; edges are computed in single precision
 HALF_TURN, FULL_TURN = math.pi + 0.3, math.tau + 0.3
 """Angles by which joints that turn fully may turn to either side of the start: the short way, and the long
 way round as well [rad]."""
-BEYOND = 2.0
-"""Length by which coordinates without limits may exceed the start and the goals [m], [rad]."""
-CONDITION_TOLERANCE = 1e-5
-"""Largest excess of a constraint that counts as satisfied; float has seven digits."""
+BEYOND = 2.0  # length by which coordinates without limits may exceed the start and the goals [m], [rad]
+CONDITION_TOLERANCE = 1e-5  # largest excess of a constraint that counts as satisfied; float has seven digits
 
 
 class PlanningSpace:

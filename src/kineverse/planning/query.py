@@ -20,14 +20,11 @@ from .sampling_planners import MOST_EDGES, PATH_ROOM, Roadmap, RrtConnect, Searc
 PATIENCE, MORE_PATIENCE = 40, 160
 """Numbers of shortcuts in a row that may bring nothing: for the first path, and where paths are optimized."""
 _REPAIRS = 12
-_FINER = 8.0
-"""Factor of the resolution where an edge collides between its samples."""
+_FINER = 8.0  # factor of the resolution where an edge collides between its samples
 _FINEST = 4000.0
 _ATTEMPTS, _NEXT_SEED = 16, 7919
-_LEAST_CHECK = 1.0
-"""Least time for the checks of a path [s]; the limit of the search, if that is longer."""
-_TELLING = 100
-"""Number of samples after which a small tree says that its root cannot be left."""
+_LEAST_CHECK = 1.0  # least time for the checks of a path [s]; the limit of the search, if that is longer
+_TELLING = 100  # number of samples after which a small tree says that its root cannot be left
 _WIDER, _WIDE_EDGES = 1e-3, 10_000
 """Wider margin, with which edges of a search are mostly free between their samples [m]. A passage, such as a
 door, may be too narrow for it: after that many edges, or half of the time, searches go on without."""

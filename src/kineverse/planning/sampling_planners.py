@@ -19,13 +19,10 @@ from .collision_checker import LEAST_INFLATION, RESOLUTION, CollisionChecker
 from .collision_geometry import Floats32
 from .manifold import Manifold
 
-RANGE = 1.0
-"""Largest length of an edge of a tree [rad], [m]; longer where a goal is thousands of them away."""
+RANGE = 1.0  # largest length of an edge of a tree [rad], [m]; longer where a goal is thousands of them away
 _MOST_NODES = 200_000
-MOST_EDGES = 1 << 40
-"""Number of edges of a search that is limited by time alone."""
-PATH_ROOM = 16_384
-"""Largest number of points of a path."""
+MOST_EDGES = 1 << 40  # number of edges of a search that is limited by time alone
+PATH_ROOM = 16_384  # largest number of points of a path
 
 
 class SearchResult(NamedTuple):
@@ -102,16 +99,13 @@ class RrtConnect:
         return s
 
 
-MOST_NODES = 20_000
-"""Default largest number of nodes of a roadmap."""
+MOST_NODES = 20_000  # default largest number of nodes of a roadmap
 _DEGREE, _MOST_DEGREE = 12, 64
-_GREED = 5.0
-"""Weight of the distance to the goal in the order of the search: shortcuts make up for longer paths."""
+_GREED = 5.0  # weight of the distance to the goal in a search: shortcuts make up for longer paths
 _LEAST_BATCH = 32
 _UNKNOWN, _BLOCKED = 0, 2
 _PADDING = 64
-_VISIT = np.dtype("i8, i8, f4, f4, i4, i4")
-"""State of a node in a search: closed, seen, cost, rest, from, edge."""
+_VISIT = np.dtype("i8, i8, f4, f4, i4, i4")  # state of a node: closed, seen, cost, rest, from, edge
 
 
 class Roadmap:

@@ -19,8 +19,7 @@ _LIMIT = 1e-6
 _ROUNDING = 1e-5
 _SAMPLES, _ENOUGH = 4096, 50
 """Number of random configurations, and of free ones among them that are enough to find barriers."""
-_NEAR = 0.01
-"""Largest residual of an end that is brought onto a manifold [m], [rad]."""
+_NEAR = 0.01  # largest residual of an end that is brought onto a manifold [m], [rad]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +127,9 @@ def describe_barrier(space: PlanningSpace, checker: CollisionChecker, start: Arr
 
 
 _BATCH = 2048
-MOST_BATCHES = 1_000_000
-"""Number of batches of a search that is limited by time alone."""
-_IDLE = 8
-"""Number of batches without anything new after which there is nothing more to find."""
-_APART = 0.05
-"""Least distance of two solutions that count as different [rad], [m]."""
+MOST_BATCHES = 1_000_000  # number of batches of a search that is limited by time alone
+_IDLE = 8  # number of batches without anything new after which there is nothing more to find
+_APART = 0.05  # least distance of two solutions that count as different [rad], [m]
 
 
 def find_solutions(

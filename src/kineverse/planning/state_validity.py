@@ -25,11 +25,9 @@ from .collision_checker import RESOLUTION, BodyPairs, CollisionChecker, LateChec
 if TYPE_CHECKING:
     from .manifold import Manifold
 
-_AT_ONCE = 512
-"""Number of samples between two looks at the clock."""
+_AT_ONCE = 512  # number of samples between two looks at the clock
 _ROUNDING = 1e-6
-_TOUCHING = 5e-5
-"""Depth up to which a contact is called a touch [m]."""
+_TOUCHING = 5e-5  # depth up to which a contact is called a touch [m]
 
 
 class SceneJudge:

@@ -26,14 +26,4 @@ if TYPE_CHECKING:
         plan_unlocking as plan_unlocking,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".boxes": "Interval IntervalBox",
-        ".find_interlocks": "interlocks",
-        ".interlock_records": "Hold Interlock Interlocks Undecided opening_order",
-        ".interlock_verification": "contradictions",
-        ".plan_verification": "InvariantSet plan_violations refutation_gaps",
-        ".unlocking_plan": "UnlockingPlan UnlockingStep plan_unlocking",
-    },
-)
+lazy_face(__name__)

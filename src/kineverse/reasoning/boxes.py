@@ -318,7 +318,6 @@ def _joined_boxes(a: IntervalBox, b: IntervalBox) -> Iterator[IntervalBox]:
 
 
 def _maximal_boxes(boxes: list[IntervalBox]) -> list[IntervalBox]:
-    """Return the boxes that no other box contains."""
     kept: list[IntervalBox] = []
     for box in sorted(dict.fromkeys(boxes), key=len):
         if not any(other.covers(box) for other in kept):

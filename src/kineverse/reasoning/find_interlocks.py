@@ -109,7 +109,6 @@ def _find_periodic(
 
 
 def _restore_coordinates(found: ConstraintEffects, periodic: PeriodicCoordinates) -> ConstraintEffects:
-    """Return effects in terms of the original periodic coordinates."""
     speed = found.speed
     if speed is not None:
         for region in (

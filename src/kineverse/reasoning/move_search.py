@@ -15,7 +15,6 @@ from .cell_graph import CellGraph, CellStep, Move, MoveRule
 
 Verdict: TypeAlias = Literal["found", "refuted", "undecided"]
 Edge: TypeAlias = tuple[int, int, int, CellStep]  # coordinate, bits of a cell and its neighbour, step
-
 _EXHAUSTED_AT_MOST = 50_000  # largest number of states for which the shortest sequence is searched
 _PRUNED_AT_MOST = 300
 _CLOCK = 64  # expansions between two looks at the clock
@@ -82,7 +81,6 @@ class MoveSearch:
 
     @cached_property
     def _reach(self) -> int:
-        """The cells that are not out of reach from the start."""
         return self.relax(self.graph.start)[0]
 
     def estimate(self, state: int) -> tuple[float, int]:

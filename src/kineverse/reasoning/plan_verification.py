@@ -28,7 +28,6 @@ from .constraint_evaluation import (
 if TYPE_CHECKING:
     from .unlocking_plan import UnlockingPlan, UnlockingStep
 
-
 SAMPLES = 21  # positions along a move at which undecided constraints are evaluated
 _NARROWEST = 1e-7  # width of an interval around a threshold that is not divided any further [m] or [rad]
 _MOST_INTERVALS = 400
@@ -46,10 +45,6 @@ def plan_violations(model: ModelView, plan: UnlockingPlan, state: StateLike | No
 
     Parameters
     ----------
-    model
-        The model.
-    plan
-        The plan.
     state
         Positions at the start, as they were given to the planner.
     """
@@ -198,10 +193,6 @@ def refutation_gaps(model: ModelView, plan: UnlockingPlan, state: StateLike | No
 
     Parameters
     ----------
-    model
-        The model.
-    plan
-        The plan.
     state
         Positions at the start, as they were given to the planner.
     """

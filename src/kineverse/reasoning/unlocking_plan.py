@@ -34,8 +34,6 @@ class UnlockingStep:
 
     Attributes
     ----------
-    coordinate
-        The coordinate.
     start, target
         Its positions before and after the move [m] or [rad].
     threshold
@@ -200,8 +198,6 @@ def plan_unlocking(
 
     Raises
     ------
-    UnknownNameError
-        For names that are no degrees of freedom.
     InvalidValueError
         For a goal beyond its limits, no goal, a number that is not finite, a budget that is not positive, or
         a parameter in the state with another value than its own.
@@ -268,7 +264,6 @@ def _find_conflict(
 
 
 def _make_invariant(graph: CellGraph, result: MoveSearchResult) -> InvariantSet:
-    """Return the states that a search has exhausted."""
     count = range(len(graph.coordinates))
 
     def region(states: int) -> Region:

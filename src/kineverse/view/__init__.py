@@ -20,11 +20,4 @@ if TYPE_CHECKING:
     from .page import show as show, view as view
     from .pictures import picture as picture, save_picture as save_picture
 
-lazy_face(
-    __name__,
-    {
-        ".camera": "Camera",
-        ".page": "show view",
-        ".pictures": "picture save_picture",
-    },
-)
+lazy_face(__name__)

@@ -14,11 +14,8 @@ from kineverse.state import State
 
 from .sliders import choose_slider_range
 
-PERIOD = 8.0
-"""Time from one limit to the other and back [s]."""
-
-FADE_IN = 1.5
-"""Time in which the motion grows from the initial posture [s]."""
+PERIOD = 8.0  # time from one limit to the other and back [s]
+FADE_IN = 1.5  # time in which the motion grows from the initial posture [s]
 
 
 class RangeAnimation:
@@ -68,11 +65,8 @@ def select_animated(
     return found
 
 
-UNLIMITED_SPEED = 2.0
-"""The largest speed on offer if the model sets no limit [m/s], [rad/s]."""
-
-LONGEST_STEP = 0.2
-"""The longest time step that is integrated [s]; after a pause nothing jumps."""
+UNLIMITED_SPEED = 2.0  # the largest speed on offer if the model sets no limit [m/s], [rad/s]
+LONGEST_STEP = 0.2  # the longest time step that is integrated [s]; after a pause nothing jumps
 
 
 class VelocityDrive:
@@ -115,14 +109,9 @@ class VelocityDrive:
         return changed
 
 
-_STEPS = 1000
-"""Steps of the slider of the time."""
-
-_DIGITS = 3
-"""Decimals of the time on the page."""
-
-_SHORTEST = 1e-3
-"""Shortest range of the slider [s], for a trajectory of no duration."""
+_STEPS = 1000  # steps of the slider of the time
+_DIGITS = 3  # decimals of the time on the page
+_SHORTEST = 1e-3  # shortest range of the slider [s], for a trajectory of no duration
 
 
 class PlaybackLayer(Protocol):

@@ -19,16 +19,12 @@ from .triangle_mesh import Floats
 
 ELEVATION = 0.42
 
-FRONT = 0.62
-"""The direction preferred among equally good ones: in front of the model and a little to its left [rad]."""
+FRONT = 0.62  # preferred direction: in front of the model and a little to its left [rad]
 
 TRIALS = 12
 
-TRIAL_HEIGHT = 80
-"""Height of the trial pictures [pixels]: enough to show a handle, small enough to draw a dozen."""
-
-MOVING_WEIGHT = 4.0
-"""Weight of a part that moves, relative to one that does not."""
+TRIAL_HEIGHT = 80  # height of trial pictures [pixels]: enough to show a handle, small enough for a dozen
+MOVING_WEIGHT = 4.0  # weight of a part that moves, relative to one that does not
 
 
 def weigh_drawables(model: ModelView, items: Sequence[Drawable]) -> Floats:
@@ -84,8 +80,7 @@ def find_extreme_points(points: Floats) -> Floats:
 
 logger = logging.getLogger(__name__)
 
-CAMERA_TOLERANCE = 1e-3
-"""Tolerance for equal camera poses, as a fraction of the distance to the target."""
+CAMERA_TOLERANCE = 1e-3  # tolerance for equal camera poses, as a fraction of the distance to the target
 
 
 class ClientCameras:

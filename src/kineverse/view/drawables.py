@@ -66,16 +66,12 @@ def _mesh_hull(solid: Solid) -> TriangleMesh:
 Kind = Literal["visual", "collision"]
 Rgba = tuple[float, float, float, float]
 
-MISSING: Rgba = (0.91, 0.12, 0.55, 1.0)
-"""Colour of placeholders: one that no kitchen has."""
+MISSING: Rgba = (0.91, 0.12, 0.55, 1.0)  # colour of placeholders: one that no kitchen has
 
 COLLISION: Rgba = (0.95, 0.55, 0.15, 0.35)
 
-STAND_IN: Rgba = (0.25, 0.62, 0.66, 0.35)
-"""Colour of the collision shapes of a body that has none of its own."""
-
-HULL_SHADES = (1.0, 0.7, 0.85, 0.55)
-"""Brightness of the hulls of one mesh, in turns."""
+STAND_IN: Rgba = (0.25, 0.62, 0.66, 0.35)  # colour of the collision shapes of a body that has none of its own
+HULL_SHADES = (1.0, 0.7, 0.85, 0.55)  # brightness of the hulls of one mesh, in turns
 
 UNPAINTED: tuple[Rgba, ...] = (
     (0.72, 0.74, 0.77, 1.0),
@@ -183,8 +179,7 @@ def create_axes(model: ModelView, corners: Floats, poses: Mapping[str, Floats]) 
     return [Drawable(name, surface, color, "visual") for name in poses for surface, color in bars]
 
 
-SPHERES: Rgba = (0.16, 0.47, 0.86, 0.3)
-"""Colour of the spheres of a cover."""
+SPHERES: Rgba = (0.16, 0.47, 0.86, 0.3)  # colour of the spheres of a cover
 
 
 def draw_cover(frame: str, cover: SphereCover) -> Drawable:
@@ -205,8 +200,7 @@ def build_spheres(centres: Floats, radii: Floats) -> TriangleMesh:
     )
 
 
-TRACE: Rgba = (0.93, 0.42, 0.13, 1.0)
-"""Colour of the way of a frame."""
+TRACE: Rgba = (0.93, 0.42, 0.13, 1.0)  # colour of the way of a frame
 
 _RADIUS, _OPACITY = 0.006, 0.3
 _WORLD = "world"

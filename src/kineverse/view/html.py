@@ -51,8 +51,7 @@ class HtmlBox:
 
 BREAK = Html("<br>")
 
-FONT = "font-size:0.8em;line-height:1.35;overflow-wrap:anywhere;"
-"""The font of the panel."""
+FONT = "font-size:0.8em;line-height:1.35;overflow-wrap:anywhere;"  # the font of the panel
 
 
 def colored_box(color: str, background: str, *content: str) -> Html:
@@ -63,8 +62,7 @@ def colored_box(color: str, background: str, *content: str) -> Html:
     )
 
 
-MOST_LINES = 12
-"""Lines of the panel; further constraints are counted, not listed."""
+MOST_LINES = 12  # lines of the panel; further constraints are counted, not listed
 
 _RED, _LIGHT_RED = "#c92a2a", "#fff5f5"
 

@@ -14,16 +14,13 @@ from .triangle_mesh import Floats, Integers, Singles, dot_rows
 
 SHADOW_PIXELS = 1024
 
-LAMP_SHADOW = True
-"""The lamp of the page casts a shadow, which takes half of the time where software draws it."""
+LAMP_SHADOW = True  # the lamp of the page casts a shadow: half of the time if software draws it
 
 KEY_LIGHT = np.array([1.0, 0.965, 0.91]) * 1.6
 SKY_LIGHT = np.array([0.86, 0.92, 1.0]) * 0.80
 GROUND_LIGHT = np.array([0.84, 0.80, 0.75]) * 0.50
 
-WHITE_LEVEL = 1.75
-"""The radiance that is displayed as pure white."""
-
+WHITE_LEVEL = 1.75  # the radiance that is displayed as pure white
 
 PICTURE_BACKGROUND = (np.array([0.93, 0.945, 0.96]), np.array([0.70, 0.745, 0.80]))
 """Display colours of the background of pictures, at the lower and the upper edge, in [0, 1]."""
@@ -77,8 +74,7 @@ class DirectionalLight:
         return np.asarray(lit / np.float32(3.0))
 
 
-_SHADOW_SAMPLES = 61
-"""Number of sampling patterns: prime, so that no line of pixels repeats them in step."""
+_SHADOW_SAMPLES = 61  # number of sampling patterns: prime, so that no line of pixels repeats them in step
 
 
 @lru_cache(maxsize=1)
@@ -120,16 +116,10 @@ def to_display(light: Singles) -> Singles:
 
 _GAMMA = ((np.arange(4096) / 4095.0) ** (1 / 2.2)).astype(np.float32)
 
+OUTLINE, CREASE = 0.42, 0.25  # darkening of the border of a part, and of a sharp edge inside of it
+CREASE_COSINE = 0.75  # cosine of the smallest angle at which an edge is drawn
 
-OUTLINE, CREASE = 0.42, 0.25
-"""Darkening of the border of a part, and of a sharp edge inside of it."""
-
-CREASE_COSINE = 0.75
-"""Cosine of the smallest angle at which an edge is drawn."""
-
-
-DEPTH_STEP = 0.02
-"""Smallest step of depth that is outlined, as a fraction of the distance."""
+DEPTH_STEP = 0.02  # smallest step of depth that is outlined, as a fraction of the distance
 
 
 def compute_outlines(

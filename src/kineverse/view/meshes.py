@@ -24,8 +24,7 @@ from .triangle_mesh import (
 
 logger = logging.getLogger(__name__)
 
-_PLACES = 3
-"""Number of places named in which a file was looked for."""
+_PLACES = 3  # number of places named in which a file was looked for
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,8 +70,6 @@ def show(
     ------
     MissingDependencyError
         If viser is not installed.
-    UnknownNameError
-        If the state has a name that the model does not have.
     InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
     """
@@ -143,14 +141,9 @@ def open_page(address: str) -> None:
 
 UNNAMED = "Kineverse"
 
-MOST = 3
-"""Most names in a title of several models."""
-
-LONGEST = 60
-"""Most characters of one of them."""
-
-SUFFIXES = (".urdf", ".xml", ".mjcf", ".sdf", ".world")
-"""Suffixes of files that declare the name of a model."""
+MOST = 3  # most names in a title of several models
+LONGEST = 60  # most characters of one of them
+SUFFIXES = (".urdf", ".xml", ".mjcf", ".sdf", ".world")  # suffixes of files that declare the name of a model
 
 NAMED_BY = {"robot": "name", "mujoco": "model", "model": "name", "world": "name"}
 """The attributes of elements of URDF, MJCF and SDF that declare the name of a model."""

@@ -13,14 +13,9 @@ from .proximity_panel import ProximityPanel
 from .scene import ViewerScene
 from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step
 
-BEYOND = 0.2
-"""Fraction of their range by which sliders are widened on demand, to violate limits."""
-
-MOST_UNFOLDED = 100
-"""With at most so many degrees of freedom all groups are unfolded at first."""
-
-_NEGLIGIBLE = 1e-9
-"""Limits below this are 0 in labels: rounding of a file's units."""
+BEYOND = 0.2  # fraction of their range by which sliders are widened on demand, to violate limits
+MOST_UNFOLDED = 100  # with at most so many degrees of freedom all groups are unfolded at first
+_NEGLIGIBLE = 1e-9  # limits below this are 0 in labels: rounding of a file's units
 
 DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
 """The unit of angles in degrees, by unit, and the factor from radians."""
@@ -222,7 +217,6 @@ class Panel:
         return self._factor(name), self._unit(name)
 
     def _factor(self, name: str) -> float:
-        """Return the factor from the units of the model to the units shown."""
         unit = self._units.get(name, "")
         return DEGREES[unit][1] if self.degrees and unit in DEGREES else 1.0
 
@@ -230,7 +224,6 @@ class Panel:
         return float(value) * self._factor(name)
 
     def _value(self, name: str) -> float:
-        """Return the value of a slider in the units of the model."""
         return float(self._sliders[name].value) / self._factor(name)
 
     def _set(
@@ -264,7 +257,6 @@ class Panel:
         return choose_slider_range(self._limits[name], value, self._units.get(name, ""), beyond)
 
     def _fit(self, name: str, value: float) -> None:
-        """Set the range of a slider for a value."""
         _set_range(self._sliders[name], *(self._to_shown(name, end) for end in self._range(name, value)))
         self._relabel(name)
 
@@ -276,7 +268,6 @@ class Panel:
                     slider.disabled = False
 
     def _convert(self, degrees: bool) -> None:
-        """Show angles in degrees or radians."""
         with self._changing:
             self._in_degrees = degrees
             for name, slider in self._sliders.items():
@@ -315,7 +306,6 @@ class Panel:
 
 
 def _count_digits(low: float, high: float) -> int:
-    """Return the number of decimals of the steps of a range."""
     return max(0, len(f"{choose_slider_step((low, high)):.9f}".rstrip("0").partition(".")[2]))
 
 

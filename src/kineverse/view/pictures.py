@@ -73,14 +73,9 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-SAMPLES = 2
-"""Number of computed pixels along each edge of a final one."""
-
-ARROW = 0.07
-"""Length of arrows at contacts, as a fraction of the height of the picture."""
-
-LARGEST = 64_000_000
-"""Most pixels of one picture, computed ones included."""
+SAMPLES = 2  # number of computed pixels along each edge of a final one
+ARROW = 0.07  # length of arrows at contacts, as a fraction of the height of the picture
+LARGEST = 64_000_000  # most pixels of one picture, computed ones included
 
 
 def picture(
@@ -99,8 +94,6 @@ def picture(
 
     Parameters
     ----------
-    model
-        The model to draw.
     state
         Values by symbol or name [m], [rad]; the default state for the others.
     size
@@ -126,8 +119,6 @@ def picture(
     ------
     MissingDependencyError
         If lines are wanted and the extra ``geometry`` is not installed.
-    UnknownNameError
-        If the state names a symbol that the model does not have.
     InvalidValueError
         If the size is not that of a picture.
     """

@@ -26,16 +26,11 @@ if TYPE_CHECKING:
 
     from kineverse.estimation.identification.result import Fit
 
-
-SIZE = (13.0, 5.2)
-"""Size of the picture of one joint [inch]."""
+SIZE = (13.0, 5.2)  # size of the picture of one joint [inch]
 
 SEEN, MODEL, AXIS = "0.35", "tab:blue", "tab:red"
-AXIAL_FAMILIES = ("revolute", "screw", "cylindrical")
-"""Families with an axis of rotation, which has a position."""
-
-SIGMAS = 2.0
-"""Half width of drawn uncertainties, in standard deviations."""
+AXIAL_FAMILIES = ("revolute", "screw", "cylindrical")  # families whose axis has a position
+SIGMAS = 2.0  # half width of drawn uncertainties, in standard deviations
 
 
 @dataclass(frozen=True)
@@ -226,7 +221,6 @@ def _list_parts(projection: FitProjection) -> list[tuple[str, Array]]:
 
 
 def _circle_outliers(axes: Axes, points: Array) -> None:
-    """Draw a ring around each outlier."""
     axes.scatter(points[:, 0], points[:, 1], s=60, facecolors="none", edgecolors=AXIS, zorder=4)
 
 

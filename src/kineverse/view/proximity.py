@@ -24,11 +24,8 @@ from .drawables import Drawable
 from .meshes import mesh_geometry
 from .triangle_mesh import Floats, TriangleMesh, mesh_placeholder
 
-RADIUS = 0.1
-"""Default distance within which pairs are shown [m]."""
-
-MOST_PAIRS = 40
-"""Most pairs that are shown; further ones are counted, not drawn."""
+RADIUS = 0.1  # default distance within which pairs are shown [m]
+MOST_PAIRS = 40  # most pairs that are shown; further ones are counted, not drawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,11 +200,8 @@ def _pose_along(ends: Floats) -> Floats:
 
 logger = logging.getLogger(__name__)
 
-QUERY_PERIOD = 1.0 / 20.0
-"""Least time between two queries [s]."""
-
-PAUSE_FACTOR = 3.0
-"""Pause after a query as a multiple of its duration: Python threads slow each other down."""
+QUERY_PERIOD = 1.0 / 20.0  # least time between two queries [s]
+PAUSE_FACTOR = 3.0  # pause after a query as a multiple of its duration: Python threads slow each other down
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,14 +34,9 @@ from .proximity import (
 )
 from .scene import ViewerScene
 
-LINES = 12
-"""Lines of the list; further pairs are counted, not listed."""
-
-EXCLUDED_LINES = 5
-"""Excluded bodies and shapes that are named with the reason; further ones are counted."""
-
-TOUCHING = 5e-6
-"""Contacts less deep than this are said to touch, instead of being 0.00 mm deep [m]."""
+LINES = 12  # lines of the list; further pairs are counted, not listed
+EXCLUDED_LINES = 5  # excluded bodies and shapes that are named with the reason; further ones are counted
+TOUCHING = 5e-6  # contacts less deep than this are said to touch, instead of being 0.00 mm deep [m]
 
 _GREY = "#868e96"
 
@@ -110,14 +105,9 @@ def _excluded_lines(problems: Mapping[str, str]) -> list[Html]:
     return [_heading("No distances to"), *lines, *_more(len(problems) - EXCLUDED_LINES)]
 
 
-LARGEST_RADIUS = 0.5
-"""The largest radius on offer [m]."""
-
-LONGEST_ARROW = 0.2
-"""Largest length of an arrow on the page [m]: contacts are as large as hands, also in a large kitchen."""
-
-LABELS = 8
-"""Depths that are written beside their arrows; more would cover the scene."""
+LARGEST_RADIUS = 0.5  # the largest radius on offer [m]
+LONGEST_ARROW = 0.2  # largest length of an arrow on the page [m], also in a large kitchen
+LABELS = 8  # depths that are written beside their arrows; more would cover the scene
 
 WAITING = wrap_report(element("b", "Reading shapes …"))
 
@@ -273,7 +263,6 @@ class ProximityPanel:
         return min(self._scene.length, LONGEST_ARROW)
 
     def _draw(self, marks: ProximityMarkers) -> dict[str, Any]:
-        """Add markers to the page, and return their nodes by name."""
         scene, length = self._server.scene, self._length
         colors = np.repeat(np.round(255 * marks.colors).astype(np.uint8)[:, None], 2, axis=1)
         nodes = [

@@ -18,8 +18,7 @@ from .camera import Camera
 from .drawables import Drawable
 from .triangle_mesh import Floats, Integers
 
-FRAGMENTS = 1_500_000
-"""Pixels handled at once: a compromise between numpy's overhead and the size of the caches."""
+FRAGMENTS = 1_500_000  # pixels handled at once: between numpy's overhead and the size of the caches
 
 
 @dataclass(frozen=True, slots=True)

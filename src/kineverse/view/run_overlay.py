@@ -27,8 +27,7 @@ from .proximity import build_arrow
 from .triangle_mesh import Floats
 from .viewer import PERIOD, Viewer
 
-GHOST: Rgba = (0.16, 0.47, 0.86, 0.35)
-"""Colour of the belief."""
+GHOST: Rgba = (0.16, 0.47, 0.86, 0.35)  # colour of the belief
 
 ARROWS: tuple[Rgba, ...] = (
     (0.86, 0.16, 0.16, 1.0),
@@ -40,11 +39,8 @@ ARROWS: tuple[Rgba, ...] = (
 )
 """Colours of arrows, in the order in which their names come."""
 
-ARROW_SCALE, LONGEST_ARROW = 0.25, 0.6
-"""Length of the arrow of a vector of 1, and the largest length of an arrow [m]."""
-
-WAY_RADIUS = 0.008
-"""Half of the width of the way of a hand [m]."""
+ARROW_SCALE, LONGEST_ARROW = 0.25, 0.6  # length of the arrow of a vector of 1, and the largest length [m]
+WAY_RADIUS = 0.008  # half of the width of the way of a hand [m]
 
 _APART, _TURNED = 3e-3, 5e-3
 """Least difference of a belief that is shown [m], [rad]; below, the ghost would flicker on the body."""
@@ -280,7 +276,6 @@ class RunLayer:
                 node.visible = frame in poses
 
     def _add_ghost(self, frame: str) -> Any:
-        """Add the shapes of a body to the page, and return the node that moves them."""
         scene = self._server.scene
         node = self._ghosts[frame] = scene.add_frame(f"{_ROOT}/ghost{len(self._ghosts)}", show_axes=False)
         color = tuple(round(255 * c) for c in GHOST[:3])
@@ -340,8 +335,7 @@ class RunLayer:
 
 
 _MOST_ACTIVE = 4
-_AHEAD = 0.02
-"""Time by which commands are followed to find the velocity of the hand [s]."""
+_AHEAD = 0.02  # time by which commands are followed to find the velocity of the hand [s]
 
 
 class LiveRun:

@@ -22,8 +22,7 @@ from .triangle_mesh import Floats, Integers, TriangleMesh
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
 
-FADED_OPACITY = 0.45
-"""Opacity of bodies while frames or nearest points inside of them are shown."""
+FADED_OPACITY = 0.45  # opacity of bodies while frames or nearest points inside of them are shown
 
 
 class ViewerScene:

@@ -25,12 +25,10 @@ from .rasterizer import Projection, TriangleSoup, rasterize
 from .run_overlay import RunDrawing, RunMoment
 from .triangle_mesh import Floats
 
-SIZE = (400, 300)
-"""Size of a still [pixels]."""
+SIZE = (400, 300)  # size of a still [pixels]
 _AZIMUTHS, _ELEVATION = 8, 0.45
 _FIELD_OF_VIEW = 0.6
-_MOVED, _ROBOT = 2.0, 1.0
-"""Weights of the object and of the robot in the choice of a camera."""
+_MOVED, _ROBOT = 2.0, 1.0  # weights of the object and of the robot in the choice of a camera
 
 
 class _Still(NamedTuple):

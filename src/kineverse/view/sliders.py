@@ -21,12 +21,9 @@ from kineverse.state import State
 from .poses import roll_pitch_yaw
 from .triangle_mesh import Floats
 
-UNLIMITED_RANGE = {"rad": np.pi, "m": 2.0, "": 2.0}
-"""Half of the range of a slider without limits [rad], [m]."""
+UNLIMITED_RANGE = {"rad": np.pi, "m": 2.0, "": 2.0}  # half of the range of a slider without limits [rad], [m]
 
-
-STANDSTILL_SPEED = 1e-6
-"""Largest speed that counts as standstill [rad/s], [m/s]; locks are as sharp as their logic."""
+STANDSTILL_SPEED = 1e-6  # largest speed at standstill [rad/s], [m/s]; locks are as sharp as their logic
 
 
 class Ranges:
@@ -114,8 +111,7 @@ def choose_slider_step(limits: tuple[float, float]) -> float:
     return float(10.0 ** np.floor(np.log10(max(limits[1] - limits[0], 1e-6) / 999.0)))
 
 
-DIFFERENCE_STEP = 1e-4
-"""Step of the finite differences; their error is its square [unit of the coordinate]."""
+DIFFERENCE_STEP = 1e-4  # step of the finite differences; their error is its square [unit of the coordinate]
 
 UNIT_TOLERANCE = 1e-5
 

@@ -31,14 +31,9 @@ from .triangle_mesh import Floats
 
 logger = logging.getLogger(__name__)
 
-PERIOD = 1.0 / 30.0
-"""Least time between two updates of the page [s]; requests in between are drawn together."""
-
-EMBEDDED_HEIGHT = 600
-"""Height of the page in a notebook [pixels]."""
-
-PANEL_WIDTH = 380
-"""Width of the controls: room for the names of joints [pixels]."""
+PERIOD = 1.0 / 30.0  # least time between two updates of the page [s]; requests in between are drawn together
+EMBEDDED_HEIGHT = 600  # height of the page in a notebook [pixels]
+PANEL_WIDTH = 380  # width of the controls: room for the names of joints [pixels]
 
 
 class Viewer:
@@ -191,7 +186,8 @@ class Viewer:
             return
         with self._change:
             start = {**self._values, **self._quaternions.angles}
-            ranges = self._animated_ranges()
+            limits, angles = self._ranges.limits_at(self._values), self._quaternions.angles
+            ranges = select_animated(self._shown, limits, angles, self._values, self._units)
             self._stop_animation()
             self._animation = RangeAnimation(start, ranges, time.monotonic()) if motion else None
             self._request_update()
@@ -263,7 +259,6 @@ class Viewer:
         return f"<page of {self.model!r}, {'taken down' if self._stopping else self.address}>"
 
     def _repr_html_(self) -> str:
-        """Return the page as a part of a notebook."""
         if self._stopping:
             return str(element("i", "This page has been taken down."))
         return str(
@@ -298,10 +293,6 @@ class Viewer:
             on_convert=self._request_redraw,
             degrees=degrees,
         )
-
-    def _animated_ranges(self) -> dict[str, tuple[float, float]]:
-        limits, angles = self._ranges.limits_at(self._values), self._quaternions.angles
-        return select_animated(self._shown, limits, angles, self._values, self._units)
 
     def _set_from_slider(self, name: str, value: float) -> None:
         """Take the value of a slider that a user moved; sliders of locked coordinates are moved back."""
@@ -373,7 +364,6 @@ class Viewer:
         self._drawn = now
 
     def _rebuild(self) -> dict[str, float]:
-        """Rebuild the page for an edited model, and return the values of its symbols."""
         model = _freeze(self.model)
         with self._change:
             # The present values, because a slider may have moved since the update was requested.
@@ -440,5 +430,4 @@ def _describe(thing: object) -> str:
 
 
 def _freeze(model: ModelView) -> ModelView:
-    """Return an immutable snapshot of a model."""
     return model.snapshot() if isinstance(model, Model) else model

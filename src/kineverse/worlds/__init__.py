@@ -15,17 +15,4 @@ if TYPE_CHECKING:
     from .sensors import Sensors as Sensors
     from .world import Contact as Contact, Observation as Observation, World as World
 
-lazy_face(
-    __name__,
-    {
-        ".kinematic_world": "Event KinematicWorld",
-        ".mechanism_world": "MechanismWorld",
-        ".mujoco_world": "MujocoWorld",
-        ".recorder": "Recorder",
-        ".recording": "RunRecording read_run_recording",
-        ".run_metrics": "Judge",
-        ".sensor_sampler": "SensorSampler",
-        ".sensors": "Sensors",
-        ".world": "Contact Observation World",
-    },
-)
+lazy_face(__name__)

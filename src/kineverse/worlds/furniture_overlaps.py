@@ -142,7 +142,6 @@ class FurnitureOverlaps:
         return np.where(self.counting[tuple(found.body_indices.T)], allowed, math.inf)
 
     def _allow(self) -> None:
-        """Set the allowances from the depths at the start."""
         depths = dict.fromkeys(self._by_default, math.inf)
         made_so = np.zeros_like(self.counting)
         for code, depth in self._depths.items():
@@ -211,7 +210,6 @@ class FurnitureOverlaps:
         return np.asarray(pairs[:, 0] * len(self.scene.collision_world.objects) + pairs[:, 1])
 
     def _decode(self, code: int) -> tuple[int, int]:
-        """Return the indices of both shapes of a pair."""
         return divmod(code, len(self.scene.collision_world.objects))
 
     def _owners(self, code: int) -> tuple[int, int]:

@@ -31,11 +31,8 @@ from .quasistatic import SKIN, ObjectMotion
 from .quasistatic_constraints import Gaps
 
 TOUCH = 1e-4  # gap below which bodies touch [m]
-
 ROTATION_ARM = 0.1  # length that makes rotations comparable to distances [m]
-
 _OPPOSED = 0.5  # least cosine of the angle between the normal of a contact that holds and the closing motion
-
 _ASLANT = 0.2  # least part of a finger's motion along the normal of a contact that stops it
 
 _ROUNDS = 6
@@ -184,7 +181,6 @@ class KinematicGrip:
         return np.minimum(back, np.abs(step)) * np.sign(step)
 
     def _try_to_hold(self) -> None:
-        """Begin the hold of an object that is between the fingers."""
         motion = self._motion
         pairs, index = motion.find_near(max(self._near, TOUCH))
         touched: list[dict[int, tuple[float, int]]] = [{}, {}]

@@ -226,11 +226,6 @@ class KinematicWorld:
         """Start again from a state, at time 0, with nothing in the gripper and all speeds zero.
 
         Coordinates without a value have their default one.
-
-        Raises
-        ------
-        UnknownNameError
-            For a symbol that the model does not have.
         """
         self._check_version()
         values = self.model.default_state().updated(_select(state, self.model))
@@ -260,7 +255,6 @@ class KinematicWorld:
         self._time = end
 
     def _move(self, speeds: Array, time: float) -> None:
-        """Move robot and objects with constant speeds of the robot."""
         motion, grip = self._motion, self._grip
         arm, start, reach = speeds.copy(), motion.q.copy(), 0.0
         arm[self._finger] = 0.0

@@ -34,11 +34,6 @@ class MechanismWorld:
         Model of the mechanism, whose constraints hold here.
     jammed
         Coordinates that do not move, by symbol or name.
-
-    Raises
-    ------
-    UnknownNameError
-        For a name that is no degree of freedom.
     """
 
     name = "mechanism"
@@ -78,13 +73,7 @@ class MechanismWorld:
         return State(values, stamp=self._time, source=self.name)
 
     def reset(self, state: StateLike) -> None:
-        """Start again from a state, at time 0; coordinates without a value have their default one.
-
-        Raises
-        ------
-        UnknownNameError
-            For a symbol that the model does not have.
-        """
+        """Start again from a state, at time 0; coordinates without a value have their default one."""
         values = self.model.default_state().updated(as_state(state, self._symbols))
         self._q, self._time = values.vector(self._symbols), 0.0
 

@@ -192,8 +192,6 @@ def _is_below(compiled: Any, body: int, root: int) -> bool:
 
 
 def _deepest(compiled: Any, names: Sequence[str]) -> int:
-    """Return the body of a finger that is farthest from the root."""
-
     def depth(body: int) -> int:
         return 0 if body == 0 else 1 + depth(int(compiled.body_parentid[body]))
 

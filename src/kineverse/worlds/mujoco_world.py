@@ -107,12 +107,8 @@ class MujocoWorld:
 
     Parameters
     ----------
-    model
-        Model of the robot and of everything that moves.
-    robot
-        Prefix of the robot: coordinates and bodies below it are the robot's.
-    gripper
-        Gripper that holds things; None for the likeliest one of the robot, if it has any.
+    model, robot, gripper, timeout, delay, sensors
+        As for :class:`.KinematicWorld`.
     step
         Time step [s].
     grip
@@ -121,12 +117,6 @@ class MujocoWorld:
         Coefficient of sliding friction of all bodies.
     grasp
         ``"friction"``: contacts alone hold. ``"tie"``: a body that both fingers touch is welded to the hand.
-    timeout
-        Age [s] of a command with a stamp beyond which the robot stops.
-    delay
-        Time [s] from a command to its effect.
-    sensors
-        Settings of the sensors whose readings :meth:`observe` returns; None for exact ones.
     leave_out
         Names of constraints that are left out without another remark, as of :meth:`kineverse.Model.save`.
     door_friction
@@ -350,7 +340,6 @@ class MujocoWorld:
         return f"{' and '.join(bad)} are no numbers, or beyond 1e10" if bad else ""
 
     def _break_off(self, qpos: Array, problem: str) -> None:
-        """Go back to positions, and raise SimulationError."""
         engine, data, now = mujoco(), self._data, self.time
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, 0.0, 0.0
         engine.mj_forward(self._compiled, data)

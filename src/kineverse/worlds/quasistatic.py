@@ -53,7 +53,6 @@ from .quasistatic_constraints import (
 )
 
 SKIN = 1e-6  # gap to which objects are pushed [m]: below, normals of nearest points are not determined
-
 _REACH = 0.005  # distance beyond the robot's motion up to which gaps are rows [m]
 _ROUNDS = 10
 _STEADY = 2e-7  # change of displacements below which a solution is final [m]
@@ -64,7 +63,6 @@ _LIGHTEST = 1e-4
 _DEEP = 1e-4  # penetration of what does not yield, from which on its side is remembered [m]
 _RELEASE = 0.1  # largest speed out of a penetration that was there before a motion [m/s]
 _FIRM = 100.0  # weight of gaps between furniture relative to the robot: so it is the robot that penetrates
-
 Residual: TypeAlias = Callable[[], tuple[Array, Array]]  # error of a hold (6,), Jacobian (6, n)
 
 

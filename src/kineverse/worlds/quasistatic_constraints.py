@@ -27,7 +27,6 @@ from kineverse.symbols import Symbol
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 JAM = 0.5  # cosine of the angle between a normal and the motion that it causes, below which a contact jams
-
 _PARALLEL = 1e-3  # least eigenvalue of directions of motion that are not parallel
 
 
@@ -204,7 +203,6 @@ def _link_columns(count: int, patterns: Sequence[npt.NDArray[np.bool_]]) -> npt.
 
 
 RESTING = OVERLAP / 2  # depth beyond the allowance at which furniture stops [m]: resting shapes slide freely
-
 _REACH = 0.001  # largest gap of pairs that have met [m]
 
 Flags = npt.NDArray[np.bool_]

@@ -115,8 +115,6 @@ class Recorder:
     ----------
     path
         Path that ends in ``.mcap``; an existing file is replaced.
-    model
-        Model of the world.
     about
         Texts to keep, such as the robot, the world and the sensors.
 

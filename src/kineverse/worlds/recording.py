@@ -36,7 +36,6 @@ from .recorder import TOPICS, import_mcap
 from .world import Contact, Observation
 
 MAX_CHUNK = 1 << 28  # largest chunk [byte], uncompressed
-
 MAX_TOTAL = 1 << 30  # largest content of a file [byte], uncompressed
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -237,8 +236,6 @@ class RunRecording:
     ----------
     path
         File that it was read from.
-    model
-        Model of the world.
     states, beliefs, commands
         True state, believed state, and commanded speeds over time.
     belief_poses

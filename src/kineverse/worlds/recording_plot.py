@@ -78,7 +78,6 @@ def _draw_values(
 
 
 def _draw_contacts(axes: Axes, recording: RunRecording) -> None:
-    """Draw a line for each pair of bodies, where they touch."""
     pairs: dict[str, list[float]] = {}
     for time, contacts in zip(recording.contacts.times, recording.contacts.entries, strict=True):
         for label in {f"{one.a} – {one.b}" for one in contacts}:

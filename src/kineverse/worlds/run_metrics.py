@@ -125,8 +125,6 @@ class Judge:
 
     Parameters
     ----------
-    model
-        Model of the world.
     robot
         Prefix of the robot.
     gripper
@@ -331,7 +329,6 @@ class Judge:
     # -- preparation ---------------------------------------------------------------------------------------
 
     def _indices(self, symbols: Iterable[Symbol]) -> npt.NDArray[np.intp]:
-        """Return the places of symbols among those of the model."""
         place = {s: k for k, s in enumerate(self._symbols)}
         return np.array([place[s] for s in symbols], dtype=np.intp)
 

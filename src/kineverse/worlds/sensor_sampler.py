@@ -30,7 +30,6 @@ from .sensors import Sensors
 from .world import Contact, Observation
 
 _INSET = 0.9  # points lie at this fraction of the distance from the middle of a shape to its corners
-
 _MOST_SHAPES = 8  # largest number of shapes of a body whose points are tried
 
 
@@ -112,10 +111,6 @@ class SensorSampler:
 
     Parameters
     ----------
-    sensors
-        Settings.
-    model
-        Model of the world.
     robot
         Prefix of the robot; empty for a model of a robot alone.
     seed
@@ -131,8 +126,6 @@ class SensorSampler:
 
     Raises
     ------
-    UnknownNameError
-        For a prefix, camera or marked frame that the model does not have.
     InvalidValueError
         If a field of view or a line of sight is asked for, but the robot has no camera.
     """
@@ -248,7 +241,6 @@ class SensorSampler:
         return self._read_base
 
     def _take_picture(self, state: State, joints: dict[Symbol, float]) -> dict[str, Array]:
-        """Return the poses of the markers that are seen."""
         sensors, count = self.sensors, len(self.marked)
         # As many numbers for each picture, whatever is visible: runs with other visibility can be compared.
         normal = self._camera_noise.standard_normal((count, 10))

@@ -221,12 +221,10 @@ def _parse_entry(entry: str) -> list[tuple[str, Any]]:
     return [(name, number)]
 
 
-_ALSO = {"encoders": {"angle", "length"}}
-"""Further dimensions of entries: encoders read lengths and angles alike."""
+_ALSO = {"encoders": {"angle", "length"}}  # encoders read lengths and angles alike
 
 
 def _parse_quantity(text: str, entry: str) -> tuple[str, float]:
-    """Return the dimension and the value of a number with a unit."""
     match = _ENTRY.fullmatch(text)
     if match is None or match["unit"] not in _UNITS:
         raise _unreadable(entry)

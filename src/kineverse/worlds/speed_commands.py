@@ -18,7 +18,6 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 ROUNDING = 1e-9  # difference of times that counts as none [s]
-
 SpeedColumns = Mapping[Symbol | str, int | None]  # by symbol and name; None for a speed that is not read
 
 

@@ -118,8 +118,6 @@ class World(Protocol):
         ------
         InvalidValueError
             For speeds that are not finite, and a duration that is not positive.
-        UnknownNameError
-            For speeds that the model does not have.
         """
 
     def contacts(self) -> Sequence[Contact]:

@@ -16,13 +16,4 @@ if TYPE_CHECKING:
     from .machine_elements import Faucet as Faucet, Ratchet as Ratchet, ScrewAndNut as ScrewAndNut
     from .mechanism import Mechanism as Mechanism, MechanismPart as MechanismPart
 
-lazy_face(
-    __name__,
-    {
-        ".doors": "FoldingDoor GarageDoor",
-        ".latched_doors": "DoorWithHandle Latch Microwave",
-        ".linkages": "DeskLamp PedalBin PistonAndRod ScissorLift",
-        ".machine_elements": "Faucet Ratchet ScrewAndNut",
-        ".mechanism": "Mechanism MechanismPart",
-    },
-)
+lazy_face(__name__)

@@ -94,8 +94,6 @@ class Mechanism(PlacedOperation):
     ------
     InvalidValueError
         For limits that contradict each other, and dimensions that are impossible.
-    DuplicateNameError
-        For an articulation or a frame that exists.
     """
 
     main: ClassVar[str]

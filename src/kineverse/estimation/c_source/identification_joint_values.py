@@ -172,7 +172,6 @@ static double *take_apart(const Problem *p, const Answer *a, Apart *apart, doubl
 }
 """
 
-
 SLIDING_POINT = r"""
 /* The poses of a solution and their derivatives, at its joint values. */
 static void place_all(const Problem *p, Answer *a) {
@@ -229,7 +228,6 @@ static void slide(const Problem *p, Answer *a, double *memory) {
   }
 }
 """
-
 
 MIRRORED_VALUES = r"""
 #define ERRORS 9 /* of the way between both parts and of both orientations */

@@ -257,7 +257,6 @@ EXPORT void at(const Problem *p, int64_t count, const Motion *m, const double *v
 }
 """
 
-
 LOG_DETERMINANT_GRADIENT = r"""
 /* How the axes of turns about more than one axis change with joint value l, weighed by v for each of them:
    the columns of L J(a), with J(a) e = e + b a x e + d a x (a x e). */

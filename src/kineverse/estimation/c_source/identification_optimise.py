@@ -180,7 +180,6 @@ static int move(const Problem *p, const Motion *m, Observation *all, double damp
 }
 """
 
-
 ITERATION = r"""
 /* What a solution is, for Python: numbers first, and arrays behind them in the same memory. */
 typedef struct {

@@ -147,7 +147,6 @@ static void judge(const Problem *p, Answer *a, const Apart *apart, double *memor
 }
 """
 
-
 STAGES = r"""
 /* How many numbers of memory a stage needs: covariances with their inverses, two answers with what their
    observations say apart, and observations three times, which is more than any sum needs. */
@@ -286,7 +285,6 @@ EXPORT void rate(const Problem *problem, int64_t sizes, const double *factors, c
   }
 }
 """
-
 
 # Stages end early if a handler of signals has raised an exception; then nobody looks at the answer.
 _WATCHED = WATCH + "static _Thread_local Watch watch;\n"

@@ -116,7 +116,6 @@ static int between(const double *inverse, double *x, const double *low, const do
 }
 """
 
-
 PROCESS_MODEL = r"""
 #define API __attribute__((visibility("default")))
 #define WIDE 64 /* numbers of an observation */
@@ -278,7 +277,6 @@ static void carry(double *m, double *v, const double *step, const double *back, 
     }
 }
 """
-
 
 RESIDUAL = r"""
 /* Axis times angle of a rotation: of four formulas for its quaternion the one with the largest divisor. */

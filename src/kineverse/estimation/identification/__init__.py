@@ -10,12 +10,4 @@ if TYPE_CHECKING:
     from .online_identification import Identifier as Identifier
     from .result import Fit as Fit, IdentificationResult as IdentificationResult
 
-lazy_face(
-    __name__,
-    {
-        ".families": "Family FamilyParameter",
-        ".joint_identification": "identify",
-        ".online_identification": "Identifier",
-        ".result": "Fit IdentificationResult",
-    },
-)
+lazy_face(__name__)

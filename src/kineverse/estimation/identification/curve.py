@@ -47,17 +47,10 @@ from .marginal_likelihood import Scored, laplace_evidence
 from .motion_model import FamilyMember, LinearisedPoses, ParameterPrior
 from .observations import Observations
 
-CURVE = "curve"
-"""Name of the family."""
-
-LEVER = 0.25
-"""Length [m] of a rotation by one radian, in the joint value of a curve."""
-
-KNOTS = (3, 4, 5, 7, 9, 12, 16, 21)
-"""Numbers K of knots that are compared."""
-
-# Log prior of a number of knots, for each knot.
-_LOG_KNOT = -0.5
+CURVE = "curve"  # name of the family
+LEVER = 0.25  # length [m] of a rotation by one radian, in the joint value of a curve
+KNOTS = (3, 4, 5, 7, 9, 12, 16, 21)  # numbers K of knots that are compared
+_LOG_KNOT = -0.5  # log prior of a number of knots, for each knot
 # Standard deviation of the second derivative of a curve of width 1 and length 1, and its bound for few knots.
 _CURVATURE = 20.0
 # Log density of a width, which is log-uniform over several decades, and least width relative to the largest.
@@ -354,21 +347,17 @@ def _quotient(a: Array, b: Array) -> Array:
     return _product(a, b * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
-FEWEST_POSES = 5
-"""Least number of observations of a curve."""
+FEWEST_POSES = 5  # least number of observations of a curve
 
 # Largest number of knots of the first curve, steps of the solver in a round, and rounds of projection.
 _COARSE, _STEPS, _ROUNDS = 7, 6, 2
-# Points of a curve among which the nearest is searched, for each knot.
-_SAMPLES = 24
-# Largest number of knots relative to the number of observations.
-_DENSEST = 0.75
+_SAMPLES = 24  # points of a curve among which the nearest is searched, for each knot
+_DENSEST = 0.75  # largest number of knots relative to the number of observations
 # Log evidence that a curve may lack, and the part of it that twice as many knots must leave at most.
 _HOPELESS, _LEFT = 30.0, 0.6
 # Largest numbers of observations among which paths are searched, and to which a shape is fitted.
 _MOST, _MOST_FITTED = 120, 240
-# Largest difference of poses that are equal.
-_EQUAL = 1e-9
+_EQUAL = 1e-9  # largest difference of poses that are equal
 
 
 def may_be_curve(observations: Observations) -> bool:

@@ -1,4 +1,12 @@
-"""Joint families: subgroups of SE(3) between parent and child, and families of a user's expression."""
+"""Joint families: subgroups of SE(3) between parent and child, and families of a user's expression.
+
+    parent_T_child = L · g(a) · R,        g(a) = translation(v(a)) · Exp(ω(a))
+
+Each joint value is one of the six components of (v, ω), and these components define the subgroup. For a
+screw, v_z also gets the pitch times ω_z. So a revolute joint rotates about the z axis of L. Of the twelve
+parameters of L and R, those without a gauge freedom remain: a motion that commutes with the subgroup can move
+from L to R, and a motion in the subgroup is a shift of joint values.
+"""
 
 from __future__ import annotations
 
@@ -65,11 +73,8 @@ _FAMILIES = (
 JOINT_FAMILIES: Mapping[str, JointFamily] = MappingProxyType({family.name: family for family in _FAMILIES})
 """Families by name. ``rigid`` has no joint values, and ``free`` has no parameters."""
 
-PITCHES = 0.1
-"""Prior standard deviation of a pitch [m/rad]."""
-
-REACH = 1.0
-"""Prior standard deviation of each component of a lever [m]."""
+PITCHES = 0.1  # prior standard deviation of a pitch [m/rad]
+REACH = 1.0  # prior standard deviation of each component of a lever [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,8 +261,7 @@ def _columns(parent_R_frame: Array, lever: Array) -> Array:
 # Candidate values of a single joint for each observation, and number of random initial members.
 _TRIED = 41
 _MEMBERS = 8
-# Prior standard deviation of the mean of a joint value [m] or [rad].
-_MEAN_SPREAD = 3.0
+_MEAN_SPREAD = 3.0  # prior standard deviation of the mean of a joint value [m] or [rad]
 
 
 class FamilyParameter(NamedTuple):

@@ -83,8 +83,6 @@ def identify(
     ------
     ShapeError, InvalidValueError
         For invalid poses or covariances, see :func:`.observations.check_observations`.
-    UnknownNameError
-        For an unknown family.
     """
     weights = family_weights(families)
     parent_covariance, child_covariance, stated = resolve_noise(

@@ -1,4 +1,9 @@
-"""Joint values of a fit: prior of their range, mirrored solutions, sliding point, revolutions."""
+"""Joint values of a fit: prior of their range, mirrored solutions, sliding point, revolutions.
+
+In parent_T_child = L · translation(v) · Exp(w) · R, the translation c of R selects the point of the child
+that v translates. The likelihood does not depend on c, but the prior of v does. So this sliding point has a
+Gaussian prior around the origin of the child, and the evidence integrates over it.
+"""
 
 from __future__ import annotations
 
@@ -99,8 +104,7 @@ def _width(values: Array, variances: Array, weight: float) -> tuple[float, float
 
 
 SLIDING_TURNS = 3
-# Step of the point at convergence [m].
-SLIDING_TOLERANCE = 1e-6
+SLIDING_TOLERANCE = 1e-6  # step of the point at convergence [m]
 
 
 def optimise_sliding_point(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
@@ -191,8 +195,7 @@ def _rotations(motion: GroupMotion, values: Array) -> Array:
 
 
 MIRROR_STEPS, MIRROR_TURNS = 6, 4
-# Least gain in log density for an exchange.
-BETTER = 1e-3
+BETTER = 1e-3  # least gain in log density for an exchange
 
 
 class SingleObservation(NamedTuple):
@@ -297,7 +300,6 @@ def mirrored_values(motion: GroupMotion, values: Array, joint_prior: JointValueP
 
 
 def _whitening(observations: Observations) -> tuple[Array, Array]:
-    """Return the whitening of the errors of displacement and orientations, and its log volume."""
     rows, of_parent = observations.rows, observations.parent_covariance
     assert of_parent is not None  # only then does the ambiguity arise
     count, size = len(observations), 3 + rows

@@ -33,8 +33,7 @@ M = TypeVar("M", bound=MotionModel)
 M_co = TypeVar("M_co", bound=MotionModel, covariant=True)
 
 STEPS = 40
-# Steps of each of several starts, before the best of them continues.
-FIRST_STEPS = 2
+FIRST_STEPS = 2  # steps of each of several starts, before the best of them continues
 # Predicted decrease of the cost at convergence: a hundredth of a standard deviation. Convergence is linear,
 # so two successive decreases also predict the next one.
 CLOSE = 1e-4

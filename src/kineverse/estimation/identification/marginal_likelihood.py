@@ -1,4 +1,13 @@
-"""Marginal likelihood of a joint family (Laplace approximation), and its staged maximisation."""
+"""Marginal likelihood of a joint family (Laplace approximation), and its staged maximisation.
+
+With Gaussian joint values as wide as the motion (:class:`.JointRanges`), each observation contributes
+
+    ∫ N(â_k; a, C_k) N(a; μ, s²) da = N(â_k; μ, s² + C_k)
+
+so a motion that is short compared with the noise costs next to nothing. μ and the parameters are integrated
+by Laplace's method. The mean pose has the same improper uniform prior in all families; the other parameters
+have proper ones: directions are uniform on the sphere, levers are Gaussian.
+"""
 
 from __future__ import annotations
 

@@ -52,8 +52,7 @@ from .outlier_rejection import RowIndices, densest_half, log_inlier_prior
 from .result import SURE, Fit, IdentificationResult, LazyFit, classify_inliers, project_observations
 from .solver import solver
 
-REFUTED = 1e-3
-"""Largest probability of χ² at which the noise is refuted."""
+REFUTED = 1e-3  # largest probability of χ² at which the noise is refuted
 
 CALIBRATED = 1.2
 """Largest size of the residuals relative to the stated noise that is no misfit, however many they are."""
@@ -77,8 +76,7 @@ _FITTING, _FITTING_FACTOR, _COMPETITIVE = 1e-3, 1.3, 1e-6
 _FEW, _SMOOTH = 20, math.cos(math.radians(45.0))
 # Probability of slow residuals, and their share in χ², that refute a joint of unknown noise.
 _SYSTEMATIC, _SYSTEMATIC_SHARE = 1e-3, 0.7
-# Largest number of classifications of outliers.
-_ROUNDS = 3
+_ROUNDS = 3  # largest number of classifications of outliers
 
 Solutions = Mapping["str | Family", FamilySolution]
 

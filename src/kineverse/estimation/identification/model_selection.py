@@ -4,6 +4,10 @@ A joint that hardly moves looks rigid, and a point on a long lever seems to move
 of the wider family is at least that of the narrower one times the prior probability of members that look like
 it. Laplace's method misses them: it knows only the surroundings of the most likely member, which follows the
 noise.
+
+Let e be the residuals with the joint values of each observation by itself, W the inverse of their covariance,
+and ν their number less those of joint values and of determined parameters. If family and noise are right,
+χ² = Σ eᵀ W e has the mean ν, and √(χ²/ν) is the ratio of the noise to the stated one.
 """
 
 from __future__ import annotations
@@ -44,8 +48,7 @@ from .solver import solver
 
 # Number of slow cosines along a joint value: at most, and relative to the number of observations.
 _COSINES, _DENSITY = 6, 0.25
-# Size of residuals relative to the noise below which they are rounding errors.
-_EXACT = 0.1
+_EXACT = 0.1  # size of residuals relative to the noise below which they are rounding errors
 
 
 @dataclass(frozen=True)
@@ -114,8 +117,7 @@ def f_distribution_tail(ratio: float, above: float, below: float) -> float:
 
 Name = TypeVar("Name")
 
-UNSEEN = 0.05
-"""Prior probability that a prismatic or revolute joint hardly moves while it is observed."""
+UNSEEN = 0.05  # prior probability that a prismatic or revolute joint hardly moves while it is observed
 
 
 def bound_log_evidences(
@@ -148,8 +150,7 @@ def log_probability_straight(line: Solution[FamilyMember]) -> float:
     if len(along) < 3:
         return -0.5  # any arc goes through two points
     terms = np.column_stack([np.ones_like(along), along, along**2])
-    # The residual of x² after regression on 1 and x.
-    triangle: Array = np.linalg.qr(terms)[1]
+    triangle: Array = np.linalg.qr(terms)[1]  # the residual of x² after regression on 1 and x
     bend = abs(float(triangle[2, 2]))
     axis = line.motion.left[:3, 2]
     across = np.trace(line.covariance, axis1=1, axis2=2) - axis @ line.covariance @ axis

@@ -31,28 +31,22 @@ class MotionModel(Protocol):
     @property
     def size(self) -> int:
         """Number of parameters."""
-        ...
 
     @property
     def joints(self) -> int:
         """Number of joint values."""
-        ...
 
     def linearise(self, values: Array) -> LinearisedPoses:
         """Return the poses at joint values (N, k) and their derivatives."""
-        ...
 
     def retract(self, step: Array) -> Self:
         """Return the motion after a step (n,) in the parameters."""
-        ...
 
     def retract_joints(self, values: Array, step: Array) -> Array:
         """Return joint values (N, k) after a step (N, k), limited in size and to their domain."""
-        ...
 
     def prior(self) -> ParameterPrior:
         """Return the prior of the parameters."""
-        ...
 
 
 class FamilyMember(MotionModel, Protocol):
@@ -61,17 +55,14 @@ class FamilyMember(MotionModel, Protocol):
     @property
     def name(self) -> str:
         """Name of the family."""
-        ...
 
     @property
     def rows(self) -> int:
         """6 for poses, 3 for positions."""
-        ...
 
     @property
     def kinds(self) -> tuple[int, ...]:
         """Kind of each joint value. Joint values of one kind share the width of their range."""
-        ...
 
     def log_prior(self, mean: Array) -> tuple[float, Array]:
         """Return the log prior of the parameters and of the mean joint values, for the evidence.
@@ -79,15 +70,12 @@ class FamilyMember(MotionModel, Protocol):
         The second result is a precision (n + k + c,) with c sliding components that is added to the one of
         :meth:`prior`. It keeps directions finite on which there are no data.
         """
-        ...
 
     def named_parameters(self) -> dict[str, Array | float]:
         """Return the parameters by name, for display."""
-        ...
 
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of the n parameters."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,7 @@ _SCALES = (
 _COUNTS = ("steps", "first_steps", "turns", "sliding_turns", "mirrored_turns", "mirrored_steps", "widths")
 # Largest number of parameters, and of all unknowns, of a family in C.
 _PARAMETERS, _UNKNOWNS = 12, 16
-MOTION_SIZE = 25
-"""Size of the C structure of a motion, in doubles."""
+MOTION_SIZE = 25  # size of the C structure of a motion, in doubles
 
 
 class _Belief(ctypes.Structure):

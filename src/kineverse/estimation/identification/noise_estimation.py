@@ -34,17 +34,14 @@ more: of cranes, and in millimetres.
 """
 
 _SHARE = 1e-3
-# Standard deviation of their logarithms: a factor of 5.
-_SPREAD = math.log(5.0)
+_SPREAD = math.log(5.0)  # standard deviation of their logarithms: a factor of 5
 
 # Factors on the medians for first solutions: ratios of position to orientation noise of 1, 16 and 1/16.
 _STARTS = ((1.0, 1.0), (4.0, 0.25), (0.25, 4.0))
 # Least factor, 5 µm and 0.001°. Without it the likelihood of identical poses has no maximum.
 _ROUNDING = 1e-3
-# Logarithms of the factors of the first search.
-_COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-# Log density by which another start has to be better.
-_BETTER = 0.5
+_COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])  # logarithms of the factors of the first search
+_BETTER = 0.5  # log density by which another start has to be better
 # Largest number of Newton steps, their largest length, and the step of finite differences, in deviations.
 _STEPS, _LONGEST, _DIFFERENCE = 12, 1.5, 0.5
 # Largest number of solutions at an improved noise, and the improvement at convergence, in deviations.
@@ -80,8 +77,7 @@ class NoisePosterior(NamedTuple):
         return NoiseDeviations(position, orientation if len(self.logs) == 2 else math.nan)
 
 
-STATED_NOISE = NoisePosterior(np.zeros(0), np.zeros((0, 0)), 0.0)
-"""Posterior of a noise that is stated."""
+STATED_NOISE = NoisePosterior(np.zeros(0), np.zeros((0, 0)), 0.0)  # posterior of a noise that is stated
 
 
 class NoiseSolution(NamedTuple):
@@ -162,8 +158,7 @@ class _NoiseSearch:
             shift *= min(1.0, _LONGEST / max(float(np.linalg.norm(shift)), 1e-12))
             best, here = int(np.argmax(density)), float(density[len(density) // 2])
             if distance > 1.0 and self.log_density((logs + shift)[None])[0] < here:
-                # The quadratic does not hold so far from here.
-                shift = stencil[best] @ width.T
+                shift = stencil[best] @ width.T  # the quadratic does not hold so far from here
             # The root is at most twice as wide as the prior in any direction.
             left, widths, right = np.linalg.svd(root @ axes / np.sqrt(bends))
             logs, root = logs + shift, left * np.minimum(widths, 2.0 * _SPREAD) @ right

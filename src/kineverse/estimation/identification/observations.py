@@ -18,8 +18,7 @@ from kineverse.lie import Array, inverse, translation
 _RIGID = 1e-4
 # Largest number and smallest standard deviation that double precision can handle.
 _LARGEST, _SMALLEST = 1e9, 1e-7
-# Factor between successive levels of the continuation.
-_THIN = 4.0
+_THIN = 4.0  # factor between successive levels of the continuation
 
 
 @dataclass(frozen=True, eq=False)

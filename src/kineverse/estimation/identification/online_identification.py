@@ -149,11 +149,6 @@ class Identifier:
         when their number has doubled.
     sequential
         True if the poses arrive in temporal order, see :func:`.identify`.
-
-    Raises
-    ------
-    UnknownNameError
-        For an unknown family.
     """
 
     def __init__(

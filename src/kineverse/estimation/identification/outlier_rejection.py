@@ -33,8 +33,7 @@ from .motion_model import FamilyMember
 from .observations import Observations
 from .solver import solver
 
-UNEVEN = 3.0
-"""Factor by which the noise may vary between observations if its size is estimated."""
+UNEVEN = 3.0  # factor by which the noise may vary between observations if its size is estimated
 
 RowIndices: TypeAlias = "npt.NDArray[np.int_]"
 Name = TypeVar("Name")
@@ -45,12 +44,9 @@ _CHI_SQUARED = {6: CHI_SQUARED_6, 3: 16.3}
 _ANNEALING, _FEW_STEPS = 2.0, 6
 # Largest number of rounds of reclassification, and of inlier sets that are shared between families.
 _ROUNDS, _SHARED = 5, 3
-# Index of the neighbour whose distance measures isolation.
-_NEIGHBOURS = 2
-# Smallest weight.
-_LEAST_WEIGHT = 1e-7
-# Largest number of observations for a first solution.
-_MOST = 40
+_NEIGHBOURS = 2  # index of the neighbour whose distance measures isolation
+_LEAST_WEIGHT = 1e-7  # smallest weight
+_MOST = 40  # largest number of observations for a first solution
 # Least number of observations, and least share of inliers, for which outliers can be identified.
 _FEWEST, _SHARE = 5, 0.5
 
@@ -66,7 +62,6 @@ class _InlierHypothesis:
 
     @property
     def has_enough_inliers(self) -> bool:
-        """True if there are enough inliers to support the family."""
         return bool(self.inliers.sum() >= max(_FEWEST - 1, _SHARE * len(self.inliers) + 0.5))
 
 
@@ -150,7 +145,6 @@ class _InlierSearch:
         return motion.joints == self.observations.rows or (self.stated and bool(hypothesis.inliers.all()))
 
     def hypothesis(self, solution: Solution[FamilyMember], weights: Array | None = None) -> _InlierHypothesis:
-        """Return the hypothesis on the inliers under a solution."""
         squares, log_scale = self._whitened_errors(solution, weights)
         log_inlier = math.log(1.0 - self.outliers.fraction) - 0.5 * squares - log_scale
         log_outlier = _log_outlier_density(self.outliers, self.observations.rows)

@@ -26,8 +26,7 @@ from .motion_model import FamilyMember, FixedMotion, MotionModel
 from .observations import Observations
 from .outlier_rejection import UNEVEN, is_inlier
 
-SURE = 0.95
-"""Least probability at which the best family is reported as identified."""
+SURE = 0.95  # least probability at which the best family is reported as identified
 
 
 class NoiseDeviations(NamedTuple):
@@ -43,8 +42,6 @@ class Fit:
 
     Attributes
     ----------
-    family
-        Name of the family.
     probability
         Posterior probability of the family among those that were compared.
     log_evidence
@@ -148,13 +145,7 @@ class Fit:
         return 0.0 if joint is None else float(np.abs(np.diff(self.joint_values[self.inliers, joint])).max())
 
     def deviation(self, coordinate: str) -> float:
-        """Return the standard deviation of a coordinate.
-
-        Raises
-        ------
-        UnknownNameError
-            If there is no such coordinate.
-        """
+        """Return the standard deviation of a coordinate."""
         if coordinate not in self.coordinates:
             hint = suggest(coordinate, self.coordinates, "coordinate")
             raise UnknownNameError(f"A {self.family} fit has no coordinate {coordinate!r}. {hint}")
@@ -281,8 +272,7 @@ class IdentificationResult:
         return self._computed[k]
 
 
-# Largest standard deviation of a direction that counts as determined [rad].
-_WELL_KNOWN = math.radians(20.0)
+_WELL_KNOWN = math.radians(20.0)  # largest standard deviation of a direction that counts as determined [rad]
 
 
 def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, probability: float) -> Fit:

@@ -109,8 +109,7 @@ _CONSTANTS = {
     "turns": marginal_likelihood.TURNS,
     "weight": 1.0,
 }
-# Largest number of doubles of a work memory that is kept between stages.
-_KEPT = 4_000_000
+_KEPT = 4_000_000  # largest number of doubles of a work memory that is kept between stages
 
 
 class IdentificationSolver:

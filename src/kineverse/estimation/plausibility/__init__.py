@@ -13,11 +13,4 @@ if TYPE_CHECKING:
         Plausibility as Plausibility,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".check": "check_plausibility",
-        ".monitor": "PlausibilityMonitor",
-        ".report": "ImplausibleError JointVerdict Plausibility",
-    },
-)
+lazy_face(__name__)

@@ -154,18 +154,12 @@ def _log_mass(mean: Array, deviation: Array, lower: float, upper: float) -> Arra
 PRIOR: Mapping[str, float] = MappingProxyType({"served": 0.8, "elsewhere": 0.05, "rigid": 0.1, "other": 0.05})
 """Prior probabilities: joint as served, joint or child displaced, rigid, another joint."""
 
-# Least number of observations for a statement about the motion.
-_LEAST_COUNT = 5
-# Least number of observations that are kept of correlated ones, if there are as many.
-_KEPT = 60
-# Ratio of successive to other distances from which on poses are unrelated.
-_UNRELATED = 0.5
-# Least number of independent observations for a certain verdict.
-_LEAST_INDEPENDENT = 1.5
-# Number of looks that are worth one, from which on this is worth saying.
-_CORRELATED = 2.0
-# Factor on covariances that changes no verdict.
-_ALMOST_ONE = 1.1
+_LEAST_COUNT = 5  # least number of observations for a statement about the motion
+_KEPT = 60  # least number of observations that are kept of correlated ones, if there are as many
+_UNRELATED = 0.5  # ratio of successive to other distances from which on poses are unrelated
+_LEAST_INDEPENDENT = 1.5  # least number of independent observations for a certain verdict
+_CORRELATED = 2.0  # number of looks that are worth one, from which on this is worth saying
+_ALMOST_ONE = 1.1  # factor on covariances that changes no verdict
 
 
 @dataclass(frozen=True)

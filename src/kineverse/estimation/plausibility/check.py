@@ -34,8 +34,7 @@ from .e_process import SequentialTest
 from .report import JointVerdict, Plausibility, TestableJoint, find_testable_joints
 from .residuals import KnownJoint, compute_residuals
 
-# Number of observations that are compared.
-_COMPARED = 50
+_COMPARED = 50  # number of observations that are compared
 
 
 def find_exchanged_frames(
@@ -71,8 +70,7 @@ def _fits(served: KnownJoint, tracks: Mapping[str, PoseTrack], joint: TestableJo
     return float(np.median(np.sum(residuals.orthogonal**2, axis=1))) < CHI_SQUARED_6
 
 
-FALSE_ALARMS = 1e-3
-"""Default probability of rejecting a joint that is as served."""
+FALSE_ALARMS = 1e-3  # default probability of rejecting a joint that is as served
 
 
 @singularity_named()
@@ -124,8 +122,6 @@ def check_plausibility(
 
     Raises
     ------
-    UnknownNameError
-        For a frame or a family that does not exist.
     ShapeError, InvalidValueError
         For invalid poses, covariances or times, and if a covariance is missing.
     ImplausibleError

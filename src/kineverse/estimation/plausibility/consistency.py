@@ -66,7 +66,6 @@ class ConsistencyTests:
         return {joint: self._apply_to(joint, residuals) for joint in residuals}
 
     def _shared_coordinates(self, joint: TestableJoint) -> tuple[Symbol, ...]:
-        """Return the coordinates of a joint whose estimate comes from another joint."""
         served = self._served_joints[joint]
         return tuple(x for x in served.coordinates if served.is_plain and self._sources[x] != joint)
 

@@ -46,14 +46,12 @@ _HALF_SHRUNK = 0.5 * (1.0 - 1.0 / (1.0 + _DEVIATIONS**2))
 _SLOPES = np.array([2.0, 5.0])
 # Fraction of the capital bet on each observation: against a permanent and an occasional deviation.
 _STAKES = np.array([1.0 - 1e-9, 0.1])
-# Upper bounds on the gain by one observation, if there are outliers.
-_CUTS = np.array([1.1, 1.5, 4.0, 20.0])
+_CUTS = np.array([1.1, 1.5, 4.0, 20.0])  # upper bounds on the gain by one observation, if there are outliers
 # Number of change points of a displacement, and of the newest ones, which have little evidence yet. Dropping
 # some only reduces M.
 _CHANGE_POINTS, _NEWEST = 6, 2
 _SIZES = np.array(SIZES)
-# Least weight of a tested observation, in independent ones.
-_LEAST_WEIGHT = 0.1
+_LEAST_WEIGHT = 0.1  # least weight of a tested observation, in independent ones
 
 
 class SequentialTest:

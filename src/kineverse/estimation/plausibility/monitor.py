@@ -67,19 +67,12 @@ class PlausibilityMonitor:
 
     Parameters
     ----------
-    model
-        The served model.
     frames
         Names of the frames that may be observed.
     noise, relative_to, families, false_alarms, outliers, decorrelation_time
         As in :func:`~kineverse.estimation.check_plausibility`.
     keep
         Number of recent observations that reports use.
-
-    Raises
-    ------
-    UnknownNameError
-        For a frame that does not exist.
     """
 
     def __init__(
@@ -313,5 +306,4 @@ def _is_rigid(pose: Array) -> bool:
 
 
 _DIAGONAL = np.diag_indices(3)
-# Tolerance of a rotation, and the farthest position, that need no further check.
-_RIGID, _FAR = 1e-6, 1e6
+_RIGID, _FAR = 1e-6, 1e6  # tolerance of a rotation, and the farthest position, that need no further check

@@ -218,8 +218,7 @@ def _remaining_writes(
     return tuple(kept)
 
 
-# Hinges with axes that differ by more [rad] have no common zero.
-_PARALLEL = 0.3
+_PARALLEL = 0.3  # hinges with axes that differ by more [rad] have no common zero
 
 
 def _turn_about_axis(served: KnownJoint, coordinates: Array, motion: GroupMotion, values: Array) -> float:

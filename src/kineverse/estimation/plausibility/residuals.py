@@ -26,10 +26,8 @@ from kineverse.symbols import Symbol
 
 # Number of initial values of a single coordinate, and of several coordinates.
 _GRID_SIZE, _SAMPLE_SIZE = 33, 256
-# Relative margin to limits, where slopes may be infinite.
-_MARGIN = 1e-6
-# Number of relinearisations where coordinates are not their own tangent.
-_ROUNDS = 4
+_MARGIN = 1e-6  # relative margin to limits, where slopes may be infinite
+_ROUNDS = 4  # number of relinearisations where coordinates are not their own tangent
 
 
 class KnownJoint:
@@ -250,8 +248,7 @@ class KnownMotion:
         return ParameterPrior(np.zeros(0), np.zeros((0, 0)))
 
 
-# Largest number of steps, and largest step of an angle [rad].
-_STEPS, _STEP = 12, 0.5
+_STEPS, _STEP = 12, 0.5  # largest number of steps, and largest step of an angle [rad]
 # Squared residual beyond which the true pose of the parent stays at the observed one. The pose that explains
 # a gross error best is many steps away, and of no use.
 _GROSS = 1e3
@@ -389,11 +386,8 @@ def _lever(pose: Array) -> Array:
     return result
 
 
-SIZES = (0.01, 0.05, 0.3)
-"""Standard deviations of a displacement, for each component of a twist [m], [rad]."""
-
-# Prior information of joint values: a deviation of 100 [m] or [rad].
-_PRECISION = 1e-4
+SIZES = (0.01, 0.05, 0.3)  # standard deviations of a displacement, for each component of a twist [m], [rad]
+_PRECISION = 1e-4  # prior information of joint values: a deviation of 100 [m] or [rad]
 
 
 @dataclass(frozen=True)

@@ -25,13 +25,4 @@ if TYPE_CHECKING:
         spaced_indices as spaced_indices,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".joint_model": "make_joint_model",
-        ".reader": "read_recording",
-        ".recorded_joint": "Assumption ObservationNoise RecordedJoint identify_recorded_joint",
-        ".recording": "RecordedPair RecordedTrack Recording spaced_indices",
-        "kineverse.estimation.correlation": "correlation_time effective_sample_size",
-    },
-)
+lazy_face(__name__)

@@ -23,8 +23,7 @@ from .recording import RecordedPair
 
 _ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
 
-_DOTS = 60
-"""Largest number of observed poses drawn in the model."""
+_DOTS = 60  # largest number of observed poses drawn in the model
 
 
 def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
@@ -36,8 +35,6 @@ def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
     ----------
     pair
         Observed poses.
-    fit
-        Joint that was identified from them.
 
     Raises
     ------

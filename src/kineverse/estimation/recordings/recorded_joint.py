@@ -38,18 +38,13 @@ from .recording import Indices, RecordedPair, spaced_indices
 MAX_ROTATION_STEP = 2.0
 """Largest rotation between successive poses for which revolutions are counted reliably [rad]."""
 
-# Standard deviations of the autocorrelation time that are added to its estimate.
-_CAUTION = 1.0
-# Rows within one autocorrelation time, and in total, that suffice.
-_ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100
+_CAUTION = 1.0  # standard deviations of the autocorrelation time that are added to its estimate
+_ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100  # rows within one autocorrelation time, and in total, that suffice
 # Log ratio of the probability of the observations at which one noise is refuted by another.
 _REFUTED = math.log(20.0)
-# Size of residuals that avoids a division by zero [m], [rad].
-_TINY = 1e-12
-# Factor on the size of residuals at which the noise explains them amply.
-_AMPLE = 1.5
-# Relative difference of autocorrelation times that matters.
-_LONGER = 1.1
+_TINY = 1e-12  # size of residuals that avoids a division by zero [m], [rad]
+_AMPLE = 1.5  # factor on the size of residuals at which the noise explains them amply
+_LONGER = 1.1  # relative difference of autocorrelation times that matters
 # Ratio of autocorrelation times below which residuals are as smooth as others, and above which motion is not
 # noise.
 _AS_SMOOTH, _SMOOTHER = 1.5, 3.0
@@ -166,8 +161,6 @@ def identify_recorded_joint(
     ------
     InvalidValueError
         If all poses are equal, or do not allow an identification.
-    UnknownNameError
-        For an unknown family.
     """
     comparison = _Comparison(pair, families, independent)
     first = comparison.assume(noise, 1.0, comparison.distinct)
@@ -242,13 +235,11 @@ class _Comparison:
         return Assumption(noise or estimated_noise(result, self.pair), time, result)
 
     def fits_of_estimated_noise(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, Fit]:
-        """Return the fits of families that have residuals to all distinct rows."""
         # If the stated noise is too small, most observations are outliers.
         result = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
         return {fit.family: fit for fit in result if fit.family not in ("free", CURVE)}
 
     def correlation_time(self, fit: Fit) -> float:
-        """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
         largest = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
         return min(largest, correlation_time(_residuals_across_motion(fit), _CAUTION))
 
@@ -271,7 +262,6 @@ class _Comparison:
         times: dict[str, float],
         rows: Indices,
     ) -> Iterator[Assumption]:
-        """Yield the joints under other assumptions that the observations allow."""
         for time in sorted(set(times.values())):
             if time > _LONGER * best.correlation_time:
                 other = self.assume(stated, time, rows)

@@ -16,13 +16,4 @@ if TYPE_CHECKING:
     )
     from .tracker import Tracker as Tracker
 
-lazy_face(
-    __name__,
-    {
-        ".estimate": "Estimate",
-        ".hypothesis_bank": "HypothesisBank",
-        ".measurements": "ObservedExpression ObservedPose ObservedPosition",
-        ".tracker": "Tracker",
-        "kineverse.estimation.noise": "Outliers",
-    },
-)
+lazy_face(__name__)

@@ -32,15 +32,13 @@ from .residuals import Measurements
 # Step length and largest distance along the ridge, in deviations.
 _STRIDE, _FARTHEST = 0.5, 5.0
 _MOST_CORRECTIONS = 6
-# Corrections across the ridge stop below this length, in deviations.
-_SETTLED = 0.03
+_SETTLED = 0.03  # corrections across the ridge stop below this length, in deviations
 # Relative densities below the first end the walk; those above the second are cut off.
 _LEAST_DENSITY, _MOST_DENSITY = 1e-4, 10.0
 # A ridge whose deviation from a line and log density ratio to a Gaussian stay below this is straight.
 _RIDGE_CURVATURE = 0.05
 _RANK = 1e-6
-# Measurements that deviate from linearity by less, in deviations of the noise, are linear.
-_LINEAR = 0.02
+_LINEAR = 0.02  # measurements that deviate from linearity by less, in deviations of the noise, are linear
 
 
 class _CovarianceComputation:

@@ -25,8 +25,7 @@ from .state_space import Layout
 
 Groups = npt.NDArray[np.bool_]
 
-# Quantile of the standard normal distribution that is exceeded once in a million.
-_QUANTILE = 4.753
+_QUANTILE = 4.753  # quantile of the standard normal distribution that is exceeded once in a million
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,7 @@ from .information_state import InformationState
 from .observability import Components
 from .state_space import CoordinateGroup, Layout
 
-MOST_COMPONENTS = 8
-"""Largest number of components of a group."""
+MOST_COMPONENTS = 8  # largest number of components of a group
 
 PRUNING_LOG_RATIO = 15.0
 """Components whose log evidence is lower than the best by more are pruned: one in three million."""

@@ -46,8 +46,7 @@ class StepResult:
 
 
 _OUTSIDE = 1e-9
-# A belief closer to its mean, in deviations, is about its mean, as after an update.
-_SETTLED = 1e-5
+_SETTLED = 1e-5  # a belief closer to its mean, in deviations, is about its mean, as after an update
 
 
 class UpdateStep:

@@ -26,17 +26,14 @@ from .state_space import CoordinateGroup, Layout
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
 
-
 # Largest distance between initial values of an angle [rad].
 _SPACING = math.pi / 2
 _MOST_STARTS = 32
 # Initial points are at most this many deviations from the first.
 _FARTHEST = 5.5
 _SAME = 1e-9
-# Turns after which gears may stand as before: a gear of ratio p/q does so after q turns.
-_MOST_TURNS = 12
-# Relative positions between limits at which predictions are sampled.
-_SAMPLES = (0.125, 0.375, 0.625, 0.875)
+_MOST_TURNS = 12  # turns after which gears may stand as before: a gear of ratio p/q does so after q turns
+_SAMPLES = (0.125, 0.375, 0.625, 0.875)  # relative positions between limits at which predictions are sampled
 
 
 def find_turning_coordinates(
@@ -198,8 +195,7 @@ def _to_tangent(layout: Layout, number: int, change: Iterable[float]) -> Array:
     return step
 
 
-# Distance beyond limits that may be rounding.
-_BEYOND = 1e-3
+_BEYOND = 1e-3  # distance beyond limits that may be rounding
 
 
 @dataclass(frozen=True, eq=False)

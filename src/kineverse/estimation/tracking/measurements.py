@@ -39,8 +39,6 @@ class ObservedPose(_Observed):
 
     Attributes
     ----------
-    frame
-        Name of the observed frame.
     relative_to
         Observing frame: the world, or a camera, which may move.
     covariance

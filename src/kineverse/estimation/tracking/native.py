@@ -34,8 +34,7 @@ from .process_model import ProcessModel
 from .residuals import RIGID, Measurements
 from .state_space import Layout
 
-# Sizes of the arrays on the stack of the C code.
-_MAX_UNKNOWNS, _MAX_MEASUREMENT_SIZE = 64, 64
+_MAX_UNKNOWNS, _MAX_MEASUREMENT_SIZE = 64, 64  # sizes of the arrays on the stack of the C code
 
 _COUNTS = ("observations", "groups", "coordinates", "directions", "known")
 _INDICES = (
@@ -201,10 +200,8 @@ class NativeMapSolver:
         self._loaded = reading
 
 
-# Above this inlier probability a measurement is taken as an inlier.
-_CERTAIN = 1 - 1e-6
-# Groups with more outliers are left to numpy.
-_MOST_TRIMMED = 4
+_CERTAIN = 1 - 1e-6  # above this inlier probability a measurement is taken as an inlier
+_MOST_TRIMMED = 4  # groups with more outliers are left to numpy
 
 
 class NativeInlierSolver:

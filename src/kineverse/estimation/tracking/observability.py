@@ -27,10 +27,8 @@ from .process_model import ProcessModel
 from .residuals import MeasurementReader, Measurements, Residuals, whitening
 from .state_space import CoordinateGroup, Layout
 
-# A direction is unobservable while its deviation exceeds this part of the initial one.
-_UNOBSERVABLE = 0.05
-# Rounding may cancel information; no step is longer than a hundred initial deviations.
-_LEAST = 1e-4
+_UNOBSERVABLE = 0.05  # a direction is unobservable while its deviation exceeds this part of the initial one
+_LEAST = 1e-4  # rounding may cancel information; no step is longer than a hundred initial deviations
 
 
 class UnobservableDirections:
@@ -68,10 +66,8 @@ class Components(NamedTuple):
     unobservable: UnobservableDirections
 
 
-# Residuals are explained if their χ² is fewer deviations than this above its mean.
-_EXPLAINED = 3.0
-# Restarts are limited to the directions of least information.
-_MOST_DIRECTIONS = 2
+_EXPLAINED = 3.0  # residuals are explained if their χ² is fewer deviations than this above its mean
+_MOST_DIRECTIONS = 2  # restarts are limited to the directions of least information
 
 
 def find_unexplained(result: MapResult) -> list[int]:
@@ -141,8 +137,7 @@ class StationaryPoints:
 
 UpdateFunction: TypeAlias = Callable[[InformationState, Measurements, Array, list[int]], MapResult]
 
-# Measurements with a smaller weight are ignored.
-_LEAST_WEIGHT = 1e-3
+_LEAST_WEIGHT = 1e-3  # measurements with a smaller weight are ignored
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,13 @@
-"""Process models: prediction along q̇ = R(q) u, constant velocity, default process noise."""
+"""Process models: prediction along q̇ = R(q) u, constant velocity, default process noise.
+
+With constant velocity, the acceleration is white noise with the spectral density q (Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 6.2.2):
+
+    ẋ = R(x) u,    u̇ = w,    Cov ∫ w dt = q dt
+
+No measurement depends on speeds. So an update of the state alone is exact, and for a step ξ in the tangent
+space the speeds stay Gaussian, u | ξ ~ N(m + K ξ, C).
+"""
 
 from __future__ import annotations
 
@@ -29,7 +38,6 @@ from .state_space import Layout
 
 if TYPE_CHECKING:
     from .gaussian_sum_filter import UpdateStep
-
 
 Speeds: TypeAlias = Mapping[Symbol, float]
 
@@ -211,8 +219,7 @@ PROCESSES: Mapping[str, tuple[float, float]] = {"position": (0.004, 0.01), "velo
 
 They suit a kitchen door that a hand opens within 3.5 s (``kineverse reproduce stream``)."""
 
-INITIAL_SPEED_TIME = 3.0
-"""The initial variance of a speed is its process noise during this time [s]."""
+INITIAL_SPEED_TIME = 3.0  # the initial variance of a speed is its process noise during this time [s]
 
 # Relative positions between limits at which frames are sampled, in addition to the start.
 _SAMPLES = (0.2, 0.5, 0.8)

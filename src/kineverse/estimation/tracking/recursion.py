@@ -78,8 +78,7 @@ def _apply_late(
     return apply(predict(before, stamp))
 
 
-NO_NOISE: Speeds = MappingProxyType({})
-"""Process noise of no speed."""
+NO_NOISE: Speeds = MappingProxyType({})  # process noise of no speed
 
 
 @dataclass(frozen=True, eq=False)

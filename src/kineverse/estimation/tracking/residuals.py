@@ -16,8 +16,7 @@ from kineverse.lie import Array, inverse_right_jacobian, pose_difference, transf
 from .measurements import MeasurementModel, require_covariance, wrap_difference
 from .state_space import Layout
 
-RIGID = 1e-4
-"""Largest accepted deviation of RᵀR from the identity; a pose in single precision has 1e-6."""
+RIGID = 1e-4  # largest accepted deviation of RᵀR from the identity; a pose in single precision has 1e-6
 
 
 class Measurements(NamedTuple):

@@ -1,4 +1,10 @@
-"""State space: coordinates, tangent space of the manifold, and independent groups."""
+"""State space: coordinates, tangent space of the manifold, and independent groups.
+
+The directions of the tangent need not be the model's free speeds: a base on two wheels moves with two speeds,
+but its pose is uncertain in three directions. So each coordinate has a direction, except for redundant ones,
+such as the components of a quaternion: where no prediction changes in the directions that the rates
+q̇ = R(q) u exclude, the speeds u span the tangent.
+"""
 
 from __future__ import annotations
 

@@ -211,11 +211,6 @@ class Tracker:
         ----------
         model
             The edited model; the model of this tracker, as it is now, if None.
-
-        Raises
-        ------
-        UnknownNameError
-            If an observed frame is not in the model.
         """
         other = Tracker(self.model if model is None else model, self._observed, **self._options)
         start = other._now
@@ -387,8 +382,6 @@ class Tracker:
             time, up to the lag.
         commands
             Speeds during this prediction.
-        inputs
-            Values of the inputs.
         process_noise
             Process noise during this prediction, as for :meth:`predict`.
 

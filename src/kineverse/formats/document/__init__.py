@@ -29,12 +29,4 @@ if TYPE_CHECKING:
         write_document as write_document,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".json_values": "schema",
-        ".opaque_operation": "OpaqueOperation",
-        ".reader": "from_bytes read_operations read_packed_operations",
-        ".writer": "document_hash to_bytes to_json write_document",
-    },
-)
+lazy_face(__name__)

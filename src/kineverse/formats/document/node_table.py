@@ -1,37 +1,7 @@
 """Node table of a document, written from expressions.
 
-Every node is a list that begins with its type; ``ref`` is the place of an earlier node in the table.
-
-====================================================================  =====================================
-node                                                                  meaning
-====================================================================  =====================================
-``["constant", number]``                                              a number, ``"inf"`` or ``"-inf"``
-``["symbol", path, order, role]``                                     a symbol; a parameter has its value
-                                                                      behind the role
-``["elementary", name, ref, ...]``                                    a function of scalars
-                                                                      (:mod:`.node_types`)
-``["element", ref, index]``                                           an element of an array, in C order
-``["matrix", shape, [ref, ...]]``                                     an array, in C order; null is a zero
-                                                                      that is not stored
-``["augment", ref, replace, heuristic, [[symbol, ref], ...]]``        a value with given gradient entries
-``["less", ref, ref, contrast]``, ``["not", ref]``,                   continuous logic
-``["and", ref, ...]``, ``["or", ref, ...]``
-``["select", condition, ref, ref]``,                                  choices, elementwise
-``["extremum", "min", ref, ref, ...]``
-``["norm", ref]``                                                     the Euclidean norm of a vector
-``["piecewise", ref, periodic, [knot, ...], [[c0, c1, ...], ...]]``   a piecewise polynomial, elementwise
-``["carried", symbol, [[symbol, [[speed, ref], ...]], ...]]``         a coordinate with its rate table
-``["composed", ref, [[symbol, ref], ...]]``                           a carried coordinate after a
-                                                                      substitution
-``["dependent", ref, symbol]``                                        a coordinate that is an expression of
-                                                                      others
-``["implicit", name, [symbol, ...], [symbol, ...], ref, [row, ...],   unknowns as a function of inputs:
-ref, steps, [ref, ...], [[lower, upper], ...]]``                      residual, rows to solve, seed, Newton
-                                                                      steps, arguments, and the domain of
-                                                                      each input, left out if unbounded
-``["read", question, part, shape, [[symbol, trends], ...]]``          in traces: a part of the result of a
-                                                                      query, or an entry of its gradient
-====================================================================  =====================================
+Every node is a list that begins with its type; a reference is the place of an earlier node in the table.
+``docs/documents.md`` lists the types, :mod:`.node_types` defines them.
 """
 
 from __future__ import annotations

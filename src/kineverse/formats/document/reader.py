@@ -107,7 +107,6 @@ class _Document:
         self._consistency = TraceConsistency(self._graph, self._cells, self._names)
 
     def read(self, parse: Callable[[bytes], Any], content: bytes) -> list[tuple[str, OpaqueOperation]]:
-        """Parse and check the content, and return its operations with their tags."""
         try:
             with no_collection():
                 return self._read(parse(content), content)

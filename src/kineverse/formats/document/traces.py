@@ -186,7 +186,6 @@ class TraceConsistency:
         return sorted(self._names[kind])
 
     def _spend(self, work: int) -> bool:
-        """Spend work, and return False if the budget is exceeded."""
         self._left -= work
         return self._left >= 0
 

@@ -225,7 +225,6 @@ _DECODERS: dict[str, Callable[[Any, NodeGraph, Rename], Any]] = {
     DATA: decode_datum,
 }
 
-
 _ROUND: dict[str, Callable[[float, float], Geometry]] = {
     kind.kind: kind for kind in (Cylinder, Capsule, Cone)
 }

@@ -157,7 +157,6 @@ class _Parts:
 
     @property
     def expressions(self) -> Iterator[Expression]:
-        """All expressions in writes, parameters and the trace."""
         for (kind, _), value in self.entry.writes.items():
             yield from find_expressions(kind, value)
         for parameter in self.parameters.values():
@@ -180,7 +179,6 @@ def _find_trace(entry: HistoryEntry, cells: dict[Cell, Any]) -> Trace | str:
 
 
 def _lines(items: list[str]) -> Iterator[str]:
-    """Yield the items of a JSON list, one a line."""
     for i, item in enumerate(items):
         yield ",\n" if i else "\n"
         yield item
@@ -216,7 +214,6 @@ def _encode_operation(what: _Parts, table: NodeTable) -> str:
 
 
 def _encode_writes(tag: str, writes: Mapping[Cell, Any], table: NodeTable) -> dict[str, dict[str, Any]]:
-    """Encode writes as a JSON value, by kind and name."""
     kinds: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
     for (kind, name), value in writes.items():
         try:

@@ -99,7 +99,6 @@ class CurveApproximation:
         return replace(motion, variable=variable, coefficients=found.polynomial, curve=None), found.error
 
     def _series(self, motion: JointMotion, symbol: Symbol, where: RealInterval) -> TaylorSeries:
-        """Return the Taylor series of a motion's position over an interval of its coordinate."""
         (inner,) = self._enclosures.enclose([motion.variable], {symbol: taylor_variable(where)})
         return taylor_polynomial(motion.coefficients, inner)
 

@@ -291,14 +291,12 @@ class LinkTreeBuilder:
         return result
 
     def _refuse(self, name: str, factors: Iterable[Pose | Expression], problem: str) -> None:
-        """Refuse a frame, naming the symbols that move it."""
         symbols = dict.fromkeys(s for f in factors if isinstance(f, Expression) for s in f.symbols)
         self._refused_symbols.update(symbols)
         moves = f"it moves with {', '.join(map(str, symbols))}" if symbols else "loops hold it where it is"
         self.unsupported.refuse(name, f"{problem}; {moves}")
 
     def _factor(self, factor: Pose | Expression) -> Pose | Expression:
-        """Return a factor of a transform in terms of independent coordinates."""
         if isinstance(factor, Pose):
             return factor
         if isinstance(factor, OneAxisTransform):
@@ -338,7 +336,6 @@ class LinkTreeBuilder:
     def _link(
         self, name: str, found: MotionChain, independent: Mapping[Symbol, tuple[str, int]], joints: TakenNames
     ) -> LinkDescription:
-        """Return the link of a frame, with a joint for each of its motions."""
         record = self._articulation_of(name)
         label = self._articulations.get(name, name)
         follows = None

@@ -172,7 +172,6 @@ class TrigPolynomialConverter:
         return TrigPolynomial.variable(term.index)
 
     def _convert_term(self, term: Term, args: list[TrigPolynomial]) -> TrigPolynomial | None:
-        """Return the polynomial of a term from those of its arguments; None if it is none."""
         op = term.op
         if op == ca.OP_CONST:
             return TrigPolynomial.constant(term.data)
@@ -213,7 +212,6 @@ def _real_part(wave: TrigPolynomial, sine: bool) -> TrigPolynomial:
 
 
 def _multiply_exponents(a: Exponents, b: Exponents) -> Exponents:
-    """Return the exponents of a product: the sums of the exponents of its factors."""
     if not a or not b:
         return a or b
     total = dict(a)

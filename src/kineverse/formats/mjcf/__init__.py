@@ -13,10 +13,4 @@ if TYPE_CHECKING:
     )
     from .reader import parse_mjcf as parse_mjcf, read_mjcf as read_mjcf
 
-lazy_face(
-    __name__,
-    {
-        ".description": "MjcfJoint MjcfLink MjcfScene MjcfSite",
-        ".reader": "parse_mjcf read_mjcf",
-    },
-)
+lazy_face(__name__)

@@ -119,7 +119,6 @@ class MjcfShapes:
         self._remark(self._nodes[geom], text)
 
     def _color(self, geom: int) -> Rgba:
-        """Return the colour of a geom, or of its material if it has none."""
         m = self._model
         rgba, material = m.geom_rgba[geom].tolist(), int(m.geom_matid[geom])
         if material >= 0 and rgba == _DEFAULT_COLOR:
@@ -297,7 +296,6 @@ class MjcfBodies:
         return MjcfJoint(name, "free", self.body_names[number], home=(0.0,) * 6 + (1.0,), where=where)
 
     def _joint(self, number: int) -> MjcfJoint:
-        """Return the joint of a number, with limits, home position and dynamics."""
         m, kinds = self._model, mujoco().mjtJoint
         kind: MjcfJointType = {
             int(kinds.mjJNT_HINGE): "hinge",
@@ -348,7 +346,6 @@ class MjcfBodies:
         return unit
 
     def _dynamics(self, number: int, kind: MjcfJointType) -> MjcfDynamics:
-        """Return the dynamics of a joint that are not zero."""
         m = self._model
         dof = int(m.jnt_dofadr[number])
         strength = self._efforts.get(m.joint(number).name) if kind in ("hinge", "slide") else None

@@ -77,13 +77,14 @@ class MeshFiles:
         return self._convert(mesh, file)
 
     def _convert(self, mesh: Mesh, file: Path) -> str | None:
-        """Convert a mesh to OBJ and return the reference to it."""
         try:
             triangles = find_service("read_mesh")(mesh)
         except (FormatError, MissingDependencyError, OSError) as error:
             self._remark(f"the mesh {mesh.uri} is left out: MuJoCo cannot read it, and {error}")
             return None
-        content = _to_obj(triangles.vertices, triangles.faces)
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in triangles.vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (triangles.faces + 1).tolist()]
+        content = ("\n".join(lines) + "\n").encode()
         name, count = f"{file.stem}.obj", 1
         while self._is_taken(self._mesh_folder / name, content):
             count += 1
@@ -120,18 +121,11 @@ def _is_binary_stl(path: Path) -> bool:
     return 0 < count <= MAX_STL_FACES and size == _HEADER + _TRIANGLE * count
 
 
-def _to_obj(vertices: np.ndarray, faces: np.ndarray) -> bytes:
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
-    return ("\n".join(lines) + "\n").encode()
-
-
 VISUAL_GROUP, COLLISION_GROUP = "1", "3"
 """Geom groups of visuals, which viewers show, and of collision shapes, which they show on request."""
 
 _SMALLEST_MASS, _SMALLEST_INERTIA = 1e-3, 1e-6
-_NEGLIGIBLE = 1e-13
-"""Mass [kg] and moment of inertia [kg m²] below which they are zero; MuJoCo needs 1e-15 and 1e-14."""
+_NEGLIGIBLE = 1e-13  # mass [kg] and inertia [kg m²] that are zero; MuJoCo needs 1e-15 and 1e-14
 _ROUNDING = 1e-12
 
 
@@ -227,7 +221,6 @@ class MjcfBodyWriter:
         return mass, min(xx, yy, zz)
 
     def _shape(self, element: Tag, shape: Shape, name: str, *, is_visual: bool) -> None:
-        """Add the geom of a shape, unless MJCF has no such shape."""
         attributes = self._geometry(shape.geometry, name)
         if attributes is None:
             return

@@ -20,8 +20,7 @@ from .elements import ElementRemark, MjcfElement
 from .held_bodies import compute_rest_poses
 from .mujoco_api import mujoco
 
-_CLOSURE_TOLERANCE = 1e-6
-"""Largest distance between the ends of a closed loop [m], [rad]; files have six digits."""
+_CLOSURE_TOLERANCE = 1e-6  # largest distance between the ends of a loop [m], [rad]; files have six digits
 
 _IDENTITY_WXYZ = (1.0, 0.0, 0.0, 0.0)
 
@@ -185,7 +184,6 @@ class MjcfConstraints:
         )
 
     def _tendon_dynamics(self, number: int) -> MjcfDynamics:
-        """Return the dynamics of a tendon that are not zero."""
         m = self._model
         stiffness = float(m.tendon_stiffness[number])
         shortest, longest = m.tendon_lengthspring[number].tolist()

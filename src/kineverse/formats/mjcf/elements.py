@@ -19,8 +19,7 @@ from kineverse.formats.files import read_file
 from kineverse.formats.root_folder import declared_roots, is_below, mesh_folders, outside_root_error
 from kineverse.formats.xml_reader import Element, label, parse_xml, quote
 
-MAX_ELEMENT_DEPTH = 450
-"""Deepest nesting of elements. MuJoCo reads 500, and bodies are nested in their parents."""
+MAX_ELEMENT_DEPTH = 450  # deepest nesting; MuJoCo reads 500, and bodies are nested in their parents
 
 
 @dataclass(slots=True, eq=False)

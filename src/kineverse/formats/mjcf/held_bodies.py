@@ -58,7 +58,6 @@ class _HeldBodies:
         return self._attach_to(closure, first, second) or self._attach_to(closure, second, first)
 
     def _on_link(self, frame: str, pose: Pose) -> tuple[str, Pose]:
-        """Return the link of a link or site, and a pose of that frame in the link."""
         site = self._sites.get(frame)
         return (frame, pose) if site is None else (site.parent, compose_poses(site.pose, pose))
 
@@ -87,7 +86,6 @@ class _HeldBodies:
 
 
 def _is_free(link: MjcfLink) -> bool:
-    """Return True if a link has a free joint."""
     return any(joint.kind == "free" for joint in link.joints)
 
 

@@ -147,7 +147,6 @@ class MeshReplacement:
         return bool(rule == kinds.mjINERTIAFROMGEOM_TRUE)
 
     def _make(self, names: set[str]) -> None:
-        """Make the meshes of these names that plugins make."""
         found = [self._prepared.files[self._nodes[name]] for name in sorted(names)]
         plugins = [reference for reference in dict.fromkeys(found) if reference.plugin]
         if plugins:

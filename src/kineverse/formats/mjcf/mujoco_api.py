@@ -136,7 +136,6 @@ def _with_absolute_files(root: Tag, folder: Path, copies: Mapping[Path, Path]) -
 
 
 def _with_absolute_file(tag: Tag, folder: Path, copies: Mapping[Path, Path]) -> Tag:
-    """Return an asset with the absolute path of its file, if it has one."""
     if "file" not in tag.attributes:
         return tag
     path = folder / tag.attributes["file"]

@@ -67,7 +67,6 @@ def loop_operations(scene: MjcfScene, model_name: NameMap, followers: FollowerJo
 def _close_loop(
     closure: MjcfClosure, model_name: NameMap, home: Iterable[tuple[str, float]]
 ) -> Iterator[Operation]:
-    """Yield the operations that close a loop, with frames for ends that have none."""
     name, dependent = model_name(closure.name), closure.dependent
     pairs: list[list[str]] = []
     for k, part in enumerate((closure, *closure.more)):
@@ -178,7 +177,6 @@ def _link(link: MjcfLink, model_name: NameMap, followers: FollowerJoints) -> Ite
 
 
 def _is_home_outside(joint: MjcfJoint, has_home: bool) -> bool:
-    """Return True if the home position of a joint in the file is outside of its limits."""
     if not has_home or joint.kind not in ("hinge", "slide") or not joint.home:
         return False
     lower, upper = joint.lower, joint.upper
@@ -237,7 +235,6 @@ def _translation(point: Vector3) -> Pose:
 
 
 def _motion_from_reference(joint: MjcfJoint) -> Pose:
-    """Return the motion of a joint from its reference to 0."""
     if joint.kind == "hinge":
         return Pose.from_matrix(axis_angle(joint.axis, -joint.reference))
     x, y, z = (-joint.reference * a for a in joint.axis)

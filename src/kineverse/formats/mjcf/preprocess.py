@@ -51,8 +51,7 @@ _ATTRIBUTES = {
     "hfield": ("file", "content_type", "elevation"),
 }
 _CONTROL = frozenset(("actuator", "keyframe"))
-_MAX_RESOLUTION = 200
-"""Largest parameter of a mesh that MuJoCo generates, whose number of triangles grows with its square."""
+_MAX_RESOLUTION = 200  # largest parameter of a mesh of MuJoCo, which has its square of triangles
 
 _INLINE = ("vertex", "normal", "texcoord", "face")
 _NAMES = frozenset(
@@ -165,7 +164,6 @@ def _mesh_directory(root: MjcfElement) -> tuple[str, bool]:
 
 
 def _plugin_instances(root: MjcfElement) -> dict[str, MeshReference]:
-    """Return the plugins that a document names, by the names of their instances."""
     result: dict[str, MeshReference] = {}
     for section in root.children:
         if section.tag != "extension":
@@ -241,7 +239,6 @@ def check_element_count(root: MjcfElement, attached: Mapping[str, int]) -> int:
 
 
 def _count(node: MjcfElement) -> int:
-    """Return the number of copies that an element makes."""
     product = 1
     for word in node.attributes.get("count", "1").split():
         try:
@@ -328,7 +325,6 @@ class MjcfPreprocessor:
         return read_tree(data, source, folder, self._root, self._on_recoverable_error)
 
     def _attached_model(self, node: MjcfElement, folder: str) -> _AttachedModel:
-        """Return the model that an element attaches, preprocessed once."""
         path = find_below_root(node, node.attributes["file"], self._root, folder)
         if path in self._open_files or len(self._open_files) >= MAX_ATTACH_DEPTH:
             node.refuse("attaches itself, directly or through others.")

@@ -48,8 +48,6 @@ def parse_mjcf(
 
     Parameters
     ----------
-    text
-        Text of the document.
     source
         Name of the document in error messages.
     folder
@@ -95,7 +93,6 @@ class _MjcfWarnings:
         self.texts: dict[str, None] = {}
 
     def add(self, node: MjcfElement | None, text: str) -> None:
-        """Add a warning about an element, or about the document."""
         if node is not None:
             text = f"{node.place if node.source == self._source else node.where} {text}"
         if text not in self.texts:
@@ -103,16 +100,13 @@ class _MjcfWarnings:
             warn([f"{self._source}, {text}"])
 
     def repair(self, where: str, problem: str, replacement: str) -> None:
-        """Add a warning about a mistake, and its replacement."""
         if self._strict:
             raise FormatError(f"{where}: {problem}.")
         self._fault(f"{where.removeprefix(f'{self._source}, ')}: {problem}; {replacement}.")
 
     def xml_fault(self, source: str, line: int, text: str) -> None:
-        """Add a warning about a mistake in the XML that can be read."""
         self._fault(f"{'' if source == self._source else f'{source}, '}line {line}, {text}")
 
     def _fault(self, text: str) -> None:
-        """Add a warning about a mistake."""
         self.texts[Fault(text)] = None
         warn([Fault(f"{self._source}, {text}")])

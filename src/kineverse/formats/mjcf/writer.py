@@ -43,8 +43,7 @@ MJCF_CAPABILITIES = FormatCapabilities(
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MAX_BODY_DOFS = 6
-_ARMATURE = 1e-3
-"""Armature [kg m²] or [kg] of dependent joints in links with many joints; avoids singular inertia."""
+_ARMATURE = 1e-3  # armature [kg m²] or [kg] of dependent joints in such links; avoids singular inertia
 _TIE_SOLREF, _TIE_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001)
 """Equalities of dependent joints: with MuJoCo's default, a mimic joint gives way under load."""
 _QUATERNION = ("qx", "qy", "qz", "qw")
@@ -186,7 +185,6 @@ class MjcfWriter:
     def _joints(
         self, body: Tag, link: LinkDescription, joints: Iterable[JointDescription | BallJointDescription]
     ) -> None:
-        """Add joints to a body, and their home position to the key."""
         free = self._freejoint_name(link)
         if free is not None:
             if link.dynamics:
@@ -239,7 +237,6 @@ class MjcfWriter:
         self._qpos += [*pose[:3, 3].tolist(), w, a, b, c]
 
     def _joint(self, body: Tag, joint: JointDescription) -> None:
-        """Add a hinge or slide to a body, with its limits and dynamics."""
         kind = "hinge" if joint.is_rotation else "slide"
         element = body.add(
             "joint", name=joint.name, type=kind, pos=_unless_zero(joint.point), axis=joint.axis
@@ -253,7 +250,6 @@ class MjcfWriter:
         self._dynamics(element, joint.name, joint.dynamics)
 
     def _dynamics(self, element: Tag, name: str, known: Mapping[str, Any]) -> None:
-        """Add the dynamics of a joint that MJCF can represent."""
         for key, attribute in _DYNAMICS.items():
             if isinstance(known.get(key), (int, float)) and known[key]:
                 element.give(attribute, float(known[key]))
@@ -305,7 +301,6 @@ class MjcfWriter:
         return tendon
 
     def _custom_elements(self) -> Tag:
-        """Return the custom elements, which MuJoCo ignores."""
         custom = Tag("custom")
         if add_speeds(custom, self._description.joints):
             self._description.remarks.append(

@@ -15,10 +15,4 @@ if TYPE_CHECKING:
     )
     from .reader import parse_sdf as parse_sdf, read_sdf as read_sdf
 
-lazy_face(
-    __name__,
-    {
-        ".description": "SdfAxis SdfFrame SdfJoint SdfLink SdfRoot SdfScene",
-        ".reader": "parse_sdf read_sdf",
-    },
-)
+lazy_face(__name__)

@@ -161,7 +161,6 @@ def _pose(pose: Pose, line: int, relative_to: str = "") -> Element:
 
 
 def _link(link: UrdfLink, joint: UrdfJoint | None, names: dict[str, str]) -> Element:
-    """Return the element of a link, at the origin of the joint above it."""
     line, parts = link.line, []
     if joint is not None and joint.kind == "floating":
         parts.append(_pose(joint.origin, line, _frame(joint.parent)))

@@ -80,7 +80,6 @@ def read_sdf_joint(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> Res
 
 
 def _kind(element: Element) -> SdfJointType:
-    """Return the type of a joint, whatever its case."""
     name = element[1].get("type")
     if not name:
         raise ElementError(
@@ -289,7 +288,7 @@ def resolve_gearboxes(
 def _sense(hinge: ResolvedJoint, gearbox: ResolvedJoint, body: PoseNode, axis: SdfAxis) -> float:
     """Return the sign of a hinge's angle from the reference body about an axis of the gearbox, 1 or -1."""
     hinge_axis = rotate_direction(pose_between(gearbox.node, hinge.node), hinge.joint.axes[0].xyz)
-    cosine = _dot(hinge_axis, axis.xyz)
+    cosine = sum(x * y for x, y in zip(hinge_axis, axis.xyz, strict=True))
     if abs(cosine) < 1.0 - _PARALLEL:
         angle = math.degrees(math.acos(min(abs(cosine), 1.0)))
         gearbox.node.refuse(
@@ -297,10 +296,6 @@ def _sense(hinge: ResolvedJoint, gearbox: ResolvedJoint, body: PoseNode, axis: S
             "where they have to be parallel."
         )
     return math.copysign(1.0, cosine) * (1.0 if hinge.parent is body else -1.0)
-
-
-def _dot(a: Vector3, b: Vector3) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True))
 
 
 def build_spanning_tree(

@@ -124,7 +124,6 @@ def _loop(joint: SdfJoint, model_name: NameMap, home: tuple[tuple[str, float], .
 
 
 def _motions(joint: SdfJoint, model_name: NameMap, child: str) -> Iterator[Operation]:
-    """Yield the operations of a joint from its parent to a frame."""
     name = model_name(joint.name)
     common: dict[str, Any] = {
         "name": name,
@@ -185,7 +184,6 @@ def _two_axes(joint: SdfJoint, common: dict[str, Any], model_name: NameMap) -> I
 
 
 def _axis(axis: SdfAxis, model_name: NameMap) -> dict[str, Any]:
-    """Return the arguments of a joint of one DoF."""
     return {
         "axis": axis.xyz,
         "lower": axis.lower,
@@ -197,12 +195,10 @@ def _axis(axis: SdfAxis, model_name: NameMap) -> dict[str, Any]:
 
 
 def _mimic_position(mimic: MimicRelation[str], model_name: NameMap) -> Expression:
-    """Return the position of a coordinate that follows another."""
     return mimic.multiplier * position(model_name(mimic.leader)) + mimic.offset
 
 
 def _dynamics(joint: SdfJoint, prefix: str, index: int = 0) -> tuple[tuple[str, float], ...]:
-    """Return the dynamics of one axis as pairs of name and value, with a prefix of the names."""
     axes = joint.axes[index : index + 1]
     return tuple((prefix + key, value) for axis in axes for key, value in axis.dynamics)
 

@@ -136,7 +136,6 @@ class SdfModelReader:
         path: str | None = None,
         include: Element | None = None,
     ) -> PoseNode:
-        """Add the node and the scope of a model, and read its elements."""
         node = self._add("model", element, outer, name)
         node.is_named_frame = path is None
         scope = SdfScope(node.path if path is None else path, document, outer, outer.static, node)
@@ -197,7 +196,6 @@ class SdfModelReader:
             self._add("frame", part, scope, self._name(part, document))
 
     def _warn_unknown(self, part: Element, owner: Element, document: SdfDocument, kind: str) -> None:
-        """Warn of an element that is ignored or that the specification does not have."""
         tag = part[0]
         if tag.startswith("xacro:"):
             document.refuse(part, "is xacro that was not expanded; expand it first: xacro in.sdf > out.sdf")
@@ -207,7 +205,6 @@ class SdfModelReader:
             document.remarks.add(part, "is left out: the specification does not know it.", owner)
 
     def _name(self, element: Element, document: SdfDocument) -> str:
-        """Return the name of an element, checked."""
         with document.locate_errors(element):
             name = read_name(element)
             check_sdf_name(name, element, document.version)
@@ -293,7 +290,6 @@ class SdfModelReader:
         self._open_files.pop()
 
     def _open_urdf(self, content: bytes, source: str, folder: str) -> tuple[SdfDocument, Element]:
-        """Return a URDF as a document of SDF, and its root element."""
         warnings = ReaderWarnings(source, self._remarks, self._strict)
         model = read_urdf_as_sdf(content, source, folder, self._root, self._strict)
         return SdfDocument(source, folder, _LATEST, warnings, self._root), ("sdf", {}, [model], 1)
@@ -331,8 +327,6 @@ def parse_sdf(
 
     Parameters
     ----------
-    text
-        Text of the document.
     source
         Name of the document in error messages.
     folder

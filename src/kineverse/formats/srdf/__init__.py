@@ -13,10 +13,4 @@ if TYPE_CHECKING:
     )
     from .reader import parse_srdf as parse_srdf, read_srdf as read_srdf
 
-lazy_face(
-    __name__,
-    {
-        ".description": "EndEffector Srdf SrdfGroup VirtualJoint",
-        ".reader": "parse_srdf read_srdf",
-    },
-)
+lazy_face(__name__)

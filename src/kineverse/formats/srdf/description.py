@@ -20,8 +20,6 @@ class SrdfGroup:
 
     Attributes
     ----------
-    name
-        Name in the file.
     joints
         Articulations of the group that move, in the order of the file: joints, joints above links, chains
         from base to tip, subgroups. Mimic joints and passive joints are among them, fixed joints are not.
@@ -47,8 +45,6 @@ class EndEffector:
 
     Attributes
     ----------
-    name
-        Name in the file.
     group
         Name of the group of the end effector itself.
     parent_link
@@ -71,8 +67,6 @@ class VirtualJoint:
 
     Attributes
     ----------
-    name
-        Name in the file.
     kind
         ``fixed``, ``planar`` or ``floating``.
     parent_frame
@@ -93,20 +87,14 @@ class Srdf:
 
     Attributes
     ----------
-    name
-        Name of the robot.
     rules
         Rules of the collision filter, ``(a, b, check, why)`` as :class:`kineverse.geometry.Rule`: for
         ``kv.geometry.Scene(model, rules=srdf.rules)``, or as data of the model.
     groups
         Planning groups by name.
-    end_effectors
-        End effectors by name.
     states
         Named states by name: the values of all groups that have a state of that name, by coordinate. Where
         groups differ, the first one counts here, and ``groups[...].states`` has each of them.
-    virtual_joints
-        Virtual joints by name.
     passive_joints
         Articulations that no motor moves.
     warnings

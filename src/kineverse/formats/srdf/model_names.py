@@ -10,8 +10,7 @@ from kineverse.model.articulation import Articulation
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 
-_MOST_SUGGESTIONS = 50
-"""Number of unknown names for which similar ones are looked up: that takes a while in large models."""
+_MOST_SUGGESTIONS = 50  # unknown names for which similar ones are looked up, which takes a while
 
 
 class ModelNames:

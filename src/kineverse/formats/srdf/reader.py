@@ -51,8 +51,6 @@ def parse_srdf(
 
     Parameters
     ----------
-    text
-        Text of the document.
     model
         Model that contains the robot, in its present version.
     prefix
@@ -204,7 +202,6 @@ class _SemanticDocument:
         return result
 
     def _states(self, groups: dict[str, SrdfGroup]) -> dict[str, dict[str, float]]:
-        """Add the named states to their groups, and return them by name for all groups together."""
         states: dict[str, dict[str, float]] = {}
         by_group: dict[str, dict[str, dict[str, float]]] = {}
         for element in self._elements("group_state"):
@@ -232,7 +229,6 @@ class _SemanticDocument:
         return states
 
     def _values(self, state: Element) -> dict[str, float]:
-        """Return the values of a named state by the name of the coordinate."""
         values: dict[str, float] = {}
         for part in state[2]:
             if part[0] != "joint":
@@ -270,8 +266,7 @@ class _SemanticDocument:
                     self._remarks.add(element, "is ignored: SRDF does not know it.")
 
 
-MOST_GROUPS = 1000
-"""Largest number of groups: each may contain all the others, so the result grows with its square."""
+MOST_GROUPS = 1000  # each may contain all the others, so the result grows with the square
 
 PASSED_OVER = "it is passed over"
 
@@ -351,7 +346,6 @@ class GroupResolver:
         return members
 
     def _add(self, members: _Members, part: Element, group: Element) -> None:
-        """Add the joints and links that one child of a group stands for."""
         names, tag = self._names, part[0]
         if tag == "joint":
             self._add_joint(members, part)

@@ -16,10 +16,4 @@ if TYPE_CHECKING:
     )
     from .reader import parse_urdf as parse_urdf, read_urdf as read_urdf
 
-lazy_face(
-    __name__,
-    {
-        ".description": "UrdfDynamics UrdfJoint UrdfLimits UrdfLink UrdfMimic UrdfRobot UrdfSafetyController",
-        ".reader": "parse_urdf read_urdf",
-    },
-)
+lazy_face(__name__)

@@ -38,8 +38,7 @@ from kineverse.model.body import (
 
 from .description import UrdfLink
 
-Appearance: TypeAlias = tuple[Rgba | None, str]
-"""Colour or None, and the file of the texture or an empty string."""
+Appearance: TypeAlias = tuple[Rgba | None, str]  # colour or None, and the file of the texture or ""
 
 _NO_APPEARANCE: Appearance = (None, "")
 

@@ -135,7 +135,6 @@ def _parts(element: Element, remarks: ReaderWarnings) -> dict[str, Element]:
 
 
 def _link(element: Element, parts: dict[str, Element], role: str) -> str:
-    """Return the name of the parent or the child link."""
     part = parts.get(role)
     if part is None:
         raise ElementError(element, f'has no <{role} link="..."/>; the specification requires it.')

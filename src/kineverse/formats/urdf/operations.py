@@ -137,7 +137,6 @@ def _joint_operations(
 def _axis_joint(
     joint: UrdfJoint, common: dict[str, Any], mimic_position: Expression | None
 ) -> JointOperation:
-    """Return the operation of a joint of one DoF, or of one that follows another."""
     assert joint.axis is not None
     return _AXIS_JOINTS[joint.kind](
         **common,

@@ -63,8 +63,6 @@ def parse_urdf(
 
     Parameters
     ----------
-    text
-        Text of the document.
     source
         Name of the document in error messages.
     folder
@@ -173,7 +171,6 @@ class _Document:
 
 
 def _add(by_name: dict[str, T], name: str, part: T, element: Element) -> None:
-    """Add a link or joint under its name, which has to be unique."""
     other = by_name.setdefault(name, part)
     if other is not part:
         raise ElementError(
@@ -242,7 +239,6 @@ def _check_expanded(element: Element, xacro: str, remarks: ReaderWarnings) -> No
 
 
 def _xacro_prefix(root: Element) -> str:
-    """Return the namespace prefix of xacro elements, with its colon."""
     for key, value in root[1].items():
         if key.startswith("xmlns:") and value.rstrip("/#").endswith("xacro"):
             return key[len("xmlns:") :] + ":"

@@ -110,7 +110,6 @@ def _with_world(
 
 
 def _outwards(root: str, joints_below: dict[str, list[UrdfJoint]]) -> list[UrdfJoint]:
-    """Return the joints below a link, depth first."""
     ordered: list[UrdfJoint] = []
     stack = joints_below.get(root, [])[::-1]
     while stack:
@@ -137,5 +136,4 @@ def _loop(start: UrdfJoint, joint_above: dict[str, UrdfJoint]) -> list[UrdfJoint
 
 
 def _location(source: str, joint: UrdfJoint) -> str:
-    """Return file, line and name of a joint for error messages."""
     return f"{source}, line {joint.line}, <joint name={quote(joint.name)}>"

@@ -47,7 +47,6 @@ from kineverse.model.body import (
     Cylinder,
     Ellipsoid,
     Geometry,
-    Inertia,
     Mesh,
     Pose,
     Shape,
@@ -76,7 +75,10 @@ class UrdfBodyWriter:
         """Add the elements of a body to its link."""
         name = link.attributes["name"]
         if body.inertia is not None:
-            _add_inertia(link, body.inertia)
+            element = link.add("inertial")
+            add_origin(element, body.inertia.origin)
+            element.add("mass", value=body.inertia.mass)
+            element.add("inertia", **dict(zip(_TENSOR, body.inertia.tensor, strict=True)))
         for shape in body.visuals:
             visual = self._shape(link, "visual", shape, name)
             if visual is not None:
@@ -110,7 +112,6 @@ class UrdfBodyWriter:
             element.add("mesh", filename=mesh_reference(form, self._folder, self._remark), scale=scale)
 
     def _material(self, visual: Tag, shape: Shape) -> None:
-        """Add the material of a visual, if it has a colour or a texture."""
         if shape.color is None and not shape.texture:
             return
         folder = shape.geometry.folder if shape.texture and isinstance(shape.geometry, Mesh) else ""
@@ -124,7 +125,6 @@ class UrdfBodyWriter:
             material.add("texture", filename=self._texture(shape))
 
     def _texture(self, shape: Shape) -> str:
-        """Return the reference to a texture, relative to the folder of the shape's mesh."""
         if isinstance(shape.geometry, Mesh) and shape.geometry.folder:
             texture = replace(shape.geometry, uri=shape.texture)
             return mesh_reference(texture, self._folder, self._remark)
@@ -144,14 +144,6 @@ def add_origin(element: Tag, pose: Pose) -> None:
     matrix = pose.matrix
     rpy = rpy_angles(matrix)
     element.add("origin", xyz=matrix[:3, 3].tolist(), rpy=None if rpy == (0.0, 0.0, 0.0) else rpy)
-
-
-def _add_inertia(link: Tag, inertia: Inertia) -> None:
-    """Add the ``<inertial>`` of a link."""
-    element = link.add("inertial")
-    add_origin(element, inertia.origin)
-    element.add("mass", value=inertia.mass)
-    element.add("inertia", **dict(zip(_TENSOR, inertia.tensor, strict=True)))
 
 
 URDF_CAPABILITIES = FormatCapabilities("URDF")
@@ -178,7 +170,6 @@ def to_urdf(
 
 
 def _check_read_back(content: bytes, path: Path) -> None:
-    """Read the text of a file as a model."""
     model = Model()
     try:
         with collect_warnings(), model.edit() as edit, no_collection():
@@ -313,7 +304,6 @@ class UrdfWriter:
         return (name, "planar", n) if same and not any(axes[2].point) else None
 
     def _axis_joint(self, joint: JointDescription, parent: str, child: str, pose: Matrix) -> None:
-        """Add a revolute, continuous or prismatic joint."""
         kind = (
             "prismatic"
             if not joint.is_rotation
@@ -339,7 +329,6 @@ class UrdfWriter:
     def _dynamics(
         self, element: Tag, name: str, known: Mapping[str, Any], soft: tuple[float, float] | None = None
     ) -> None:
-        """Add the ``<dynamics>`` and the ``<safety_controller>`` of a joint."""
         if known.get("damping") or known.get("friction"):
             element.add("dynamics", damping=_number(known, "damping"), friction=_number(known, "friction"))
         if soft is not None or "k_velocity" in known:
@@ -390,7 +379,6 @@ class UrdfWriter:
 
 
 def _axis_key(joint: JointDescription) -> tuple[str, bool, tuple[float, ...]]:
-    """Return name, kind and axis of a joint for comparison."""
     return joint.name, joint.is_rotation, joint.axis
 
 

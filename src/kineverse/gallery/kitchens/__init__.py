@@ -72,11 +72,6 @@ def kitchen_operations(name: str, prefix: str | None = None) -> Iterator[Operati
         Its seed.
     prefix
         Prefix of the names, without the slash.
-
-    Raises
-    ------
-    UnknownNameError
-        If the name is no seed.
     """
     if not is_seed(name):
         raise UnknownNameError(

@@ -201,7 +201,6 @@ def _row(
 
 
 def _place(units: Iterable[tuple[str, float]], low: float, names: _Names) -> tuple[Unit, ...]:
-    """Return units side by side from one end."""
     placed = []
     for kind, width in units:
         placed.append(Unit(kind, names.take(kind), round(low + width / 2, 5), width))
@@ -216,7 +215,6 @@ class _Names:
         self._counts: dict[str, int] = {}
 
     def take(self, kind: str) -> str:
-        """Return the next name for a unit of a kind."""
         first = kind.partition("_")[0]
         single = ("sink", "dishwasher", "oven", "fridge", "larder")
         stem = first if first in (*single, "wall") else "shelf" if kind == "open_shelf" else "base"

@@ -30,8 +30,7 @@ ROOM = "room"  # frame on the floor, in the middle of the aisle; y along the row
 _OVERHANG = 0.035  # end of a countertop before the fronts' plane [m]
 _ISLAND_BACK = 0.75
 _BASIN_X, _BASIN_DEPTH = (-0.47, -0.11), 0.17
-_WHEEL_ROOM = 0.01
-"""Depth of what the floor collides with below what is seen [m]: wheels at height 0 do not touch it."""
+_WHEEL_ROOM = 0.01  # depth of the floor's collision shape below what is seen [m], for wheels at height 0
 _CEILING, _PARAPET, _SIDE_WALKWAY = 2.45, 1.1, 0.3
 
 

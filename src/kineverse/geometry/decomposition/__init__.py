@@ -27,12 +27,4 @@ if TYPE_CHECKING:
         list_entries as list_entries,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".accuracy": "Accuracy",
-        ".coacd_process": "DecompositionError ResourceLimits",
-        ".convex_decomposition": "DecompositionOutcome decompose decompose_all find_hulls",
-        ".result": "CacheEntry Decomposition DecompositionSettings clear folder list_entries",
-    },
-)
+lazy_face(__name__)

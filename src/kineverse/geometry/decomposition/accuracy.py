@@ -10,15 +10,10 @@ import numpy as np
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
 from kineverse.geometry.shapes import build_bvh, convex_hull, hull_faces
 
-SAMPLES = 4000
-"""Number of sample points on each surface and in each hull, in addition to all corners."""
-
-# Largest number of corners of the mesh that are sampled.
-_MOST_CORNERS = 20_000
-# Lengths below this part of the size are rounding errors.
-_NEGLIGIBLE = 1e-7
-# Largest number of pairs of a point and a triangle in one batch, which bounds the memory.
-_PAIRS = 2_000_000
+SAMPLES = 4000  # number of sample points on each surface and in each hull, in addition to all corners
+_MOST_CORNERS = 20_000  # largest number of corners of the mesh that are sampled
+_NEGLIGIBLE = 1e-7  # lengths below this part of the size are rounding errors
+_PAIRS = 2_000_000  # largest number of pairs of a point and a triangle in one batch, which bounds the memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +122,6 @@ def _sample_volume(polytope: Polytope, random: np.random.Generator) -> Floats:
 
 
 def _sample_surface(vertices: Floats, faces: Integers, count: int, random: np.random.Generator) -> Floats:
-    """Return points distributed uniformly on triangles."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     chosen = random.choice(len(areas), count, p=areas / areas.sum())

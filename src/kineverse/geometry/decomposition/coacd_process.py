@@ -102,7 +102,6 @@ def _run_process(
 
 
 def _read_hulls(target: Path, surface: CleanMesh) -> list[Floats]:
-    """Read the hulls, and check that they lie near the mesh."""
     try:
         with np.load(target, allow_pickle=False) as arrays:
             points, sizes = np.asarray(arrays["points"], dtype=float), np.asarray(arrays["sizes"])

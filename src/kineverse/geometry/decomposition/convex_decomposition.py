@@ -20,8 +20,7 @@ from .coacd_process import DecompositionError, ResourceLimits, run_coacd
 from .mesh_cleanup import CleanMesh, clean_mesh
 from .result import Decomposition, DecompositionSettings
 
-# A hull that protrudes from another by less than this part of its size is inside of it.
-_INSIDE = 1e-9
+_INSIDE = 1e-9  # a hull that protrudes from another by less than this part of its size is inside of it
 
 
 def clean_hulls(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
@@ -129,8 +128,6 @@ def decompose(
     ----------
     mesh
         A mesh; its scale is applied.
-    settings
-        Settings of the decomposition.
     limits
         Limits on time and memory.
     force

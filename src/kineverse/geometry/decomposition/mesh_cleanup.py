@@ -15,13 +15,9 @@ from kineverse.model.body import Mesh
 
 from .accuracy import enclosed_volume, is_closed
 
-MOST_FACES = 300_000
-"""Largest number of triangles that is decomposed; more take CoACD hours and all memory."""
-
-# Connected parts of a mesh are decomposed one by one, up to this number.
-_MOST_PARTS = 64
-# A mesh thinner than this part of its size has no volume.
-_FLAT = 1e-6
+MOST_FACES = 300_000  # largest number of triangles that is decomposed; more take CoACD hours and all memory
+_MOST_PARTS = 64  # connected parts of a mesh are decomposed one by one, up to this number
+_FLAT = 1e-6  # a mesh thinner than this part of its size has no volume
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +107,6 @@ def _drop_degenerate(vertices: Floats, faces: Integers) -> Integers:
 
 
 def _connected_parts(faces: Integers, count: int) -> Integers:
-    """Return the index of the connected part of each triangle."""
     label = np.arange(count)
     while True:
         least = label[faces].min(axis=1)

@@ -19,14 +19,9 @@ from kineverse.geometry.mesh_files import Floats
 
 from .accuracy import Accuracy
 
-ERROR_OF_SIZE = 0.02
-"""Default error, as a part of the longest edge of the mesh's bounding box."""
-
-MOST_HULLS = 32
-"""Default of the largest number of hulls."""
-
-# Increased when the hulls of equal meshes and settings change.
-_VERSION = 1
+ERROR_OF_SIZE = 0.02  # default error, as a part of the longest edge of the mesh's bounding box
+MOST_HULLS = 32  # default of the largest number of hulls
+_VERSION = 1  # increased when the hulls of equal meshes and settings change
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,4 @@ if TYPE_CHECKING:
     from .base_placement import BasePlacement as BasePlacement, PlacementSearch as PlacementSearch
     from .grasped_opening import open_object as open_object
 
-lazy_face(
-    __name__,
-    {
-        ".base_placement": "BasePlacement PlacementSearch",
-        ".grasped_opening": "open_object",
-    },
-)
+lazy_face(__name__)

@@ -126,8 +126,6 @@ class PlacementSearch:
     ----------
     model
         Model of the robot and of everything around it.
-    gripper
-        The gripper.
     state
         State of everything; the robot's idle coordinates keep these values.
     margin
@@ -324,7 +322,6 @@ class _Search:
 
     @property
     def nothing(self) -> BasePlacement:
-        """Placement that was not found."""
         none = np.zeros((0, len(self.owner.coordinates)))
         return BasePlacement(
             None, self.owner.coordinates, none, none, self.values, none, none, self.tried, self.reasons,

@@ -221,7 +221,6 @@ class _Run:
 
     @property
     def how(self) -> str:
-        """Words on pushes that helped the grasped motions."""
         if self.pushed_from is None:
             return ""
         return f"; it was pushed from {self.pushed_from:.3f} on, where no grasp led further"
@@ -447,7 +446,6 @@ class _Run:
         return result
 
     def _plan(self, placement: BasePlacement) -> bool:
-        """Plan the path to the pose before the handle, and return whether there is one."""
         self._approach = self.opener.approaches.plan_to(self.session.state, placement, self.seed)
         return bool(self._approach)
 

@@ -219,7 +219,6 @@ class PathCheck:
         return self.contacts.first(self.state, self._columns, rows, handle, opened=opened)
 
     def _note(self) -> str:
-        """Count the contact in the scene, and return the robot's body."""
         one, other = self.contacts.touching()
         self.reasons[f"{one} at {other}"] += 1
         return one

@@ -8,10 +8,4 @@ if TYPE_CHECKING:
     from .push_controller import Pushing as Pushing
     from .push_skill import push as push
 
-lazy_face(
-    __name__,
-    {
-        ".push_controller": "Pushing",
-        ".push_skill": "push",
-    },
-)
+lazy_face(__name__)

@@ -268,7 +268,6 @@ class _Sampler:
         return chosen[near]
 
     def _targets(self, k: int, solver: InverseKinematics) -> dict[Symbol, float]:
-        """Return the values of the targets at a contact point for a solver."""
         point, normal = self._points.points[k], self._points.normals[k]
         values = self._point.values(point + _STANDOFF * normal) | self._facing.values(-normal)
         return {s: v for s, v in values.items() if s in solver.inputs}

@@ -68,8 +68,6 @@ class Pushing:
         The coordinate to change, as symbol or name.
     bodies
         Bodies of the robot that may touch the object, names or patterns: the pusher.
-    state
-        Present state.
     target
         Wanted value [m], [rad].
     robot
@@ -181,7 +179,6 @@ class Pushing:
         self.reset()
 
     def _hand_body(self) -> str:
-        """Return a body of the pusher that moves with its frame."""
         motion = FrameDependence(self.model, self.model.speeds)
         own = motion.moving_ancestors(self.tool.frame)
         return next((b for b in self.pusher if motion.moving_ancestors(b) == own), self.pusher[0])
@@ -271,7 +268,6 @@ class Pushing:
         return command
 
     def _locate(self, state: State) -> tuple[Vector, PushPoint | None]:
-        """Return the tip, and the chosen contact point if there is one."""
         chosen = self.choice.chosen
         tip, point = self.surface.locate(state, chosen or 0)
         return tip, None if chosen is None else point
@@ -326,7 +322,6 @@ class Pushing:
     def _numbers(
         self, tip: Vector, point: PushPoint, contact: PushPair | None
     ) -> tuple[PushNumbers, Array | None]:
-        """Return the numbers of the program, and the derivatives of a contact."""
         c, m, press = point.point, point.normal, self.press
         near, height = self._aside < NEAR and not self.retreating, inner_product(subtract(tip, c), m)
         standoff = _STANDOFF
@@ -354,7 +349,6 @@ class Pushing:
         return numbers, None if contact is None else self._add_contact(numbers, contact, tip)
 
     def _add_contact(self, numbers: PushNumbers, contact: PushPair, tip: Vector) -> Array:
-        """Set the numbers of a near pair of pusher and object, and return the derivatives."""
         press, thing = self.press, contact.thing
         allowed = -_JAMMED * press.depth - press.slack < contact.gap < LOST + press.slack
         numbers.free = float(self.touching and allowed)

@@ -167,7 +167,6 @@ def push(
     first, begin = session.steps, world.time
 
     def skip(done: bool, reason: str, failure: str = "other", **measures: Any) -> Outcome:
-        """Return the outcome of a push that was not begun."""
         measures |= {} if done else {"failure": failure}
         steps, passed = session.steps - first, world.time - begin
         return Outcome(done, world.state[coordinate], reason, world.name, passed, steps, measures)
@@ -257,7 +256,6 @@ class _End:
         return self._settled > 0 and not self._pushing.touching
 
     def reached(self, state: State) -> bool:
-        """Return whether the push ends at a state."""
         pushing, press = self._pushing, self._pushing.press
         rest = state[pushing.coordinate] - pushing.target
         if press.deviation > 0.0:
@@ -392,7 +390,6 @@ class _Run:
             self.act({s.derivative(): float(v) for s, v in zip(trajectory.symbols, rates, strict=True)})
 
     def retreat(self) -> None:
-        """Take the pusher away from the object."""
         self._pushing.retreating = True
         for _ in range(_RETREAT_STEPS):
             self._step("retreat")
@@ -402,7 +399,6 @@ class _Run:
         self._pushing.retreating = False
 
     def measures(self) -> dict[str, Any]:
-        """Return figures of the push."""
         pushing, force = self._pushing, self._session.peak_force
         return {
             **({} if math.isnan(force) else {"peak_force": force}),

@@ -8,10 +8,4 @@ if TYPE_CHECKING:
     from .unknown_opening import open_unknown as open_unknown
     from .unmodelled_joint import forget_joint as forget_joint
 
-lazy_face(
-    __name__,
-    {
-        ".unknown_opening": "open_unknown",
-        ".unmodelled_joint": "forget_joint",
-    },
-)
+lazy_face(__name__)

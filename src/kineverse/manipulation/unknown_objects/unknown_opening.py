@@ -165,7 +165,6 @@ class _Run:
         self._truth = compile(self.world.model.fk((names or [handle])[0]))
 
     def __call__(self) -> Outcome:
-        """Open the part, and return the outcome."""
         session, world = self.session, self.world
         believed = session.belief
         session.belief = self.belief
@@ -271,7 +270,6 @@ class _Run:
         raise SkillError("collision", f"{why}{self.approach.barrier}")
 
     def _place_further(self) -> BasePlacement:
-        """Return a placement along the learned joint."""
         learned = self.learning.learned
         assert learned is not None
         path = JointPath.of_fit(learned.fit, self.pulling.start)

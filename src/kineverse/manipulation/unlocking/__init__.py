@@ -18,10 +18,4 @@ if TYPE_CHECKING:
         execute_unlocking as execute_unlocking,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".lock_exploration": "LearnedLock LockExploration LockTry explore_locks",
-        ".plan_execution": "ExecutedMove PartMover UnlockingExecution execute_unlocking",
-    },
-)
+lazy_face(__name__)

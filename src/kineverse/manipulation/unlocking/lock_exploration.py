@@ -174,7 +174,6 @@ class _Explorer:
 
     @property
     def here(self) -> Configuration:
-        """The present configuration."""
         return self.known.read(self.state)
 
     @property
@@ -258,7 +257,6 @@ class _Explorer:
         return likely if likely is not None and chances[likely] > 0.0 else None
 
     def attempt(self, move: KeySide, target: float) -> bool:
-        """Try to move a coordinate, and learn from it."""
         before, symbol = self.here, self.known.coordinates[move.key]
         reached = self._move(symbol, target)
         self.state = self.state.updated({symbol: reached})

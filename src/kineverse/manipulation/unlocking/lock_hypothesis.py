@@ -17,7 +17,6 @@ Side: TypeAlias = Literal[1, -1]
 _SIDES: tuple[Side, Side] = (1, -1)
 Configuration: TypeAlias = tuple[float, ...]
 
-
 _HELD = 0.1  # relative probability of a condition that holds at the start: boxes come shut
 
 

@@ -86,7 +86,6 @@ class LockModel:
     def _estimate(
         self, move: KeySide, here: Configuration, costs: Costs
     ) -> tuple[float, list[dict[KeySide, None]]]:
-        """Return the expected tries of a move, and the conditions of its lock."""
         lock, best, result = self.locks[move], math.inf, list[dict[KeySide, None]]()
         for box in lock.alternatives:
             refusals = [(q, lock.suspects(q, box)) for q in reversed(lock.refused)]

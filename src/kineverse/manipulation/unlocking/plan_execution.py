@@ -63,11 +63,6 @@ class PartMover:
         """Move a coordinate to a target, and return the position where it ends [m] or [rad].
 
         It ends within the tolerance of the target, or where it has come no nearer for the patience.
-
-        Raises
-        ------
-        UnknownNameError
-            For a name that is no degree of freedom.
         """
         symbol = self.model.degree_of_freedom(coordinate)
         controller, session = self._controller(symbol), self.session
@@ -109,8 +104,6 @@ class ExecutedMove:
 
     Attributes
     ----------
-    step
-        The planned move.
     reached
         Position where the coordinate ended [m] or [rad].
     seconds
@@ -327,7 +320,6 @@ class _OverlapJudge:
             self._overlaps.begin()
 
     def update(self) -> None:
-        """Measure the present state."""
         if self._overlaps is None:
             return
         self._scene.update(self._world.state)

@@ -19,11 +19,4 @@ if TYPE_CHECKING:
     )
     from .trace_queries import Access as Access, Query as Query
 
-lazy_face(
-    __name__,
-    {
-        ".recorder": "record_trace",
-        ".trace": "ReadNode Trace TraceStep UntraceableError",
-        ".trace_queries": "Access Query",
-    },
-)
+lazy_face(__name__)

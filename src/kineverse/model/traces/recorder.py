@@ -31,8 +31,6 @@ def record_trace(operation: Operation, model: ReadRecorder, writes: Mapping[Cell
 
     Parameters
     ----------
-    operation
-        Operation that was applied.
     model
         Model before the operation.
     writes
@@ -108,15 +106,12 @@ class _RecordingReader(TracingReader):
 
     @property
     def gave_numbers(self) -> bool:
-        """True if a query result has a number."""
         return any(isinstance(part, float) for reply in self.results for part in reply.parts)
 
     def trace(self, writes: tuple[tuple[Cell, Any], ...]) -> Trace:
-        """Return the trace of the recorded queries and of given writes."""
         return Trace(self.steps(), writes)
 
     def steps(self) -> tuple[TraceStep, ...]:
-        """Return the recorded queries with their accesses."""
         return tuple(
             TraceStep(_apart(q), access) for q, access in zip(self._queries, self._accesses, strict=True)
         )
@@ -126,7 +121,6 @@ class _RecordingReader(TracingReader):
             self._accesses[query] = max(self._accesses[query], how)
 
     def decided_by(self, query: int) -> None:
-        """Record that the operation depends on the value of a query result."""
         self._accesses[query] = Access.VALUE
 
     def notify(self, expression: Expression) -> Expression:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from kineverse.expressions.substitution import Substitution
     from kineverse.symbols import Symbol
 
-
 GradientPath = tuple[tuple["Symbol", bool], ...]
 
 
@@ -225,8 +224,6 @@ class Trace:
 
         Parameters
         ----------
-        model
-            Present model.
         before
             Model at the time of the trace.
 
@@ -234,8 +231,6 @@ class Trace:
         ------
         UntraceableError
             If a value has changed that the operation depends on.
-        UnknownNameError
-            If the name in a query no longer exists.
         """
         old: list[QueryResult] = []
         new: list[QueryResult] = []

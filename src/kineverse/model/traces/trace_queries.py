@@ -72,13 +72,7 @@ class Query:
         return self.kind, *(structural_hash(a) if isinstance(a, Expression) else a for a in self.arguments)
 
     def ask(self, model: ReadRecorder) -> QueryResult:
-        """Return the result of the query on a model.
-
-        Raises
-        ------
-        UnknownNameError
-            If the queried name does not exist.
-        """
+        """Return the result of the query on a model."""
         return QUERY_KINDS[self.kind].ask(model, *self.arguments)
 
     def answer(self, rest: Any, parts: Sequence[Expression | float]) -> Any:

@@ -56,7 +56,6 @@ _ROUNDING = as_expression(1e-12)
 _FLAT = as_expression(1e-8)
 """Square of the coefficient below which the requested speed is proportional to it instead of inverse."""
 
-
 RequestedSpeeds: TypeAlias = tuple[Mapping[Symbol, Expression], Mapping[Symbol, Expression]]
 
 

@@ -22,11 +22,4 @@ if TYPE_CHECKING:
         make_sphere_tree as make_sphere_tree,
     )
 
-lazy_face(
-    __name__,
-    {
-        ".object_covers": "cover_objects",
-        ".sphere_cover": "SphereCover cover_solid cover_solids default_protrusion",
-        ".sphere_tree": "SphereTree enclosing_ball make_sphere_tree",
-    },
-)
+lazy_face(__name__)

@@ -18,8 +18,7 @@ from .polytope import CoverRegion, scalar_products
 
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 _MOST_CELLS = 60_000
-_NEAR, _SMALL = 10, 0.7
-"""Spheres that a cell is tried with, and the edge of a small cell, as a fraction of the median radius."""
+_NEAR, _SMALL = 10, 0.7  # spheres that a cell is tried with, and a small cell's edge in median radii
 
 
 @dataclass(frozen=True, slots=True, eq=False)

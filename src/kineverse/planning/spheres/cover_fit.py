@@ -24,11 +24,8 @@ from .certificate import distances, find_uncovered
 from .cover_sampling import CoverMesh, CoverStarts
 from .polytope import CoverRegion
 
-_ROUNDS, _FEW_ROUNDS, _STEPS = 14, 10, 6
-"""Power diagrams of a descent and of a short one, and steps between two of them."""
-
-_WARM, _COLD = 0.2, 0.015
-"""First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
+_ROUNDS, _FEW_ROUNDS, _STEPS = 14, 10, 6  # power diagrams of a descent and of a short one, steps between two
+_WARM, _COLD = 0.2, 0.015  # first and last temperature of the smoothed maximum, in protrusions
 
 _MOMENTUM, _SIDES = 0.6, 12
 _SAMPLES, _SAMPLES_EACH, _HARD = 300, 8, 0.6
@@ -37,8 +34,7 @@ _REMOVALS, _FEW_SPHERES = 3, 12
 _PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
 """Growth of radii for the sake of the proof, as a fraction of the protrusion."""
 
-_ROUNDING = 1e-9
-"""Growth of radii for the sake of rounding, as a fraction."""
+_ROUNDING = 1e-9  # growth of radii for the sake of rounding, as a fraction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -265,7 +261,6 @@ def _relax(
 
 
 def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSpheres:
-    """Remove spheres that the others can replace within the aim."""
     failures = 0
     while cover.protrusion <= aim and len(cover.radii) > 1 and failures < _REMOVALS:
         # Protrusions shrink about as the number of spheres to the power -0.7.

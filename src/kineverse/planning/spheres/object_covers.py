@@ -25,8 +25,7 @@ from kineverse.model.body import Mesh
 from .sphere_cover import MOST, SphereCover, check_cover_settings, cover_solids
 from .sphere_tree import SphereTree
 
-_DIGITS = 12
-"""Digits in which poses in a body differ."""
+_DIGITS = 12  # digits in which poses in a body differ
 
 
 def cover_objects(
@@ -68,7 +67,6 @@ def are_covered(items: Sequence[CollisionObject], protrusion: float | None = Non
 def _request(
     items: Sequence[CollisionObject], protrusion: float | None, most: int
 ) -> tuple[list[tuple[Solid, Floats]], str]:
-    """Return the solids of objects with their poses, and the key of their cover."""
     check_cover_settings(protrusion, most)
     if not items:
         raise InvalidValueError("There is no shape to cover.")

@@ -20,8 +20,7 @@ from kineverse.geometry.mesh_files import Faces, Floats, Integers
 from kineverse.geometry.shapes import Hull, Solid, solid_from_points, solid_surface
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
-_ROUNDNESS = 0.03
-"""Gap between a round solid and its polytope, as a fraction of the protrusion of a cover."""
+_ROUNDNESS = 0.03  # gap between a round solid and its polytope, as a fraction of the protrusion of a cover
 
 _FEWEST_SIDES, _MOST_SIDES = 12, 192
 
@@ -31,11 +30,8 @@ _MANY_CORNERS, _DIRECTIONS = 200, 400
 
 _BLOCK = 80_000
 _SAMPLES = 1000
-_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)
-"""Steps of the sequence R3 (Roberts 2018), whose points fill the cube evenly."""
-
-_FAR = 1e9
-"""Offset of a plane that bounds nothing."""
+_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)  # steps of the sequence R3 (Roberts 2018)
+_FAR = 1e9  # offset of a plane that bounds nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)

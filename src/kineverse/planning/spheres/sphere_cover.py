@@ -16,8 +16,7 @@ from kineverse.model.body import Capsule, Sphere
 from .cover_fit import FittedSpheres, fit_spheres
 from .polytope import CoverPolytope, CoverRegion, bound_solid, solid_volume
 
-MOST = 48
-"""Default largest number of spheres of a cover."""
+MOST = 48  # default largest number of spheres of a cover
 
 PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
 """Default protrusion, as a fraction of the edge of a cube with the volume of the solid; its bounds [m]."""
@@ -26,8 +25,7 @@ _MOST_OF_ALL = 1024
 
 _NEEDLE, _LEAST_RATIO = 1e-3, 1e-4
 """Thickness of a needle relative to its length, and least thickness relative to the largest size."""
-_SMALL, _LARGE = 1e-4, 1e4
-"""Radii between which a solid is bounded as it is [m]."""
+_SMALL, _LARGE = 1e-4, 1e4  # radii between which a solid is bounded as it is [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -105,7 +105,6 @@ def enclosing_ball(centres: Floats, radii: Floats, steps: int = _BALL_STEPS) -> 
 
 
 def _cluster(centres: Floats, radii: Floats, count: int) -> Integers:
-    """Return the cluster (N,) of each sphere."""
     seeds = [int(np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmax())]
     nearest = np.linalg.norm(centres - centres[seeds[0]], axis=1)
     while len(seeds) < count:

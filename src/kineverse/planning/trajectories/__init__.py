@@ -10,12 +10,4 @@ if TYPE_CHECKING:
     from .time_parameterization import time_parameterize as time_parameterize
     from .trajectory import Trajectory as Trajectory, TrajectoryFollower as TrajectoryFollower
 
-lazy_face(
-    __name__,
-    {
-        ".blends": "BlendedPath round_corners",
-        ".kinematic_limits": "MotionLimits motion_limits",
-        ".time_parameterization": "time_parameterize",
-        ".trajectory": "Trajectory TrajectoryFollower",
-    },
-)
+lazy_face(__name__)

@@ -23,8 +23,7 @@ from kineverse.lie import Array
 Validity: TypeAlias = Callable[[Array], npt.NDArray[np.bool_]]
 """Function that returns (N,) flags for configurations (N, n): True for those that are valid."""
 
-_HALVINGS = 8
-"""Number of times that a blend is halved before the path stops at the corner."""
+_HALVINGS = 8  # number of times that a blend is halved before the path stops at the corner
 
 _STRAIGHT = 1e-9
 """Norm of d₂ - d₁ below which there is no corner; and the length of a step, relative to that of the path,
@@ -34,8 +33,7 @@ _ROUNDING = 1e-12
 """Error of points, relative to 1 and to their largest coordinate: some thousand units in the last place, as
 computations leave them."""
 
-_RESOLUTION = 1 / 32
-"""Largest distance between two configurations of a blend that are checked [rad], [m]."""
+_RESOLUTION = 1 / 32  # largest distance between two configurations of a blend that are checked [rad], [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +206,6 @@ def _find_corners(points: Array, allowed: Array) -> npt.NDArray[np.intp]:
 
 
 def _shrink(path: BlendedPath, valid: Validity, resolution: float) -> BlendedPath:
-    """Halve blends until they are valid."""
     reach = path.reach.copy()
     open_corners = np.flatnonzero(reach > 0)
     for _ in range(_HALVINGS + 1):

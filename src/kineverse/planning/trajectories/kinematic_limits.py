@@ -18,11 +18,8 @@ from kineverse.model.velocity_constraints.speed_limits import SpeedLimits
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-RAMP = 0.5
-"""Time from rest to the full speed [s] where the model states no acceleration."""
-
-UNSTATED_SPEED = 1.0
-"""Speed [rad/s], [m/s] of coordinates for which the model states none."""
+RAMP = 0.5  # time from rest to the full speed [s] where the model states no acceleration
+UNSTATED_SPEED = 1.0  # speed [rad/s], [m/s] of coordinates for which the model states none
 
 
 class MotionLimits(NamedTuple):
@@ -48,8 +45,6 @@ def motion_limits(
 
     Parameters
     ----------
-    model
-        The model.
     symbols
         Coordinates that move together (n,).
     ramp
@@ -62,8 +57,6 @@ def motion_limits(
 
     Raises
     ------
-    UnknownNameError
-        If the model does not have a coordinate.
     InvalidValueError
         For a ramp or speed that is not positive.
     """

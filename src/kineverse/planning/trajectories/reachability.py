@@ -67,17 +67,10 @@ def divide_path(path: BlendedPath, cells: int) -> PathGrid:
     return PathGrid(lengths[keep], first[keep], last[keep], bend[keep], start[keep], kind[keep], stops)
 
 
-_ITERATIONS = 12
-"""Most steps of searches among lines, which end after some three."""
-
-_ROUNDING = 1e-9
-"""Relative difference of values that is rounding."""
-
-_LARGEST_CHANGE = 0.3
-"""Relative change of a derivative q' in a cell up to which the tangent of the speed limit is used."""
-
-_TINY = 1e-9
-"""Relative size of a coefficient that counts as 0: a bound that is divided by it is nothing but rounding."""
+_ITERATIONS = 12  # most steps of searches among lines, which end after some three
+_ROUNDING = 1e-9  # relative difference of values that is rounding
+_LARGEST_CHANGE = 0.3  # relative change of q' in a cell up to which the tangent of the limit is used
+_TINY = 1e-9  # relative size of a coefficient that counts as 0: a bound divided by it is rounding
 
 
 def maximal_squared_speeds(grid: PathGrid, speeds: Array, accelerations: Array) -> Array:

@@ -27,23 +27,12 @@ from .blends import BlendedPath, Validity, round_corners
 from .reachability import PathGrid, divide_path, maximal_squared_speeds
 from .trajectory import Trajectory
 
-_CELLS = 250
-"""Cells of all blends together, where none is asked for."""
-
-_FEWEST = 4
-"""Fewest cells of a blend."""
-
-_EXCESS = 1e-3
-"""Error of the accelerations of cubics between knots, relative to the limits."""
-
-_MOST_PHASES = 50
-"""Most knots of a cell."""
-
-_ROUNDING = 1e-9
-"""Relative excess of a limit that is rounding."""
-
-_SHORTEST = 4 * np.finfo(float).eps
-"""Shortest time between two knots, relative to the duration: times increase."""
+_CELLS = 250  # cells of all blends together, where none is asked for
+_FEWEST = 4  # fewest cells of a blend
+_EXCESS = 1e-3  # error of the accelerations of cubics between knots, relative to the limits
+_MOST_PHASES = 50  # most knots of a cell
+_ROUNDING = 1e-9  # relative excess of a limit that is rounding
+_SHORTEST = 4 * np.finfo(float).eps  # shortest relative time between two knots
 
 
 def time_parameterize(

@@ -26,10 +26,8 @@ from .trajectory_file import TrajectoryData, parse_coordinates, read_trajectory_
 if TYPE_CHECKING:
     from kineverse.control import Controller
 
-_JUMP = 1e-6
-"""Largest difference of positions and velocities at which two trajectories are joined [rad], [m], per s."""
-_GAIN, _WEIGHT = 5.0, 100.0
-"""Gain [1/s] and weight of the goals of a follower."""
+_JUMP = 1e-6  # largest difference of positions [rad], [m] and velocities where two are joined
+_GAIN, _WEIGHT = 5.0, 100.0  # gain [1/s] and weight of the goals of a follower
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,8 +49,6 @@ class Trajectory:
 
     Raises
     ------
-    ShapeError
-        For arrays whose shapes do not match.
     InvalidValueError
         For times that do not begin at 0 or do not increase, numbers that are not finite, a symbol that is
         there twice, or one that is no coordinate.
@@ -228,13 +224,7 @@ class Trajectory:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the trajectory to a JSON file; all numbers are exact.
-
-        Raises
-        ------
-        FormatError
-            If the file cannot be written.
-        """
+        """Write the trajectory to a JSON file; all numbers are exact."""
         names = [str(symbol) for symbol in self.symbols]
         write_trajectory_file(path, TrajectoryData(names, self.times, self.positions, self.velocities))
 
@@ -244,8 +234,6 @@ class Trajectory:
 
         Parameters
         ----------
-        path
-            Path of the file.
         model
             Model to which the coordinates belong; None to accept all names.
 
@@ -253,8 +241,6 @@ class Trajectory:
         ------
         FormatError
             If the file cannot be read or is no trajectory; the message says what is wrong.
-        UnknownNameError
-            For a coordinate that the model does not have.
         """
         data, source = read_trajectory_file(path), Path(path).name
         if model is None:
@@ -328,8 +314,6 @@ class TrajectoryFollower:
 
     Parameters
     ----------
-    trajectory
-        The trajectory.
     gain
         Rate at which errors decay [1/s], at most 1/dt of the controller.
     weight

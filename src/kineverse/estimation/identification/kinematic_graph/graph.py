@@ -411,8 +411,6 @@ def identify_graph(
         For invalid poses or covariances, fewer than two parts, points only, and a part without covariance.
     DuplicateNameError
         For a part named ``world`` in addition to the world.
-    UnknownNameError
-        For an unknown family.
     """
     tracks = check_tracks(poses, noise, points=True)
     if world:

@@ -95,15 +95,10 @@ class DependentCoordinates:
         return {u: slope[rows] for u, slope in known.slopes.items()}
 
 
-RANK_TOLERANCE = 0.05
-"""Smallest singular value that counts as a degree of freedom, relative to the largest."""
-
-# Degree of polynomials or Fourier series of one and of two joint values; 2 for more.
-_DEGREES = {1: 5, 2: 3}
-# Largest unexplained share of the variance of a dependent joint value.
-_UNEXPLAINED = 0.1
-# Range from which on an angle is treated as periodic [rad].
-_WRAPPING = math.pi
+RANK_TOLERANCE = 0.05  # smallest singular value that counts as a degree of freedom, relative to the largest
+_DEGREES = {1: 5, 2: 3}  # degree of polynomials or Fourier series of one and of two joint values; 2 for more
+_UNEXPLAINED = 0.1  # largest unexplained share of the variance of a dependent joint value
+_WRAPPING = math.pi  # range from which on an angle is treated as periodic [rad]
 # Largest random change of joint values for configurations that were not observed [m] or [rad].
 _PERTURBATION = 0.3
 
@@ -136,8 +131,7 @@ def build_chain(joints: Sequence[PartPair], start: str, random: np.random.Genera
     for one in joints[1:]:
         times = np.intersect1d(times, one.times)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
-    # Twists about the origin of the first part, until all joints are passed.
-    twists: list[Array] = []
+    twists: list[Array] = []  # twists about the origin of the first part, until all joints are passed
     values: list[Array] = []
     deviations: list[Array] = []
     for one in joints:
@@ -239,8 +233,7 @@ CONSTRAINED_COMPONENTS: Mapping[str, tuple[int, ...]] = {
 }
 """Components of the pin in the seat that each joint constrains: x, y, z and the rotations about them."""
 
-# Families whose seat may be rotated about z.
-_ABOUT_Z = ("prismatic", "revolute", "cylindrical", "planar")
+_ABOUT_Z = ("prismatic", "revolute", "cylindrical", "planar")  # families whose seat may be rotated about z
 # Tolerance for the axes in standard deviations, and the largest tolerance of the rank.
 _WELL_KNOWN, _SMALL = 4.0, 0.15
 

@@ -37,8 +37,7 @@ LOG_ANYWHERE = _LOG_ROTATION - 3.0 * math.log(2.0)
 _LOG_ROOM = -3.0 * math.log(10.0)
 _TINY = 1e-300
 
-SURPRISE_DEVIATIONS = 4.0
-"""Largest deviation of χ² from its mean that noise explains, in standard deviations."""
+SURPRISE_DEVIATIONS = 4.0  # largest deviation of χ² from its mean that noise explains, in standard deviations
 
 
 @dataclass(frozen=True)
