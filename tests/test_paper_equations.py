@@ -116,13 +116,7 @@ def test_equation_6_of_2022_drives_a_base():
     with model.edit() as edit:
         edit.apply(
             kv.articulations.DifferentialDrive(
-                name="base",
-                parent="world",
-                child="base",
-                radius=r,
-                track=width,
-                left="left",
-                right="right",
+                name="base", parent="world", child="base", radius=r, track=width, left="left", right="right"
             )
         )
     pose = model.fk("base")
@@ -165,11 +159,7 @@ def test_equation_8_of_2022(at):
     product = overridden() * (4 * a)
     x, y = at[a], at[b]
     assert numbers(product.gradient(), at) == pytest.approx(
-        {
-            "a:velocity": 4 * (math.sin(x) + x * math.cos(x) + y**2),
-            "b:velocity": 4 * x,
-            "c:velocity": 16 * x,
-        }
+        {"a:velocity": 4 * (math.sin(x) + x * math.cos(x) + y**2), "b:velocity": 4 * x, "c:velocity": 16 * x}
     )
     # Where nothing was overridden, the entry is the slope; where something was, the slope is 8ab.
     assert product.gradient()[da](at) == pytest.approx(slope(product, a, at), abs=1e-7)

@@ -77,9 +77,7 @@ def test_garage_door_constraints_equal_those_of_the_papers() -> None:
 
 
 @BOTH
-def test_lock_forces_speed_zero_and_its_gradient_shows_how_to_open(
-    door: kv.articulations.GarageDoor,
-) -> None:
+def test_lock_forces_speed_zero_and_its_gradient_shows_how_to_open(door: kv.articulations.GarageDoor) -> None:
     model = model_of(door)
     closed, opening = (2.0, -1.0) if door is PUBLISHED else (0.0, 1.0)
     rows = model.velocity_rows(0.1)

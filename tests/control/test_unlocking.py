@@ -115,8 +115,7 @@ def test_demand_is_needed_where_a_key_has_to_be_on_both_sides():
 
 
 @pytest.mark.parametrize(
-    ("name", "goal"),
-    [("latch", "gate/door"), ("microwave", "oven/door"), ("garage_door", "garage/door")],
+    ("name", "goal"), [("latch", "gate/door"), ("microwave", "oven/door"), ("garage_door", "garage/door")]
 )
 def test_unlock_opens_doors_of_the_gallery(name, goal):
     model = kv.load(f"articulations/{name}", "it")

@@ -44,8 +44,7 @@ SOME = ("at rest", "curved", "augmented", "upper symbol", "zero", "negative", "s
 """Changes of each kind, of which some are followed and others are not, whatever decides."""
 
 of_changes = pytest.mark.parametrize(
-    "changes",
-    [pytest.param(SOME, id="some"), pytest.param(tuple(CHANGES), id="all", marks=pytest.mark.long)],
+    "changes", [pytest.param(SOME, id="some"), pytest.param(tuple(CHANGES), id="all", marks=pytest.mark.long)]
 )
 
 

@@ -156,10 +156,7 @@ def gambling(model: kv.model.ReadRecorder) -> kv.model.Writes:
     return kv.model.Writes(data={"length": len(repr(model.fk("car")))})
 
 
-@pytest.mark.parametrize(
-    ("code", "change"),
-    [(branching, {"number": 0.5}), (gambling, CHANGES[0])],
-)
+@pytest.mark.parametrize(("code", "change"), [(branching, {"number": 0.5}), (gambling, CHANGES[0])])
 def test_a_value_that_the_operation_depends_on_must_stay(code: Any, change: dict[str, Any]) -> None:
     read = reloaded(build(code))
     before = read.snapshot()

@@ -446,12 +446,7 @@ def test_every_function_is_compared():
     """What is added to the tables is to be added here."""
     names = {
         f.__name__
-        for f in (
-            *protocol._FUNCTIONS,
-            *protocol._REARRANGING,
-            *protocol._SPREADING,
-            *protocol._JOINING,
-        )
+        for f in (*protocol._FUNCTIONS, *protocol._REARRANGING, *protocol._SPREADING, *protocol._JOINING)
     }
     here = Path(__file__).read_text(encoding="utf-8")
     assert [name for name in sorted(names) if not re.search(rf"\b{name}\b", here)] == []

@@ -57,9 +57,7 @@ LEG = body(
     "thigh",
     hinge("hip", "0 1 0", 'range="-40 40"')
     + body(
-        "rod",
-        '<joint name="ball" type="ball"/>' + '<site name="rod_end" pos="0 0 -.39"/>',
-        'pos=".1 0 0"',
+        "rod", '<joint name="ball" type="ball"/>' + '<site name="rod_end" pos="0 0 -.39"/>', 'pos=".1 0 0"'
     )
     + body(
         "shin",

@@ -37,10 +37,7 @@ CASES = {
     "version 1.3": (robot(links=1, attributes='name="r" version="1.3"'), "1.0, 1.1, 1.2 are"),
     "version 1": (robot(links=1, attributes='name="r" version="1"'), 'version="1" is not one that is read'),
     "no version": (robot(links=1, attributes='name="r" version=""'), 'version="" is not one that is read'),
-    "capital robot": (
-        robot(links=1).replace("robot", "Robot"),
-        "is not <robot>, the root element of a URDF",
-    ),
+    "capital robot": (robot(links=1).replace("robot", "Robot"), "is not <robot>, the root element of a URDF"),
     "spherical": (pair(kind="spherical"), J + 'type="spherical" is no joint type of URDF'),
     "1.2 without lower": (
         pair('<limit upper="1"/>', attributes='name="r" version="1.2"'),

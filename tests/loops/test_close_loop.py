@@ -7,13 +7,7 @@ import math
 import numpy as np
 import pytest
 from linkages import at, bar, four_bar, four_bar_by_circles, limited_four_bar, slider_crank
-from loop_checks import (
-    assert_closed,
-    assert_moves_as_its_jacobian_says,
-    function,
-    record,
-    residual,
-)
+from loop_checks import assert_closed, assert_moves_as_its_jacobian_says, function, record, residual
 
 import kineverse as kv
 

@@ -153,11 +153,7 @@ def test_bounds_and_general_rows_admit_the_same_speeds(seed: int, recovery: Any)
     rows = mixed().velocity_rows(DT, recovery=recovery)
     bounds, general = rows.bounds, rows.general
     assert {*general.names} == {"a below b", "b", "sum", "level", "norm"}
-    assert bounds.names == (
-        ("a speed", "a backwards", "a", "a scaled"),
-        ("locked", "b"),
-        (),
-    )
+    assert bounds.names == (("a speed", "a backwards", "a", "a scaled"), ("locked", "b"), ())
     rng = np.random.default_rng(seed)
     state = kv.State(dict(zip((a, b, c), rng.normal(size=3) * 2, strict=True)))
     matrix, lower, upper = rows.matrix(state), rows.lower(state), rows.upper(state)

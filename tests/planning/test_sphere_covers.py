@@ -11,12 +11,7 @@ from hypothesis import strategies as st
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.shapes import Solid, scale_solid, solid_from_geometry, solid_from_points
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
-from kineverse.planning.spheres import (
-    cover_objects,
-    cover_solid,
-    cover_solids,
-    default_protrusion,
-)
+from kineverse.planning.spheres import cover_objects, cover_solid, cover_solids, default_protrusion
 from kineverse.planning.spheres.certificate import find_uncovered
 from kineverse.planning.spheres.polytope import CoverRegion, bound_solid
 

@@ -133,12 +133,7 @@ def test_the_report_counts_right_answers_and_sure_errors() -> None:
     report = report_answers({Setting(True, False): answers})
     assert report.tables[0].rows[0][1:4] == (50.0, 50.0, 25.0)
     assert report.tables[0].rows[0][-1] == "no"
-    assert [row[1] for row in report.tables[1].rows][1:] == [
-        "100.0 of 1 (0)",
-        "-",
-        "33.3 of 3 (1)",
-        "-",
-    ]
+    assert [row[1] for row in report.tables[1].rows][1:] == ["100.0 of 1 (0)", "-", "33.3 of 3 (1)", "-"]
 
 
 RANDOM = np.random.default_rng(0)

@@ -139,10 +139,7 @@ def two_cylinders() -> kv.Model:
             )
             edit.apply(slide)
             edit.close_loop(
-                f"{side}_rod_end",
-                side,
-                mask=("x", "y"),
-                home={f"{side}_rod_hinge": 0, "crank_hinge": 0.3},
+                f"{side}_rod_end", side, mask=("x", "y"), home={f"{side}_rod_hinge": 0, "crank_hinge": 0.3}
             )
     return model
 

@@ -228,10 +228,7 @@ def test_exchanged_frames_are_told(kitchen: kv.Model) -> None:
     monitor = PlausibilityMonitor(kitchen, FRAMES, noise=NOISE, families=SOME)
     for k in range(30):
         monitor.update({frame: track[k] for frame, track in exchanged.items()})
-    for report in (
-        check_plausibility(kitchen, exchanged, noise=NOISE, families=SOME),
-        monitor.report(),
-    ):
+    for report in (check_plausibility(kitchen, exchanged, noise=NOISE, families=SOME), monitor.report()):
         assert report.implausible
         assert not report.replacements
         assert all("exchanged" in verdict.reason for verdict in report)
