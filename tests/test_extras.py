@@ -95,8 +95,7 @@ def test_install_command_without_metadata_asks_for_a_checkout(tmp_path, monkeypa
 
 @pytest.mark.parametrize("extra", [name for name in EXTRAS if name != "all"])
 def test_requirements_of_each_extra_are_in_the_metadata(extra):
-    declared = metadata.requires(DISTRIBUTION)
-    found = requirements(extra, declared)
+    found = requirements(extra, metadata.requires(DISTRIBUTION))
     assert [line.partition(";")[0].strip() for line in found] == [
         line.partition(";")[0].strip() for line in EXTRAS[extra]
     ]

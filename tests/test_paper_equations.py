@@ -201,8 +201,7 @@ def test_relevance_of_2022():
     with model.edit() as edit:
         for name, triple in triples.items():
             edit.constrain(name, *triple)
-    subjects = [a, b * c, np.sin(da), c.augment({dd: a}), kv.rotation_x(b) @ kv.translation(a, 0, 0)]
-    for subject in subjects:
+    for subject in [a, b * c, np.sin(da), c.augment({dd: a}), kv.rotation_x(b) @ kv.translation(a, 0, 0)]:
         variables = {str(s) for s in subject.symbols}
         shared = {n for n, (_, e, _) in triples.items() if {str(s) for s in e.symbols} & variables}
         assert set(model.constraints_for(subject, exact=True)) == shared

@@ -57,8 +57,7 @@ def test_base_jacobians_equal_finite_differences(base: Base, seed: int) -> None:
 
 @pytest.mark.parametrize("base", EVERY, ids=lambda o: type(o).__name__)
 def test_base_tangents_equal_motion_along_rates(base: Base) -> None:
-    arm = kv.Revolute(name="arm", parent="c", child="arm", axis=(1, 2, 3))
-    model = model_of(base, arm)
+    model = model_of(base, kv.Revolute(name="arm", parent="c", child="arm", axis=(1, 2, 3)))
     assert_motion_law(model, [model.fk("arm"), model.jacobian("arm"), model.fk("c", "arm")], seed=4)
 
 

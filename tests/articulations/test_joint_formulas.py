@@ -220,8 +220,7 @@ def test_mimic_joint_has_no_coordinate_of_its_own() -> None:
     assert model.articulations["j"].coordinates == ()
     expected = ORIGIN @ homogeneous(Rotation.from_euler("z", 0.49))
     np.testing.assert_allclose(model.fk("c")({"bolt": 0.7}), expected, atol=1e-14)
-    same = model_of(kv.Prismatic(**WHERE, position=bolt))
-    assert same.articulations["j"].coordinates == ()
+    assert model_of(kv.Prismatic(**WHERE, position=bolt)).articulations["j"].coordinates == ()
 
 
 def test_planar_joint_limits() -> None:

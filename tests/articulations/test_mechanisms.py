@@ -102,8 +102,7 @@ def test_mechanism_limits_are_constraints(mechanism: Mechanism) -> None:
 def test_velocity_rows_keep_all_limits_of_mechanisms(mechanism: Mechanism, direction: float) -> None:
     model = model_of(mechanism)
     wish = {str(s): direction for s in model.speeds}
-    start = model.default_state()
-    end = assert_rows_keep_limits(model, start, wish, 60, 0.05)
+    end = assert_rows_keep_limits(model, model.default_state(), wish, 60, 0.05)
     for q in model.degrees_of_freedom:
         slack = 1e-9
         lower, upper = ends(mechanism, q)

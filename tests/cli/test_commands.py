@@ -320,10 +320,8 @@ def test_pages_end_with_status_0(stop, words, hears_ctrl_c):
         env={**environment, "PYTHONUNBUFFERED": "1"},
     ) as process:
         try:
-            first = process.stdout.readline()
-            assert first.startswith("http://127.0.0.1:")
-            second = process.stdout.readline()
-            assert "DoF" in second
+            assert process.stdout.readline().startswith("http://127.0.0.1:")
+            assert "DoF" in process.stdout.readline()
             process.send_signal(stop)
             out, err = process.communicate(timeout=60)
         finally:

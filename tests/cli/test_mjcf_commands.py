@@ -52,5 +52,4 @@ def test_meshes_are_drawn(door):
     """The mesh is drawn at the frame of its file: lowered by its reference, raised by its geom."""
     shapes = kv.load(door).bodies["door"].visuals
     assert [shape.origin.matrix[2, 3] for shape in shapes] == [0.0, 1.0]
-    surface = mesh_geometry(shapes[1].geometry)
-    assert np.diff(surface.bounds, axis=0)[0].tolist() == [1.0, 1.0, 1.0]
+    assert np.diff(mesh_geometry(shapes[1].geometry).bounds, axis=0)[0].tolist() == [1.0, 1.0, 1.0]

@@ -163,8 +163,7 @@ def points(count: int, size: int, seed: int = 0) -> np.ndarray:
         rng.uniform(-1.5e6, 1.5e6, (count, size)),
         rng.choice(SPECIAL, (count, size)),
     ]
-    kind = rng.choice(5, (count, size), p=[0.5, 0.2, 0.1, 0.1, 0.1])
-    return np.choose(kind, kinds)
+    return np.choose(rng.choice(5, (count, size), p=[0.5, 0.2, 0.1, 0.1, 0.1]), kinds)
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> bool:

@@ -42,8 +42,7 @@ def inputs() -> np.ndarray:
     ]
     first = np.concatenate(kinds)
     pairs = np.stack([first, rng.permutation(first)], axis=1)
-    special = np.array([(u, v) for u in SPECIAL for v in SPECIAL])
-    return np.concatenate([pairs, special])
+    return np.concatenate([pairs, np.array([(u, v) for u in SPECIAL for v in SPECIAL])])
 
 
 @pytest.fixture(scope="module")

@@ -185,8 +185,7 @@ def test_closed_loops_close_in_float() -> None:
     model = kv.load("articulations/four_bar")
     outputs = [model.fk(frame) for frame in model.frames if frame != "world"]
     symbols = sorted(set().union(*(o.symbols for o in outputs)), key=str)
-    start = model.default_state().vector(symbols)
-    rows = start + np.linspace(-0.05, 0.05, 20)[:, None]
+    rows = model.default_state().vector(symbols) + np.linspace(-0.05, 0.05, 20)[:, None]
     results = VectorProgram(outputs, symbols).evaluate(rows)
     wanted = kv.compile(outputs, symbols, tier="interpreter").batch(rows)
     assert all(np.abs(r - w).max() < 1e-5 for r, w in zip(results, wanted, strict=True))

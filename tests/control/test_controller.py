@@ -68,8 +68,7 @@ def test_nothing_moves_once_goals_are_reached() -> None:
     model = planar_arm()
     state = model.default_state().updated({"joint1": 1.9, "joint2": 0.5, "joint3": 0.2})
     target = model.fk("tip")(state)[:3, 3]
-    controller = Controller(model, [Goal(model.fk("tip")[:3, 3], target)], dt=DT)
-    _, commands = follow(controller, state, 1.0)
+    _, commands = follow(Controller(model, [Goal(model.fk("tip")[:3, 3], target)], dt=DT), state, 1.0)
     assert max(abs(v) for c in commands for v in c.speeds.values()) < 1e-9
 
 
@@ -87,8 +86,7 @@ def test_hold_keeps_its_relation_while_a_goal_moves() -> None:
     tip = model.fk("tip")
     state = model.default_state().updated({"joint1": 0.3, "joint2": 0.9, "joint3": -1.2, "joint4": 0.5})
     held = Hold(tip[:2, 3], tip(state)[:2, 3], name="pin")
-    controller = Controller(model, [held, Goal(model.symbol("joint1"), 0.9)], dt=DT)
-    end, commands = follow(controller, state, 4.0)
+    end, commands = follow(Controller(model, [held, Goal(model.symbol("joint1"), 0.9)], dt=DT), state, 4.0)
     assert max(c.residuals["pin"] for c in commands) < 2e-3
     assert end["joint1"] == pytest.approx(0.9, abs=1e-2)
     assert all(c.progress > 0.99 for c in commands)
@@ -97,8 +95,7 @@ def test_hold_keeps_its_relation_while_a_goal_moves() -> None:
 def test_hold_that_is_violated_is_approached_with_progress() -> None:
     model = planar_arm(3)
     state = model.default_state().updated({"joint2": 0.6, "joint3": 0.6})
-    held = Hold(model.fk("tip")[:2, 3], [1.2, 1.5], name="pin")
-    controller = Controller(model, [held], dt=DT)
+    controller = Controller(model, [Hold(model.fk("tip")[:2, 3], [1.2, 1.5], name="pin")], dt=DT)
     end, commands = follow(controller, state, 6.0)
     residuals = [c.residuals["pin"] for c in commands]
     assert all(b <= a + 1e-9 for a, b in pairwise(residuals))
@@ -182,8 +179,7 @@ def test_targets_gains_and_weights_are_parameters() -> None:
 def test_command_at_rate_of_a_moving_target_has_no_lag() -> None:
     model = planar_arm(velocity=None)
     q, time = model.symbol("joint1"), kv.parameter("time", 0.0)
-    goal = Goal(q, np.sin(time), rate=np.cos(time), gain=5.0)
-    controller = Controller(model, [goal], dt=DT, smooth=0)
+    controller = Controller(model, [Goal(q, np.sin(time), rate=np.cos(time), gain=5.0)], dt=DT, smooth=0)
     state = model.default_state()
     errors = []
     for k in range(100):

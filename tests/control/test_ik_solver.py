@@ -69,8 +69,7 @@ def test_robots_with_bases_reach_the_poses_of_random_states(name: str, frames: t
     targets = [pose_target(f"target{k}") for k in range(len(frames))]
     errors = [same_pose(model.fk(f), t.expression) for f, t in zip(frames, targets, strict=True)]
     solver = InverseKinematics(model, [Goal(e) for e in errors])
-    base = {f"{name}/base/{c}" for c in ("x", "y", "angle")}
-    assert base <= set(map(str, solver.coordinates))
+    assert {f"{name}/base/{c}" for c in ("x", "y", "angle")} <= set(map(str, solver.coordinates))
     for _ in range(8):
         state = random_state(model, generator)
         values = {
@@ -212,8 +211,7 @@ def test_contradictory_holds_are_named() -> None:
 def test_goal_that_is_impossible_alone_is_named() -> None:
     model = planar_arm(2)
     tasks = [Goal(model.symbol("joint1"), 5.0, name="far"), Goal(model.fk("tip")[0, 3], 9.0, name="reach")]
-    result = inverse_kinematics(model, tasks)
-    assert "Not even alone can 'far', 'reach' be done." in result.why
+    assert "Not even alone can 'far', 'reach' be done." in inverse_kinematics(model, tasks).why
 
 
 def test_range_that_is_impossible_is_named_and_no_other_task() -> None:
@@ -536,5 +534,4 @@ def test_solutions_of_arms_are_confirmed_by_pinocchio(file: str, frame: str) -> 
         result = solver.solve(target.values(np.vstack([wanted[:3], [0, 0, 0, 1]])), starts=20)
         assert result.solved
         assert not model.violations(result.best)
-        found = place({str(s): v for s, v in result.best.items()})
-        assert np.abs(found - wanted).max() < 1e-4
+        assert np.abs(place({str(s): v for s, v in result.best.items()}) - wanted).max() < 1e-4

@@ -41,8 +41,7 @@ def first_moves(trace, least=0.1):
 
 def reversals(trace, name):
     """Return how often a coordinate turned round."""
-    values = [state[kv.position(name)] for state in trace]
-    ways = [b > a for a, b in pairwise(values) if abs(b - a) > 1e-9]
+    ways = [b > a for a, b in pairwise([state[kv.position(name)] for state in trace]) if abs(b - a) > 1e-9]
     return sum(a != b for a, b in pairwise(ways))
 
 

@@ -90,8 +90,7 @@ def test_document_is_read_without_the_classes_that_made_it(tmp_path):
         "print(m.data['twice'], m.history.entry('mine').operation.kind)"
     )
     command = [sys.executable, "-c", script, tmp_path / "rich.kv.json"]
-    other = subprocess.run(command, capture_output=True, check=True, text=True)
-    assert other.stdout == "42 Doubled\n"
+    assert subprocess.run(command, capture_output=True, check=True, text=True).stdout == "42 Doubled\n"
 
 
 def test_document_is_read_under_a_prefix(tmp_path):

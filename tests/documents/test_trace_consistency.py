@@ -106,8 +106,7 @@ def test_listed_names_count_as_reads_even_if_the_document_omits_them() -> None:
 
 
 def test_a_consistent_document_has_its_recorded_reads() -> None:
-    content = tree()
-    assert to_json(read(content)) == to_json(build(placed))
+    assert to_json(read(tree())) == to_json(build(placed))
     stripped = tree()
     without_reads(stripped)
     assert to_json(read(stripped)) == to_json(build(placed))
@@ -138,8 +137,7 @@ def frozen_too(content: dict[str, Any]) -> None:
 
 def gone(content: dict[str, Any]) -> None:
     """Let the trace be about an answer that the document's own model does not give."""
-    questions = custom(content)["trace"]["questions"]
-    next(q for q in questions if q[0] == "datum")[2] = "nowhere"
+    next(q for q in custom(content)["trace"]["questions"] if q[0] == "datum")[2] = "nowhere"
 
 
 def not_written(content: dict[str, Any]) -> None:

@@ -107,8 +107,7 @@ def test_rows_without_times_pair_in_order(tmp_path):
 
 
 def test_single_part_takes_any_name(tmp_path):
-    recording = read_recording(write_table(tmp_path, "1 2 3\n4 5 7\n"))
-    assert recording.pair(child="door").child == "door"
+    assert read_recording(write_table(tmp_path, "1 2 3\n4 5 7\n")).pair(child="door").child == "door"
 
 
 @pytest.mark.parametrize("column", ["part", "name", "link", "body", "object", "frame", "child_frame_id"])
@@ -122,8 +121,7 @@ def test_part_named_world_is_a_part(tmp_path):
     recording = read_recording(
         write_table(tmp_path, "part,x,y,z,rx,ry,rz\nworld,1,0,0,0,0,0\ndoor,2,0,0,0,0,0\n")
     )
-    pair = recording.pair(child="door")
-    assert pair.parent_poses[0, 0, 3] == 1
+    assert recording.pair(child="door").parent_poses[0, 0, 3] == 1
 
 
 def test_unknown_columns_are_listed(tmp_path):

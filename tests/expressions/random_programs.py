@@ -281,8 +281,7 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
         return apply(kind, a, b)
 
     def selection():
-        kind = draw(choice("where", "clip"))
-        if kind == "where":
+        if draw(choice("where", "clip")) == "where":
             return apply("where", truth(), inner(), fitting())
         return apply("clip", inner(), const(-0.513), const(0.467))
 

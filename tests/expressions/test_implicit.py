@@ -69,8 +69,7 @@ def test_kepler_equation_by_its_inverse(eccentricity):
     anomalies = np.linspace(-7, 7, 101)
     solve = kv.compile(known.kepler().apply([u, v]), tier="interpreter")
     means = anomalies - eccentricity * np.sin(anomalies)
-    found = [solve([m, eccentricity])[0] for m in means]
-    assert_allclose(found, anomalies, rtol=0, atol=1e-14)
+    assert_allclose([solve([m, eccentricity])[0] for m in means], anomalies, rtol=0, atol=1e-14)
 
 
 def test_residuals_are_zero_with_expressions_as_inputs(function):
@@ -108,8 +107,7 @@ def test_derivatives_equal_the_implicit_function_theorem_in_numpy(function):
     n, k = len(function.unknowns), len(function.inputs)
     everything = [*function.unknowns, *function.inputs]
     first = function.equations.partial(everything)
-    second = first.partial(everything)
-    numbers = kv.compile([first, second], everything, tier="interpreter")
+    numbers = kv.compile([first, first.partial(everything)], everything, tier="interpreter")
     itself = function.apply(function.inputs)
     jacobian = itself.jacobian(function.inputs)
     hessian = jacobian.jacobian(function.inputs)
@@ -237,8 +235,7 @@ def test_nested_implicit_functions():
     cubic, kepler = known.cubic(), known.kepler()
     inner = cubic.apply([a * b])[0]
     nested = kepler.apply([inner, 0.3 * inner])
-    later = kepler.apply([c, 0.3 * c]).substitute({c: inner})
-    assert nested == later
+    assert nested == kepler.apply([c, 0.3 * c]).substitute({c: inner})
     assert implicit_nodes([nested])[0].function is not implicit_nodes([nested])[1].function
     assert [n.label for n in implicit_nodes([nested])] == ["cubic", "Kepler"]
     values = {a: 1.7, b: 2.1}

@@ -78,8 +78,7 @@ def test_batches_agree_with_single_calls():
 
 
 def test_values_do_not_depend_on_earlier_calls():
-    function = known.polar()
-    evaluate = compiled([function.apply([u, v])], [u, v])
+    evaluate = compiled([known.polar().apply([u, v])], [u, v])
     points = np.random.default_rng(5).uniform((0.5, -2), (3, 2), (200, 2))
     first = [evaluate(x)[0].tobytes() for x in points]
     orders = [np.random.default_rng(k).permutation(200) for k in range(3)]
@@ -187,8 +186,7 @@ def test_the_inner_one_of_nested_functions_is_named():
 
 
 def test_message_lists_all_inputs_and_parameters():
-    function = known.radius_and_height()
-    e = function.apply([a * 2, p])[0]
+    e = known.radius_and_height().apply([a * 2, p])[0]
     assert e({a: 0.15}) == pytest.approx(0.4)
     with pytest.raises(
         kv.errors.NoSolutionError, match=r"'height' has no solution at input/u = 0\.6, input/v = 0\.5\b"
@@ -239,8 +237,7 @@ def test_nan_from_elsewhere_is_returned(tier):
     with pytest.raises(kv.errors.NoSolutionError, match=WHERE):
         function([1.5, -1.0])
     # A logarithm that an input of the function is made of.
-    inner = compiled([CIRCLE.apply([f.log(b)])[0]], [b], tier)
-    assert np.isnan(inner([-1.0])[0])
+    assert np.isnan(compiled([CIRCLE.apply([f.log(b)])[0]], [b], tier)([-1.0])[0])
 
 
 # -- nor anything made of it -------------------------------------------------------------------------------

@@ -122,11 +122,9 @@ ALL = pytest.mark.parametrize("name", CASES)
 
 def points(count, size):
     """Numbers whose first three are a rotation by 0.3 to 2.9 rad."""
-    rng = np.random.default_rng(11)
-    result = rng.uniform(-1.5, 1.5, (count, size))
+    result = np.random.default_rng(11).uniform(-1.5, 1.5, (count, size))
     if size == 6:
-        angles = np.linspace(0.3, 2.9, count)
-        result[:, :3] *= (angles / np.linalg.norm(result[:, :3], axis=1))[:, None]
+        result[:, :3] *= (np.linspace(0.3, 2.9, count) / np.linalg.norm(result[:, :3], axis=1))[:, None]
     return result
 
 

@@ -133,8 +133,7 @@ def test_error_bounds_hold_and_are_tight(
     assert 0 < max(report.error.position, report.error.angle) <= tolerance
     read = kv.load(file)
     assert read.degrees_of_freedom == model.degrees_of_freedom
-    found = sampled_errors(model, read)
-    for name, error in found.items():
+    for name, error in sampled_errors(model, read).items():
         promised = report.errors.get(name, FrameDeviation())
         assert error.position <= promised.position + 1e-12, name
         assert error.angle <= promised.angle + 1e-7, name  # an arc sine of rounding
@@ -186,8 +185,7 @@ def test_frame_errors_grow_with_the_distance_from_the_approximated_joint(tmp_pat
         edit.add_frame("far", parent="near", transform=kv.translation(1.9, 0, 0))
     report = model.save(tmp_path / "m.urdf", tolerance=0.2)
     assert report.errors["bend"].position == 0
-    ratio = report.errors["far"].position / report.errors["near"].position
-    assert ratio == pytest.approx(20)
+    assert report.errors["far"].position / report.errors["near"].position == pytest.approx(20)
     with pytest.raises(kv.errors.FormatError, match="'far' would be off by up to"):
         model.save(tmp_path / "m.urdf", tolerance=report.errors["far"].position * 0.9)
     with model.edit() as edit:

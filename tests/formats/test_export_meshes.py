@@ -165,10 +165,9 @@ def test_without_mesh_reader_meshes_to_convert_are_left_out(
         raise kv.errors.MissingDependencyError("reading meshes needs trimesh: install it")
 
     monkeypatch.setattr(mesh_files, "read_faces", missing)
-    saved = robot(package, "../meshes/cup.dae", "../meshes/cup.stl").save(tmp_path / "r.xml")
     assert any(
         "cup.dae is left out: MuJoCo cannot read it, and reading meshes needs trimesh" in r
-        for r in saved.remarks
+        for r in robot(package, "../meshes/cup.dae", "../meshes/cup.stl").save(tmp_path / "r.xml").remarks
     )
     assert len(kv.load(tmp_path / "r.xml").bodies["b"].visuals) == 1
 
@@ -187,8 +186,7 @@ def test_missing_textures_are_left_out_and_shapes_kept(tmp_path: Path) -> None:
             "cup", parent="world", transform=kv.rotation_z(kv.position("q")), body=Body(tuple(shapes))
         )
     (tmp_path / "out").mkdir()
-    saved = model.save(tmp_path / "out" / "m.xml")
-    assert [r for r in saved.remarks if r.startswith("the texture")] == [
+    assert [r for r in model.save(tmp_path / "out" / "m.xml").remarks if r.startswith("the texture")] == [
         "the texture no.png is left out: it is not there",
         "the texture wood.jpg is left out: it is not there",
     ]
@@ -204,8 +202,7 @@ def test_save_in_another_folder_warns_of_the_root_to_give(ending: str, package: 
     model = robot(
         package, "../meshes/cup.stl", "package://cups/meshes/cup.STL", "package://cups/meshes/cup.stl"
     )
-    saved = model.save(there / f"r.{ending}")
-    (said,) = [r for r in saved.remarks if "outside" in r]
+    (said,) = [r for r in model.save(there / f"r.{ending}").remarks if "outside" in r]
     assert said.endswith(f"are outside of {there}: give root='{tmp_path}' to open them from there")
     again = kv.load(there / f"r.{ending}", root=tmp_path).bodies["b"].visuals
     assert {locate_mesh(s.geometry).resolve().parent for s in again} == {package / "meshes"}  # type: ignore[arg-type]
@@ -269,8 +266,7 @@ def test_mesh_references_are_relative_to_the_written_file(
 ) -> None:
     there = tmp_path / "some" / "where"
     there.mkdir(parents=True)
-    model = robot(package, said(reference, "cup.stl", package))
-    model.save(there / f"r.{ending}")
+    robot(package, said(reference, "cup.stl", package)).save(there / f"r.{ending}")
     (shape,) = kv.load(there / f"r.{ending}").bodies["b"].visuals
     assert isinstance(shape.geometry, Mesh)
     found = locate_resource(shape.geometry.uri, shape.geometry.folder)
@@ -297,6 +293,5 @@ def test_mesh_addresses_stay_if_they_lead_to_the_same_file(
 
 def test_missing_meshes_keep_their_reference(tmp_path: Path) -> None:
     (tmp_path / "urdf").mkdir()
-    model = robot(tmp_path, "package://nobody/a.stl")
-    model.save(tmp_path / "r.urdf")
+    robot(tmp_path, "package://nobody/a.stl").save(tmp_path / "r.urdf")
     assert "package://nobody/a.stl" in (tmp_path / "r.urdf").read_text()

@@ -151,8 +151,7 @@ def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path
     again = kv.load(file)
     assert_same_motion(model, again, tolerance=1e-10 if model.rates.dependent else 1e-12)
     assert model.rates.dependent.keys() == again.rates.dependent.keys()
-    without = {frame for frame in model.frames if frame not in model.bodies}
-    assert not without & set(again.bodies)
+    assert not {frame for frame in model.frames if frame not in model.bodies} & set(again.bodies)
 
 
 @settings(max_examples=attempts(6), deadline=None)
@@ -209,8 +208,7 @@ def test_home_position_becomes_a_key(tmp_path: Path) -> None:
             )
         )
     model.save(tmp_path / "m.xml")
-    compiled = MujocoReference(tmp_path / "m.xml").model
-    assert compiled.key("home").qpos[0] == 0.5
+    assert MujocoReference(tmp_path / "m.xml").model.key("home").qpos[0] == 0.5
     assert kv.load(tmp_path / "m.xml").default_state()["q"] == 0.5
 
 

@@ -55,8 +55,7 @@ def mesh_of(model: kv.Model):
 @pytest.mark.parametrize("mark", [".git/HEAD", "package.xml", "model.config", "__init__.py"])
 def test_a_repository_or_package_around_a_file_is_its_root(put, tmp_path, mark):
     put(f"top/{mark}")
-    folder = put("top/a/b/r.urdf").parent
-    assert find_root(folder) == str(tmp_path / "top")
+    assert find_root(put("top/a/b/r.urdf").parent) == str(tmp_path / "top")
     assert find_root(tmp_path) == str(tmp_path)
 
 

@@ -243,8 +243,7 @@ def test_rate_tables_are_read_back_unchanged(rows):
             [12, None, None, 11, None, 12, None, None, None, None, 12, None, 10, None, None, 10],
         ],
     ]
-    writes = {"frames": {"h": {"parent": "world", "factors": [13]}}}
-    text = to_json(built(document(nodes, writes)))
+    text = to_json(built(document(nodes, {"frames": {"h": {"parent": "world", "factors": [13]}}})))
     assert to_json(built(text)) == text
 
 

@@ -78,8 +78,7 @@ def test_loops_are_solved_again_when_read_back(saved: str, tmp_path: Path) -> No
     model = load_cached("articulations/parallel_gripper")
     if saved != "as it is":
         model.save(tmp_path / "m.kv.json")
-        prefix = "left/a:b" if "prefix" in saved else None
-        model = kv.load(tmp_path / "m.kv.json", prefix=prefix)
+        model = kv.load(tmp_path / "m.kv.json", prefix="left/a:b" if "prefix" in saved else None)
     again = read(written(model, tmp_path))
     assert set(again.frames) == set(model.frames)
     assert model.rates.dependent.keys() == again.rates.dependent.keys()

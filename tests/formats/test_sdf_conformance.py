@@ -50,8 +50,7 @@ def test_poses_are_those_of_drake(file: str, published: Callable[..., Path]):
     model = kv.load(published(file))
     state = dict(model.default_state())
     for name, values in DRAKE[file]["q"].items():
-        joints = {n.removesuffix("/first") for n in model.articulations}
-        at = known(name, joints)
+        at = known(name, {n.removesuffix("/first") for n in model.articulations})
         names = [at] if len(values) == 1 else [f"{at}/first", f"{at}/second"]
         state |= {kv.position(n): value for n, value in zip(names, values, strict=True)}
     for body, rows in DRAKE[file]["poses"].items():

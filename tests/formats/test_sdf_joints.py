@@ -63,8 +63,7 @@ def test_revolute2_joint_becomes_two_hinges():
     ],
 )
 def test_screw_pitches_are_read(inside, pitch):
-    model = one("screw", Z + inside)
-    assert at(model, "b", j=math.tau)[2, 3] == pytest.approx(pitch)
+    assert at(one("screw", Z + inside), "b", j=math.tau)[2, 3] == pytest.approx(pitch)
 
 
 def test_sdf_limits_and_dynamics_are_read():
@@ -110,10 +109,9 @@ def mimic(
 
 
 def test_sdf_mimic_joints_follow():
-    links = "".join(link(name) for name in "abcd")
     model = model_of(
         sdf(
-            links,
+            "".join(link(name) for name in "abcd"),
             joint("c1", "revolute", "c", "d", Z.replace("</axis>", mimic("inner::q", 2, 1, 0.5))),
             joint("u", "universal", "a", "b", Z + "<axis2><xyz>0 1 0</xyz></axis2>"),
             joint("p", "prismatic", "b", "c", Z.replace("</axis>", mimic("u", -3, axis="axis2"))),
@@ -123,8 +121,7 @@ def test_sdf_mimic_joints_follow():
             + joint("on", "fixed", "a", "inner::x"),
         )
     )
-    names = {str(s) for s in model.degrees_of_freedom}
-    assert names == {"inner/q", "u/first", "u/second"}
+    assert {str(s) for s in model.degrees_of_freedom} == {"inner/q", "u/first", "u/second"}
     assert model.articulations["p"].position({"u/second": 0.5}) == -1.5
     assert model.articulations["c1"].position({"inner/q": 2.0}) == 2 * (2.0 - 0.5) + 1
 

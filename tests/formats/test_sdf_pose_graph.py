@@ -83,8 +83,7 @@ def test_placement_frames_place_models(frame: str):
     model = model_of(text.replace('name="__"', 'name="origin"'))
     name = {"__model__": "origin", "inner::l": "inner/l"}.get(frame, frame)
     expected = matrix((1, 2, 3, 0.1, 0.2, 0.3))
-    got = model.fk(name)(dict(model.default_state()))
-    np.testing.assert_allclose(got, expected, atol=1e-14)
+    np.testing.assert_allclose(model.fk(name)(dict(model.default_state())), expected, atol=1e-14)
 
 
 def test_scopes_become_paths():

@@ -38,8 +38,7 @@ def test_operations_have_prefixed_names_and_tags():
 
 
 def test_names_without_prefix_are_those_of_the_file():
-    model = model_of(SMALL)
-    assert model.history.tags == ["frame base", "body base", "joint elbow"]
+    assert model_of(SMALL).history.tags == ["frame base", "body base", "joint elbow"]
 
 
 def test_a_file_is_loaded_by_its_path(tmp_path):
@@ -65,8 +64,7 @@ def test_a_root_called_world_is_a_frame_with_prefix():
 
 
 def test_a_root_can_be_attached_elsewhere():
-    model = model_of(SMALL, "p", parent="table")
-    assert model.fk("p/arm")({"p/elbow": 0.0})[:3, 3].tolist() == [1, 0, 1]
+    assert model_of(SMALL, "p", parent="table").fk("p/arm")({"p/elbow": 0.0})[:3, 3].tolist() == [1, 0, 1]
     with pytest.raises(kv.errors.FormatError, match="its root link is the world"):
         model_of(WORLD, parent="table")
 
@@ -266,5 +264,4 @@ def test_planar_joints_move_in_the_plane_of_their_axis(axis):
 
 
 def test_a_long_chain_becomes_a_model():
-    model = model_of(chain(2000, "", "continuous"))
-    assert len(model.degrees_of_freedom) == 2000
+    assert len(model_of(chain(2000, "", "continuous")).degrees_of_freedom) == 2000

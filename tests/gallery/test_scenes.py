@@ -96,8 +96,7 @@ def test_commands_take_the_name_of_a_scene(name, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["counts"]["dof"] == len(model.degrees_of_freedom)
     assert told["counts"]["shapes"] == sum(len(body.visuals) for body in model.bodies.values())
-    frame = next(iter(model.bodies))
-    assert main(["fk", f"articulations/{name}", frame, "--json"]) == 0
+    assert main(["fk", f"articulations/{name}", next(iter(model.bodies)), "--json"]) == 0
     assert np.shape(json.loads(capsys.readouterr().out)["transform"]) == (4, 4)
 
 
@@ -161,8 +160,7 @@ def test_unknown_scene_error_suggests_names():
     }.items():
         with pytest.raises(UnknownNameError, match=f"Did you mean .*'{meant}'") as caught:
             kv.load(name)
-        suggested = re.findall("'([^']*)'", str(caught.value).split("Did you mean")[1].split("?")[0])
-        for one in suggested:
+        for one in re.findall("'([^']*)'", str(caught.value).split("Did you mean")[1].split("?")[0]):
             kv.load(one)  # each can be typed as it is told
     with pytest.raises(UnknownNameError, match=r"no model 'articulations/zzz'\. Available: .*jansen_leg"):
         kv.load("articulations/zzz")

@@ -133,8 +133,7 @@ def test_distance_expression_as_constraint_survives_a_document(tmp_path):
     # Without other values the parameters have those of where it was made.
     assert constraint.expression(state) == pytest.approx(float(constraint.expression(values)))
     assert "clear" in again.constraints_for(again.fk("hand"))
-    rows = again.velocity_rows(0.1, distance.expression)
-    assert rows is not None
+    assert again.velocity_rows(0.1, distance.expression) is not None
 
 
 def test_distance_expression_reuses_its_symbols():

@@ -197,8 +197,7 @@ def test_distances_scale_with_the_solids(one, other, shapes):
         for spread in (0.05, 0.3):
             poses = np.stack([random_pose(rng, spread), random_pose(rng, spread)])
             distance, *_ = measured(a, b, poses)
-            there = poses * (1, 1, 1, factor)
-            narrow = Narrowphase(small, there)
+            narrow = Narrowphase(small, poses * (1, 1, 1, factor))
             assert narrow.distance(0, 1) / factor == pytest.approx(distance, abs=3e-5)
             point_a, point_b, normal = narrow.witness()
             assert normal @ (point_b - point_a) == pytest.approx(factor * distance, abs=3e-5 * factor)

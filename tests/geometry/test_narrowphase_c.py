@@ -172,8 +172,7 @@ def test_depth_of_polytopes_matches_their_minkowski_difference(seed, kinds, spre
         (shape.points if shape.kind == "hull" else CORNERS * shape.sizes) @ pose[:, :3].T + pose[:, 3]
         for shape, pose in zip(shapes, poses, strict=True)
     ]
-    differences = (corners[1][None] - corners[0][:, None]).reshape(-1, 3)
-    heights = -ConvexHull(differences).equations[:, 3]
+    heights = -ConvexHull((corners[1][None] - corners[0][:, None]).reshape(-1, 3)).equations[:, 3]
     distance, _ = measured(placed(shapes, poses))
     if heights.min() > 1e-6:
         assert distance == pytest.approx(-heights.min(), abs=1e-8)

@@ -195,8 +195,7 @@ def test_neighbours_are_found_by_boxes_of_bodies_or_by_a_sweep(shapes):
             edit.add_frame(
                 f"body{k}", "carriage" if k % 3 else "world", at, body=Body(collisions=tuple(parts))
             )
-    scene = Scene(model)
-    watch = scene.watch(radius=0.4, moving=[rail])
+    watch = Scene(model).watch(radius=0.4, moving=[rail])
     counts = set()
     for value in np.cumsum(rng.normal(0.0, 0.2, 40)):
         found = watch.at(np.array([value]))

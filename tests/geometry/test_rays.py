@@ -104,8 +104,7 @@ def test_ray_returns_the_first_of_several_hits():
         assert (near.distance < 0) == near.inside
         alone = []
         for name in scene.bodies:
-            others = [other for other in scene.bodies if other != name]
-            single = Scene(model, leave_out=others)
+            single = Scene(model, leave_out=[other for other in scene.bodies if other != name])
             single.update(state)
             if (found := single.ray(origin, way, 5.0)) is not None:
                 alone.append((found.distance, found.body))

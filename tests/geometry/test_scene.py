@@ -92,8 +92,7 @@ def test_bounds_spare_most_distance_computations(model):
     for k in range(20):
         scene.update(state.updated({"j0": 0.002 * k}))
         scene.pairs_within(0.3)
-    measured = (scene.collision_world.narrowphase.calls - before) / 20
-    assert measured < 0.3 * len(brute_force(scene, state))
+    assert (scene.collision_world.narrowphase.calls - before) / 20 < 0.3 * len(brute_force(scene, state))
 
 
 def test_distances_to_and_distances_match_brute_force(model):
@@ -107,8 +106,7 @@ def test_distances_to_and_distances_match_brute_force(model):
         (set(names) - {"hand"}).pop(): d for names, d in expected.items() if "hand" in names
     }
     assert [r.b for r in scene.distances_to("hand", around[1].distance)] == [r.b for r in around[:2]]
-    pairs = [("hand", "box0"), ("box0", "hand"), ("box1", "box2")]
-    one, other, boxes = scene.distances(pairs)
+    one, other, boxes = scene.distances([("hand", "box0"), ("box0", "hand"), ("box1", "box2")])
     assert (one.a, one.b, other.a, other.b) == ("hand", "box0", "box0", "hand")
     assert one.distance == other.distance
     np.testing.assert_array_equal(one.point_a, other.point_b)
@@ -347,8 +345,7 @@ def test_adjacent_bodies_are_not_checked(model):
 
 
 def test_door_is_adjacent_to_its_cupboard_and_not_to_the_wall():
-    model = kv.load("kitchen")
-    scene = Scene(model)
+    scene = Scene(kv.load("kitchen"))
     assert not scene.checks_pair("kitchen/fridge_door", "kitchen/fridge")
     assert scene.checks_pair("kitchen/fridge_door", "kitchen/wall")
 

@@ -37,8 +37,7 @@ def test_scene_of_the_pr2_in_the_iai_kitchen(monkeypatch, published):
     packages = [published("pr2"), published("iai_kitchen")]
     monkeypatch.setenv("KINEVERSE_PACKAGE_PATH", ":".join(map(str, packages)))
     robot = next(path for path in packages[0].rglob("*.urdf"))
-    kitchen = next(path for path in packages[1].rglob("kitchen.urdf"))
-    model = kv.load(str(kitchen), prefix="kitchen")
+    model = kv.load(str(next(path for path in packages[1].rglob("kitchen.urdf"))), prefix="kitchen")
     model.include(str(robot), prefix="pr2")
     scene = Scene(model)
     state = model.default_state()

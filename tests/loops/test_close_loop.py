@@ -74,16 +74,14 @@ def test_of_two_branches_that_are_equally_near_rounding_does_not_choose(rounding
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_home_says_which(side):
-    home = {"crank": 0.3, "coupler": 0.6 * side, "rocker": 1.4 * side}
-    bars = four_bar(home=home)
+    bars = four_bar(home={"crank": 0.3, "coupler": 0.6 * side, "rocker": 1.4 * side})
     for angle in (-2.0, 0.3, 5.0):
         wanted = four_bar_by_circles(angle, side=side)
         np.testing.assert_allclose(bars.fk("rocker_tip")({"crank": angle})[:2, 3], wanted, rtol=0, atol=1e-11)
 
 
 def test_home_may_be_turns_away():
-    home = {"crank": 0.3 + 4 * np.pi, "coupler": 0.6, "rocker": 1.4 - 2 * np.pi}
-    bars = four_bar(home=home)
+    bars = four_bar(home={"crank": 0.3 + 4 * np.pi, "coupler": 0.6, "rocker": 1.4 - 2 * np.pi})
     assert bars.rates.carried(rocker)({"crank": 0.3}) == pytest.approx(1.4 - 2 * np.pi, abs=0.3)
     assert_closed(bars, 100)
 
@@ -211,8 +209,7 @@ def test_expressions_move_as_their_gradients_say(model):
     """ė and ë of something about pose and followers, along a motion of the crank."""
     e = model.fk("coupler_tip")[0, 3] * model.rates.carried(rocker) + np.sin(model.rates.carried(coupler))
     first = e.gradient()[crank.derivative()]
-    second = first.gradient()[crank.derivative()]
-    f = function(model, e, first, second)
+    f = function(model, e, first, first.gradient()[crank.derivative()])
     for q in np.linspace(-6, 6, 25):
         before, now, after = (f([q + s]) for s in (-1e-4, 0, 1e-4))
         assert now[1] == pytest.approx((after[0] - before[0]) / 2e-4, abs=1e-6)
@@ -353,8 +350,7 @@ def test_many_inputs():
 
 def test_the_guess_is_periodic_over_full_revolutions():
     """A guess that grew by what rounding leaves of 0 would have no period."""
-    model = slider_crank()
-    (loop,) = model.rates.dependent[kv.position("piston")]._nodes
+    (loop,) = slider_crank().rates.dependent[kv.position("piston")]._nodes
     guess = kv.compile(loop.function.seed[1])
     # Two angles that are the same number, as sine and cosine see it, but a rate of 1e-16 [m/rad] does not.
     far = 1e17

@@ -162,8 +162,7 @@ def test_exploration_in_a_world_by_the_controller():
     box = draw_lockbox(5, 3)
     model, world = make_lockbox_model(remove_locks(box), None), MechanismWorld(make_lockbox_model(box, None))
     mover = PartMover(model.snapshot(), Session(world, dt=0.05))
-    done = explore_locks(model, box.goal, mover.move)
-    assert done
+    assert explore_locks(model, box.goal, mover.move)
     (goal,) = box.goal
     assert world.state[kv.position(goal)] == pytest.approx(box.goal[goal], abs=2e-4)
     assert plan_unlocking(model, box.goal).verdict == "found"

@@ -172,8 +172,7 @@ def test_a_hand_from_below_opens_a_door_that_none_from_across_reaches():
     model = make_model("shelf_door", 1.5)
     gripper, handle, state = find_gripper(model, "hsr"), find_handle(model, DOOR), start(model)
     across = sample_grasps(model, gripper, handle, 32)
-    search = PlacementSearch(model, gripper, state)
-    found = search.find(state, across, 1.2)
+    found = PlacementSearch(model, gripper, state).find(state, across, 1.2)
     assert found.failure == "reach"
     assert found.samples < 600  # no arm reached the handle at all
     world = KinematicWorld(model, "hsr")
@@ -340,8 +339,7 @@ def test_hand_believes_that_a_locked_door_is_open_where_it_is():
     state = model.default_state().updated({door: 0.5, "microwave/oven/button": 0.006})
     hand = SimpleNamespace(hand="world")
     opener = SimpleNamespace(gripper=hand, search=search, approaches=None, controllers={})
-    motion = HandMotion(SimpleNamespace(state=state), opener, handle, None, 0.0)
-    assert motion.state[door] == 0.5
+    assert HandMotion(SimpleNamespace(state=state), opener, handle, None, 0.0).state[door] == 0.5
 
 
 def test_drawer_that_is_locked_on_the_way_is_said_not_to_move():

@@ -223,8 +223,7 @@ SENSORS = Sensors.parse("3mm+3mm/m,0.5deg,30Hz")
 def test_push_on_estimates_feels_for_the_object() -> None:
     world = KinematicWorld(room(), "robot", sensors=SENSORS)
     world.reset(opened(door=0.3) | {"robot/base/y": 1.0})
-    belief = TrackedBelief(room(), "robot", SENSORS)
-    outcome = push(Session(world, belief=belief), "door", bodies=PUSHER)
+    outcome = push(Session(world, belief=TrackedBelief(room(), "robot", SENSORS)), "door", bodies=PUSHER)
     assert outcome, outcome.reason
     assert outcome.measures["losses"] <= 1
 
@@ -365,8 +364,7 @@ def test_points_beyond_one_that_was_out_of_reach_are_given_up_too() -> None:
         choice.reset()
         choice.chosen = first
         choice.give_up(False, way)
-        after = choice.choose(start, (0.0, 0.0, 0.0))
-        assert (np.array(after.point) - points[first]) @ way <= 1e-9
+        assert (np.array(choice.choose(start, (0.0, 0.0, 0.0)).point) - points[first]) @ way <= 1e-9
         assert choice.blocked == 1
 
 

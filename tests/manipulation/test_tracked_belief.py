@@ -281,6 +281,5 @@ def test_door_with_a_position_lock_is_believed_where_it_is(model):
         lock = kv.articulations.position_lock(door, open_if=bolt > 0.5, lower=0.0, upper=0.0)
         edit.constrain("door/lock", *lock)
     world, belief = start(locked, bolt=1.0, door=0.5)
-    state = run(world, belief, 20)
-    assert state["door"] == pytest.approx(0.5, abs=0.02)
+    assert run(world, belief, 20)["door"] == pytest.approx(0.5, abs=0.02)
     assert belief.deviation(locked.symbol("door")) < 0.02

@@ -43,8 +43,7 @@ def test_thesis_box_is_opened_in_order():
 def test_random_boxes_are_opened_without_violations(seed):
     """Boxes with negations and circles: those that exhaustive search can open are opened, and no others."""
     box = draw_tangled_lockbox(5, 300 + seed)
-    world = MechanismWorld(make_lockbox_model(box))
-    done = execute_unlocking(world, goal_of(box))
+    done = execute_unlocking(MechanismWorld(make_lockbox_model(box)), goal_of(box))
     assert bool(done) == can_be_opened(box)
     assert all(move.done for move in done.moves)
     assert done.violation < 1e-6
@@ -65,8 +64,7 @@ def test_jammed_part_is_left_out_of_the_next_plan():
         assert done
         assert done.stuck in ((), (jammed,))
         assert done.plans == 1 + len(done.stuck)
-        moved = [move.step.coordinate for move in done.moves if move.done]
-        assert moved == [other, A]
+        assert [move.step.coordinate for move in done.moves if move.done] == [other, A]
         assert world.state[jammed] == 0.0
 
 

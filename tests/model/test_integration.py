@@ -231,8 +231,7 @@ def test_random_expressions_on_a_base_move_as_their_gradients_say(base: str, see
     model = with_arm(base)
     rng = np.random.default_rng(seed)
     symbols = list(model.degrees_of_freedom)
-    expressions = [model.rates.carry(random_expression(rng, symbols)) for _ in range(4)]
-    assert_motion_law(model, expressions, seed)
+    assert_motion_law(model, [model.rates.carry(random_expression(rng, symbols)) for _ in range(4)], seed)
 
 
 @pytest.mark.parametrize("name", NONLINEAR)

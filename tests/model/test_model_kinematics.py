@@ -40,8 +40,7 @@ def test_poses_in_all_directions_equal_products_of_numbers(seed: int) -> None:
 def test_jacobians_are_the_twists_of_poses_along_every_speed(seed: int) -> None:
     model = random_tree(seed, 10)
     rng = np.random.default_rng(seed)
-    values = random_state(model, seed)
-    state, h = kv.State(values), 1e-5
+    state, h = kv.State(random_state(model, seed)), 1e-5
     names = ["world", *model.frames]
     pairs = [(names[-1], "world"), *((names[i], names[j]) for i, j in rng.integers(0, len(names), (5, 2)))]
     speeds = random_speeds(model, seed)
@@ -234,14 +233,12 @@ def test_a_chain_of_thousands_of_moving_frames() -> None:
 
 
 def test_frames_placed_by_several_factors_or_one_matrix_are_the_same() -> None:
-    rng = np.random.default_rng(3)
-    pose = random_pose(rng)
+    pose = random_pose(np.random.default_rng(3))
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("product", "world", [pose, kv.rotation_z(x), kv.translation(y, 0, 0), pose])
         edit.add_frame("matrix", "world", model.fk("product"))
-        rows = [[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]]
-        edit.add_frame("rows", "world", rows)
+        edit.add_frame("rows", "world", [[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]])
     at = {"x": 0.3, "y": 0.4}
     np.testing.assert_allclose(model.fk("product")(at), model.fk("matrix")(at), atol=1e-15)
     np.testing.assert_allclose(model.jacobian("product")(at), model.jacobian("matrix")(at), atol=1e-14)

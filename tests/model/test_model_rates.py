@@ -76,9 +76,8 @@ def assert_motion_law(model: kv.Model, expressions: list[kv.Expression], seed: i
     points = [at(k * h) for k in (-2, -1, 0, 1, 2)]
     for e in expressions:
         first = kv.expressions.total_derivative(e)
-        gradient = first.gradient(heuristic=False)
         second = sum(
-            (entry * key for key, entry in gradient.items() if key.order == 1),
+            (entry * key for key, entry in first.gradient(heuristic=False).items() if key.order == 1),
             kv.Expression(np.zeros(e.shape)),
         )
         for below, above in ((e, first), (first, second)):

@@ -44,8 +44,7 @@ def test_a_model_of_shared_nodes(kind):
     assert to_plain(carried)(values)[0, 3] == e(values)
     assert collect_symbols(carried) == {a, b}
     assert w in carried.gradient()
-    moved = carried.substitute({a: a + b})
-    assert to_plain(moved)(values)[0, 3] == e({"a": 0.75, "b": 0.5})
+    assert to_plain(carried.substitute({a: a + b}))(values)[0, 3] == e({"a": 0.75, "b": 0.5})
     assert model.constraints["c"].expression == carried[0, 3]
     assert read_operations(to_json(model))
 
@@ -53,8 +52,7 @@ def test_a_model_of_shared_nodes(kind):
 def test_rates_of_shared_nodes():
     e = nested("where")
     rates = Rates({a: as_row(a, {w: e})})
-    again = Rates({a: as_row(a, {w: rates.carry(e)})})
-    assert again == rates
+    assert Rates({a: as_row(a, {w: rates.carry(e)})}) == rates
     assert rates.symbols == {a, b, w, w.position}
 
 

@@ -85,8 +85,7 @@ def test_zero_speed_satisfies_all_rows_with_allowed_recovery(
 
 
 def test_allowed_recovery_is_required_recovery_inside_of_bounds() -> None:
-    triples = {name: triple for name, triple in MIXED.items() if name != "level"}
-    model = constrained(triples)
+    model = constrained({name: triple for name, triple in MIXED.items() if name != "level"})
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (200, 3))
     inside = points[[not model.violations(dict(zip((a, b, c), p, strict=True))) for p in points]]
     assert len(inside) > 50

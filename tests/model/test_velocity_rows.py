@@ -141,14 +141,12 @@ def test_a_row_is_the_difference_of_gradients() -> None:
 
 
 def test_a_bound_with_a_gradient_of_its_own_moves_by_it() -> None:
-    upper = kv.parameter("u", 1.0).augment({vb: 0.5})
-    rows = rows_of({"n": (-math.inf, a, upper)})
+    rows = rows_of({"n": (-math.inf, a, kv.parameter("u", 1.0).augment({vb: 0.5}))})
     np.testing.assert_array_equal(rows.matrix({"a": 0.0, "u": 1.0}), [[1, -0.5]])
 
 
 def test_heuristic_gradients_make_no_rows() -> None:
-    hint = a.augment({vb: 5.0}, heuristic=True)
-    rows = rows_of({"n": (-1, hint, 2 + ((b < 1) & (c < 1)))})
+    rows = rows_of({"n": (-1, a.augment({vb: 5.0}, heuristic=True), 2 + ((b < 1) & (c < 1)))})
     assert rows.speeds == (va,)
     at = {"a": 0.0, "b": 0.0, "c": 0.0}
     np.testing.assert_array_equal(rows.matrix(at), [[1]])
@@ -291,8 +289,7 @@ def test_one_sided_limits_give_numbers() -> None:
 def test_velocity_rows_leave_the_braking_distance(
     brake: float, weight: float, dt: float, start: float
 ) -> None:
-    triples = {"range": (-5, weight * a, 5), "brake": (-brake, va.derivative(), 3 * brake)}
-    model = constrained(triples)
+    model = constrained({"range": (-5, weight * a, 5), "brake": (-brake, va.derivative(), 3 * brake)})
     rows = model.velocity_rows(dt)
     assert rows.names == ("range",)
     bounds = kv.compile([rows.lower, rows.upper], [a], tier="interpreter")
@@ -337,8 +334,7 @@ def test_a_brake_without_bounds_is_none() -> None:
 
 
 def test_a_constraint_on_speeds_is_the_row_itself() -> None:
-    expression = 2 * va - np.cos(c) * vb + np.sin(a)
-    rows = rows_of({"n": (-1, expression, b)})
+    rows = rows_of({"n": (-1, 2 * va - np.cos(c) * vb + np.sin(a), b)})
     at = kv.State({"a": 0.4, "b": 3.0, "c": 0.9})
     np.testing.assert_allclose(rows.matrix(at), [[2, -np.cos(0.9)]])
     np.testing.assert_allclose(rows.lower(at), [-1 - np.sin(0.4)])
@@ -362,8 +358,7 @@ def on_the_rim(rows: VelocityRows, directions: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("dimensions", "loss"), [(1, 0), (2, 0.01922), (3, 0.03807)])
 def test_a_norm_becomes_a_body_inside_the_ball(dimensions: int, loss: float) -> None:
-    speeds = [va, vb, vc][:dimensions]
-    rows = rows_of({"n": (0, kv.norm(kv.array(speeds)), 2.0)})
+    rows = rows_of({"n": (0, kv.norm(kv.array([va, vb, vc][:dimensions])), 2.0)})
     assert len(rows.names) == (2, 16, 128)[dimensions - 1]
     directions = np.random.default_rng(0).normal(size=(20_000, dimensions))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -390,8 +385,7 @@ def test_a_norm_of_wheels_is_written_in_wheels() -> None:
         name="base", parent="world", child="base", radius=0.1, track=0.5
     )
     floor = kv.norm(kv.array([kv.velocity("base/x"), kv.velocity("base/y")]))
-    model = constrained({"floor": (-math.inf, floor, 0.3)}, drive)
-    rows = model.velocity_rows(DT)
+    rows = constrained({"floor": (-math.inf, floor, 0.3)}, drive).velocity_rows(DT)
     assert [str(s) for s in rows.speeds] == ["base/left_wheel:velocity", "base/right_wheel:velocity"]
     for angle in np.linspace(-3, 3, 13):
         at = {"base/x": 0.0, "base/y": 0.0, "base/angle": angle}
@@ -437,8 +431,7 @@ def test_rows_of_poses_are_their_rates_in_every_kind_of_joint(seed: int) -> None
         edit.constrain("height", -100, height, 100)
     rows = model.velocity_rows(DT, speeds=model.speeds)
     state, speeds = random_state(model, seed), random_speeds(model, seed)
-    matrix = rows.matrix({s: state[s] for s in rows.matrix.symbols})
-    row = matrix[rows.names.index("height")]
+    row = rows.matrix({s: state[s] for s in rows.matrix.symbols})[rows.names.index("height")]
     forth, back = model.integrate(state, speeds, 1e-4), model.integrate(state, speeds, -1e-4)
     rate = (height(forth) - height(back)) / 2e-4
     assert row @ [speeds[s] for s in rows.speeds] == pytest.approx(rate, rel=1e-5, abs=1e-7)

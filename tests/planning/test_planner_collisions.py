@@ -20,8 +20,7 @@ def arm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("meshes")
     points = np.random.default_rng(0).normal(size=(30, 3)) * 0.08
     trimesh.Trimesh(points).convex_hull.export(folder / "hull.stl")
-    model = arm_among_shapes(Mesh("hull.stl", folder=str(folder)))
-    return Planner(model, "j*")
+    return Planner(arm_among_shapes(Mesh("hull.stl", folder=str(folder))), "j*")
 
 
 @pytest.fixture(scope="module")
@@ -129,8 +128,7 @@ def test_pair_that_is_apart_in_a_small_gap_only_is_checked():
 
 
 def test_certificate_finds_a_plate_between_two_samples(plate):
-    rng = np.random.default_rng(0)
-    A, B = rng.uniform(0.02, 0.5, (2, 100, 3)).astype(np.float32)
+    A, B = np.random.default_rng(0).uniform(0.02, 0.5, (2, 100, 3)).astype(np.float32)
     B[:, 0] *= -1
     A[:, 2], B[:, 2] = 0.0, 0.0
     column = [str(s) for s in plate.symbols].index("x")

@@ -108,8 +108,7 @@ def test_cover_solid_contains_the_solid_and_keeps_to_its_protrusion(solid, protr
 @settings(max_examples=2, deadline=None)
 @given(st.integers(0, 100), st.sampled_from([0.25, 8.0]))
 def test_cover_solid_scales_with_the_solid(seed, factor):
-    points = np.random.default_rng(seed).normal(size=(20, 3)) * (0.1, 0.05, 0.08)
-    solid = solid_from_points(points)
+    solid = solid_from_points(np.random.default_rng(seed).normal(size=(20, 3)) * (0.1, 0.05, 0.08))
     large = scale_solid(solid, factor)
     one, other = cover_solid(solid, 0.05), cover_solid(large, 0.05 * factor)
     assert other.protrusion <= 0.05 * factor * (1 + 1e-9)
@@ -174,8 +173,7 @@ def test_cover_solid_takes_a_chain_for_a_capsule(length, most):
 
 def test_cover_solid_covers_a_cube_by_few_spheres():
     """Eight spheres in a lattice reach 18.3 mm."""
-    cover = cover_solid(solid_from_geometry(Box((0.1, 0.1, 0.1))), 0.02)
-    assert len(cover) == 8
+    assert len(cover_solid(solid_from_geometry(Box((0.1, 0.1, 0.1))), 0.02)) == 8
 
 
 @pytest.mark.parametrize(
@@ -212,8 +210,7 @@ def test_find_uncovered_finds_a_gap_between_spheres():
     assert uncovered.growth.max() >= needed
     assert uncovered.growth.max() <= needed + 2e-4
     assert distances_outside(centres, radii, uncovered.points).min() > 0.0
-    grown = find_uncovered(region, centres, radii + uncovered.growth, 1e-4)
-    assert not len(grown.points)
+    assert not len(find_uncovered(region, centres, radii + uncovered.growth, 1e-4).points)
 
 
 EXTREME = [

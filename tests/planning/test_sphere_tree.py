@@ -46,8 +46,7 @@ def test_enclosing_ball_is_close_to_the_smallest(seed, count):
         return (np.linalg.norm(centres - x, axis=1) + radii).max()
 
     tried = (minimize(reach, x, method="Nelder-Mead", options={"xatol": 1e-7}) for x in centres[:3])
-    best = min(result.fun for result in tried)
-    assert found <= 1.01 * best
+    assert found <= 1.01 * min(result.fun for result in tried)
 
 
 def test_one_sphere_is_its_own_hierarchy():

@@ -87,8 +87,7 @@ def test_too_many_cases_are_undecided() -> None:
 
 
 def test_nonlinear_limit_of_several_coordinates_is_undecided() -> None:
-    subject = model(both=(0, A * A + B * B, 1))
-    (unknown,) = interlocks(subject).undecided
+    (unknown,) = interlocks(model(both=(0, A * A + B * B, 1))).undecided
     assert unknown.reason == "it limits several coordinates at once, and they are not just added"
 
 

@@ -69,8 +69,7 @@ def test_show_without_block_returns_at_once(capfd, opened):
 
 def test_show_at_a_prompt_does_not_wait(monkeypatch, opened):
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
-    page = show(cabinet(), port=0)
-    page.stop()
+    show(cabinet(), port=0).stop()
     assert len(opened) == 1
 
 

@@ -134,8 +134,7 @@ def test_fingers_hold_a_handle_and_the_door_follows_the_hand(world, model, hand)
     assert [e.text for e in world.events] == ["'room/door_handle' is held"]
     assert world.state["robot/finger"] == pytest.approx(0.015, abs=1e-5)  # a bar of 1 cm radius
     pose = model.fk("robot/base")
-    before = model.fk("room/door_handle")(world.state)
-    in_door = np.linalg.inv(before) @ pose(world.state)
+    in_door = np.linalg.inv(model.fk("room/door_handle")(world.state)) @ pose(world.state)
     dt, angle = 0.02, world.state["room/door"]
     for k in range(1, 41):
         wanted = angle - 0.012 * k  # opens towards the robot

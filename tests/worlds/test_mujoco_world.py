@@ -187,8 +187,7 @@ def test_fingers_hold_a_bar_with_the_stated_force_until_they_open(robot: str) ->
     before = world.state
     for _ in range(5):
         world.apply(forward, 0.1)
-    way = world.state["thing/way"] - before["thing/way"]
-    assert way == pytest.approx(-0.05, abs=2e-3)
+    assert world.state["thing/way"] - before["thing/way"] == pytest.approx(-0.05, abs=2e-3)
     assert world.held == "thing/bar"
     world.apply({v: -x for v, x in close.items()}, 0.2)
     assert world.held is None
@@ -420,8 +419,7 @@ def test_remarks_tell_what_was_added_and_left_out() -> None:
     ],
 )
 def test_descriptions_of_others_stand_still(path: str, still: float, published: Callable[..., Path]) -> None:
-    model = kv.load(published(path), prefix="robot")
-    world = MujocoWorld(model, "robot")
+    world = MujocoWorld(kv.load(published(path), prefix="robot"), "robot")
     before = world.state
     world.apply({}, 0.5)
     assert max(abs(world.state[s] - before[s]) for s in before) < still

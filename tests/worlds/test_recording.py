@@ -53,8 +53,7 @@ def run(model, tmp_path_factory):
     with Recorder(path, model, {"robot": "robot", "noise": "3mm"}) as recorder:
         for k in range(150):
             seen = Observation(0.02 * k - 0.01, {X: 0.5}, {"cupboard": np.eye(4)}, frozenset({"robot/neck"}))
-            arrows = {"p": (np.zeros(3), np.array([0.0, 0, k]))}
-            recorder(step(model, k, observation=seen, vectors=arrows))
+            recorder(step(model, k, observation=seen, vectors={"p": (np.zeros(3), np.array([0.0, 0, k]))}))
         recorder.write_belief(3.0, {"cupboard/other": 1.0}, {"cupboard/panel": np.eye(4)})
         recorder.write_outcome(Result())
     return path
@@ -145,8 +144,7 @@ def mcap(path, *messages: tuple[str, object], schema: str = "") -> None:
         writer = Writer(file)
         writer.start()
         for topic, content in messages:
-            name = schema or f"kineverse.{TOPICS[topic][0]}"
-            number = writer.register_schema(name, "jsonschema", b"{}")
+            number = writer.register_schema(schema or f"kineverse.{TOPICS[topic][0]}", "jsonschema", b"{}")
             channel = writer.register_channel(topic, "json", number)
             text = content if isinstance(content, bytes) else json.dumps(content).encode()
             writer.add_message(channel, 10**9, text, 10**9)

@@ -57,8 +57,7 @@ def test_a_screw_of_several_revolutions_is_identified(pitch: float) -> None:
     nut = kv.translation(0.3, 0.1, 0.0) @ kv.translation(0, 0, pitch * turn) @ kv.rotation_z(turn)
     pose = kv.compile([nut @ kv.translation(0.1, 0.0, 0.0)])
     angles = np.linspace(0.0, 20.0, 60)
-    true = pose.batch(angles[:, None])[0]
-    data = noisy(true, 0.002, 0.01, np.random.default_rng(0))
+    data = noisy(pose.batch(angles[:, None])[0], 0.002, 0.01, np.random.default_rng(0))
     result = identify(None, data[np.random.default_rng(1).permutation(60)], noise=COVARIANCE)
     assert result.best.family == "screw"
     assert result.best.parameters["pitch"] == pytest.approx(2 * np.pi * pitch, rel=0.05)

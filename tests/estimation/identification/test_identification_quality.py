@@ -121,8 +121,7 @@ def test_rigid_evidence_agrees_with_the_integral() -> None:
 
 
 def test_range_evidence_agrees_with_the_integral_over_the_width() -> None:
-    random = np.random.default_rng(1)
-    values, noise = random.normal(0.0, 0.1, 30), 0.05
+    values, noise = np.random.default_rng(1).normal(0.0, 0.1, 30), 0.05
     motion = GroupMotion(JOINT_FAMILIES["prismatic"], 6, np.eye(4), np.eye(4))
     result = fit_joint_ranges(motion, PerObservation(values[:, None], np.full((30, 1, 1), noise**2), 0.0))
     assert result.deviations[0] == pytest.approx(0.1, rel=0.4)

@@ -106,8 +106,7 @@ def test_model_of_a_graph_moves_as_the_true_model(cart: kv.Model, poses: dict[st
     assert {f"learned/{part}" for part in PARTS} <= set(model.frames)
     assert model.articulations["learned/door"].kind == "floating"
     truth = kv.compile([cart.fk("handle", "cart"), cart.fk("sticker", "cart")], cart.degrees_of_freedom)
-    random = np.random.default_rng(0)
-    points = random.uniform(0.0, 1.0, (40, len(cart.degrees_of_freedom)))
+    points = np.random.default_rng(0).uniform(0.0, 1.0, (40, len(cart.degrees_of_freedom)))
     for k in (0, 17):
         values = {f"learned/{edge.child}": float(edge.fit.joint_values[k, 0]) for edge in graph.edges}
         handle, sticker = truth(points[k])
@@ -228,8 +227,7 @@ def test_a_free_point_is_a_sliding_point() -> None:
     assert {str(s) for s in model.degrees_of_freedom} == {"fly/x", "fly/y", "fly/z", "ant/x", "ant/y"}
     for edge in graph.edges:
         values = dict(zip((f"{edge.child}/{c}" for c in "xyz"), edge.fit.joint_values[7], strict=False))
-        result = model.fk(edge.child)[:3, 3](values)
-        assert np.allclose(result, places[edge.child][7], atol=5.0 * POSITION)
+        assert np.allclose(model.fk(edge.child)[:3, 3](values), places[edge.child][7], atol=5.0 * POSITION)
         everywhere = {str(x): value for x, value in model.default_state().items()} | values
         assert not model.violations(everywhere)
 
@@ -377,8 +375,7 @@ def test_leaves_have_one_connection(seed: int) -> None:
     total = logsumexp(list(trees.values()))
     best = spanning_tree(range(5), gains, leaves)
     assert set(best) == set(max(trees, key=trees.__getitem__))
-    result = edge_probabilities(range(5), gains, leaves)
-    for connection, probability in result.items():
+    for connection, probability in edge_probabilities(range(5), gains, leaves).items():
         logs = [log for tree, log in trees.items() if connection in tree]
         assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
     for connection in best:
@@ -388,7 +385,6 @@ def test_leaves_have_one_connection(seed: int) -> None:
 
 
 def test_orient_tree_lists_parents_before_children() -> None:
-    tree = [frozenset("ab"), frozenset("bc"), frozenset("de")]
-    roots, directed = orient_tree("bdac", "abcde", tree)
+    roots, directed = orient_tree("bdac", "abcde", [frozenset("ab"), frozenset("bc"), frozenset("de")])
     assert roots == ("b", "d")
     assert directed == [("b", "a"), ("b", "c"), ("d", "e")]

@@ -140,8 +140,7 @@ def exact_poses(kind: str, scale: float, far: float, count: int, seed: int) -> n
 @pytest.mark.parametrize("count", [10, pytest.param(80, marks=pytest.mark.long)])
 def test_family_of_exact_poses_is_found_in_any_unit(kind: str, scale: float, count: int) -> None:
     """Millimetres, and a frame far away. The noise is none, and may not be taken for less than rounding."""
-    poses = exact_poses(kind, scale, 10.0 * scale, count, seed=count)
-    result = identify(None, poses)
+    result = identify(None, exact_poses(kind, scale, 10.0 * scale, count, seed=count))
     assert result.best.family == kind
     assert result.noise is not None
     assert result.noise.position < 2e-3 * max(scale, 5.0)

@@ -61,10 +61,8 @@ def left(model: kv.Model, poses: dict[str, Array]) -> float:
             off = (observed[:, :3, 3] - poses[:, :3, 3]) / POSITION
             return np.concatenate([off, turned.as_rotvec() / ORIENTATION]).ravel()
 
-        starts = np.linspace(lower, upper, 9)
-        start = min(starts, key=lambda q: float(np.sum(errors(q) ** 2)))
-        identified = least_squares(errors, start, bounds=(lower, upper))
-        squares += 2.0 * identified.cost
+        start = min(np.linspace(lower, upper, 9), key=lambda q: float(np.sum(errors(q) ** 2)))
+        squares += 2.0 * least_squares(errors, start, bounds=(lower, upper)).cost
         count += 6 * len(poses) - len(start)
     return squares / count
 

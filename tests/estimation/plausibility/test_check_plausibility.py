@@ -140,8 +140,7 @@ def test_door_beyond_its_limits_is_rejected(kitchen: kv.Model) -> None:
     report = check_plausibility(kitchen, observations, noise=NOISE, families=SOME)
     assert report[TAG].implausible_since is not None
     assert report[TAG].implausible_since >= 40
-    model = repair_model(kitchen, report)
-    assert model.limits(DOOR)[1] == pytest.approx(2.2, abs=0.1)
+    assert repair_model(kitchen, report).limits(DOOR)[1] == pytest.approx(2.2, abs=0.1)
 
 
 def corrupt(observations: dict[str, np.ndarray], rows: list[int], seed: int) -> None:
@@ -349,8 +348,7 @@ def test_ball_joint_is_tested() -> None:
     with model.edit() as edit:
         edit.apply(kv.articulations.Ball(name="shoulder", parent="world", child="arm"), tag="ball")
         edit.add_frame("hand", parent="arm", transform=kv.translation(0.6, 0, 0))
-    random = np.random.default_rng(13)
-    turns = random.normal(size=(30, 4))
+    turns = np.random.default_rng(13).normal(size=(30, 4))
     values = dict(zip(map(str, model.degrees_of_freedom), turns.T, strict=True))
     observations = observe_frames(model, ["hand"], values, 14)
     report = check_plausibility(model, observations, noise=NOISE, families=("spherical", "free"))

@@ -73,8 +73,7 @@ def test_limit_set_by_another_coordinate_is_tested() -> None:
     doors = random.uniform(0.1, 1.4, 40)
     inside = random.uniform(0.0, 1.0, 40) * (0.1 + 0.3 * np.sin(doors))
     for drawers, explained in ((inside, True), (np.minimum(inside + 0.25, 0.55), False)):
-        values = {"door": doors, "drawer": drawers}
-        observations = observe_frames(model, ["handle", "drawer"], values, 1)
+        observations = observe_frames(model, ["handle", "drawer"], {"door": doors, "drawer": drawers}, 1)
         report = check_plausibility(model, observations, noise=NOISE, families=SOME)
         assert report["door"].explains
         assert report["drawer"].explains is explained
@@ -160,12 +159,11 @@ def make_gripper(factor: float = -1.0, shift: float = 0.0) -> kv.Model:
     with model.edit() as edit:
         finger = kv.Prismatic(name="left", parent="world", child="left", axis=(0, 1, 0), lower=0, upper=0.4)
         edit.apply(finger, tag="left")
-        place = kv.model.Pose.from_matrix(kv.translation(0.1, shift, 0)())
         other = replace(
             finger,
             name="right",
             child="right",
-            origin=place,
+            origin=kv.model.Pose.from_matrix(kv.translation(0.1, shift, 0)()),
             position=factor * kv.position("left"),
             lower=-0.4,
         )

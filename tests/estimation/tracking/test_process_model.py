@@ -32,8 +32,7 @@ def make_drive() -> kv.Model:
 def test_flow_and_its_derivatives_equal_model_integration(make):
     model = make()
     (frame,) = [f for f in model.frames if model.speeds_of(f)][:1]
-    process_model = Tracker(model, [frame])._update_step.process_model
-    motion = process_model._flows[0]
+    motion = Tracker(model, [frame])._update_step.process_model._flows[0]
     rng, h = np.random.default_rng(0), 1e-5
 
     def integrated(q, u):
@@ -172,8 +171,7 @@ def test_speed_of_a_periodic_angle_does_not_jump_after_a_turn():
         edit.apply(kv.Continuous(name="q", parent="world", child="part"))
     tracker, observer = Tracker(model, ["part"], process="velocity"), NoisyObserver(model, ["part"])
     result = [tracker.update(observer({"q": 2.0 * 0.05 * k}), at=0.05 * k).speeds for k in range(100)]
-    speeds = np.array([next(iter(one.values())) for one in result])
-    np.testing.assert_allclose(speeds[20:], 2.0, atol=0.5)
+    np.testing.assert_allclose(np.array([next(iter(one.values())) for one in result])[20:], 2.0, atol=0.5)
     assert tracker.estimate.state["q"] == pytest.approx(9.9, abs=0.1)
 
 

@@ -55,8 +55,7 @@ def test_the_noise_has_the_stated_deviation(cell):
 
 @by_cell
 def test_without_noise_the_child_moves_about_the_axis(cell):
-    exact = Cell(cell.joint, 0.0, 0.0, 7, cell.range)
-    samples = draw_samples(exact, 4, np.random.default_rng(1))
+    samples = draw_samples(Cell(cell.joint, 0.0, 0.0, 7, cell.range), 4, np.random.default_rng(1))
     poses = relative(samples.seen_parents, samples.seen_children)
     np.testing.assert_allclose(poses[:, 0], samples.zero, atol=1e-12)
     since = poses @ np.linalg.inv(poses[:, :1])
@@ -145,8 +144,7 @@ def test_the_bound_is_that_of_all_unknowns_at_once(cell):
 def test_attainable_bound_equals_that_of_gaussian_joint_values():
     """The principal direction of N Gaussian points has the variance σ²(s² + σ²)/(N s⁴)."""
     # Only positions matter where orientations are exact; the errors of both poses add up.
-    cell = Cell("prismatic", 0.05, 1e-7, 50, 0.1)
-    samples = draw_samples(cell, 2, np.random.default_rng(4))
+    samples = draw_samples(Cell("prismatic", 0.05, 1e-7, 50, 0.1), 2, np.random.default_rng(4))
     spread, noise = samples.joint_values[0].var(), 2 * 0.05**2
     expected = noise * (spread + noise) / (50 * spread**2)
     np.testing.assert_allclose(

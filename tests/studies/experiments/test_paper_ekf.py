@@ -110,8 +110,7 @@ def test_nested_drawers_equal_weighted_least_squares(furniture):
     assert len(published.groups) == 1
     training = seen(poses(furniture, frames, drawer=0.1, inner=0.1), rng, 50)
     published.learn_noise(training)
-    true = poses(furniture, frames, drawer=0.3, inner=0.05)
-    observed = seen(true, rng, 8)
+    observed = seen(poses(furniture, frames, drawer=0.3, inner=0.05), rng, 8)
     for z in observed:
         published.update(z)
     # What a linear filter ends with is weighted least squares on prior and all but the first observation.

@@ -34,8 +34,7 @@ def test_errors_are_correlated_as_stated():
     errors = correlated_errors(40_000, (4,), np.random.default_rng(0), StreamErrors())
     assert errors.std() == pytest.approx(1.0, abs=0.03)
     for lag in (1, 10):
-        correlation = np.mean(errors[lag:] * errors[:-lag])
-        assert correlation == pytest.approx(0.7 * 0.95**lag, abs=0.04)
+        assert np.mean(errors[lag:] * errors[:-lag]) == pytest.approx(0.7 * 0.95**lag, abs=0.04)
 
 
 @pytest.mark.long

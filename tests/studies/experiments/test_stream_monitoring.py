@@ -12,8 +12,7 @@ from kineverse_studies.experiments.stream import PERIOD, measure_monitoring, rep
 
 
 def test_repeated_motion_is_smooth() -> None:
-    times = np.arange(0.0, 3.0 * PERIOD, 1.0 / 30.0)
-    angles = repeated_motion(times)
+    angles = repeated_motion(np.arange(0.0, 3.0 * PERIOD, 1.0 / 30.0))
     assert np.abs(np.diff(angles)).max() < 0.03
     assert angles[0] == 0.0
     assert angles.max() == pytest.approx(1.3)
