@@ -25,8 +25,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+import hypothesis_profiles
 import published_data
-from hypothesis_profiles import USUAL
 from native_libraries import compile_native_libraries
 
 ROOT = Path(__file__).parents[1]
@@ -34,7 +34,9 @@ sys.path.append(str(ROOT / "examples"))  # living_kitchen
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 settings.register_profile("kineverse", deadline=None, max_examples=45, derandomize=bool(os.environ.get("CI")))
-settings.register_profile("thorough", settings.get_profile("kineverse"), max_examples=10 * USUAL)
+settings.register_profile(
+    "thorough", settings.get_profile("kineverse"), max_examples=10 * hypothesis_profiles.USUAL
+)
 settings.load_profile("kineverse")
 
 
@@ -47,6 +49,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Set the environment, once: the workers of xdist inherit it."""
+    hypothesis_profiles.is_long = config.getoption("long")
     if hasattr(config, "workerinput"):
         return
     if published_data.FOLDER and not published_data.FOLDER.is_dir():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kineverse as kv
-from kineverse.cli import main
 from kineverse.formats.document import to_json
 from kineverse.formats.validate import find_inertia_errors, find_problems
 
@@ -21,15 +21,8 @@ LIMIT = '<limit lower="-1" upper="2" effort="1" velocity="1"/>'
 
 
 @pytest.fixture
-def run(capsys):
-    """Run the command in this process: status, standard output, standard error."""
-
-    def call(*words):
-        status = main(["validate", *map(str, words)])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
+def run(run):
+    return partial(run, "validate")
 
 
 def robot(*parts):

@@ -177,19 +177,23 @@ def bar(name: str, x: float, y: float, angle: float) -> str:
     return link(name, pose(f"{x} {y} 0 0 0 {angle!r}"))
 
 
-def test_sdf_loops_are_closed():
-    # A parallelogram: crank and rocker of length 1 on a base of length 2, the coupler from one to the other.
+def parallelogram(second: str) -> str:
+    """Crank and rocker of length 1 on a base of length 2, the coupler from one to the other."""
     axis = "<axis><xyz>0 0 1</xyz><limit><lower>-0.5</lower><upper>0.5</upper></limit></axis>"
-    text = sdf(
+    return sdf(
         link("base"),
         bar("crank", 0, 0, math.pi / 2),
         bar("coupler", 0, 1, 0.0),
         bar("rocker", 2, 0, math.pi / 2),
         joint("q1", "revolute", "base", "crank", axis),
-        joint("q2", "revolute", "crank", "coupler", Z),
+        second,
         joint("q3", "revolute", "base", "rocker", axis),
         joint("q4", "revolute", "coupler", "rocker", pose("1 0 0 0 0 0") + Z),
     )
+
+
+def test_sdf_loops_are_closed():
+    text = parallelogram(joint("q2", "revolute", "crank", "coupler", Z))
     assert [loop.name for loop in parse_sdf(text).loops] == ["q4"]
     model = model_of(text)
     (free,) = model.degrees_of_freedom
@@ -201,17 +205,7 @@ def test_sdf_loops_are_closed():
 
 @pytest.mark.parametrize("name", ["q2", "q:2"])
 def test_home_positions_of_ball_joints_in_loops_are_set(name):
-    axis = "<axis><xyz>0 0 1</xyz><limit><lower>-0.5</lower><upper>0.5</upper></limit></axis>"
-    text = sdf(
-        link("base"),
-        bar("crank", 0, 0, math.pi / 2),
-        bar("coupler", 0, 1, 0.0),
-        bar("rocker", 2, 0, math.pi / 2),
-        joint("q1", "revolute", "base", "crank", axis),
-        joint(name, "ball", "crank", "coupler"),
-        joint("q3", "revolute", "base", "rocker", axis),
-        joint("q4", "revolute", "coupler", "rocker", pose("1 0 0 0 0 0") + Z),
-    )
+    text = parallelogram(joint(name, "ball", "crank", "coupler"))
     # A quaternion does not follow, and nobody knows its range.
     with pytest.raises(kv.KineverseError, match=f"needs limits of '{name.replace(':', '%3A')}/qz'"):
         model_of(text)

@@ -59,7 +59,7 @@ def opens(lock, q):
     return all(s.side * (q[s.key] - t) > 0 for s, t in lock.items())
 
 
-@settings(max_examples=attempts(80))
+@settings(max_examples=attempts(80, long=150))
 @given(locks_with_tries())
 def test_hypothesis_of_a_conjunction_is_never_wrong(drawn):
     """Each statement that is certain agrees with the true lock, after every try."""

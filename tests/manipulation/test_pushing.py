@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kineverse as kv
+from cupboards import box
 from kineverse.articulations import OmniBase
 from kineverse.control.contact_constraints import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
@@ -30,19 +31,11 @@ from kineverse.manipulation.pushing.vectors import move_point
 from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.tracked_belief import TrackedBelief
-from kineverse.model.body import Body, Box, Pose, Shape
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 from kineverse_studies.experiments.table1_push import SHIPPED_KITCHEN, make_push_setup
 
 PUSHER = "robot/finger"
 TIP = kv.array([0.0, 0.0, 0.0])
-
-
-def box(*size: float, at: tuple[float, float, float] = (0, 0, 0)) -> Body:
-    pose = np.eye(4)
-    pose[:3, 3] = at
-    shape = Shape(Box(size), Pose.from_matrix(pose))
-    return Body(visuals=(shape,), collisions=(shape,))
 
 
 @cache

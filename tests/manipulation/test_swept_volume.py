@@ -166,8 +166,11 @@ def test_skills_say_what_is_in_the_way_and_move_nothing() -> None:
         assert outcome.measures["free"] < scene_free.value
 
 
-def test_robots_at_random_cupboards_go_through_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert random_cupboards.main(["--count", "2", "--robots", "hsr"]) == 0, capsys.readouterr().out
+@pytest.mark.parametrize("count", ["2", pytest.param("4", marks=pytest.mark.long)])
+def test_robots_at_random_cupboards_go_through_nothing(
+    capsys: pytest.CaptureFixture[str], count: str
+) -> None:
+    assert random_cupboards.main(["--count", count, "--robots", "hsr"]) == 0, capsys.readouterr().out
 
 
 @pytest.mark.long

@@ -255,6 +255,14 @@ def check(model: kv.Model, sequence: Sequence[Sequenced]) -> Fold:
     return expected
 
 
+def holds(sequence: list[Sequenced]) -> bool:
+    try:
+        fold(sequence)
+    except kv.KineverseError:
+        return False
+    return True
+
+
 def changed(before: Fold, after: Fold, tags: Sequence[str]) -> list[str]:
     """Return the tags whose operations see something else than before."""
     return [t for t in tags if t in before.seen and before.seen[t] != after.seen[t]]

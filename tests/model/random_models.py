@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -20,6 +23,16 @@ KINDS = (
     "differential",
     "mimic",
 )
+
+
+def constrained(triples: Mapping[str, tuple[Any, Any, Any]], *operations: kv.Operation) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in operations:
+            edit.apply(operation)
+        for name, triple in triples.items():
+            edit.constrain(name, *triple)
+    return model
 
 
 def random_pose(rng: np.random.Generator) -> kv.model.Pose:

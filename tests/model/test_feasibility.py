@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_models import constrained
 from scipy.optimize import linprog
 
 import kineverse as kv
@@ -26,14 +27,6 @@ acc = [s.derivative() for s in v]
 p = kv.parameter("p", 0.0)
 Triples = dict[str, tuple[Any, Any, Any]]
 Numbers = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-def constrained(triples: Triples) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for name, triple in triples.items():
-            edit.constrain(name, *triple)
-    return model
 
 
 def numbers(rows: VelocityRows, at: Mapping[kv.Symbol, float]) -> Numbers:

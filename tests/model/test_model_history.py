@@ -24,7 +24,7 @@ from history_operations import (
     Watch,
     changed,
     check,
-    fold,
+    holds,
     state_of,
 )
 from hypothesis import given, settings
@@ -106,14 +106,6 @@ def started() -> tuple[kv.Model, list[Sequenced]]:
         for tag, operation in sequence:
             edit.apply(operation, tag)
     return model, sequence
-
-
-def holds(sequence: list[Sequenced]) -> bool:
-    try:
-        fold(sequence)
-    except kv.KineverseError:
-        return False
-    return True
 
 
 @given(st.lists(step, min_size=1, max_size=12))

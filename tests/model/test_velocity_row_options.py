@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_models import constrained
 
 import kineverse as kv
 from hypothesis_profiles import attempts
@@ -22,14 +23,6 @@ va, vb, vc = (s.derivative() for s in (a, b, c))
 DT = 0.1
 Triples = Mapping[str, tuple[Any, Any, Any]]
 SHIPPED = ("fetch", "hsr", "pr2", "kitchen", "shelf_door")
-
-
-def constrained(triples: Triples) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for name, triple in triples.items():
-            edit.constrain(name, *triple)
-    return model
 
 
 MIXED: Triples = {

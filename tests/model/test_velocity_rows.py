@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from random_models import random_speeds, random_state, random_tree
+from random_models import constrained, random_speeds, random_state, random_tree
 from scipy.optimize import linprog
 from scipy.spatial import HalfspaceIntersection
 
@@ -27,16 +27,6 @@ a, b, c = (kv.position(n) for n in "abc")
 va, vb, vc = (s.derivative() for s in (a, b, c))
 DT = 0.1
 Triples = Mapping[str, tuple[Any, Any, Any]]
-
-
-def constrained(triples: Triples, *operations: kv.Operation) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for operation in operations:
-            edit.apply(operation)
-        for name, triple in triples.items():
-            edit.constrain(name, *triple)
-    return model
 
 
 def rows_of(triples: Triples, dt: float = DT, **options: Any) -> VelocityRows:

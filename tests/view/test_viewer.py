@@ -17,12 +17,6 @@ from kineverse.view import view
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
 
 
-@pytest.fixture
-def page():
-    with view(cabinet(), port=0) as viewer:
-        yield viewer
-
-
 def sliders(viewer):
     """Label, range and value of all sliders, by name; what the page shows."""
     return {

@@ -32,7 +32,7 @@ def some_pose(seed: int) -> np.ndarray:
     return transform(Rotation.random(random_state=random), random.normal(0, 2.0, 3))
 
 
-@settings(max_examples=attempts(4))
+@settings(max_examples=attempts(4, long=6))
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
 def test_identify_is_invariant_to_the_observers_pose(seed: int, family: str) -> None:
     data = seeded(family, seed)
@@ -48,7 +48,7 @@ def test_identify_is_invariant_to_the_observers_pose(seed: int, family: str) -> 
     same_joint(before, after, family)
 
 
-@settings(max_examples=attempts(4))
+@settings(max_examples=attempts(4, long=6))
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
 def test_identify_is_equivariant_to_the_childs_frame(seed: int, family: str) -> None:
     data = seeded(family, seed)
@@ -62,7 +62,7 @@ def test_identify_is_equivariant_to_the_childs_frame(seed: int, family: str) -> 
     )
 
 
-@settings(max_examples=attempts(4))
+@settings(max_examples=attempts(4, long=6))
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
 def test_identify_is_invariant_to_the_order_of_poses(seed: int, family: str) -> None:
     data = seeded(family, seed)

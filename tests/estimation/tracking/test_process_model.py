@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from synthetic_observations import NoisyObserver
+from synthetic_observations import NoisyObserver, make_slides
 
 import kineverse as kv
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError
@@ -69,15 +69,6 @@ def test_floating_body_is_found_at_any_pose(place):
         said = Rotation.from_quat([estimate.state[f"box/q{c}"] for c in "xyzw"])
         assert (said * turn.inv()).magnitude() < np.radians(4)
         assert np.allclose([estimate.state[f"box/{c}"] for c in "xyz"], place, atol=0.05)
-
-
-def make_slides() -> kv.Model:
-    """Return two coordinates with linear observations."""
-    model = kv.Model()
-    a, b = kv.position("a"), kv.position("b")
-    with model.edit() as edit:
-        edit.add_frame("cart", parent="world", transform=kv.translation(a, b, 0))
-    return model
 
 
 def make_body(*, wheels: bool) -> kv.Model:

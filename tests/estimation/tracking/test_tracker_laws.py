@@ -9,20 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, nnls
 from scipy.spatial.transform import Rotation
-from synthetic_observations import NoisyObserver, add_pose_noise
+from synthetic_observations import NoisyObserver, add_pose_noise, make_slides
 
 import kineverse as kv
 from kineverse.estimation import ObservedExpression, ObservedPose, Outliers, Tracker, pose_covariance
 from kineverse.estimation.tracking.bounds import solve_bounded_qp
-
-
-def make_slides() -> kv.Model:
-    """Return two coordinates with linear observations."""
-    model = kv.Model()
-    a, b = kv.position("a"), kv.position("b")
-    with model.edit() as edit:
-        edit.add_frame("cart", parent="world", transform=kv.translation(a, b, 0))
-    return model
 
 
 def make_arm(tilt: object = None) -> kv.Model:

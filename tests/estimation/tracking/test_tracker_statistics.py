@@ -70,7 +70,8 @@ def test_kitchen_is_consistent_and_efficient(position, degrees):
     assert low < np.mean(innovations) / estimate.dof < high
 
 
-def test_covariance_of_a_free_body_equals_the_sample_covariance():
+@pytest.mark.parametrize("count", [20, pytest.param(40, marks=pytest.mark.long)])
+def test_covariance_of_a_free_body_equals_the_sample_covariance(count):
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
@@ -81,7 +82,7 @@ def test_covariance_of_a_free_body_equals_the_sample_covariance():
     state = dict(zip(("box/x", "box/y", "box/z"), (1.0, -2.0, 0.5), strict=True)) | {"lid": 0.4}
     state |= dict(zip(("box/qx", "box/qy", "box/qz", "box/qw"), turn.as_quat(), strict=True))
     nees = []
-    for _ in range(20):
+    for _ in range(count):
         tracker = first.copy()
         for _ in range(5):
             estimate = tracker.update(observer(state))
@@ -298,12 +299,13 @@ def test_one_point_of_a_body_leaves_its_angle_unknown(seed):
         assert abs(estimate.state[name] - truth[name]) < 3 * estimate.deviation[name]
 
 
-def test_two_alternating_points_determine_a_body():
+@pytest.mark.parametrize("count", [12, pytest.param(20, marks=pytest.mark.long)])
+def test_two_alternating_points_determine_a_body(count):
     points = {"p": (0.1, 0.2, 0.3), "q": (-0.4, 0.1, 0.0)}
     model, first = make_vehicle(points)
     first.wait()
     result = []
-    for seed in range(12):
+    for seed in range(count):
         tracker, rng = first.copy(), np.random.default_rng(seed)
         truth = {"b/x": rng.normal(), "b/y": rng.normal(), "b/angle": rng.uniform(-3, 3)}
         body = model.fk("b")(truth)
