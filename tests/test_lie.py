@@ -1,7 +1,5 @@
 """Every function of kineverse.lie on stacks, against scipy and against kineverse.spatial."""
 
-from __future__ import annotations
-
 import inspect
 import math
 

@@ -1,7 +1,5 @@
 """Commands of other distributions, which are found by entry points; what is broken is one line and status 2."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

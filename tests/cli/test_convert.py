@@ -1,7 +1,5 @@
 """``kineverse convert``: conversion to files and to standard output."""
 
-from __future__ import annotations
-
 import json
 import os
 from functools import partial

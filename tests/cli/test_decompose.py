@@ -1,7 +1,5 @@
 """``kineverse decompose``: meshes of models and mesh files as convex hulls in the cache."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

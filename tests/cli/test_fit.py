@@ -1,7 +1,5 @@
 """``kineverse fit``: joints from tables of poses, as text, JSON, picture and model."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """``kineverse info`` prints the hash of a document."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """``kineverse info`` lists bodies without collision shapes."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """MJCF files on the command line and in the viewer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

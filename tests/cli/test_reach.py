@@ -1,7 +1,5 @@
 """``kineverse reach``: positions for a pose, as text, JSON and picture."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 

@@ -1,7 +1,5 @@
 """``kineverse spheres``: covers of a model's shapes in a table, a picture and the cache."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``kineverse validate``: problems of files as text, JSON and exit status."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

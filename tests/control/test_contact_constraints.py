@@ -1,7 +1,5 @@
 """Constraints of near pairs: equal in C and in numpy, as distances change, and at parallel faces."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A model that was saved and loaded is the same model, to the last bit, with none of the classes that made it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Reading of pose tables in every form, and refusals that name the line."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

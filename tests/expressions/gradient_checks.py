@@ -1,7 +1,5 @@
 """What is compared between library and oracle; shared by the law tests and by the mutants that must fail them."""
 
-from __future__ import annotations
-
 import itertools
 
 import gradient_oracle as oracle

@@ -4,8 +4,6 @@ A program is a nested tuple ``(operation, options, *operands)``. Functions that 
 program, so no example is thrown away for it.
 """
 
-from __future__ import annotations
-
 import functools
 import operator
 

@@ -1,7 +1,5 @@
 """Numbers at the ends of what doubles can say: value and gradient are right there too, in every tier."""
 
-from __future__ import annotations
-
 import math
 import operator
 

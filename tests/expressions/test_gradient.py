@@ -1,7 +1,5 @@
 """The law of augmented gradients: random programs against dual numbers and finite differences."""
 
-from __future__ import annotations
-
 import gradient_checks as lc
 import numpy as np
 import pytest

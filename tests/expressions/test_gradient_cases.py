@@ -1,7 +1,5 @@
 """What went wrong in earlier implementations, and the rest of the law that is said in single cases."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

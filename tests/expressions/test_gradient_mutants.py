@@ -5,8 +5,6 @@ single cases. It is killed if anything disagrees with the oracle or raises. Ever
 because equal nodes are shared and remember their gradients.
 """
 
-from __future__ import annotations
-
 import functools
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Implicit functions: values by closed forms, derivatives by the theorem, of any order and augmented."""
 
-from __future__ import annotations
-
 import gradient_checks as lc
 import gradient_oracle as oracle
 import implicit_functions as known

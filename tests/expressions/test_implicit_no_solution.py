@@ -1,7 +1,5 @@
 """Where an implicit function has no solution: one error that says which and where, however it is evaluated."""
 
-from __future__ import annotations
-
 import implicit_functions as known
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Implicit functions as nodes: equal ones are one, they can be sent, and bad ones are refused."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import pickle

@@ -1,7 +1,5 @@
 """Continuous boolean logic: values, trends by the table of the papers, De Morgan. ``test_trends`` follows them."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Trends: following them makes a condition true, and as facts conditions are constant."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -3,8 +3,6 @@
 What is not available is the subject of ``test_numpy_refusals``, gradients that of ``test_law``.
 """
 
-from __future__ import annotations
-
 import operator
 import re
 import warnings

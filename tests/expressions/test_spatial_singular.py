@@ -4,8 +4,6 @@ The oracle of derivatives is scipy's matrix exponential along the imaginary axis
 for logarithms the inverse right Jacobian: log(R·exp(δ)) = v + J⁻¹δ.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

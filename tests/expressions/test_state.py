@@ -1,7 +1,5 @@
 """States: immutable mappings from symbols to numbers, asked by symbol or by name."""
 
-from __future__ import annotations
-
 import copy
 import math
 import pickle

@@ -1,7 +1,5 @@
 """Every articulation that can be opened by name: it loads, shows something, and all of it moves within its limits."""
 
-from __future__ import annotations
-
 import json
 import re
 from functools import cache

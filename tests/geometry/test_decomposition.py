@@ -1,7 +1,5 @@
 """Convex decomposition: results of CoACD, the cache, and the measured accuracy."""
 
-from __future__ import annotations
-
 import functools
 import os
 import signal

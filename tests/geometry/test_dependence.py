@@ -1,7 +1,5 @@
 """Dependence of bodies and distances on symbols."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scene_models import arm_among_boxes, body, brute_force, random_state

@@ -1,7 +1,5 @@
 """Distances as expressions: value, gradient against finite differences, across contact, in documents."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scene_models import arm_among_boxes, body, random_state

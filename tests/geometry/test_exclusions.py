@@ -1,7 +1,5 @@
 """Excluded shapes and pairs with their reasons; surfaces of solids."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Distances of pairs against MuJoCo, and against the definition of a distance."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 import sys

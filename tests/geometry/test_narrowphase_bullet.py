@@ -1,7 +1,5 @@
 """Distances against Bullet, which keeps a margin of a millimetre around or inside most of its shapes."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

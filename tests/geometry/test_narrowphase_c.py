@@ -1,7 +1,5 @@
 """Distances in C: bounded by their witnesses, equal to coal's, and to brute force in a scene."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

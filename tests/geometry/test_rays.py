@@ -1,7 +1,5 @@
 """Rays against MuJoCo and trimesh, points against the definition of a distance."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

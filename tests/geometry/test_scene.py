@@ -1,7 +1,5 @@
 """Queries of a scene match brute force, at every state, after every edit, in every thread."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 

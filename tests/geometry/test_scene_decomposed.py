@@ -1,7 +1,5 @@
 """Scenes with decomposed meshes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

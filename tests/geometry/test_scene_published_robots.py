@@ -1,7 +1,5 @@
 """Scenes of published robots and kitchens with their meshes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scene_models import brute_force, by_names

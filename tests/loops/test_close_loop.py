@@ -1,7 +1,5 @@
 """Closed loops in a model: what is free, what follows, what limits mean, and how all of it is edited and sent."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

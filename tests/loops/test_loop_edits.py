@@ -1,7 +1,5 @@
 """Models with closed loops are edited, copied, saved and heard of like any other."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

@@ -1,7 +1,5 @@
 """Loops that cannot be: one error of the project's own that names the loop and the number; nothing happened."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

@@ -1,7 +1,5 @@
 """Nine linkages: closed in every configuration, moving as their Jacobians say, on one branch."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,7 +1,5 @@
 """A robot is put next to furniture: its names, its base, its place, its start."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The difference between models: what a commit would report that leads from one to the other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Sphere covers and trees by the content of shapes: in memory, on the disk, damaged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Paths with times: trajectories that are free, limits, holds, and errors."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 

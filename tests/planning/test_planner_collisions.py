@@ -1,7 +1,5 @@
 """Collision checks of a planner against the collision scene, which computes in double precision."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -1,7 +1,5 @@
 """Holds, conditions and closed loops of planners."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from planning_models import body, contacts, is_free

@@ -1,7 +1,5 @@
 """The page in a real Chromium: moving a slider moves the part."""
 
-from __future__ import annotations
-
 import re
 
 import browsers

@@ -1,7 +1,5 @@
 """Files and pages that attack the viewer, in a real Chromium."""
 
-from __future__ import annotations
-
 from html import escape
 
 import pytest

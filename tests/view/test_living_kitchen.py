@@ -1,7 +1,5 @@
 """The simulation of the demo without a browser: motion, readings, tracking, identification and drawing."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,7 +1,5 @@
 """The page of the demo: its thread, and a real Chromium that opens it."""
 
-from __future__ import annotations
-
 import socket
 import threading
 

@@ -1,7 +1,5 @@
 """Plots of identified joints: views along and across the axis, and the uncertainty of the fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

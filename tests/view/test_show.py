@@ -1,7 +1,5 @@
 """kv.show in a script, at a prompt and in a notebook; titles of pages."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Arm among boxes: all searches find equal pairs, and differences are errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Planning problems and queries: what they contain, and a tiny run of the planners."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

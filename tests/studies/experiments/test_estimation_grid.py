@@ -1,7 +1,5 @@
 """Estimation grid: noise of samples, Cramér-Rao bound, report."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fig. 3 of the 2022 paper: path of the garage door, and its lock."""
 
-from __future__ import annotations
-
 import json
 import sys
 

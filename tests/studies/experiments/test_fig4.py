@@ -1,7 +1,5 @@
 """Fig. 4 of the papers: noise, order of groups, bounds, errors of the published filter."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

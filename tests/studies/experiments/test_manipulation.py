@@ -1,7 +1,5 @@
 """Experiments about manipulation: trials and their summary, the papers' programs, locks, set-ups."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

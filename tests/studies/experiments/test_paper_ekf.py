@@ -1,7 +1,5 @@
 """The papers' filter: its equations, implemented a second time, and its refusals."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
