@@ -416,8 +416,7 @@ def test_bounds_that_are_about_other_symbols_are_kept_too() -> None:
     assert dict(state) == {d: 3, c: 3, b: 4, a: 5}
     assert not model.violations(state)
     assert set(constrained(a=(b + 1, a, 100), b=(a + 1, b, 100)).default_state()) == {a, b}
-    unknown = constrained(a=(b.derivative(), a, 1))
-    assert dict(unknown.default_state()) == {a: 0, b: 0}
+    assert dict(constrained(a=(b.derivative(), a, 1)).default_state()) == {a: 0, b: 0}
 
 
 def test_home_of_articulations() -> None:

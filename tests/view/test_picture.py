@@ -76,8 +76,7 @@ def test_frames_are_drawn_on_demand_and_through_bodies():
 
 
 def test_collision_shapes_on_demand():
-    image = picture(cabinet(), camera=FRONT, size=SMALL, collisions=True)
-    assert bluish(image).sum() == 0
+    assert bluish(picture(cabinet(), camera=FRONT, size=SMALL, collisions=True)).sum() == 0
 
 
 @pytest.mark.parametrize("frames", [False, True])

@@ -20,8 +20,7 @@ def hinge(count=25):
     poses = np.tile(np.eye(4), (count, 1, 1))
     turns = Rotation.from_rotvec(np.outer(np.linspace(0, 1.2, count), AXIS)).as_matrix()
     poses[:, :3, :3] = Rotation.from_rotvec(0.02 * rng.standard_normal((count, 3))).as_matrix() @ turns
-    lever = np.cross(AXIS, [0.5, 0, 0])
-    poses[:, :3, 3] = POINT + turns @ lever + 0.005 * rng.standard_normal((count, 3))
+    poses[:, :3, 3] = POINT + turns @ np.cross(AXIS, [0.5, 0, 0]) + 0.005 * rng.standard_normal((count, 3))
     return poses
 
 
