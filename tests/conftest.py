@@ -41,7 +41,6 @@ settings.load_profile("kineverse")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option for long tests."""
     parser.addoption(
         "--long", action="store_true", help="also run the tests that are slow for what they check"
     )

@@ -128,10 +128,11 @@ QUIETLY = (
 )
 
 
-def test_help_imports_neither_numpy_nor_casadi() -> None:
-    count, *heavy = imported(QUIETLY.format(words=["--help"]), "numpy", "casadi", "rich")
+def test_help_imports_nothing_heavy() -> None:
+    unneeded = ("numpy", "casadi", "rich", "viser", "trimesh", "scipy", "PIL", "websockets")
+    count, *heavy = imported(QUIETLY.format(words=["--help"]), *unneeded)
     assert count <= 40
-    assert heavy == [0, 0, 0]
+    assert not any(heavy)
 
 
 def test_a_controller_without_a_scene_imports_no_geometry() -> None:

@@ -49,17 +49,14 @@ of_changes = pytest.mark.parametrize(
 
 
 def said(value: Callable[[kv.model.ReadRecorder], Any]) -> Code:
-    """Return code that writes one datum."""
     return lambda model: kv.model.Writes(data={"said": value(model)})
 
 
 def placed(value: Callable[[kv.model.ReadRecorder], Any]) -> Code:
-    """Return code that places one frame."""
     return lambda model: kv.model.Writes(frames={"knob": ("car", value(model))})
 
 
 def limited(value: Callable[[kv.model.ReadRecorder], Any]) -> Code:
-    """Return code that writes one constraint."""
     return lambda model: kv.model.Writes(constraints={"near": value(model)})
 
 

@@ -91,7 +91,6 @@ def examples(count, **options):
 
 
 def law(strategy, vocabulary, count, order=2):
-    """Return a test of the programs of a strategy."""
 
     @examples(count)
     @given(strategy)

@@ -245,7 +245,6 @@ EVERYTHING = (*SMOOTH, "augmented", "augmented", "truth", "selection")
 @functools.cache
 @st.composite
 def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
-    """Draw a program of a shape out of some kinds of operations."""
     if depth == 0:
         return draw(leaf(shape))
 

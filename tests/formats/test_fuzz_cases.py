@@ -22,7 +22,6 @@ INVISIBLE = "\U000e0001"
 
 
 def loaded(tmp_path, text: str, name: str = "input.urdf", strict: bool = True) -> kv.Model | str:
-    """Return the model or the message of the error."""
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
     try:

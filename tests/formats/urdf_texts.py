@@ -17,7 +17,6 @@ def robot(*parts: str, links: int = 0, attributes: str = 'name="r"') -> str:
 
 
 def pair(inside: str = LIMIT, kind: str = "revolute", attributes: str = 'name="r"') -> str:
-    """Return two links and one joint ``j`` on line 4."""
     return robot(joint("j", "l0", "l1", kind, inside), links=2, attributes=attributes)
 
 

@@ -20,7 +20,6 @@ PICTURES = DOCS / "pictures"
 
 
 def shown_in(*pages: Path) -> list[str]:
-    """Return the names of the pictures that pages show."""
     text = "".join(page.read_text(encoding="utf-8") for page in pages)
     return sorted(re.findall(r"!\[[^\]]+\]\(pictures/(\w+)\.png\)", text))
 

@@ -20,7 +20,6 @@ def model():
 
 @pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
 def either_search(request, monkeypatch):
-    """Search in numpy and in C."""
     library = bindings.CollisionLibrary()
     if request.param == "c":
         assert library.prepare(wait=True)

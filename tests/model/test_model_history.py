@@ -81,7 +81,6 @@ START: tuple[kv.Operation, ...] = (
 def take(
     edit: kv.model.Edit, sequence: list[Sequenced], kind: str, operation: Any, at: int, tag: str
 ) -> None:
-    """Take a step, on the model and on the list."""
     if kind == "append" or not sequence:
         edit.apply(operation, tag)
         sequence.append((tag, operation))

@@ -46,7 +46,6 @@ def mixed() -> kv.Model:
 
 
 def values_of(rows: VelocityRows, inputs: Any, points: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return matrix, lower, upper and violation at many points."""
     parts = [rows.matrix, rows.lower, rows.upper, rows.violation]
     return kv.compile(parts, inputs, tier="interpreter").batch(points)
 

@@ -13,7 +13,6 @@ from kineverse.planning.spheres import enclosing_ball, make_sphere_tree
 
 
 def spheres(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random spheres."""
     random = np.random.default_rng(seed)
     return random.normal(size=(count, 3)) * (0.3, 0.1, 0.05), random.uniform(0.01, 0.1, size=count)
 

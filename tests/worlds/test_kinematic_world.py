@@ -35,7 +35,6 @@ def world(model: Model, hand: Gripper) -> KinematicWorld:
 
 
 def start(world: KinematicWorld, **values: float) -> None:
-    """Reset to a state: names of the robot, or of the room."""
     prefixes = {name: "room" if name in OBJECTS else "robot" for name in values}
     world.reset({"robot/finger": 0.05} | {f"{prefixes[name]}/{name}": v for name, v in values.items()})
 

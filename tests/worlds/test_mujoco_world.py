@@ -305,7 +305,6 @@ def test_loops_move_as_the_model_says() -> None:
 
 
 def simulated_pose(world: MujocoWorld, frame: str) -> Array:
-    """Return the pose of a body in MuJoCo."""
     data, engine = world._data, mujoco
     engine.mj_kinematics(world._compiled, data)
     body = data.body(frame)

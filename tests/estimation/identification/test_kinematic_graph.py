@@ -46,7 +46,6 @@ def at(x: float, y: float, z: float) -> kv.model.Pose:
 
 @pytest.fixture(scope="module")
 def cart() -> kv.Model:
-    """Return a cart with a drawer, and a door on it with a handle that turns."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="cart", parent="world", child="cart"))

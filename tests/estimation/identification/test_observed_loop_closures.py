@@ -108,7 +108,6 @@ def four_bar() -> kv.Model:
 
 
 def slider_crank() -> kv.Model:
-    """Return a crank, a rod, and a slider on a rail."""
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("stand", "world", kv.translation(0.3, -0.2, 0.5) @ kv.rpy(-0.4, 0.6, 0.8))

@@ -40,7 +40,6 @@ def make_slider(joint: kv.Revolute) -> kv.Operation:
 
 
 def repair_model(model: kv.Model, report: Plausibility) -> kv.Model:
-    """Return the model with its replacements."""
     result = model.copy()
     with result.edit() as edit:
         for tag, operation in report.replacements.items():

@@ -217,7 +217,6 @@ def test_replacement_of_a_mimic_joint_follows_an_unobserved_leader() -> None:
 
 
 def make_linkage(pivot: float = 1.0, coupler: float = 1.1) -> kv.Model:
-    """Return a crank that revolves, and a rocker."""
     model = kv.Model()
     with model.edit() as edit:
         bars = [

@@ -48,7 +48,6 @@ class NoisyObserver:
         self._poses = kv.compile([model.fk(f, relative_to) for f in frames])
 
     def truth(self, state: Mapping[Any, float]) -> Any:
-        """Return the true poses."""
         return np.array(self._poses(kv.State(state)))
 
     def array(self, state: Mapping[Any, float]) -> Any:

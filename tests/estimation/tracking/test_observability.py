@@ -32,7 +32,6 @@ def make_arm() -> kv.Model:
 
 
 def make_tip_tracker(model: kv.Model, observer: NoisyObserver, deviation: float, **options) -> Tracker:
-    """Return a tracker of the arm's tip."""
     observed = [ObservedPose("tip", covariance=observer.covariance)]
     return Tracker(model, observed, start=BENT, uncertainty=dict.fromkeys(BENT, deviation), **options)
 

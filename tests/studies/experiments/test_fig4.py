@@ -243,7 +243,6 @@ def test_experiment_is_deterministic(report, commanded):
 
 
 def leaves(value):
-    """Return all numbers in lists and mappings."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
     if inside is None:
         return [value] if isinstance(value, float) else []
