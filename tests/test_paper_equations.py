@@ -338,8 +338,7 @@ def test_equation_3_of_2020():
 def test_equation_4_of_2020(at, contrast):
     """Eq. 4: a smooth "less than", and a gradient that is the trend of its truth and not its slope."""
     left, right = a * b, c + np.sin(a)
-    e = kv.logic.less(left, right, contrast=contrast)
-    difference = right(at) - left(at)
+    e, difference = kv.logic.less(left, right, contrast=contrast), right(at) - left(at)
     # (1 + tanh x)/2 is the logistic function of 2x, here in the form that does not overflow.
     far = math.exp(-2 * abs(difference) * contrast)
     assert e(at) == pytest.approx(1 / (1 + far) if difference > 0 else far / (1 + far), rel=1e-9, abs=1e-12)

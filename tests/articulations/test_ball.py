@@ -69,8 +69,7 @@ def test_ball_tangent_equals_motion_along_rates() -> None:
 @settings(max_examples=attempts(60), derandomize=True)
 @given(seed=st.integers(0, 10**6), length=st.sampled_from([1.0, -2.0]))
 def test_cone_and_twist_constraints_equal_swing_and_twist_angles(seed: int, length: float) -> None:
-    rng = np.random.default_rng(seed)
-    axis = np.array([1, 2, 3]) / math.sqrt(14)
+    rng, axis = np.random.default_rng(seed), np.array([1, 2, 3]) / math.sqrt(14)
     across = np.cross(axis, rng.normal(size=3))
     tilt, twist = rng.uniform(0, 1.5), rng.uniform(-1.0, 1.0)
     rotation = Rotation.from_rotvec(across / np.linalg.norm(across) * tilt) * Rotation.from_rotvec(

@@ -190,8 +190,7 @@ def test_differential_drive_limits_of_speed_and_turn() -> None:
 @pytest.mark.parametrize("base", [WHEELED, TWO_WHEELED], ids=lambda o: type(o).__name__)
 @pytest.mark.parametrize("seed", range(3))
 def test_velocity_rows_keep_speed_limits_of_bases(base: Base, seed: int) -> None:
-    model = model_of(base)
-    rng = np.random.default_rng(seed)
+    model, rng = model_of(base), np.random.default_rng(seed)
     wish = {str(s): float(rng.normal()) for s in model.speeds}
     assert_rows_keep_limits(model, model.default_state(), wish, 5, 0.1)
 

@@ -77,8 +77,7 @@ def test_joint_pose_about_any_axis(axis: Any, q: float) -> None:
     "axis", [*AXES, (0, 0, -1), (1e-8, 0, -1), (0, 1e-5, -1), (1e-13, 1e-13, -1), (1e-5, 0, 1)]
 )
 def test_planar_joint_pose(axis: Any) -> None:
-    n = unit(axis)
-    turn = np.diag([1.0, -1.0, -1.0])
+    n, turn = unit(axis), np.diag([1.0, -1.0, -1.0])
     if n[:2].any() or n[2] > 0:
         # The smallest rotation from z to n.
         v = np.cross([0, 0, 1], n)

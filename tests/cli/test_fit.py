@@ -59,8 +59,7 @@ def write(path, parts, positions_only=()):
 @pytest.fixture(scope="module")
 def door(tmp_path_factory):
     """Return a recording of a door and a cupboard by a moving camera."""
-    rng = np.random.default_rng(1)
-    angles = np.linspace(0.0, math.radians(80), 30)
+    rng, angles = np.random.default_rng(1), np.linspace(0.0, math.radians(80), 30)
     cupboard = np.array([pose(turned(rng.normal(size=3)), rng.normal(size=3)) for _ in angles])
     parts = {"cupboard": noisy(cupboard, rng), "door": noisy(cupboard @ hinge(angles), rng)}
     return write(tmp_path_factory.mktemp("door") / "poses.csv", parts)
@@ -116,8 +115,7 @@ def test_the_document_is_the_joint(door, tmp_path, capsys):
     assert (float(limits.lower), float(limits.upper)) == pytest.approx((low, high))
     # From one end to the other it moves as the door did.
     first, last = (model.fk("door", "cupboard")({"door": q}) for q in (low, high))
-    way = np.linalg.inv(first) @ last
-    truth = hinge(np.radians([0, 80]))
+    way, truth = np.linalg.inv(first) @ last, hinge(np.radians([0, 80]))
     there = np.linalg.inv(truth[0]) @ truth[1]
     back = np.linalg.inv(there)
     assert min(np.abs(way - there).max(), np.abs(way - back).max()) < 0.03

@@ -161,8 +161,7 @@ def test_contradictory_bounds_are_a_problem(run, tmp_path):
     ],
 )
 def test_nonfinite_poses_are_a_problem(bend, text):
-    model = kv.Model()
-    q = kv.position("q")
+    model, q = kv.Model(), kv.position("q")
     with model.edit() as edit:
         edit.add_frame("a", parent="world", transform=kv.translation(bend(q), 0, 0))
         edit.add_frame("b", parent="world", transform=kv.translation(q, 0, 0))

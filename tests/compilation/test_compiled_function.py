@@ -73,8 +73,7 @@ def test_calls_share_no_memory(tier: str, outputs: int) -> None:
 @in_each_tier
 def test_vectors_of_every_type_are_accepted(tier: str) -> None:
     f = kv.compile(kv.array([a, b, a * b]), tier=tier, wait=tier == "c")
-    wanted = [1.0, -3.0, -3.0]
-    strided = np.zeros((2, 4))
+    wanted, strided = [1.0, -3.0, -3.0], np.zeros((2, 4))
     strided[:, 1] = 1.0, -3.0
     readonly = np.array([1.0, -3.0])
     readonly.flags.writeable = False

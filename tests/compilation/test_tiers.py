@@ -134,8 +134,7 @@ def test_switch_to_c_during_calls_from_many_threads() -> None:
     stop = threading.Event()
 
     def work(offset: int) -> None:
-        i = offset
-        calls_in_c = 0
+        i, calls_in_c = offset, 0
         while not stop.is_set() or calls_in_c < 200:
             i = (i + 1) % len(rows)
             calls_in_c += f.tier == "c"
@@ -208,8 +207,7 @@ def test_functions_stay_interpreted_if_the_compiler_fails(
     monkeypatch.setenv("CC", broken_compiler(tmp_path, "echo 'cannot do that' >&2; exit 3"))
     monkeypatch.setattr(build_queue, "_worker", build_queue._Worker())
     with caplog.at_level(logging.WARNING, "kineverse.compile"):
-        f = kv.compile(a * b * 4.5, wait=True)
-        g = kv.compile(a * b * 5.5, wait=True)
+        f, g = kv.compile(a * b * 4.5, wait=True), kv.compile(a * b * 5.5, wait=True)
     assert (f.tier, g.tier) == ("interpreter", "interpreter")
     assert f([1.0, 2.0]) == 9.0
     assert len(caplog.records) == 1

@@ -57,8 +57,7 @@ def load(program: VectorProgram, path: str) -> VectorProgram:
 @pytest.fixture(scope="module")
 def inputs() -> np.ndarray:
     """Floats on which reductions are hard, and all pairs of special ones; shape (N, 2)."""
-    rng = np.random.default_rng(0)
-    n = 1500
+    rng, n = np.random.default_rng(0), 1500
     kinds = [
         rng.uniform(-4, 4, n),
         rng.uniform(-1, 1, n),

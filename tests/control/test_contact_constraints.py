@@ -94,8 +94,7 @@ def least_distance(model):
     ]
     controller = Controller(model, tasks, dt=0.02, scene=Scene(model), contacts=8)
     state = model.default_state().updated({x: 0.793})
-    scene = Scene(model)
-    least = np.inf
+    scene, least = Scene(model), np.inf
     for k in range(200):
         controller.set(swing, 0.3 * (-1.0) ** (k // 3))
         state = model.integrate(state, controller.step(state).speeds, 0.02)

@@ -193,8 +193,7 @@ def test_errors_of_the_controller_slow_down_and_are_reported(kind: str) -> None:
 
 @pytest.mark.parametrize("part", ["controller", "source", "until", "on_error"])
 def test_other_exceptions_stop_the_robot_and_are_raised(part: str) -> None:
-    world = World()
-    error = RuntimeError("cable")
+    world, error = World(), RuntimeError("cable")
     options: dict[str, Any] = {}
 
     def late(*arguments: Any) -> Any:

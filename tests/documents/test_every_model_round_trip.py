@@ -79,8 +79,7 @@ def survives(model: kv.Model) -> None:
     values = np.array([home.get(s, 0.3 if s.value is None else s.value) for s in ours.symbols])
     for scale in (0.0, 0.02):
         moved = values + np.random.default_rng(5).uniform(-scale, scale, len(values))
-        at = dict(zip(ours.symbols, moved, strict=True))
-        results = []
+        at, results = dict(zip(ours.symbols, moved, strict=True)), []
         for elements in (ours, theirs):
             try:
                 results.append(elements(at).tobytes())

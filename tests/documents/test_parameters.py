@@ -125,8 +125,7 @@ def test_record_of_an_unknown_class_stays_opaque() -> None:
 
 
 def test_joint_from_a_document_is_replaced_by_a_rebuilt_one() -> None:
-    model = build_scene("scissor_lift")
-    tag = "scissor lift lift"
+    model, tag = build_scene("scissor_lift"), "scissor lift lift"
     read = kv.Model()
     with read.edit() as edit:
         for name, operation in read_operations(to_json(model)):

@@ -101,8 +101,7 @@ def test_document_is_read_under_a_prefix(tmp_path):
         read.fk("there/bent")({f"there/{name}": value for name, value in state.items()}),
         model.fk("bent")(state),
     )
-    twice = kv.Model()
-    path = tmp_path / "model.kv.json"
+    twice, path = kv.Model(), tmp_path / "model.kv.json"
     twice.include(path, prefix="left")
     twice.include(path, prefix="right")
     assert len(twice.constraints) == 2 * len(model.constraints)

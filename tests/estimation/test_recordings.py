@@ -26,8 +26,7 @@ def write_table(tmp_path, text, name="poses.csv"):
 
 
 def random_poses(seed, count=6):
-    rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4), (count, 1, 1))
+    rng, poses = np.random.default_rng(seed), np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
     poses[:, :3, 3] = rng.normal(size=(count, 3))
     return poses

@@ -32,8 +32,7 @@ def close(actual, wanted, scale=1.0):
 
 def check(expression, value, values, order=2):
     """Compare value, D in both modes, and D of a few entries in both modes, with the oracle."""
-    wanted = [(expression, value)]
-    layer = [(expression, value)]
+    wanted, layer = [(expression, value)], [(expression, value)]
     for _ in range(order):
         following = []
         for (e, v), mode in itertools.product(layer, MODES):

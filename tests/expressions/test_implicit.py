@@ -53,8 +53,7 @@ def test_values_equal_closed_forms():
     cubic = known.cubic().apply([u])
     for p in np.linspace(-30, 30, 61):
         assert_allclose(cubic({u: p}), [known.cubic_root(p)], rtol=0, atol=1e-14)
-    polar = known.polar().apply([u, v])
-    spherical = known.spherical().apply([u, v, w])
+    polar, spherical = known.polar().apply([u, v]), known.spherical().apply([u, v, w])
     for p in points(known.spherical()):
         wanted = [np.linalg.norm(p), np.arctan2(p[1], p[0]), np.arctan2(p[2], np.hypot(p[0], p[1]))]
         assert_allclose(at(spherical, known.spherical(), p), wanted, rtol=0, atol=1e-14)
@@ -204,8 +203,7 @@ def test_gradients_with_augmented_inputs_and_trends(kind, first, second, wrapped
 @given(st.sampled_from(["Kepler", "polar"]), ARGUMENTS, ARGUMENTS)
 def test_substitution_is_composition(kind, first, second):
     """The function of plain symbols, with programs in their places afterwards."""
-    symbols = [a, WORDS.symbols[-1]]
-    inside = [("symbol", 0), ("symbol", 5)]
+    symbols, inside = [a, WORDS.symbols[-1]], [("symbol", 0), ("symbol", 5)]
     try:
         with np.errstate(all="ignore"):
             replacements = {

@@ -50,8 +50,7 @@ def outputs():
 
 @pytest.mark.compiler
 def test_all_tiers_give_the_same_bits(extension):
-    wanted = compiled(outputs(), [a, b])
-    fast = compiled(outputs(), [a, b], "c")
+    wanted, fast = compiled(outputs(), [a, b]), compiled(outputs(), [a, b], "c")
     assert (wanted.tier, fast.tier) == ("interpreter", "c")
     bound, slow = fast.bind(), wanted.bind()
     for x in np.random.default_rng(0).uniform(-3, 3, (300, 2)):
@@ -148,8 +147,7 @@ def test_evaluator_without_a_solution_is_refused_after_the_switch_to_c():
 @pytest.mark.parametrize("tier", TIERS)
 @pytest.mark.parametrize("count", [1, 7, 40])
 def test_batch_without_a_solution_names_the_first_row(tier, count):
-    function = compiled([a + b, height], [a, b], tier)
-    points = np.full((count, 2), 0.6)
+    function, points = compiled([a + b, height], [a, b], tier), np.full((count, 2), 0.6)
     assert function.batch(points)[1] == pytest.approx(0.8, abs=1e-15)
     row = count * 2 // 3
     points[row, 0] = 1.5
@@ -258,8 +256,7 @@ HIDING = {
 @pytest.mark.parametrize("tier", TIERS)
 @pytest.mark.sampled(2)
 def test_comparisons_do_not_hide_a_missing_solution(name, tier):
-    e = HIDING[name]
-    inputs = [a, b]
+    e, inputs = HIDING[name], [a, b]
     with pytest.raises(kv.errors.NoSolutionError, match=WHERE):
         e(dict.fromkeys(e.symbols, 1.5))
     function = compiled([e], inputs, tier)

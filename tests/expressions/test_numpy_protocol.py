@@ -249,8 +249,7 @@ def test_rearranging(data):
 @given(st.data())
 def test_joining(data):
     x = data.draw(arrays(min_dims=1))
-    axis = data.draw(st.integers(-x.ndim, x.ndim - 1))
-    which = data.draw(SOME)
+    axis, which = data.draw(st.integers(-x.ndim, x.ndim - 1)), data.draw(SOME)
     longer = np.concatenate([x, x], axis=axis) + 9
     same(lambda y, z: np.concatenate([y, z], axis=axis), x, longer, which=which)
     same(lambda y, z: np.concatenate((z, y, z), axis), x, longer, which=which)

@@ -19,8 +19,7 @@ x, y = kv.position("x"), kv.position("y")
 
 def profile(seed: int, n: int, periodic: bool) -> tuple[list[float], list[float]]:
     rng = np.random.default_rng(seed)
-    knots = np.cumsum(rng.uniform(0.05, 1.0, n)) - 2
-    values = rng.normal(size=n)
+    knots, values = np.cumsum(rng.uniform(0.05, 1.0, n)) - 2, rng.normal(size=n)
     if periodic:
         values[-1] = values[0]
     return knots.tolist(), values.tolist()
@@ -87,8 +86,7 @@ def test_compiled_code_gives_the_same_bits_as_the_interpreter() -> None:
 
 def test_gradients_obey_the_chain_rule() -> None:
     knots, values = profile(5, 7, True)
-    wheel = kv.velocity("wheel")
-    oracle = CubicSpline(knots, values, bc_type="periodic")
+    wheel, oracle = kv.velocity("wheel"), CubicSpline(knots, values, bc_type="periodic")
     e = kv.spline((x * np.sin(y)).augment({wheel: 4 * x, y.derivative(): 3.0}), knots, values, True) * x
     at = {x: 0.7, y: 1.1}
     u = 0.7 * np.sin(1.1)

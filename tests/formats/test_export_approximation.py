@@ -53,8 +53,7 @@ def sampled_errors(model: kv.Model, read: kv.Model, count: int = 60) -> dict[str
         for name, a, b in zip(frames, ours(values), theirs(values), strict=True):
             chord = np.linalg.norm(a[:3, :3] - b[:3, :3]) / np.sqrt(8)  # that is sin(angle / 2)
             angle = 2 * np.arcsin(min(1.0, chord))
-            distance = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
-            before = found[name]
+            distance, before = float(np.linalg.norm(a[:3, 3] - b[:3, 3])), found[name]
             found[name] = FrameDeviation(max(before.position, distance), max(before.angle, float(angle)))
     return found
 
@@ -87,8 +86,7 @@ def test_taylor_series_enclose_the_function_and_the_series_at_all_points(
 def test_taylor_series_enclose_implicit_functions() -> None:
     model = kv.load("articulations/four_bar")
     terms = TermGraph({})
-    enclosures = Enclosures(terms)
-    crank = model.symbol("four_bar/crank")
+    enclosures, crank = Enclosures(terms), model.symbol("four_bar/crank")
     for follower in model.rates.dependent.values():
         (whole,) = enclosures.enclose([terms.term(follower)], {crank: taylor_variable((0.5, 0.51))})
         values = [float(follower({crank: x})) for x in np.linspace(0.5, 0.51, 9)]

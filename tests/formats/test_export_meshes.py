@@ -77,8 +77,7 @@ def test_mujoco_loads_written_meshes(reference: str, name: str, package: Path, t
     (tmp_path / "out").mkdir()
     target = tmp_path / "out" / "r.xml"
     saved = robot(package, said(reference, name, package)).save(target)
-    found = corners(target)
-    expected = np.array(mesh_bytes.CORNERS) * (1, 2, 1)
+    found, expected = corners(target), np.array(mesh_bytes.CORNERS) * (1, 2, 1)
     distances = np.linalg.norm(found[:, None] - expected[None], axis=-1)
     assert distances.min(axis=1).max() < 1e-6
     assert distances.min(axis=0).max() < 1e-6

@@ -33,8 +33,7 @@ def moving(mass: float, moments: tuple[float, ...], turn: kv.Expression | None =
 
 def in_mujoco(model: kv.Model, folder: Path) -> tuple[float, np.ndarray, tuple[str, ...]]:
     """Return mass, tensor in axes of the frame, and remarks of what MuJoCo reads."""
-    mujoco = pytest.importorskip("mujoco")
-    saved = model.save(folder / "m.xml")
+    mujoco, saved = pytest.importorskip("mujoco"), model.save(folder / "m.xml")
     read = mujoco.MjModel.from_xml_path(str(folder / "m.xml"))
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, read.body_iquat[1])

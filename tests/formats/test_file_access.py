@@ -260,8 +260,7 @@ def test_files_in_declared_folders_may_be_named_by_path(put, tmp_path, monkeypat
 @pytest.mark.parametrize("name", ["etc", "home", "tmp"])
 def test_common_folders_are_no_packages(put, tmp_path, name, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home/me"))
-    file = put("home/me/secret")
-    folder = str(put("home/me/robot/r.urdf").parent)
+    file, folder = put("home/me/secret"), str(put("home/me/robot/r.urdf").parent)
     uris = [
         f"package://{tmp_path.parts[1]}/x",
         "package://etc/hostname",

@@ -32,8 +32,7 @@ def read(text: str, prefix: str | None = None) -> kv.Model:
 
 
 def test_velocity_limits_are_read_back(tmp_path: Path) -> None:
-    model = kv.Model()
-    q = kv.position("q")
+    model, q = kv.Model(), kv.position("q")
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=0, upper=1, velocity=2.5))
         edit.apply(kv.Prismatic(name="p", parent="q", child="p", position=3 * q, velocity=4))

@@ -20,8 +20,7 @@ DRAKE = json.loads((Path(__file__).parent / "sdf_poses_of_drake.json").read_text
 @pytest.mark.parametrize("file", OUTCOMES)
 @pytest.mark.sampled(2)
 def test_frames_and_dofs_or_errors_of_all_files(file: str, published: Callable[..., Path]):
-    path = published(file)
-    expected = OUTCOMES[file]
+    path, expected = published(file), OUTCOMES[file]
     if expected[0].isdecimal():
         model = kv.load(path, prefix="p")
         assert f"{len(model.frames)} {len(model.degrees_of_freedom)}" == expected

@@ -111,8 +111,7 @@ WORLD = f"""<sdf version="1.8"><world name="w">
 
 
 def test_first_world_is_read():
-    scene = parse_sdf(WORLD)
-    model = model_of(WORLD)
+    scene, model = parse_sdf(WORLD), model_of(WORLD)
     assert set(model.frames) == {
         "table",
         "table/top",
@@ -250,8 +249,7 @@ def said(m: np.ndarray, relative: str) -> str:
 def written(tree: list, about: list[int]) -> str:
     """Write a tree of hinges, each pose relative to the frame that ``about`` returns."""
     places = {"__model__": np.eye(4), "l0": np.eye(4)}
-    parts = [link("l0")]
-    names = ["__model__", "l0"]
+    parts, names = [link("l0")], ["__model__", "l0"]
     for n, (above, joint, child, axis) in enumerate(tree, start=1):
         parent = f"l{above % n}"
         j = places[f"j{n}"] = places[parent] @ matrix(joint)

@@ -215,8 +215,7 @@ def test_joints_that_follow_have_no_degree_of_freedom_and_keep_their_limits():
         joint("b", "l1", "l2", "prismatic", LIMIT + FOLLOWING.format("a", -2, 1)),
         links=4,
     )
-    model = model_of(text, "p")
-    a = kv.position("p/a")
+    model, a = model_of(text, "p"), kv.position("p/a")
     assert model.degrees_of_freedom == (a,)
     # b = -2 a + 1 and c = 3 b + 0.5 = -6 a + 3.5, each within [-1, 2] and at most 3 fast.
     for name, value in (("b", -2 * a + 1), ("c", -6 * a + 3.5)):

@@ -64,8 +64,7 @@ def test_scene_moves_over_the_whole_range_of_every_slider(name):
             rows[:, poses.inputs.index(freedom)] = path
         for pose in poses.batch(rows):
             assert np.isfinite(pose).all()
-            rotation = pose[:, :3, :3]
-            identity = np.tile(np.eye(3), (len(path), 1, 1))
+            rotation, identity = pose[:, :3, :3], np.tile(np.eye(3), (len(path), 1, 1))
             np.testing.assert_allclose(rotation @ np.swapaxes(rotation, 1, 2), identity, atol=1e-9)
             moved[freedom] = max(moved[freedom], float(np.abs(pose - pose[0]).max()))
     # One element of a quaternion is its length only.

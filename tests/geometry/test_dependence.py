@@ -52,8 +52,7 @@ def test_bodies_moved_by_a_crank_include_those_of_dependent_coordinates():
 
 def test_pairs_affected_by_contains_every_pair_whose_distance_changes():
     model = arm_among_boxes()
-    scene = Scene(model)
-    state = random_state(model, np.random.default_rng(0))
+    scene, state = Scene(model), random_state(model, np.random.default_rng(0))
     for symbol in ("rail", "j2", "ball/x", "ball/wz:velocity"):
         listed = {frozenset(pair) for pair in scene.pairs_affected_by(symbol)}
         if ":" in symbol:

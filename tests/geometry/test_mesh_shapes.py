@@ -231,8 +231,7 @@ def test_error_lists_several_unusable_shapes(tmp_path):
 
 
 def test_update_with_poses_that_are_not_finite_moves_nothing():
-    model = kv.Model()
-    x = kv.position("x")
+    model, x = kv.Model(), kv.position("x")
     with model.edit() as edit:
         edit.add_frame("odd", "world", kv.translation(np.sqrt(x), 0, 0), body(Box((1, 1, 1))))
         edit.add_frame("ball", "world", kv.translation(3, 0, 0), body(Sphere(0.5)))

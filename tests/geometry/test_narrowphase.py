@@ -226,8 +226,7 @@ def test_triangle_meshes_have_distances_and_contact_normals():
 
 
 def test_distances_of_a_triangle_mesh_match_its_hull(shapes):
-    rng = np.random.default_rng(11)
-    apart = 0
+    rng, apart = np.random.default_rng(11), 0
     for _ in range(150):
         a, b = shapes["hull"][rng.integers(EACH)], shapes["hull"][rng.integers(EACH)]
         poses = np.stack([random_pose(rng, 0.4), random_pose(rng, 0.4)])

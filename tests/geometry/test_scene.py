@@ -31,15 +31,13 @@ def either_broadphase(request, monkeypatch):
 
 
 def test_pairs_within_match_brute_force(model, either_broadphase):
-    scene = Scene(model)
-    rng = np.random.default_rng(1)
+    scene, rng = Scene(model), np.random.default_rng(1)
     state = random_state(model, rng)
     for step in range(25):
         size = 0.5 if step % 10 == 9 else 0.01
         state = state.updated({s: v + float(rng.normal()) * size for s, v in state.items()})
         scene.update(state)
-        expected = brute_force(scene, state)
-        radius = (0.0, 0.1, 0.4)[step % 3]
+        expected, radius = brute_force(scene, state), (0.0, 0.1, 0.4)[step % 3]
         near = scene.pairs_within(radius)
         want = {frozenset(names): d for names, d in expected.items() if d <= radius}
         assert by_names(near).keys() == want.keys()
@@ -51,8 +49,7 @@ def test_pairs_within_match_brute_force(model, either_broadphase):
 
 @pytest.mark.parametrize("jump", [1e5, 1e12])
 def test_pairs_within_are_exact_after_jumps_of_any_size(model, either_broadphase, jump):
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     for rail in (0.0, jump, *(np.arange(8) * 3e-5).tolist()):
         there = state.updated({"rail": rail})
         scene.update(there)
@@ -64,8 +61,7 @@ def test_pairs_within_are_exact_after_jumps_of_any_size(model, either_broadphase
 
 
 def test_update_refuses_poses_that_are_too_far_away(model, either_broadphase):
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     scene.update(state)
     near = by_names(scene.pairs_within(0.3))
     for rail in (1e13, 1e200):
@@ -81,8 +77,7 @@ def test_update_refuses_poses_that_are_too_far_away(model, either_broadphase):
 
 
 def test_bounds_spare_most_distance_computations(model):
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     scene.update(state)
     scene.pairs_within(0.3)
     before = scene.collision_world.narrowphase.calls
@@ -93,11 +88,9 @@ def test_bounds_spare_most_distance_computations(model):
 
 
 def test_distances_to_and_distances_match_brute_force(model):
-    scene = Scene(model)
-    state = random_state(model, np.random.default_rng(4))
+    scene, state = Scene(model), random_state(model, np.random.default_rng(4))
     scene.update(state)
-    expected = brute_force(scene, state)
-    around = scene.distances_to("hand")
+    expected, around = brute_force(scene, state), scene.distances_to("hand")
     assert all(r.a == "hand" for r in around)
     assert {r.b: pytest.approx(r.distance, abs=1e-6) for r in around} == {
         (set(names) - {"hand"}).pop(): d for names, d in expected.items() if "hand" in names
@@ -131,8 +124,7 @@ def test_results_do_not_depend_on_earlier_queries(model):
 
 
 def test_self_pairs_and_pairs_between_select_subtrees(model):
-    scene = Scene(model)
-    state = random_state(model, np.random.default_rng(8))
+    scene, state = Scene(model), random_state(model, np.random.default_rng(8))
     scene.update(state)
     everything = by_names(scene.pairs_within(0.5))
     own = {f"link{k}" for k in range(5)} | {"base", "hand"}
@@ -201,8 +193,7 @@ def counted(monkeypatch):
 
 def test_edit_rebuilds_only_the_objects_it_changes(counted):
     model = arm_among_boxes()
-    scene = Scene(model)
-    state = random_state(model, np.random.default_rng(3))
+    scene, state = Scene(model), random_state(model, np.random.default_rng(3))
     scene.update(state)
     scene.pairs_within(0.3)
 
@@ -210,8 +201,7 @@ def test_edit_rebuilds_only_the_objects_it_changes(counted):
         counted.update(dict.fromkeys(counted, 0))
         with model.edit() as edit:
             change(edit)
-        near = scene.pairs_within(0.3)
-        fresh = Scene(model)
+        near, fresh = scene.pairs_within(0.3), Scene(model)
         work = dict(counted)
         fresh.update({**state, **{s: model.default_state()[s] for s in model.symbols if s not in state}})
         assert by_names(near) == by_names(fresh.pairs_within(0.3))
@@ -258,8 +248,7 @@ def test_scenes_of_a_model_share_compiled_poses_until_it_is_edited(counted):
 
 def test_attached_body_moves_with_its_new_parent():
     model = arm_among_boxes(boxes=1)
-    state = random_state(model, np.random.default_rng(5))
-    scene = Scene(model)
+    state, scene = random_state(model, np.random.default_rng(5)), Scene(model)
     scene.update(state)
     assert scene.checks_pair("hand", "box0")
     with model.edit() as edit:
@@ -276,8 +265,7 @@ def test_attached_body_moves_with_its_new_parent():
 
 def test_pose_is_current_right_after_an_edit():
     model = arm_among_boxes(boxes=1)
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     scene.update(state)
     with model.edit() as edit:
         edit.attach("box0", "hand", kv.translation(0, 0, 0.3))

@@ -17,8 +17,7 @@ def model(tmp_path, monkeypatch):
     """A ball of 1 cm that goes up from the floor of a tray, which is turned about z by a right angle."""
     monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "cache"))
     tray().export(tmp_path / "tray.stl")
-    turned = Pose.from_matrix(kv.rotation_z(np.pi / 2))
-    model = kv.Model()
+    turned, model = Pose.from_matrix(kv.rotation_z(np.pi / 2)), kv.Model()
     with model.edit() as edit:
         shape = Shape(Mesh("tray.stl", folder=str(tmp_path)), turned)
         edit.add_frame("tray", parent="world", transform=kv.rotation_x(0.0), body=Body(collisions=(shape,)))

@@ -12,8 +12,7 @@ from kineverse.geometry import Scene
 def test_scene_of_the_shipped_robot_and_kitchen():
     model = kv.load("kitchen")
     model.include("fetch")
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     rng = np.random.default_rng(0)
     robot = [s for s in model.degrees_of_freedom if str(s).startswith("fetch/")]
     for step in range(3):
@@ -37,8 +36,7 @@ def test_scene_of_the_pr2_in_the_iai_kitchen(monkeypatch, published):
     robot = next(path for path in packages[0].rglob("*.urdf"))
     model = kv.load(str(next(path for path in packages[1].rglob("kitchen.urdf"))), prefix="kitchen")
     model.include(str(robot), prefix="pr2")
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     scene.update(state)
     assert len(scene.bodies) > 150
     moved = scene.bodies_moved_by("pr2/torso_lift_joint")

@@ -361,8 +361,7 @@ def test_the_guess_is_periodic_over_full_revolutions():
 def test_branches_that_come_close_are_told_apart(names, lower, upper):
     # The bars are nearly in line on the way. Of twins no determinant shows that both change their branch.
     a, b, c = 0.5707049918, 0.9098700426, 0.6058904411
-    d = b + c - a - 1e-5
-    model = kv.Model()
+    d, model = b + c - a - 1e-5, kv.Model()
     with model.edit() as edit:
         bar(edit, "crank", "world", at(0), lower=lower, upper=upper)
         for name in names:

@@ -122,8 +122,7 @@ def test_second_derivatives(name):
 def test_accelerations_of_the_delta_robot():
     """ẍ = J q̈ + q̇ᵀ H q̇ along a path of the motors."""
     model = linkage("delta robot")
-    motors = model.degrees_of_freedom
-    where = model.fk("platform")[:3, 3]
+    motors, where = model.degrees_of_freedom, model.fk("platform")[:3, 3]
     hessian = function(model, where.jacobian(motors).jacobian(motors))
     along = function(model, where)
     q, v = np.array([0.1, 0.3, 0.2]), np.array([1.0, -0.4, 0.7])
@@ -169,8 +168,7 @@ def test_a_whole_turn_changes_nothing(model):
 
 
 def test_the_four_bar_by_circles():
-    model = linkage("four-bar")
-    sides = set()
+    model, sides = linkage("four-bar"), set()
     for q in configurations(model, 200):
         found = model.fk("rocker_tip")({"crank": q[0]})[:2, 3]
         meetings = [four_bar_by_circles(q[0], side=side) for side in (1, -1)]

@@ -86,8 +86,7 @@ def test_wheels_below():
 
 def test_a_crank_that_a_wheel_drives():
     """Rates of what is free reach what follows."""
-    bars = four_bar()
-    wheel = kv.velocity("wheel")
+    bars, wheel = four_bar(), kv.velocity("wheel")
     with bars.edit() as edit:
         edit.set_rate(crank, {wheel: 0.25})
     assert bars.speeds == (wheel,)

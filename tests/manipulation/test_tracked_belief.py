@@ -90,8 +90,7 @@ def test_pictures_average_while_nothing_moves(model):
     for seed in range(10):
         world = HiddenWorld(model, belief.sensors, seed, door=0.7, drawer=0.15)
         belief.update(world)
-        first = belief.deviation(model.symbol("door"))
-        state = run(world, belief, 40)
+        first, state = belief.deviation(model.symbol("door")), run(world, belief, 40)
         for name in ("door", "drawer"):
             deviation = belief.deviation(model.symbol(name))
             squares.append(((state[name] - world.truth[name]) / deviation) ** 2)

@@ -70,8 +70,7 @@ def joint(kind: str, name: str, parent: str, child: str, rng: np.random.Generato
 
 def random_tree(seed: int, size: int = 9) -> kv.Model:
     """Return a tree of frames joined at random; every kind of joint occurs."""
-    rng = np.random.default_rng(seed)
-    model = kv.Model()
+    rng, model = np.random.default_rng(seed), kv.Model()
     kinds = [*rng.permutation(KINDS), *rng.choice(KINDS, max(0, size - len(KINDS)))]
     frames = ["world"]
     with model.edit() as edit:

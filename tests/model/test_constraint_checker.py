@@ -53,8 +53,7 @@ def test_it_finds_the_violations_of_the_model(fetch: kv.Model) -> None:
 
 
 def test_speeds_are_checked_where_they_are_in_the_vector(fetch: kv.Model) -> None:
-    home = fetch.default_state()
-    checker = fetch.constraint_checker()
+    home, checker = fetch.default_state(), fetch.constraint_checker()
     assert checker.symbols == fetch.symbols
     x = [home[s] for s in checker.symbols]
     found = checker.violations(x)

@@ -135,8 +135,7 @@ def test_two_wheels_drive_an_arc(left: float, right: float, heading: float, dt: 
 @settings(max_examples=attempts(20))
 @given(seed=st.integers(0, 10**6), dt=st.floats(-3, 3))
 def test_a_quaternion_moves_by_its_exponential_and_keeps_its_length(seed: int, dt: float) -> None:
-    rng = np.random.default_rng(seed)
-    model = model_of(BASES["floating"])
+    rng, model = np.random.default_rng(seed), model_of(BASES["floating"])
     turn, omega, linear = Rotation.random(rng=rng), rng.normal(size=3), rng.normal(size=3)
     quaternion = [f"base/q{s}" for s in "xyzw"]
     start = dict(zip(quaternion, turn.as_quat(), strict=True)) | {f"base/{s}": 0.5 for s in "xyz"}
@@ -228,8 +227,7 @@ def test_jacobians_on_a_base_move_as_their_gradients_say(base: str) -> None:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.sampled(2)
 def test_random_expressions_on_a_base_move_as_their_gradients_say(base: str, seed: int) -> None:
-    model = with_arm(base)
-    rng = np.random.default_rng(seed)
+    model, rng = with_arm(base), np.random.default_rng(seed)
     symbols = list(model.degrees_of_freedom)
     assert_motion_law(model, [model.rates.carry(random_expression(rng, symbols)) for _ in range(4)], seed)
 

@@ -99,8 +99,7 @@ def names(model: kv.Model, subject: Any, **options: bool) -> list[str]:
 
 
 def test_constraints_for_compares_coordinates_of_any_order() -> None:
-    model = constrained(**LIMITS)
-    about_a = ["a", "a_jerk", "a_speed", "ab"]
+    model, about_a = constrained(**LIMITS), ["a", "a_jerk", "a_speed", "ab"]
     assert (
         names(model, a)
         == names(model, [a])

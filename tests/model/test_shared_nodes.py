@@ -33,8 +33,7 @@ def nested(kind: str, levels: int = LEVELS) -> kv.Expression:
 
 @pytest.mark.parametrize("kind", NESTED)
 def test_a_model_of_shared_nodes(kind):
-    e = nested(kind)
-    model = kv.Model()
+    e, model = nested(kind), kv.Model()
     with model.edit() as edit:
         edit.add_frame("f", "world", kv.translation(e, 0, 0))
         edit.constrain("c", 0, e, 1)

@@ -186,8 +186,7 @@ def test_merged_bounds_hide_no_nan(order: tuple[str, str]) -> None:
 
 def test_entries_are_the_matrix() -> None:
     model = kv.load("fetch")
-    rows = model.velocity_rows(DT)
-    state = model.default_state()
+    rows, state = model.velocity_rows(DT), model.default_state()
     matrix = np.zeros(rows.matrix.shape)
     for row, column, weight in rows.entries:
         matrix[row, column] = weight(state)
@@ -254,8 +253,7 @@ def test_extra_constraints_are_rows_with_their_columns_and_limits() -> None:
 
 
 def test_extra_constraints_are_about_free_speeds() -> None:
-    model = kv.load("fetch")
-    x = kv.position("fetch/base/x")
+    model, x = kv.load("fetch"), kv.position("fetch/base/x")
     rows = model.velocity_rows(DT, subject=x, extra={"wall": (-math.inf, x, 1.0)})
     assert {*rows.speeds} == {*model.rates[x]}
     assert "wall" in rows.general.names

@@ -47,8 +47,7 @@ class Controlled:
         matrix, lower, upper = self._numbers(q)
         assert not np.isnan(np.hstack([matrix.ravel(), lower, upper])).any()
         both = np.vstack([matrix, -matrix]), np.hstack([upper, -lower])
-        keep = np.isfinite(both[1])
-        free = [(-1e3, 1e3)] * len(wish)
+        keep, free = np.isfinite(both[1]), [(-1e3, 1e3)] * len(wish)
         found = linprog(-wish, both[0][keep], both[1][keep], bounds=free, method="highs")
         assert found.status == 0, (found.message, q, matrix, lower, upper)
         return np.asarray(found.x)
@@ -82,10 +81,8 @@ JOINTS: Triples = {
 @settings(max_examples=attempts(6))
 @given(seed=st.integers(0, 10**6), dt=st.floats(0.01, 1), share=st.floats(0.05, 1))
 def test_velocity_rows_keep_a_feasible_state_feasible(seed: int, dt: float, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    model = constrained(JOINTS)
-    system = Controlled(model, dt, gain=share / dt)
-    q = np.zeros(3)
+    rng, model = np.random.default_rng(seed), constrained(JOINTS)
+    system, q = Controlled(model, dt, gain=share / dt), np.zeros(3)
     for _ in range(25):
         q = system.step(q, rng.normal(size=3))
         assert excess(model, q) == 0
@@ -93,8 +90,7 @@ def test_velocity_rows_keep_a_feasible_state_feasible(seed: int, dt: float, shar
 
 def test_the_bound_is_reached() -> None:
     """Rows that allowed nothing would keep everything inside as well."""
-    system = Controlled(constrained(JOINTS))
-    q = np.zeros(3)
+    system, q = Controlled(constrained(JOINTS)), np.zeros(3)
     for _ in range(60):
         q = system.step(q, np.array([1.0, 0, 0]))
     assert q[0] == pytest.approx(2)
@@ -190,8 +186,7 @@ FEW = ("alone", "norm, then single", "slow where it is")
 )
 def test_velocity_rows_lead_back_monotonically_from_outside(name: str, share: float) -> None:
     model = constrained(SINGLE[name])
-    system = Controlled(model, gain=share / DT)
-    n = len(model.symbols)
+    system, n = Controlled(model, gain=share / DT), len(model.symbols)
     rng = np.random.default_rng(0)
     q = rng.choice([-1, 1], n) * rng.uniform(2, 4, n)
     outwards = np.sign(q)
@@ -216,8 +211,7 @@ def test_the_way_back_is_as_fast_as_limits_allow() -> None:
     assert rows.lower({"a": -9.0})[row] == 1
     followed = rows_of(SINGLE["speed of what follows"])
     assert followed.lower({"a": -9.0})[followed.names.index("a")] == 0.5
-    norm = rows_of(SINGLE["norm, then single"])
-    inner = 0.5 * math.cos(math.pi / 16)
+    norm, inner = rows_of(SINGLE["norm, then single"]), 0.5 * math.cos(math.pi / 16)
     row = norm.names.index("a")
     assert norm.upper({"a": 9.0, "b": 0.0})[row] == pytest.approx(-inner)
     assert norm.upper({"a": 9.0, "b": 9.0})[row] == pytest.approx(-inner / math.sqrt(2))  # both come back
@@ -231,8 +225,7 @@ def test_the_way_back_is_as_fast_as_limits_allow() -> None:
 @given(seed=st.integers(0, 10**6))
 def test_rows_can_be_obeyed_wherever_it_starts(seed: int) -> None:
     """Random limits on speeds, single, summed, scaled, of norms; positions each limited by itself."""
-    rng = np.random.default_rng(seed)
-    speeds = [va, vb, vc]
+    rng, speeds = np.random.default_rng(seed), [va, vb, vc]
     triples: dict[str, tuple[Any, Any, Any]] = {}
     for s in (a, b, c):
         triples[f"{s}"] = (-rng.uniform(0, 1), rng.choice([-2.0, 0.5, 1]) * s, rng.uniform(0, 1))

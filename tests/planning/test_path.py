@@ -58,8 +58,7 @@ def test_trajectory_stays_free_and_within_the_limits_from_rest_to_rest(planner, 
     trajectory = path.trajectory()
     times = np.linspace(0.0, trajectory.duration, 2000)
     assert _clearance(planner, trajectory.positions_at(times)) > 0
-    limits = motion_limits(model, path.symbols)
-    speeds = trajectory.velocities_at(times)
+    limits, speeds = motion_limits(model, path.symbols), trajectory.velocities_at(times)
     assert (np.abs(speeds) <= limits.velocity * (1 + 1e-6)).all()
     assert (np.abs(np.diff(speeds, axis=0) / np.diff(times)[:, None]) <= limits.acceleration * 1.01).all()
     assert not trajectory.velocities[[0, -1]].any()
@@ -97,8 +96,7 @@ def test_limits_may_be_given(path):
 
 
 def test_trajectory_is_that_of_the_place_where_it_was_planned(planner, path):
-    before = path.trajectory()
-    valid = planner.valid([LEFT, INSIDE, [0.5, 1.0, 0.0]])
+    before, valid = path.trajectory(), planner.valid([LEFT, INSIDE, [0.5, 1.0, 0.0]])
     planner.place({"hinge": 0.8})
     try:
         assert path.trajectory() == before

@@ -191,8 +191,7 @@ def test_goal_behind_full_turns_is_checked_where_it_is(plate):
 
 
 def test_edits_of_the_model_are_followed():
-    x = kv.position("x")
-    model = kv.Model()
+    x, model = kv.position("x"), kv.Model()
     with model.edit() as edit:
         edit.add_frame("hand", "world", kv.translation(x, 0, 0), body(Sphere(0.05)))
         edit.add_frame("post", "world", kv.translation(0.5, 0.3, 0), body(Sphere(0.05)))

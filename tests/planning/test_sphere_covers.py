@@ -93,8 +93,7 @@ def random_directions(count: int) -> np.ndarray:
 @settings(max_examples=12, deadline=None)
 @given(solids(), st.sampled_from([None, 0.01, 0.03]), st.sampled_from([1, 6, 32]))
 def test_cover_solid_contains_the_solid_and_keeps_to_its_protrusion(solid, protrusion, most):
-    cover = cover_solid(solid, protrusion, most)
-    points = sample(solid, 400)
+    cover, points = cover_solid(solid, protrusion, most), sample(solid, 400)
     assert distances_outside(cover.centres, cover.radii, points).max() <= 1e-9
     reached = protrusions_by_coal([(solid, np.eye(4))], cover.centres, cover.radii, random_directions(6))
     assert reached <= cover.protrusion + 1e-6
@@ -136,8 +135,7 @@ def test_cover_solids_contains_the_union_and_keeps_to_its_protrusion(drawn, most
 
 def test_shapes_inside_of_others_need_no_spheres():
     box = solid_from_geometry(Box((0.2, 0.2, 0.2)))
-    inside = solid_from_geometry(Cylinder(0.05, 0.1))
-    aside = np.eye(4)
+    inside, aside = solid_from_geometry(Cylinder(0.05, 0.1)), np.eye(4)
     aside[0, 3] = 0.02
     alone, both = (
         cover_solids([(box, np.eye(4))], 0.03),
@@ -224,8 +222,7 @@ EXTREME = [
 @pytest.mark.parametrize("geometry", EXTREME, ids=str)
 def test_covers_of_plates_needles_and_extreme_sizes_contain_them(geometry):
     solid = solid_from_geometry(geometry)
-    cover = cover_solid(solid, most=6)
-    size = solid.radius
+    cover, size = cover_solid(solid, most=6), solid.radius
     assert 1 <= len(cover) <= 6
     assert distances_outside(cover.centres, cover.radii, sample(solid, 200)).max() < 1e-7 * size
     # Centres are inside, so that none sticks out by more than its radius.

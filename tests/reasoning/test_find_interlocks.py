@@ -52,8 +52,7 @@ def test_interlock_of_the_garage_door() -> None:
 
 
 def lockbox() -> kv.Model:
-    a = (B > 0.4) & (C > 0.6)
-    c = (D > 0.5) & (E > 1.0)
+    a, c = (B > 0.4) & (C > 0.6), (D > 0.5) & (E > 1.0)
     limits = {"b": (B, 0.7), "c": (C, 0.8), "d": (D, 0.9), "e": (E, 1.1)}
     steps = {"b": (B, D > 0.8), "c": (C, c), "d": (D, E > 0.9), "e": (E, F > 1.2)}
     return model(

@@ -357,8 +357,7 @@ def test_known_interlocks_are_used():
 
 
 def test_coordinates_without_limits_or_locks():
-    door = kv.position("door")
-    model = kv.Model()
+    door, model = kv.position("door"), kv.Model()
     with model.edit() as edit:
         edit.constrain("lock", -1, door.derivative(), A > 3)
     assert [str(step) for step in plan_unlocking(model, {door: 2}).steps] == [

@@ -36,8 +36,7 @@ def test_parts_are_drawn_in_their_colours():
 
 
 def test_opening_the_drawer_moves_red_pixels_and_shows_more_of_it():
-    model = cabinet()
-    side = Camera((-2.0, -3.0, 1.2), (0.0, 0.0, 0.5))
+    model, side = cabinet(), Camera((-2.0, -3.0, 1.2), (0.0, 0.0, 0.5))
     shut = reddish(picture(model, camera=side, size=SMALL))
     open_ = reddish(picture(model, {"cabinet/drawer": 0.4}, camera=side, size=SMALL))
     assert open_.sum() > 1.5 * shut.sum()
@@ -55,8 +54,7 @@ def test_the_automatic_camera_shows_moving_parts():
 
 
 def test_states_are_given_by_symbol_by_name_or_as_larger_states():
-    model = cabinet()
-    door = kv.position("cabinet/door")
+    model, door = cabinet(), kv.position("cabinet/door")
     by_name = picture(model, {"cabinet/door": 1.0}, camera=FRONT, size=SMALL)
     np.testing.assert_array_equal(by_name, picture(model, {door: 1.0}, camera=FRONT, size=SMALL))
     more = kv.State({door: 1.0, kv.position("elsewhere"): 3.0})

@@ -16,8 +16,7 @@ NOISE = pose_covariance(0.005, 0.02)
 
 
 def hinge(count=25):
-    rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (count, 1, 1))
+    rng, poses = np.random.default_rng(0), np.tile(np.eye(4), (count, 1, 1))
     turns = Rotation.from_rotvec(np.outer(np.linspace(0, 1.2, count), AXIS)).as_matrix()
     poses[:, :3, :3] = Rotation.from_rotvec(0.02 * rng.standard_normal((count, 3))).as_matrix() @ turns
     poses[:, :3, 3] = POINT + turns @ np.cross(AXIS, [0.5, 0, 0]) + 0.005 * rng.standard_normal((count, 3))

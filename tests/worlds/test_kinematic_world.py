@@ -387,8 +387,7 @@ def test_mechanisms_of_all_kinds_keep_their_limits(scene):
         {s: float(r.mean()) for s, r in ranges.items() if np.isfinite(r).all()}
     )
     for body in [name for name in model.bodies if name.startswith("thing")][-3:]:
-        middle = model.fk(body)(home)[:3, 3]
-        way = rng.normal(size=3)
+        middle, way = model.fk(body)(home)[:3, 3], rng.normal(size=3)
         way *= 0.25 / np.linalg.norm(way)
         world.reset(home.updated(dict(zip((x, y, z), middle - way, strict=True))))
         judge.reset()

@@ -307,8 +307,7 @@ def test_loops_move_as_the_model_says() -> None:
 def simulated_pose(world: MujocoWorld, frame: str) -> Array:
     data, engine = world._data, mujoco
     engine.mj_kinematics(world._compiled, data)
-    body = data.body(frame)
-    pose = np.eye(4)
+    body, pose = data.body(frame), np.eye(4)
     pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos
     return pose
 
@@ -426,8 +425,7 @@ def test_descriptions_of_others_stand_still(path: str, still: float, published: 
 
 
 def test_wrong_arguments_are_refused() -> None:
-    model = kv.load("fetch")
-    hand = gripper("fetch")
+    model, hand = kv.load("fetch"), gripper("fetch")
     for options, words in (
         ({"step": 0.0}, "'step' of a world is a positive number"),
         ({"grip": -1.0}, "'grip'"),

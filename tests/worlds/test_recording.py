@@ -193,8 +193,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 def test_chunks_that_are_larger_than_they_say_are_refused(tmp_path):
-    path = tmp_path / "bomb.mcap"
-    packed = zstandard.compress(bytes(1 << 26))
+    path, packed = tmp_path / "bomb.mcap", zstandard.compress(bytes(1 << 26))
     for states in (100, 1 << 40):
         body = struct.pack("<QQQI", 0, 0, states, 0) + struct.pack("<I", 4) + b"zstd"
         body += struct.pack("<Q", len(packed)) + packed
@@ -221,10 +220,8 @@ def test_the_recorder_refuses_what_cannot_be_read_again(model, tmp_path):
 
 
 def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(model, tmp_path):
-    resource = pytest.importorskip("resource")
-    path = tmp_path / "run.mcap"
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    recorder = Recorder(path, model)
+    resource, path = pytest.importorskip("resource"), tmp_path / "run.mcap"
+    before, recorder = resource.getrlimit(resource.RLIMIT_FSIZE), Recorder(path, model)
     recorder.write_state(0.0, state(model))
     recorder.write_state(1.0, state(model))
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 1000, before[1]))

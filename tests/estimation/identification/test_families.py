@@ -31,8 +31,7 @@ def test_operation_moves_as_its_fit(family: str) -> None:
     with model.edit() as edit:
         edit.add_frame("body", parent="world", transform=np.eye(4))
         edit.apply(fit.operation("joint", parent="body", child="part"), tag="learned")
-    joint = model.articulations["joint"]
-    pose = model.fk("part", "body")
+    joint, pose = model.articulations["joint"], model.fk("part", "body")
     home = dict(zip(joint.coordinates, joint.home, strict=True))
     np.testing.assert_allclose(pose(home), fit.parameters["reference"], atol=1e-9)
     if family in ("prismatic", "revolute", "screw", "cylindrical"):
@@ -77,8 +76,7 @@ def garage() -> Family:
 def door_poses(count: int, position: float, orientation: float) -> tuple[np.ndarray, np.ndarray]:
     family = garage()
     (a,), (length,) = family.joints, family.parameters
-    random = np.random.default_rng(0)
-    values = np.linspace(0.05, 1.2, count)
+    random, values = np.random.default_rng(0), np.linspace(0.05, 1.2, count)
     poses = np.stack([family.transform({a: v, length: LENGTH}) for v in values])
     return values, noisy(poses, position, orientation, random)
 

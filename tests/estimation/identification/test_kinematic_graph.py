@@ -30,8 +30,7 @@ SOME = ("rigid", "prismatic", "revolute", "planar", "free")
 
 def data(model: kv.Model, frames: list[str], count: int, seed: int, reach: float = 1.0) -> dict[str, Array]:
     """Return noisy poses of frames while all coordinates move at random."""
-    random = np.random.default_rng(seed)
-    symbols = model.degrees_of_freedom
+    random, symbols = np.random.default_rng(seed), model.degrees_of_freedom
     points = random.uniform(0.0, reach, (count, len(symbols)))
     return {
         frame: noisy(kv.compile(model.fk(frame), symbols).batch(points), POSITION, ORIENTATION, random)
@@ -298,15 +297,13 @@ def all_trees(gains: Gains) -> dict[tuple[frozenset[int], ...], float]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_spanning_tree_agrees_with_scipy(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    nodes = list(range(7))
+    random, nodes = np.random.default_rng(seed), list(range(7))
     gains = {frozenset(pair): float(random.uniform(1.0, 9.0)) for pair in combinations(nodes, 2)}
     matrix = np.zeros((7, 7))
     for connection, gain in gains.items():
         a, b = sorted(connection)
         matrix[a, b] = 10.0 - gain
-    wanted = minimum_spanning_tree(matrix).tocoo()
-    tree = spanning_tree(nodes, gains)
+    wanted, tree = minimum_spanning_tree(matrix).tocoo(), spanning_tree(nodes, gains)
     assert set(tree) == {frozenset(map(int, ends)) for ends in zip(wanted.row, wanted.col, strict=True)}
     one, other = split_tree(tree[2], tree)
     assert one | other == set(nodes)
@@ -348,8 +345,7 @@ def test_spanning_tree_of_an_unconnected_graph_is_a_forest() -> None:
 def test_replacement_probabilities_agree_with_the_sum_over_all_trees(seed: int) -> None:
     gains = all_gains(5, 1.0, seed)
     trees = all_trees(gains)
-    total = logsumexp(list(trees.values()))
-    best = spanning_tree(range(5), gains)
+    total, best = logsumexp(list(trees.values())), spanning_tree(range(5), gains)
     assert set(best) == set(max(trees, key=trees.__getitem__))
     for connection in best:
         one, other = split_tree(connection, best)

@@ -69,8 +69,7 @@ def test_evidence_is_that_of_a_sum_over_noises_with_a_solution_for_each(family: 
     )
     one = solve_with_inliers(data, {family: WEIGHTS[family]})[family]
     solution, spread, step = one.scored.solution, math.log(5.0), 0.1
-    axis = np.arange(-1.0, 1.01, step)
-    total = []
+    axis, total = np.arange(-1.0, 1.01, step), []
     for shift in itertools.product(axis, axis):
         logs = np.log(one.noise.factors) + shift
         identified = solver.continue_from(

@@ -72,8 +72,7 @@ def test_lengths_of_a_fit_scale_with_the_poses(family: str) -> None:
 
 
 def test_a_crane_is_identified_as_a_hinge() -> None:
-    random = np.random.default_rng(5)
-    q = kv.position("q")
+    random, q = np.random.default_rng(5), kv.position("q")
     boom = kv.compile([kv.translation(3, 1, 20) @ kv.rotation_z(q) @ kv.translation(40, 0, 0)])
     data = noisy(boom.batch(np.linspace(0.0, 0.6, 25)[:, None])[0], 0.1, 0.02, random)
     identified = identify(None, data, noise=pose_covariance(0.1, 0.02))

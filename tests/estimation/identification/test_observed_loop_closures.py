@@ -34,8 +34,7 @@ SOME = ("rigid", "prismatic", "revolute", "planar", "free")
 
 def data(model: kv.Model, frames: list[str], values: Array, seed: int) -> dict[str, Array]:
     """Return noisy poses of frames at values (N, n) of the degrees of freedom."""
-    random = np.random.default_rng(seed)
-    symbols = model.degrees_of_freedom
+    random, symbols = np.random.default_rng(seed), model.degrees_of_freedom
     compiled = [kv.compile(model.fk(frame), symbols, tier="interpreter") for frame in frames]
     return {
         frame: noisy(f.batch(values), POSITION, ORIENTATION, random)
@@ -242,8 +241,7 @@ def test_a_loop_of_balls_is_reported_and_left_open() -> None:
 
 
 def test_dependent_coordinates_are_resolved_transitively() -> None:
-    random = np.random.default_rng(0)
-    times = np.arange(7)
+    random, times = np.random.default_rng(0), np.arange(7)
     twists = Twists(("a", "b", "c", "d"), times, random.normal(size=(7, 6, 4)))
     b_by_a, b_by_c, c_by_a, c_by_d = random.normal(size=(4, 7))
     followers = DependentCoordinates()

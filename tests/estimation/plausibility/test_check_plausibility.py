@@ -193,8 +193,7 @@ def test_small_motion_is_undetermined(kitchen: kv.Model) -> None:
 
 
 def test_fixed_frame_that_moves_is_rejected(kitchen: kv.Model) -> None:
-    loose = kitchen.copy()
-    tag = "joint kitchen/fridge_joint"
+    loose, tag = kitchen.copy(), "joint kitchen/fridge_joint"
     joint = loose.history.operation(tag)
     assert isinstance(joint, kv.Fixed)
     with loose.edit() as edit:
@@ -360,8 +359,7 @@ def test_ball_joint_is_tested() -> None:
 
 
 def test_missing_poses_and_a_moving_observer_are_handled(kitchen: kv.Model) -> None:
-    values = np.random.default_rng(0).uniform(0.0, 0.4, 60)
-    frames = [HANDLE, FRIDGE]
+    values, frames = np.random.default_rng(0).uniform(0.0, 0.4, 60), [HANDLE, FRIDGE]
     before = observe_frames(kitchen, frames, {DOOR: values[:30]}, 15)
     after = observe_frames(replace_hinge(kitchen, make_slider), frames, {DOOR: values[30:]}, 16)
     camera_T_world = np.stack([kv.rotation_z(0.1 * k)() @ kv.translation(k, 1, 0)() for k in range(60)])

@@ -179,8 +179,7 @@ def test_tracker_is_checked_and_its_model_repaired(kitchen: kv.Model) -> None:
     assert again.repair(model) == ()
 
     # Outliers only: nothing is proposed, and the repair says so.
-    random = np.random.default_rng(0)
-    wrong = np.tile(poses[HANDLE][0], (20, 1, 1))
+    random, wrong = np.random.default_rng(0), np.tile(poses[HANDLE][0], (20, 1, 1))
     wrong[:, :3, 3] = random.uniform(-1.0, 1.0, (20, 3))
     lost = check_plausibility(track(model, wrong), families=SOME)
     assert lost[TAG].probabilities == {}

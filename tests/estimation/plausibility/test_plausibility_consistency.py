@@ -68,8 +68,7 @@ def is_standard_normal(z: Array) -> bool:
 
 
 def test_limit_set_by_another_coordinate_is_tested() -> None:
-    model = make_cupboard()
-    random = np.random.default_rng(0)
+    model, random = make_cupboard(), np.random.default_rng(0)
     doors = random.uniform(0.1, 1.4, 40)
     inside = random.uniform(0.0, 1.0, 40) * (0.1 + 0.3 * np.sin(doors))
     for drawers, explained in ((inside, True), (np.minimum(inside + 0.25, 0.55), False)):
@@ -88,8 +87,7 @@ def test_limit_set_by_another_coordinate_is_tested() -> None:
 
 def test_limit_excess_is_standard_normal_at_the_limit() -> None:
     """Both coordinates contribute; without the door's share the deviation would be 1.4."""
-    model = make_cupboard()
-    doors = np.random.default_rng(2).uniform(0.3, 1.2, 400)
+    model, doors = make_cupboard(), np.random.default_rng(2).uniform(0.3, 1.2, 400)
     observations = observe_frames(
         model, ["handle", "drawer"], {"door": doors, "drawer": 0.1 + 0.3 * np.sin(doors)}, 3
     )
@@ -200,8 +198,7 @@ def test_wrong_mimic_joint_is_replaced(factor: float, shift: float) -> None:
 
 
 def test_replacement_of_a_mimic_joint_follows_an_unobserved_leader() -> None:
-    served = make_gripper()
-    truth = make_gripper()
+    served, truth = make_gripper(), make_gripper()
     with truth.edit() as edit:
         turned = kv.model.Pose.from_matrix((kv.translation(0.1, 0, 0) @ kv.rotation_z(0.4))())
         edit.replace("right", replace(truth.history.operation("right"), origin=turned))

@@ -164,8 +164,7 @@ def test_linear_model_keeps_its_covariance_in_unobservable_directions():
         estimate = tracker.update({"sum": value})
     information = np.eye(2) / 9 + 300 * np.ones((2, 2))
     assert np.allclose(estimate.covariance, np.linalg.inv(information), rtol=1e-9)
-    spread = 0.1**2 * np.eye(3) + 18 * np.ones((3, 3))
-    data = np.array([1.0, 1.2, 0.9])
+    spread, data = 0.1**2 * np.eye(3) + 18 * np.ones((3, 3)), np.array([1.0, 1.2, 0.9])
     density = -data @ np.linalg.inv(spread) @ data / 2 - np.linalg.slogdet(2 * np.pi * spread)[1] / 2
     assert tracker.log_evidence == pytest.approx(density, rel=1e-9)
 

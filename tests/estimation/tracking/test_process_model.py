@@ -114,8 +114,7 @@ def test_linear_model_equals_a_constant_velocity_kalman_filter():
             x, P = F @ x, F @ P @ F.T + Q
         z = rng.standard_normal(2)
         estimate = tracker.update({"z": z}, at=time)
-        S = H @ P @ H.T + R
-        r = z - H @ x
+        S, r = H @ P @ H.T + R, z - H @ x
         log_density -= 0.5 * (r @ np.linalg.solve(S, r) + np.linalg.slogdet(2 * np.pi * S)[1])
         K = P @ H.T @ np.linalg.inv(S)
         x, P = x + K @ r, P - K @ S @ K.T
@@ -304,8 +303,7 @@ def test_late_measurements_repeat_steps_with_their_own_noise(model):
 
 
 def test_refuted_groups_are_those_that_moved(model):
-    rng = np.random.default_rng(3)
-    tracker = Tracker(model, FRAMES, process="static")
+    rng, tracker = np.random.default_rng(3), Tracker(model, FRAMES, process="static")
     covariances = np.tile(pose_covariance(0.01, 0.01), (2, 1, 1))
     for step in range(10):
         poses = look(model, rng, left=0.5, right=1.0)

@@ -51,8 +51,7 @@ def test_kitchen_is_consistent_and_efficient(position, degrees):
     errors, bounds, normalised, innovations = [], [], [], []
     for _ in range(CONFIGURATIONS):
         truth = rng.uniform(*limits.T)
-        state = dict(zip(names, truth.tolist(), strict=True))
-        tracker = first.copy()
+        state, tracker = dict(zip(names, truth.tolist(), strict=True)), first.copy()
         for step in range(STEPS):
             estimate = tracker.update_poses(observer.array(state))
             if step:  # the start is uniform and no Gaussian
@@ -108,8 +107,7 @@ def test_process_noise_on_wheels_is_consistent():
         )
     wheels, spread, dt = model.speeds, 0.5, 0.1
     start = {"base/x": 0.0, "base/y": 0.0, "base/angle": 0.3}
-    rng = np.random.default_rng(0)
-    speeds = dict(zip(wheels, (8.0, 6.0), strict=True))
+    rng, speeds = np.random.default_rng(0), dict(zip(wheels, (8.0, 6.0), strict=True))
     tracker = Tracker(model, ["base"], start=start, uncertainty=dict.fromkeys(start, 1e-6),
                       process_noise=dict.fromkeys(wheels, spread**2 * dt))  # fmt: skip
     for _ in range(20):
@@ -164,8 +162,7 @@ def test_first_measurement_as_outlier_is_corrected():
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
     observer = NoisyObserver(model, ["box"])
-    tracker = Tracker(model, ["box"], outliers=True)
-    truth = model.default_state()
+    tracker, truth = Tracker(model, ["box"], outliers=True), model.default_state()
     tracker.update({"box": anywhere(np.random.default_rng(1))})
     estimate = tracker.update(observer(truth))
     assert max(estimate.confidence.values()) < 0.9
@@ -190,8 +187,7 @@ def test_hypothesis_bank_tells_hinge_from_drawer():
             name: Tracker(m, ["part"], process_noise={"q:velocity": 0.05})
             for name, m in (("hinge", hinge), ("drawer", drawer))
         }
-        hypotheses = HypothesisBank(trackers)
-        observer = NoisyObserver(model, ["part"])
+        hypotheses, observer = HypothesisBank(trackers), NoisyObserver(model, ["part"])
         for k in range(10):
             probabilities = hypotheses.update(observer({"q": reach * k / 10}), at=0.1 * k)
         assert sum(probabilities.values()) == pytest.approx(1.0)

@@ -108,8 +108,7 @@ def test_backwards_takes_as_long(seed: int) -> None:
 
 def fastest(path: BlendedPath, velocity: Array, acceleration: Array, steps: int) -> float:
     """Return the duration of the fastest motion, by linear programs on an even grid (Pham & Pham 2018)."""
-    ends = np.concatenate(([0.0], path.reach, [0.0]))
-    parts = []
+    ends, parts = np.concatenate(([0.0], path.reach, [0.0])), []
     for k, length in enumerate(path.lengths):
         parts.append((length - ends[k] - ends[k + 1], path.directions[k], 0 * path.directions[k]))
         if k < len(path.reach):

@@ -78,12 +78,10 @@ def test_without_noise_the_child_moves_about_the_axis(cell):
 def everything_seen(cell, unknown):
     """Return the measurements as a function of all unknowns: axis, point, zero pose, joint values, parents."""
     axis, point, zero = unknown[:3] / np.linalg.norm(unknown[:3]), unknown[3:6], pose(unknown[6:12])
-    values = unknown[12 : 12 + cell.count]
-    seen = []
+    values, seen = unknown[12 : 12 + cell.count], []
     for k, value in enumerate(values):
         start = 12 + cell.count + 6 * k
-        parent = pose(unknown[start : start + 6])
-        moved = np.eye(4)
+        parent, moved = pose(unknown[start : start + 6]), np.eye(4)
         if cell.joint == "prismatic":
             moved[:3, 3] = value * axis
         else:
@@ -131,8 +129,7 @@ def test_the_bound_is_that_of_all_unknowns_at_once(cell):
         there, back = (errors(everything_seen(cell, truth + s * step), true) for s in (1, -1))
         columns.append((there - back).ravel() / 2e-6 * weights)
     covariance = np.linalg.pinv(np.array(columns) @ np.array(columns).T, rcond=1e-12, hermitian=True)
-    sides = orthonormal_complement(samples.axis)[0]
-    found = compute_bound(samples)
+    sides, found = orthonormal_complement(samples.axis)[0], compute_bound(samples)
     np.testing.assert_allclose(found.direction[0], sides.T @ covariance[:3, :3] @ sides, rtol=1e-3)
     if cell.joint == "revolute":
         # The true point is in the plane across the axis in which the places of the axes are compared.
@@ -191,8 +188,7 @@ def test_the_grid_has_18900_fits():
 def made_up(cell, ratio, right=True, count=40):
     """Return a result with a given ratio of errors to the attainable bound, which is 1.2 times the other."""
     bounds = np.full(count, 2.0)
-    errors = ratio * 1.2 * bounds
-    turns = cell.joint == "revolute"
+    errors, turns = ratio * 1.2 * bounds, cell.joint == "revolute"
     return CellResult(
         cell=cell,
         degrees=errors,

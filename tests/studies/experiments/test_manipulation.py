@@ -192,8 +192,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
 @pytest.mark.long
 def test_leader_follower_opens_the_drawer_within_the_papers_tolerance():
     setup = make_opening_setup(SHIPPED["hsr"], OBJECTS["drawer"])
-    start = setup.find_start()
-    program = LeaderFollower(setup)
+    start, program = setup.find_start(), LeaderFollower(setup)
     found = open_by_program(program, setup, start)
     assert found.done
     assert found.position_error <= 1e-3
