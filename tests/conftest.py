@@ -16,6 +16,7 @@ import gc
 import importlib.util
 import os
 import shutil
+import signal
 import sys
 import tempfile
 from collections import Counter
@@ -165,6 +166,14 @@ def chromium() -> str:
     if path is None:
         pytest.skip("There is no Chromium: install the package 'chromium'.")
     return path
+
+
+@pytest.fixture
+def hears_ctrl_c() -> Generator[None]:
+    """Restore the default handler of SIGINT, which child processes lack if this one was started with ``&``."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

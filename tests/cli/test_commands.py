@@ -281,14 +281,6 @@ def test_ctrl_c_gives_status_130_and_an_empty_line(monkeypatch, run):
     assert run("info", "kitchen") == (130, "", "\n")
 
 
-@pytest.fixture
-def hears_ctrl_c():
-    """Restore the default handler of SIGINT, which child processes lack if this one was started with ``&``."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.parametrize(
     ("stop", "words"),
     [

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from trace_models import read_document
 
 import kineverse as kv
 from kineverse import gallery
-from kineverse.formats.document import read_operations, to_json
+from kineverse.formats.document import to_json
 
 FOLDERS = {
     "articulated_objects": 5,
@@ -39,14 +40,6 @@ MOST = 3
 """Expressions of a kind that are compared for one model."""
 
 
-def read(text: str) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for tag, operation in read_operations(text):
-            edit.apply(operation, tag)
-    return model
-
-
 def sample(model: kv.Model) -> kv.Expression:
     """Return the elements of poses, Jacobians, constraints, bounds, and their gradients; of large models a part."""
     draw = random.Random(1)
@@ -69,7 +62,7 @@ def sample(model: kv.Model) -> kv.Expression:
 def survives(model: kv.Model) -> None:
     """Compare a model with what its document and its packed document say."""
     text = to_json(model)
-    again = read(text)
+    again = read_document(text)
     assert again.snapshot() == model.snapshot()
     assert to_json(again) == text
     assert kv.formats.from_bytes(kv.formats.to_bytes(model)).snapshot() == model.snapshot()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from trace_models import Custom, build
+from trace_models import Custom, build, read_document
 
 import kineverse as kv
 from kineverse.formats.document import read_operations, to_json, traces
@@ -45,11 +45,7 @@ def custom(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def read(content: dict[str, Any], prefix: str | None = None) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for tag, operation in read_operations(sealed(content), prefix=prefix):
-            edit.apply(operation, tag)
-    return model
+    return read_document(sealed(content), prefix)
 
 
 def without_reads(content: dict[str, Any]) -> None:

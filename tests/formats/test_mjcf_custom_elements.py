@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mujoco_oracle import model_of
 from round_trip import assert_same_motion, load_cached
-
-pytest.importorskip("mujoco")
 
 import kineverse as kv
 from kineverse.formats.mjcf import parse_mjcf
-from kineverse.formats.mjcf.operations import mjcf_operations
 from kineverse.model.body import Body, Box, Inertia, Shape
 
 LINKAGE = "articulations/slider_crank"
@@ -24,11 +22,7 @@ def written(model: kv.Model, folder: Path) -> str:
 
 
 def read(text: str, prefix: str | None = None) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for operation in mjcf_operations(parse_mjcf(text), prefix):
-            edit.apply(operation)
-    return model
+    return model_of(parse_mjcf(text), prefix)
 
 
 def test_velocity_limits_are_read_back(tmp_path: Path) -> None:

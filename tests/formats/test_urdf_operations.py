@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from urdf_texts import LIMIT, SMALL, chain, joint, pair, robot
+from urdf_texts import LIMIT, SMALL, chain, joint, model_of, pair, robot
 
 import kineverse as kv
 from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.urdf import parse_urdf
 from kineverse.formats.urdf.operations import urdf_operations
-
-
-def model_of(text: str, prefix: str | None = None, parent: str = "world") -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        if parent != "world":
-            edit.add_frame(parent, "world", kv.translation(0, 0, 1))
-        for operation in urdf_operations(parse_urdf(text), prefix, parent):
-            edit.apply(operation)
-    return model
 
 
 def bounds(model: kv.Model, name: str) -> tuple[float, float]:

@@ -10,22 +10,7 @@ from kineverse.gallery.lockboxes import THESIS, draw_tangled_lockbox, make_lockb
 from kineverse.manipulation import execute_unlocking
 from kineverse.worlds import MechanismWorld
 from kineverse_studies.experiments.lockbox.unknown_locks import can_be_opened
-
-A, B, C = map(kv.position, "abc")
-
-
-def three_sliders(**locks):
-    model = kv.Model()
-    with model.edit() as edit:
-        for q in (A, B, C):
-            edit.constrain(f"{q} range", 0, q, 1)
-        for name, open_if in locks.items():
-            edit.constrain(f"lock {name}", -1, kv.position(name).derivative(), open_if)
-    return model
-
-
-def goal_of(box):
-    return {f"lockbox/{name}": value for name, value in box.goal.items()}
+from sliders import A, B, C, goal_of, three_sliders
 
 
 def test_thesis_box_is_opened_in_order():

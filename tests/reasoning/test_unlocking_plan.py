@@ -18,22 +18,7 @@ from kineverse.gallery.lockboxes import (
 from kineverse.reasoning import Interval, interlocks, plan_unlocking, plan_violations, refutation_gaps
 from kineverse.reasoning.move_search import MoveSearch
 from kineverse_studies.experiments.lockbox.unknown_locks import can_be_opened
-
-A, B, C = map(kv.position, "abc")
-
-
-def goal_of(box):
-    return {f"lockbox/{name}": value for name, value in box.goal.items()}
-
-
-def three_sliders(**locks):
-    model = kv.Model()
-    with model.edit() as edit:
-        for q in (A, B, C):
-            edit.constrain(f"{q} range", 0, q, 1)
-        for name, open_if in locks.items():
-            edit.constrain(f"lock {name}", -1, kv.position(name).derivative(), open_if)
-    return model
+from sliders import A, B, C, goal_of, three_sliders
 
 
 def test_plan_of_thesis_box_gives_its_order_with_reasons():

@@ -90,14 +90,6 @@ def test_show_without_a_screen_opens_no_browser(monkeypatch, opened):
     assert opened == []
 
 
-@pytest.fixture
-def hears_ctrl_c():
-    """Have processes started here hear Ctrl-C, which they would not if this one was started with ``&``."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 def test_a_real_script_ends_with_ctrl_c(hears_ctrl_c):
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     with subprocess.Popen(
