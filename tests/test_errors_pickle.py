@@ -56,7 +56,8 @@ def test_error_survives_a_pickle(kind: type[Exception]) -> None:
         error.__dict__["added"] = "later"
     after = pickle.loads(pickle.dumps(error))
     assert type(after) is kind
-    assert (str(after), after.args) == (str(error), error.args)
+    assert str(after) == str(error)
+    assert after.args == error.args
     assert {k: str(v) for k, v in vars(after).items()} == {k: str(v) for k, v in vars(error).items()}
 
 

@@ -98,8 +98,7 @@ def test_missing_and_invalid_meshes_are_left_out(package: Path, tmp_path: Path) 
     (package / "meshes" / "notes.txt").write_text("hello")
     names = ("missing.stl", "noise.stl", "noise.dae", "noise.obj", "notes.txt", "cup.stl")
     model = robot(package, *(f"package://cups/meshes/{name}" for name in names), "https://a.b/c.stl")
-    saved = model.save(tmp_path / "r.xml")
-    again = kv.load(tmp_path / "r.xml").bodies["b"]
+    saved, again = model.save(tmp_path / "r.xml"), kv.load(tmp_path / "r.xml").bodies["b"]
     assert [Path(s.geometry.uri).name for s in again.visuals] == ["cup.stl"]  # type: ignore[union-attr]
     for name in names[:-1]:
         assert any(name in r and "is left out" in r for r in saved.remarks), name

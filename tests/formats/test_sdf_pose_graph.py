@@ -254,8 +254,7 @@ def written(tree: list, about: list[int]) -> str:
         parent = f"l{above % n}"
         j = places[f"j{n}"] = places[parent] @ matrix(joint)
         c = places[f"l{n}"] = j @ matrix(child)
-        pick = names[about[2 * n] % len(names)]
-        other = names[about[2 * n + 1] % len(names)]
+        pick, other = names[about[2 * n] % len(names)], names[about[2 * n + 1] % len(names)]
         names += [f"l{n}"]
         a = np.array(axis) if np.linalg.norm(axis) > 0.1 else np.array([0, 0, 1.0])
         expressed = places[other][:3, :3].T @ j[:3, :3] @ a

@@ -45,8 +45,7 @@ def at(model: Model, **values: float) -> State:
 @pytest.mark.parametrize("number", range(6))
 def test_obstacles_are_those_that_coal_finds_along_the_way(number: int, tmp_path: Path) -> None:
     """Cupboards of a generator, with shapes, motions and distances of its own."""
-    drawn = random_cupboards.draw_cupboard(number, seed=7)
-    path = tmp_path / "cupboard.urdf"
+    drawn, path = random_cupboards.draw_cupboard(number, seed=7), tmp_path / "cupboard.urdf"
     path.write_text(drawn.urdf(), encoding="utf-8")
     model, others = kv.load(path), {f"{name}_joint": value for name, value in drawn.values.items()}
     state = at(model, front_joint=drawn.start, **others)

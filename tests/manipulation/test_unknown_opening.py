@@ -191,8 +191,7 @@ def test_looks_at_a_part_that_slips_through_the_hand_are_those_of_its_joint(trut
     assert belief.is_seen
     belief.hold()
     belief.begin_motion()
-    place = inverse(belief.pose) @ belief.hand_pose
-    angles = np.linspace(0.0, 0.04 / 0.38, 60)
+    place, angles = inverse(belief.pose) @ belief.hand_pose, np.linspace(0.0, 0.04 / 0.38, 60)
     for world.angle in angles:
         world.time += 1 / 30
         belief.update(world)

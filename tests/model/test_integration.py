@@ -112,8 +112,7 @@ def test_rows_of_any_kind_are_followed(name: str) -> None:
         edit.add_frame("seen", "world", kv.translation(x, y, z))
     start = {x: 1.0, y: 0.3, z: -0.4}
     speeds = dict.fromkeys(model.speeds, 0.9)
-    after = model.integrate(start, speeds, 1.0)
-    expected = oracle(model, start, speeds, 1.0)
+    after, expected = model.integrate(start, speeds, 1.0), oracle(model, start, speeds, 1.0)
     np.testing.assert_allclose(numbers(model, after), expected, rtol=1e-10, atol=1e-11)
 
 
@@ -178,8 +177,7 @@ def test_a_quaternion_of_another_length_keeps_it_and_turns_alike(length: float) 
 def test_two_steps_are_one_and_backwards_is_back(seed: int) -> None:
     model = random_tree(seed, 9)
     start, speeds = random_state(model, seed), random_speeds(model, seed)
-    halfway = model.integrate(start, speeds, 0.4)
-    whole = model.integrate(start, speeds, 1.0)
+    halfway, whole = model.integrate(start, speeds, 0.4), model.integrate(start, speeds, 1.0)
     np.testing.assert_allclose(
         numbers(model, model.integrate(halfway, speeds, 0.6)), numbers(model, whole), atol=1e-12
     )

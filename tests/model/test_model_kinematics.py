@@ -19,8 +19,7 @@ def numeric(model: kv.Model, frame: str, values: dict[kv.Symbol, float]) -> np.n
     """Return world_T_frame by multiplying numbers."""
     pose = np.eye(4)
     while frame != "world":
-        pose = model.frames[frame].transform(values) @ pose
-        frame = model.frames[frame].parent
+        pose, frame = model.frames[frame].transform(values) @ pose, model.frames[frame].parent
     return pose
 
 

@@ -127,8 +127,7 @@ def test_motion_against_the_violation_leads_back() -> None:
     bound = np.cos(b)
     rows = constrained({"n": (-bound, np.sin(2 * a), bound)}).velocity_rows(DT)
     point = np.array([0.6, 1.2])
-    state = kv.State(dict(zip((a, b), point, strict=True)))
-    excess = np.sin(1.2) - np.cos(1.2)
+    state, excess = kv.State(dict(zip((a, b), point, strict=True))), np.sin(1.2) - np.cos(1.2)
     np.testing.assert_allclose(rows.violation(state), [0, excess])
     step, *_ = np.linalg.lstsq(rows.matrix(state)[1:], -1e-4 * rows.violation(state)[1:])
     after = point + step

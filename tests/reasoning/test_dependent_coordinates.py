@@ -114,8 +114,7 @@ def test_lock_that_a_linkage_never_reaches_is_omitted() -> None:
 
 def test_range_of_a_dependent_coordinate_keeps_its_name() -> None:
     """The condition is about the crank, the bound is where the slider is."""
-    model = kv.load("articulations/slider_crank")
-    slider = kv.position("slider_crank/slider")
+    model, slider = kv.load("articulations/slider_crank"), kv.position("slider_crank/slider")
     with model.edit() as edit:
         edit.constrain("door", 0, DOOR, 0.3)
         edit.constrain("wedge", 0, DOOR, slider)

@@ -93,8 +93,7 @@ def test_drift_leaves_what_the_camera_sees_relative_to_itself(model):
     sampler = SensorSampler(Sensors(odometry=0.1, turn=0.1), model, "robot", seed=1)
     sampler.observe(0.0, state(model))
     at = state(model, robot__base__x=1.0, robot__base__y=0.5, robot__base__angle=0.3)
-    seen = sampler.observe(0.1, at)
-    camera = kv.compile(model.fk("robot/head_tilt_link"))
+    seen, camera = sampler.observe(0.1, at), kv.compile(model.fk("robot/head_tilt_link"))
     read = camera({s: seen.joints[s] for s in camera.inputs})
     assert abs(read - camera(at)).max() > 1e-2
     expected = inverse(camera(at)) @ kv.compile(model.fk("cupboard"))(at)

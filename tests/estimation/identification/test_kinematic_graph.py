@@ -317,8 +317,7 @@ def test_spanning_tree_agrees_with_scipy(seed: int) -> None:
 def test_edge_probabilities_agree_with_the_sum_over_all_trees(count: int, spread: float) -> None:
     gains = all_gains(count, spread, seed=count, missing=count // 4)
     trees = all_trees(gains)
-    total = logsumexp(list(trees.values()))
-    result = edge_probabilities(range(count), gains)
+    total, result = logsumexp(list(trees.values())), edge_probabilities(range(count), gains)
     assert sum(result.values()) == pytest.approx(len(next(iter(trees))))
     for connection, probability in result.items():
         logs = [log for tree, log in trees.items() if connection in tree]
@@ -367,8 +366,7 @@ def test_leaves_have_one_connection(seed: int) -> None:
         for tree, log in all_trees(gains).items()
         if all(sum(leaf in c for c in tree) == 1 for leaf in leaves)
     }
-    total = logsumexp(list(trees.values()))
-    best = spanning_tree(range(5), gains, leaves)
+    total, best = logsumexp(list(trees.values())), spanning_tree(range(5), gains, leaves)
     assert set(best) == set(max(trees, key=trees.__getitem__))
     for connection, probability in edge_probabilities(range(5), gains, leaves).items():
         logs = [log for tree, log in trees.items() if connection in tree]

@@ -120,8 +120,7 @@ def exact_poses(kind: str, scale: float, far: float, count: int, seed: int) -> n
     right = pose(Rotation.random(random_state=rng), scale * rng.normal(size=3))
     poses = []
     for q in rng.uniform(-1.5, 1.5, count):
-        turn = Rotation.from_rotvec([0.0, 0.0, q])
-        free = scale * rng.uniform(-1.0, 1.0, 3)
+        turn, free = Rotation.from_rotvec([0.0, 0.0, q]), scale * rng.uniform(-1.0, 1.0, 3)
         moved = {
             "rigid": pose(Rotation.identity(), np.zeros(3)),
             "prismatic": pose(Rotation.identity(), [0.0, 0.0, scale * q]),

@@ -260,8 +260,7 @@ def test_covariances_of_an_array_are_those_of_pairs(model):
     rng = np.random.default_rng(0)
     by_array, by_pairs = Tracker(model, FRAMES), Tracker(model, FRAMES)
     for step in range(5):
-        poses = look(model, rng, left=0.5, right=1.0)
-        factors = rng.normal(size=(2, 6, 6))
+        poses, factors = look(model, rng, left=0.5, right=1.0), rng.normal(size=(2, 6, 6))
         covariances = 1e-4 * (factors @ np.swapaxes(factors, 1, 2) + np.eye(6))
         data = np.array([True, step % 2 == 0])
         covariances[~data] = np.nan  # those of missing poses are not read

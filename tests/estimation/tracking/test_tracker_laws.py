@@ -112,8 +112,7 @@ def test_estimate_is_invariant_to_the_world_frame():
 
 def residuals(x, model, data, covariance, prior):
     """Compute whitened residuals of a state with scipy."""
-    parts = [(x - prior[0]) / prior[1]]
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    parts, whiten = [(x - prior[0]) / prior[1]], np.linalg.inv(np.linalg.cholesky(covariance))
     for frame, T in data.items():
         said = model.fk(frame)(
             {str(s): v for s, v in zip(model.symbols, x, strict=True) if s in model.fk(frame).symbols}
