@@ -204,7 +204,8 @@ def _run(tree: Path, cache: Path, only: list[str]) -> dict[str, float]:
         "OPENBLAS_NUM_THREADS": "1",
     }
     command = [sys.executable, __file__, "--measure", *only]
-    printed = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
+    process = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE)
+    printed = process.stdout.decode()
     measured: dict[str, float] = json.loads(printed.splitlines()[-1])
     return measured
 

@@ -219,7 +219,9 @@ def unknown_attribute_error(
     public = sorted({one for one in available if not one.startswith("_")})
     by_lower: dict[str, str] = {one.lower(): place for one, place in below.items()}
     by_lower |= {one.lower(): one for one in public}
-    close = [by_lower[match] for match in difflib.get_close_matches(name.lower(), by_lower, n=3, cutoff=0.6)]
+    lower = name.lower()
+    matches = [lower] if lower in by_lower else difflib.get_close_matches(lower, by_lower, n=3, cutoff=0.6)
+    close = [by_lower[match] for match in matches]
     if close:
         return UnknownAttributeError(f"{problem} Did you mean {' or '.join(map(repr, close))}?")
     return UnknownAttributeError(f"{problem} dir(...) lists what there is.")

@@ -415,7 +415,7 @@ def test_find_never_colliding_excepts_pairs_that_never_touch(model):
             s.update(state)
         assert by_names(scene.pairs_within(0.0)) == by_names(quiet.pairs_within(0.0))
         assert len(quiet.pairs_within(0.5)) <= len(scene.pairs_within(0.5))
-    with pytest.raises(kv.errors.InvalidValueError, match="none is given"):
+    with pytest.raises(kv.errors.InvalidValueError, match="there is none"):
         scene.find_never_colliding([])
 
 

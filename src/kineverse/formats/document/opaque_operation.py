@@ -22,7 +22,7 @@ class OpaqueOperation(Operation):
 
     While its reads are unchanged, it writes what the original wrote, to the last bit. When a read changes, it
     is run again by its trace. Without a trace it is *frozen*: a loop (``kv.CloseLoop``) is closed again, any
-    other change is refused. Then, or if the original branched on the changed value, replace it by an operation
+    other change is refused. Then, or if the original branched on the changed value, replace it by one
     of its class in the same edit.
 
     Attributes
