@@ -1,7 +1,5 @@
 """The arm of three links of the examples, in a plane, with a box and a door in its way."""
 
-from __future__ import annotations
-
 from markdown_examples import ROOT
 
 ARM, SRDF = ROOT / "examples" / "arm.urdf", ROOT / "examples" / "arm.srdf"

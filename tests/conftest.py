@@ -16,6 +16,7 @@ import gc
 import importlib.util
 import os
 import shutil
+import signal
 import sys
 import tempfile
 from collections import Counter
@@ -25,8 +26,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+import hypothesis_profiles
 import published_data
-from hypothesis_profiles import USUAL
 from native_libraries import compile_native_libraries
 
 ROOT = Path(__file__).parents[1]
@@ -34,12 +35,13 @@ sys.path.append(str(ROOT / "examples"))  # living_kitchen
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 settings.register_profile("kineverse", deadline=None, max_examples=45, derandomize=bool(os.environ.get("CI")))
-settings.register_profile("thorough", settings.get_profile("kineverse"), max_examples=10 * USUAL)
+settings.register_profile(
+    "thorough", settings.get_profile("kineverse"), max_examples=10 * hypothesis_profiles.USUAL
+)
 settings.load_profile("kineverse")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option for long tests."""
     parser.addoption(
         "--long", action="store_true", help="also run the tests that are slow for what they check"
     )
@@ -47,6 +49,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Set the environment, once: the workers of xdist inherit it."""
+    hypothesis_profiles.is_long = config.getoption("long")
     if hasattr(config, "workerinput"):
         return
     if published_data.FOLDER and not published_data.FOLDER.is_dir():
@@ -163,6 +166,14 @@ def chromium() -> str:
     if path is None:
         pytest.skip("There is no Chromium: install the package 'chromium'.")
     return path
+
+
+@pytest.fixture
+def hears_ctrl_c() -> Generator[None]:
+    """Restore the default handler of SIGINT, which child processes lack if this one was started with ``&``."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Meshes made here, and a CoACD that does what a test wants."""
 
-from __future__ import annotations
-
 import numpy as np
 import shapely
 import trimesh

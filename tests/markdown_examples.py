@@ -52,8 +52,7 @@ def run(file: Path) -> None:
     for example in examples(file):
         printed = io.StringIO()
         # The empty lines make a traceback show the line of the file.
-        source = "\n" * example.line + example.code
-        code = compile(source, str(example.file), "exec", dont_inherit=True)
+        code = compile("\n" * example.line + example.code, str(example.file), "exec", dont_inherit=True)
         with contextlib.redirect_stdout(printed):
             exec(code, names)
         if example.output is not None and not agree(example.output, printed.getvalue()):

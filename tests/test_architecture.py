@@ -52,8 +52,7 @@ def test_the_modules_of_the_data_flow_exist() -> None:
 
 def test_modules_and_folders_have_a_good_size() -> None:
     """Large modules are divided, and small ones belong into the module that imports them."""
-    modules = _modules()
-    importers = defaultdict(set)
+    modules, importers = _modules(), defaultdict(set)
     for name, path in modules.items():
         for imported in _imports(name, path, modules):
             importers[imported].add(name)

@@ -74,8 +74,7 @@ def at_the_root(tmp_path, monkeypatch):
 def pages(monkeypatch):
     """Fetch each page that is opened, instead of waiting until somebody has seen enough."""
     viewer = pytest.importorskip("kineverse.view.viewer")
-    living = pytest.importorskip("living_kitchen.page")
-    answers = []
+    living, answers = pytest.importorskip("living_kitchen.page"), []
 
     def fetch(page):
         with urllib.request.urlopen(page.address, timeout=30) as answer:
@@ -106,8 +105,7 @@ def test_documented_commands_print_the_documented_output(page, at_the_root, page
             continue
         if words[0] == "bench" and not WHOLE:
             words, output = ["bench", "--list"], ""
-        status = main(words)
-        printed = capsys.readouterr()
+        status, printed = main(words), capsys.readouterr()
         assert status == int(shlex.join(words) in DIFFERENT), command
         assert not printed.err or words[0] in NARRATED, command
         if output:

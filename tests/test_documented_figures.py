@@ -4,8 +4,6 @@
 are compared in ``tests/bench``.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections import Counter

@@ -7,9 +7,7 @@ what to do: the pattern is what the message cannot do without.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
-import pickle
 import re
 import shlex
 import sys
@@ -233,20 +231,3 @@ def test_docs_warn_of_comparing_an_expression_with_a_number():
 
 def test_the_table_of_mistakes_is_long_enough():
     assert len(PYTHON) + len(COMMANDS) >= 25
-
-
-def test_errors_survive_a_pickle() -> None:
-    """A worker of a pool raises them; one that cannot be unpickled breaks the pool."""
-    for path in (ROOT / "src/kineverse").rglob("*.py"):
-        if re.search(r"^class \w+\(.*Error\b.*\):$", path.read_text(encoding="utf-8"), re.MULTILINE):
-            name = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
-            importlib.import_module(name.removesuffix(".__init__"))
-    kinds: list[type[kv.KineverseError]] = [kv.KineverseError]
-    for kind in kinds:
-        kinds += [one for one in kind.__subclasses__() if one not in kinds]
-    assert len(kinds) > 20
-    for kind in kinds:
-        error = kind.__new__(kind, "it failed")
-        error.__dict__["kind"] = "other"
-        back = pickle.loads(pickle.dumps(error))
-        assert (type(back), str(back), back.__dict__) == (kind, "it failed", {"kind": "other"})

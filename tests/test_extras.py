@@ -17,9 +17,7 @@ from kineverse._extras import DISTRIBUTION, install_command, install_studies, re
 from kineverse._version import __version__
 
 ROOT = Path(__file__).parents[1]
-EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
-    "optional-dependencies"
-]
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
 STUDIES = tomllib.loads((ROOT / "studies" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 HERE = Path(sys.executable)
 
@@ -95,8 +93,7 @@ def test_install_command_without_metadata_asks_for_a_checkout(tmp_path, monkeypa
 
 @pytest.mark.parametrize("extra", [name for name in EXTRAS if name != "all"])
 def test_requirements_of_each_extra_are_in_the_metadata(extra):
-    declared = metadata.requires(DISTRIBUTION)
-    found = requirements(extra, declared)
+    found = requirements(extra, metadata.requires(DISTRIBUTION))
     assert [line.partition(";")[0].strip() for line in found] == [
         line.partition(";")[0].strip() for line in EXTRAS[extra]
     ]

@@ -116,13 +116,7 @@ def test_equation_6_of_2022_drives_a_base():
     with model.edit() as edit:
         edit.apply(
             kv.articulations.DifferentialDrive(
-                name="base",
-                parent="world",
-                child="base",
-                radius=r,
-                track=width,
-                left="left",
-                right="right",
+                name="base", parent="world", child="base", radius=r, track=width, left="left", right="right"
             )
         )
     pose = model.fk("base")
@@ -165,11 +159,7 @@ def test_equation_8_of_2022(at):
     product = overridden() * (4 * a)
     x, y = at[a], at[b]
     assert numbers(product.gradient(), at) == pytest.approx(
-        {
-            "a:velocity": 4 * (math.sin(x) + x * math.cos(x) + y**2),
-            "b:velocity": 4 * x,
-            "c:velocity": 16 * x,
-        }
+        {"a:velocity": 4 * (math.sin(x) + x * math.cos(x) + y**2), "b:velocity": 4 * x, "c:velocity": 16 * x}
     )
     # Where nothing was overridden, the entry is the slope; where something was, the slope is 8ab.
     assert product.gradient()[da](at) == pytest.approx(slope(product, a, at), abs=1e-7)
@@ -211,8 +201,7 @@ def test_relevance_of_2022():
     with model.edit() as edit:
         for name, triple in triples.items():
             edit.constrain(name, *triple)
-    subjects = [a, b * c, np.sin(da), c.augment({dd: a}), kv.rotation_x(b) @ kv.translation(a, 0, 0)]
-    for subject in subjects:
+    for subject in [a, b * c, np.sin(da), c.augment({dd: a}), kv.rotation_x(b) @ kv.translation(a, 0, 0)]:
         variables = {str(s) for s in subject.symbols}
         shared = {n for n, (_, e, _) in triples.items() if {str(s) for s in e.symbols} & variables}
         assert set(model.constraints_for(subject, exact=True)) == shared
@@ -349,8 +338,7 @@ def test_equation_3_of_2020():
 def test_equation_4_of_2020(at, contrast):
     """Eq. 4: a smooth "less than", and a gradient that is the trend of its truth and not its slope."""
     left, right = a * b, c + np.sin(a)
-    e = kv.logic.less(left, right, contrast=contrast)
-    difference = right(at) - left(at)
+    e, difference = kv.logic.less(left, right, contrast=contrast), right(at) - left(at)
     # (1 + tanh x)/2 is the logistic function of 2x, here in the form that does not overflow.
     far = math.exp(-2 * abs(difference) * contrast)
     assert e(at) == pytest.approx(1 / (1 + far) if difference > 0 else far / (1 + far), rel=1e-9, abs=1e-12)

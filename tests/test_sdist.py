@@ -1,7 +1,5 @@
 """A source distribution has all that the repository has: documentation, changelog, examples, and tests that run."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -191,7 +191,3 @@ def test_the_face_is_small() -> None:
 def test_a_name_that_lives_below_is_answered_with_its_place(name: str, place: str) -> None:
     with pytest.raises(AttributeError, match=re.escape(place)):
         getattr(kv, name)
-
-
-def test_dir_lists_the_face() -> None:
-    assert [name for name in dir(kv) if not name.startswith("_")] == [n for n in kv.__all__ if n[0] != "_"]

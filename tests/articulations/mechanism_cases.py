@@ -52,8 +52,7 @@ def ends(mechanism: Mechanism, q: kv.Symbol) -> tuple[float, float]:
 def across(mechanism: Mechanism, steps: int = 9) -> list[dict[kv.Symbol, float]]:
     """Return states over the whole range of every coordinate, its ends included; the others at home."""
     model = model_of(mechanism)
-    home = dict(model.default_state())
-    states = []
+    home, states = dict(model.default_state()), []
     for q in model.degrees_of_freedom:
         lower, upper = np.clip(ends(mechanism, q), -7.0, 7.0)
         states += [{**home, q: float(v)} for v in np.linspace(lower, upper, steps)]

@@ -69,8 +69,7 @@ def test_ball_tangent_equals_motion_along_rates() -> None:
 @settings(max_examples=attempts(60), derandomize=True)
 @given(seed=st.integers(0, 10**6), length=st.sampled_from([1.0, -2.0]))
 def test_cone_and_twist_constraints_equal_swing_and_twist_angles(seed: int, length: float) -> None:
-    rng = np.random.default_rng(seed)
-    axis = np.array([1, 2, 3]) / math.sqrt(14)
+    rng, axis = np.random.default_rng(seed), np.array([1, 2, 3]) / math.sqrt(14)
     across = np.cross(axis, rng.normal(size=3))
     tilt, twist = rng.uniform(0, 1.5), rng.uniform(-1.0, 1.0)
     rotation = Rotation.from_rotvec(across / np.linalg.norm(across) * tilt) * Rotation.from_rotvec(
@@ -84,8 +83,7 @@ def test_cone_and_twist_are_smooth_at_rest() -> None:
     model = model_of(FULL)
     home = model.default_state()
     for name in ("j/cone", "j/twist"):
-        expression = model.constraints[name].expression
-        for entry in expression.gradient().values():
+        for entry in model.constraints[name].expression.gradient().values():
             assert entry(home) == 0
             assert all(math.isfinite(second(home)) for second in entry.gradient().values())
 
@@ -115,8 +113,7 @@ def test_velocity_rows_keep_cone_twist_and_speed(wish: tuple[float, ...]) -> Non
     names = dict(zip((f"j/w{c}:velocity" for c in "xyz"), wish, strict=True))
     dt = 0.02
     end = assert_rows_keep_limits(model, model.default_state(), names, 60, dt, slack=(2 * dt) ** 2 / 2)
-    rotation = Rotation.from_quat([end[kv.position(f"j/q{c}")] for c in "xyzw"])
-    assert rotation.magnitude() > 0.45
+    assert Rotation.from_quat([end[kv.position(f"j/q{c}")] for c in "xyzw"]).magnitude() > 0.45
 
 
 @pytest.mark.parametrize("operation", EVERY)

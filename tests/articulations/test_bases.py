@@ -57,8 +57,7 @@ def test_base_jacobians_equal_finite_differences(base: Base, seed: int) -> None:
 
 @pytest.mark.parametrize("base", EVERY, ids=lambda o: type(o).__name__)
 def test_base_tangents_equal_motion_along_rates(base: Base) -> None:
-    arm = kv.Revolute(name="arm", parent="c", child="arm", axis=(1, 2, 3))
-    model = model_of(base, arm)
+    model = model_of(base, kv.Revolute(name="arm", parent="c", child="arm", axis=(1, 2, 3)))
     assert_motion_law(model, [model.fk("arm"), model.jacobian("arm"), model.fk("c", "arm")], seed=4)
 
 
@@ -191,8 +190,7 @@ def test_differential_drive_limits_of_speed_and_turn() -> None:
 @pytest.mark.parametrize("base", [WHEELED, TWO_WHEELED], ids=lambda o: type(o).__name__)
 @pytest.mark.parametrize("seed", range(3))
 def test_velocity_rows_keep_speed_limits_of_bases(base: Base, seed: int) -> None:
-    model = model_of(base)
-    rng = np.random.default_rng(seed)
+    model, rng = model_of(base), np.random.default_rng(seed)
     wish = {str(s): float(rng.normal()) for s in model.speeds}
     assert_rows_keep_limits(model, model.default_state(), wish, 5, 0.1)
 

@@ -61,8 +61,7 @@ def test_panels_are_rigid_and_share_a_hinge() -> None:
         np.testing.assert_allclose(f2, [f1[1], -f1[0]], atol=1e-14)
         np.testing.assert_allclose(hinge + 0.15621 * f1 - 0.0031 * f2, lower[[0, 2], 3], atol=1e-14)
         np.testing.assert_allclose(hinge + 0.17871 * f1 - 0.0671 * f2, planar("arm_end", angle), atol=1e-14)
-    shut = pose(DOOR, "lower_panel", {"m": 0.0})
-    np.testing.assert_allclose(-shut[[0, 2], 2], [0.009, -1], atol=5e-4)
+    np.testing.assert_allclose(-pose(DOOR, "lower_panel", {"m": 0.0})[[0, 2], 2], [0.009, -1], atol=5e-4)
 
 
 def test_folding_door_opens_at_its_speed_limit() -> None:

@@ -64,8 +64,7 @@ def test_garage_door_constraints_equal_those_of_the_papers() -> None:
     assert constraints["m/door/position"] == kv.Constraint.from_expressions(0, a, 2)
     c2 = constraints["m/lock"]
     assert c2.expression is a.derivative()
-    unlocked = ~((b < 0.3) & (a > 1.99))
-    product = 1 - (b < 0.3) * (a > 1.99)
+    unlocked, product = ~((b < 0.3) & (a > 1.99)), 1 - (b < 0.3) * (a > 1.99)
     for where in (1.0, 1.99, 1.995, 2.0):
         for bolt in np.linspace(0, 0.6, 50):  # fig. 3, right
             values = {"m/door": where, "m/bolt": float(bolt)}
@@ -77,9 +76,7 @@ def test_garage_door_constraints_equal_those_of_the_papers() -> None:
 
 
 @BOTH
-def test_lock_forces_speed_zero_and_its_gradient_shows_how_to_open(
-    door: kv.articulations.GarageDoor,
-) -> None:
+def test_lock_forces_speed_zero_and_its_gradient_shows_how_to_open(door: kv.articulations.GarageDoor) -> None:
     model = model_of(door)
     closed, opening = (2.0, -1.0) if door is PUBLISHED else (0.0, 1.0)
     rows = model.velocity_rows(0.1)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from articulation_checks import ORIGIN, WHERE, homogeneous, model_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -17,9 +18,6 @@ from hypothesis_profiles import attempts
 from kineverse.articulations import Joint, OneDofJoint
 
 INF = float("inf")
-ORIGIN = np.eye(4)
-ORIGIN[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.8, 1.9]).as_matrix()
-ORIGIN[:3, 3] = [0.5, -0.25, 2.0]
 AXES = [
     (0, 0, 1),
     (0, -1, 0),
@@ -30,34 +28,12 @@ AXES = [
     (0, 1e-200, 0),
     (1e200, 1e200, 0),
 ]
-WHERE: dict[str, Any] = {
-    "name": "j",
-    "parent": "world",
-    "child": "c",
-    "origin": kv.model.Pose.from_matrix(ORIGIN),
-}
 numbers = st.floats(-4, 4)
-
-
-def model_of(*operations: kv.Operation) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for operation in operations:
-            edit.apply(operation)
-    return model
 
 
 def pose(operation: kv.Operation, **values: float) -> np.ndarray:
     at = {f"j/{name}" if name != "j" else name: value for name, value in values.items()}
     return model_of(operation).fk("c")(at)
-
-
-def homogeneous(rotation: Any = None, position: Any = (0, 0, 0)) -> np.ndarray:
-    result = np.eye(4)
-    if rotation is not None:
-        result[:3, :3] = rotation.as_matrix()
-    result[:3, 3] = position
-    return result
 
 
 def unit(axis: Any) -> np.ndarray:
@@ -101,8 +77,7 @@ def test_joint_pose_about_any_axis(axis: Any, q: float) -> None:
     "axis", [*AXES, (0, 0, -1), (1e-8, 0, -1), (0, 1e-5, -1), (1e-13, 1e-13, -1), (1e-5, 0, 1)]
 )
 def test_planar_joint_pose(axis: Any) -> None:
-    n = unit(axis)
-    turn = np.diag([1.0, -1.0, -1.0])
+    n, turn = unit(axis), np.diag([1.0, -1.0, -1.0])
     if n[:2].any() or n[2] > 0:
         # The smallest rotation from z to n.
         v = np.cross([0, 0, 1], n)
@@ -220,8 +195,7 @@ def test_mimic_joint_has_no_coordinate_of_its_own() -> None:
     assert model.articulations["j"].coordinates == ()
     expected = ORIGIN @ homogeneous(Rotation.from_euler("z", 0.49))
     np.testing.assert_allclose(model.fk("c")({"bolt": 0.7}), expected, atol=1e-14)
-    same = model_of(kv.Prismatic(**WHERE, position=bolt))
-    assert same.articulations["j"].coordinates == ()
+    assert model_of(kv.Prismatic(**WHERE, position=bolt)).articulations["j"].coordinates == ()
 
 
 def test_planar_joint_limits() -> None:

@@ -38,8 +38,7 @@ def row(model: kv.Model, at: dict[str, float], name: str = "lock") -> tuple[floa
 
 
 def trend(e: kv.Expression, at: dict[str, float]) -> dict[str, float]:
-    found = {str(s): float(entry(at)) for s, entry in e.gradient().items()}
-    return {s: v for s, v in found.items() if v}
+    return {s: v for s, v in {str(s): float(entry(at)) for s, entry in e.gradient().items()}.items() if v}
 
 
 # -- unlocked while ------------------------------------------------------------------------------------
@@ -134,8 +133,7 @@ def test_locked_door_stays_and_free_door_opens() -> None:
     shut = dict.fromkeys(model.symbols, 0.0)
     wish = {"door:velocity": 1.0}
     assert assert_rows_keep_limits(model, shut, wish, 10, 0.1)[door] == pytest.approx(0, abs=1e-12)
-    unbolted = {**shut, bolt: 0.02}
-    assert assert_rows_keep_limits(model, unbolted, wish, 10, 0.1)[door] == pytest.approx(1.0)
+    assert assert_rows_keep_limits(model, {**shut, bolt: 0.02}, wish, 10, 0.1)[door] == pytest.approx(1.0)
     # Open, with the bolt out: it comes back, and is held again.
     back = assert_rows_keep_limits(model, {**shut, door: 0.3}, {"door:velocity": -1.0}, 10, 0.1)
     assert back[door] == pytest.approx(0.0, abs=1e-12)

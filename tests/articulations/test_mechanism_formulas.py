@@ -115,8 +115,7 @@ def test_desk_lamp_head_keeps_its_orientation() -> None:
 @pytest.mark.parametrize(("pitch", "start"), [(0.004, 0.2), (-0.004, 0.0)])
 def test_nut_slides_while_the_screw_rotates(pitch: float, start: float) -> None:
     vice = kv.articulations.ScrewAndNut(**WHERE, pitch=pitch)
-    model = model_of(vice)
-    assert model.limits("m") == (0, pytest.approx(math.tau * 50))
+    assert model_of(vice).limits("m") == (0, pytest.approx(math.tau * 50))
     for angle in (0.0, 1.0, math.tau, math.tau * 50):
         nut = at(z=start - pitch * angle / math.tau)
         np.testing.assert_allclose(pose(vice, "nut", {"m": angle}), nut, atol=1e-14)
@@ -145,8 +144,7 @@ def test_ratchet_turns_one_way_until_its_pawl_is_lifted() -> None:
     assert not model.violations({**back, "m/pawl": 0.3})
     assert not model.violations({**back, "m/wheel:velocity": 0.0, "m/wheel": -100.0})
     # Its gradient says what to do: lift the pawl.
-    lock = model.constraints["m/lock"].lower
-    assert lock.gradient()[pawl.derivative()]({pawl: 0.0}) < 0
+    assert model.constraints["m/lock"].lower.gradient()[pawl.derivative()]({pawl: 0.0}) < 0
     for held, turned_to in ((0.0, 1.0), (0.3, -4.0)):
         assert assert_rows_keep_limits(
             model, {wheel: 1.0, pawl: held}, {"m/wheel:velocity": -10.0, "m/pawl:velocity": 0.0}, 5, 0.1

@@ -66,8 +66,7 @@ def test_mechanism_jacobians_equal_finite_differences_over_the_whole_range(mecha
 @each
 @pytest.mark.parametrize("seed", range(2))
 def test_mechanism_tangent_equals_motion_along_rates(mechanism: Mechanism, seed: int) -> None:
-    model = model_of(mechanism)
-    rng = np.random.default_rng(seed)
+    model, rng = model_of(mechanism), np.random.default_rng(seed)
     inside = {}
     for q in model.degrees_of_freedom:
         lower, upper = np.clip(ends(mechanism, q), -7.0, 7.0)
@@ -102,8 +101,7 @@ def test_mechanism_limits_are_constraints(mechanism: Mechanism) -> None:
 def test_velocity_rows_keep_all_limits_of_mechanisms(mechanism: Mechanism, direction: float) -> None:
     model = model_of(mechanism)
     wish = {str(s): direction for s in model.speeds}
-    start = model.default_state()
-    end = assert_rows_keep_limits(model, start, wish, 60, 0.05)
+    end = assert_rows_keep_limits(model, model.default_state(), wish, 60, 0.05)
     for q in model.degrees_of_freedom:
         slack = 1e-9
         lower, upper = ends(mechanism, q)
@@ -160,8 +158,7 @@ def test_mechanism_refuses_taken_names(kind: type[Mechanism]) -> None:
 @each_kind
 def test_every_numeric_field_is_checked(kind: type[Mechanism]) -> None:
     """No length, speed or threshold may be NaN, zero or a word; the error names the mechanism and the number."""
-    made = kind(**WHERE)
-    lengths = 0
+    made, lengths = kind(**WHERE), 0
     for field, value in vars(made).items():
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             continue

@@ -43,8 +43,7 @@ def test_screw_moves_by_its_pitch_in_a_revolution(axis: Any, pitch: float) -> No
     for q in (0.0, 0.7, -2.0, 9.0, math.tau):
         expected = ORIGIN @ slid(axis, pitch * q / math.tau) @ turned(axis, q)
         np.testing.assert_allclose(pose({"j": q}), expected, atol=1e-14)
-    whole = pose({"j": math.tau}) - pose({"j": 0.0})
-    assert np.linalg.norm(whole) == pytest.approx(abs(pitch))
+    assert np.linalg.norm(pose({"j": math.tau}) - pose({"j": 0.0})) == pytest.approx(abs(pitch))
 
 
 @pytest.mark.parametrize("axis", AXES)

@@ -130,13 +130,7 @@ def test_transmission_limits_constrain_the_function_of_the_driver() -> None:
 def test_velocity_rows_keep_transmission_limits() -> None:
     gear = kv.articulations.Gearbox(**WHERE, driver="motor", ratio=-2, upper=3, lower=-3, velocity=4)
     cam = kv.articulations.Cam(
-        name="k",
-        parent="world",
-        child="k",
-        driver="j",
-        angles=ANGLES,
-        values=LIFTS,
-        upper=0.025,
+        name="k", parent="world", child="k", driver="j", angles=ANGLES, values=LIFTS, upper=0.025
     )
     model = model_of(MOTOR, gear, cam)
     # The lift is no straight line in the angle, so a step of the row passes it by what bends within a step.

@@ -1,7 +1,5 @@
 """Commands of other distributions, which are found by entry points; what is broken is one line and status 2."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -26,12 +24,8 @@ def add_command(tmp_path, monkeypatch):
     def add(name, text, module="other_command"):
         about = tmp_path / "other-1.0.dist-info"
         about.mkdir()
-        (about / "METADATA").write_text(
-            "Metadata-Version: 2.1\nName: other\nVersion: 1.0\n", encoding="utf-8"
-        )
-        (about / "entry_points.txt").write_text(
-            f"[kineverse.commands]\n{name} = {module}\n", encoding="utf-8"
-        )
+        (about / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n", "utf-8")
+        (about / "entry_points.txt").write_text(f"[kineverse.commands]\n{name} = {module}\n", "utf-8")
         if text is not None:
             (tmp_path / f"{module}.py").write_text(text, encoding="utf-8")
         monkeypatch.syspath_prepend(str(tmp_path))

@@ -1,7 +1,5 @@
 """Contacts in ``info``, ``validate --contacts`` and ``view --picture --near``."""
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -1,9 +1,8 @@
 """``kineverse convert``: conversion to files and to standard output."""
 
-from __future__ import annotations
-
 import json
 import os
+from functools import partial
 
 import pytest
 
@@ -15,15 +14,8 @@ HINGE = f'<joint name="j" type="revolute"><parent link="a"/><child link="b"/>{LI
 
 
 @pytest.fixture
-def run(capsys):
-    """Run the command in this process: status, standard output, standard error."""
-
-    def call(*words):
-        status = main(["convert", *map(str, words)])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
+def run(run):
+    return partial(run, "convert")
 
 
 @pytest.fixture

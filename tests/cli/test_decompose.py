@@ -1,7 +1,5 @@
 """``kineverse decompose``: meshes of models and mesh files as convex hulls in the cache."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -74,8 +72,7 @@ def test_decompose_reuses_the_cache(run):
 def test_json_is_one_object_and_nothing_else(run, folder):
     status, out, err = run("robot.urdf", "--json", "--links", "base", "--error", "2mm", "--max-hulls", 4)
     assert (status, err) == (0, "")
-    answer = json.loads(out)
-    (mesh,) = answer["meshes"]
+    (mesh,) = json.loads(out)["meshes"]
     assert mesh["file"] == str(folder / "ell.stl")
     assert (mesh["links"], mesh["hulls"], mesh["error"], mesh["max_hulls"]) == (["base"], 1, 0.002, 4)
     assert mesh["mesh_volume"] < mesh["volume"] <= mesh["hull_volume"] * (1 + 1e-9)

@@ -1,7 +1,5 @@
 """``kineverse demo``: objects, reports, page, picture and mistakes. How openings go is tested with these."""
 
-from __future__ import annotations
-
 import json
 import urllib.request
 

@@ -6,24 +6,17 @@ import json
 import os
 import sys
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.cli import main
 
 
 @pytest.fixture
-def run(capsys):
-    """Run the command in this process: status, standard output, standard error."""
-
-    def call(*words):
-        status = main(["diff", *map(str, words)])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
+def run(run):
+    return partial(run, "diff")
 
 
 def link(name, inside=""):

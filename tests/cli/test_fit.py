@@ -1,7 +1,5 @@
 """``kineverse fit``: joints from tables of poses, as text, JSON, picture and model."""
 
-from __future__ import annotations
-
 import json
 import math
 
@@ -61,8 +59,7 @@ def write(path, parts, positions_only=()):
 @pytest.fixture(scope="module")
 def door(tmp_path_factory):
     """Return a recording of a door and a cupboard by a moving camera."""
-    rng = np.random.default_rng(1)
-    angles = np.linspace(0.0, math.radians(80), 30)
+    rng, angles = np.random.default_rng(1), np.linspace(0.0, math.radians(80), 30)
     cupboard = np.array([pose(turned(rng.normal(size=3)), rng.normal(size=3)) for _ in angles])
     parts = {"cupboard": noisy(cupboard, rng), "door": noisy(cupboard @ hinge(angles), rng)}
     return write(tmp_path_factory.mktemp("door") / "poses.csv", parts)
@@ -109,8 +106,7 @@ def test_the_noise_is_estimated_if_it_is_not_given(door, capsys):
 
 def test_the_document_is_the_joint(door, tmp_path, capsys):
     file = str(tmp_path / "door.kv.json")
-    words = [door, *DOOR, *TWO, "--noise", "2mm,0.5deg", "--document", file]
-    found = answer(words, capsys)
+    found = answer([door, *DOOR, *TWO, "--noise", "2mm,0.5deg", "--document", file], capsys)
     assert found["document"] == file
     model = kv.load(file)
     assert list(map(str, model.symbols)) == ["door"]
@@ -119,8 +115,7 @@ def test_the_document_is_the_joint(door, tmp_path, capsys):
     assert (float(limits.lower), float(limits.upper)) == pytest.approx((low, high))
     # From one end to the other it moves as the door did.
     first, last = (model.fk("door", "cupboard")({"door": q}) for q in (low, high))
-    way = np.linalg.inv(first) @ last
-    truth = hinge(np.radians([0, 80]))
+    way, truth = np.linalg.inv(first) @ last, hinge(np.radians([0, 80]))
     there = np.linalg.inv(truth[0]) @ truth[1]
     back = np.linalg.inv(there)
     assert min(np.abs(way - there).max(), np.abs(way - back).max()) < 0.03
@@ -144,8 +139,7 @@ def test_correlated_neighbours_count_once(tmp_path, capsys):
     rng = np.random.default_rng(5)
     seen = noisy(hinge(np.linspace(0.0, 1.2, 200)), rng)
     seen[:, 0, 3] += 0.006 * np.sin(np.linspace(0, 12, 200))
-    table = write(tmp_path / "poses.csv", {"door": seen})
-    words = [table, *TWO]
+    words = [write(tmp_path / "poses.csv", {"door": seen}), *TWO]
     found = answer(words, capsys)
     assert (found["count"], found["family"]) == (200, "revolute")
     assert found["judged"] < 60
@@ -198,14 +192,12 @@ def test_a_hinge_is_located_from_positions(tmp_path, capsys):
     model = kv.load(document)
     values = [found["fits"][0]["ranges"][0][end] for end in ("lower", "upper")]
     ends = np.array([model.fk("door")({"door": q})[:3, 3] for q in values])
-    off = min(np.abs(ends - points[[0, -1]]).max(), np.abs(ends - points[[-1, 0]]).max())
-    assert off < 0.01
+    assert min(np.abs(ends - points[[0, -1]]).max(), np.abs(ends - points[[-1, 0]]).max()) < 0.01
     np.testing.assert_allclose(model.fk("door")({"door": 0.0})[:3, :3], np.eye(3), atol=1e-9)
 
 
 def test_only_the_requested_families_are_tried(door, capsys):
-    words = [door, *DOOR, "--families", "rigid, prismatic"]
-    found = answer(words, capsys)
+    found = answer([door, *DOOR, "--families", "rigid, prismatic"], capsys)
     assert {fit["family"] for fit in found["fits"]} == {"rigid", "prismatic"}
 
 
@@ -228,8 +220,7 @@ def test_fit_notes_options_without_effect(tmp_path, capsys):
 
 
 def test_thin_reduces_the_number_of_poses(door, capsys):
-    words = [door, *DOOR, *TWO, "--noise", "2mm,0.5deg", "--thin", "10"]
-    assert answer(words, capsys)["count"] == 10
+    assert answer([door, *DOOR, *TWO, "--noise", "2mm,0.5deg", "--thin", "10"], capsys)["count"] == 10
 
 
 @pytest.mark.parametrize(
@@ -274,8 +265,7 @@ def test_revolutions_are_counted_in_timed_recordings(tmp_path, capsys, count, to
     assert found["family"] == "revolute"
     (ends,) = found["fits"][0]["ranges"]
     main(["fit", *words])
-    out = capsys.readouterr().out
-    assert ("it may be more turns, or fewer" in out) is not told
+    assert ("it may be more turns, or fewer" in capsys.readouterr().out) is not told
     if told:
         assert ends["upper"] - ends["lower"] == pytest.approx(10 * math.pi, abs=0.2)
         assert found["judged"] < 60
@@ -285,12 +275,10 @@ def test_an_axis_is_as_uncertain_as_its_correlated_errors_make_it(tmp_path, caps
     """The squared error of the axis, relative to its variance, is about 1 over several recordings."""
     squares = []
     for seed in range(6):
-        rng = np.random.default_rng(seed)
-        errors = rng.standard_normal((200, 3))
+        errors = np.random.default_rng(seed).standard_normal((200, 3))
         for k in range(1, 200):
             errors[k] = 0.9 * errors[k - 1] + math.sqrt(1.0 - 0.81) * errors[k]
-        points = hinge(np.linspace(0.0, 1.4, 200))[:, :3, 3] + 0.003 * errors
-        np.savetxt(tmp_path / "handle.log", points)
+        np.savetxt(tmp_path / "handle.log", hinge(np.linspace(0.0, 1.4, 200))[:, :3, 3] + 0.003 * errors)
         words = [str(tmp_path / "handle.log"), "--noise", "3mm", "--families", "revolute"]
         best = answer(words, capsys)["fits"][0]
         axis = np.array(best["parameters"]["axis"])
@@ -354,8 +342,7 @@ def test_poses_anywhere_are_no_joint(tmp_path, capsys):
 
 def test_correlated_errors_do_not_make_a_screw(capsys, published):
     """Deviations of a hand from a circle are correlated over seconds, and count by effective sample size."""
-    handle = published("sturm_tracks", "microwave", "microwave1.log")
-    main(["fit", str(handle), "--json"])
+    main(["fit", str(published("sturm_tracks", "microwave", "microwave1.log")), "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["judged"] < 20
     assert found["family"] == "revolute"

@@ -1,7 +1,5 @@
 """``kineverse open``, ``close`` and ``push``: start, target, result, and mistakes."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

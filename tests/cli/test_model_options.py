@@ -1,7 +1,5 @@
 """Options ``--strict`` and ``--root`` of all commands."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Frames with nonfinite poses are named in one line, and are never NaN in JSON."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

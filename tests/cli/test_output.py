@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import argparse
 import io
 import math
@@ -14,12 +12,7 @@ from kineverse.expressions.printing import format_number
 
 def test_format_table_aligns_columns():
     text = format_table(("name", "value"), [("a", "1"), ("longer", "10")], "<>")
-    assert text.splitlines() == [
-        "name    value",
-        "------  -----",
-        "a           1",
-        "longer     10",
-    ]
+    assert text.splitlines() == ["name    value", "------  -----", "a           1", "longer     10"]
 
 
 def test_format_table_cuts_the_first_column_in_its_middle():

@@ -1,7 +1,5 @@
 """``kineverse plan``: paths as text, JSON, files and pictures."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 

@@ -1,7 +1,5 @@
 """``kineverse reach``: positions for a pose, as text, JSON and picture."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 
@@ -158,8 +156,7 @@ def test_a_bolted_arm_is_put_where_its_place_says(run, tmp_path):
     words = ["reach", tmp_path / "room.urdf", "finger", "--position-only", "--json", "--robot"]
     slide = f"{tmp_path / 'slide.urdf'}@0.3,-0.4,0.5,90deg"
     status, out, _ = run(*words, slide, "--pose", 0.3, 0.2, 0.5)
-    answer = json.loads(out)
-    assert (status, answer["positions"]) == (0, {"slide": pytest.approx(0.6, abs=1e-4)})
+    assert (status, json.loads(out)["positions"]) == (0, {"slide": pytest.approx(0.6, abs=1e-4)})
     assert run(*words, slide, "--pose", 0.9, -0.4, 0.5)[0] == 1
     status, out, _ = run(*words, slide.replace(",0.5,90deg", ",0"), "--pose", 0.9, -0.4, 0)
     assert json.loads(out)["positions"] == {"slide": pytest.approx(0.6, abs=1e-4)}

@@ -1,7 +1,5 @@
 """``kineverse spheres``: covers of a model's shapes in a table, a picture and the cache."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -44,8 +42,7 @@ def test_the_table_has_all_links_and_their_sum(run):
     assert rows["base"][1] == "2"
     assert int(rows["total"][2]) == int(rows["base"][2]) + int(rows["arm"][2])
     assert float(rows["total"][3]) <= 20.0
-    again = run("spheres", "robot.urdf", "--protrusion", "2cm")[1]
-    assert again.count("cached") == 3
+    assert run("spheres", "robot.urdf", "--protrusion", "2cm")[1].count("cached") == 3
 
 
 def test_json_has_the_spheres(run):

@@ -1,7 +1,5 @@
 """Suggestions for mistyped names, missing prefixes, missing units and missing commands."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,10 +1,9 @@
 """``kineverse validate``: problems of files as text, JSON and exit status."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kineverse as kv
-from kineverse.cli import main
 from kineverse.formats.document import to_json
 from kineverse.formats.validate import find_inertia_errors, find_problems
 
@@ -21,15 +19,8 @@ LIMIT = '<limit lower="-1" upper="2" effort="1" velocity="1"/>'
 
 
 @pytest.fixture
-def run(capsys):
-    """Run the command in this process: status, standard output, standard error."""
-
-    def call(*words):
-        status = main(["validate", *map(str, words)])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
+def run(run):
+    return partial(run, "validate")
 
 
 def robot(*parts):
@@ -170,8 +161,7 @@ def test_contradictory_bounds_are_a_problem(run, tmp_path):
     ],
 )
 def test_nonfinite_poses_are_a_problem(bend, text):
-    model = kv.Model()
-    q = kv.position("q")
+    model, q = kv.Model(), kv.position("q")
     with model.edit() as edit:
         edit.add_frame("a", parent="world", transform=kv.translation(bend(q), 0, 0))
         edit.add_frame("b", parent="world", transform=kv.translation(q, 0, 0))

@@ -1,7 +1,5 @@
 """``kineverse view``: list of models, and options of the page."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

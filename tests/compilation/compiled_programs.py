@@ -58,13 +58,11 @@ def arm(prefix: str = "arm", joints: int = 7) -> Arm:
     pose = kv.translation(0.1, 0.2, 0.3)
     axes, origins = [], []
     for i, q in enumerate(symbols):
-        pose = pose @ kv.translation(0.1, -0.05 * i, 0.2)
-        axis = i % 3
+        pose, axis = pose @ kv.translation(0.1, -0.05 * i, 0.2), i % 3
         axes.append(pose[:3, axis])
         origins.append(pose[:3, 3])
         pose = pose @ (kv.rotation_x, kv.rotation_y, kv.rotation_z)[axis](q)
-    pose = pose @ kv.translation(0.1, 0.05, 0.02)
-    columns = []
+    pose, columns = pose @ kv.translation(0.1, 0.05, 0.02), []
     for a, o in zip(axes, origins, strict=True):
         r = pose[:3, 3] - o
         cross = [a[1] * r[2] - a[2] * r[1], a[2] * r[0] - a[0] * r[2], a[0] * r[1] - a[1] * r[0]]
@@ -97,8 +95,7 @@ class RandomProgram:
 
 @st.composite
 def random_programs(draw: st.DrawFn, inputs: int = 5, length: int = 60) -> RandomProgram:
-    available = inputs + 2
-    steps = []
+    available, steps = inputs + 2, []
     for _ in range(draw(st.integers(1, length))):
         op = draw(st.sampled_from(UNARY + BINARY))
         count = 1 if op in UNARY else 2
@@ -163,8 +160,7 @@ def points(count: int, size: int, seed: int = 0) -> np.ndarray:
         rng.uniform(-1.5e6, 1.5e6, (count, size)),
         rng.choice(SPECIAL, (count, size)),
     ]
-    kind = rng.choice(5, (count, size), p=[0.5, 0.2, 0.1, 0.1, 0.1])
-    return np.choose(kind, kinds)
+    return np.choose(rng.choice(5, (count, size), p=[0.5, 0.2, 0.1, 0.1, 0.1]), kinds)
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> bool:

@@ -126,8 +126,7 @@ def test_one_output_gives_an_array(tier: str) -> None:
 
 def test_points_of_any_type_and_strides(function: kv.CompiledFunction) -> None:
     x = np.random.default_rng(0).integers(-2, 3, (20, 7))
-    wanted = function.batch(x.astype(float))
-    wide = np.zeros((40, 14))
+    wanted, wide = function.batch(x.astype(float)), np.zeros((40, 14))
     wide[::2, ::2] = x
     readonly = x.astype(float)
     readonly.flags.writeable = False
@@ -163,8 +162,7 @@ def test_invalid_points_are_refused(function: kv.CompiledFunction, x: object) ->
 
 
 def test_out_that_does_not_fit_is_refused() -> None:
-    f = kv.compile([kv.array([a, b, a]), a * b])
-    x = np.ones((4, 2))
+    f, x = kv.compile([kv.array([a, b, a]), a * b]), np.ones((4, 2))
     first, second = np.empty((4, 3)), np.empty(4)
     readonly = np.empty((4, 3))
     readonly.flags.writeable = False
@@ -181,8 +179,7 @@ def test_out_that_does_not_fit_is_refused() -> None:
 
 
 def test_out_may_share_memory_with_the_points() -> None:
-    f = kv.compile(kv.array([b, a + b]), [a, b])
-    x = np.arange(40.0).reshape(20, 2)
+    f, x = kv.compile(kv.array([b, a + b]), [a, b]), np.arange(40.0).reshape(20, 2)
     wanted = f.batch(x.copy())
     assert np.array_equal(f.batch(x, out=x), wanted)
 
@@ -191,8 +188,7 @@ def test_nan_stays_in_its_row(function: kv.CompiledFunction) -> None:
     x = np.random.default_rng(3).uniform(-3, 3, (64, 7))
     wanted = [v.copy() for v in function.batch(x)]
     x[5, 2], x[17, 0], x[63, 6] = np.nan, np.inf, 1e300
-    results = function.batch(x)
-    others = np.delete(np.arange(64), [5, 17, 63])
+    results, others = function.batch(x), np.delete(np.arange(64), [5, 17, 63])
     assert all(same_bits(v[others], w[others]) for v, w in zip(results, wanted, strict=True))
     assert np.isnan(results[0][5]).any()
     assert np.isnan(results[0][17]).any()
@@ -250,8 +246,7 @@ def test_batches_by_the_interpreter(count: int) -> None:
 
 @pytest.mark.compiler
 def test_small_batches_are_interpreted_until_they_add_up() -> None:
-    f = kv.compile([a * b * 3.375, kv.array([a, b])])
-    x = np.ones((10, 2))
+    f, x = kv.compile([a * b * 3.375, kv.array([a, b])]), np.ones((10, 2))
     f.batch(x)
     assert f._batch._library._build is None
     library = f._batch._library
@@ -313,8 +308,7 @@ def test_memory_is_reused_only_after_results_are_deleted() -> None:
     assert first.ctypes.data % 64 == 0
     assert first.shape == (size,)
     first[:] = 1.0
-    piece = first[100:200].reshape(10, 10)
-    address = first.ctypes.data
+    piece, address = first[100:200].reshape(10, 10), first.ctypes.data
     del first
     gc.collect()
     second = memory.allocate_aligned(size)

@@ -219,8 +219,7 @@ def test_build_folders_of_killed_processes_are_removed(folder: Path) -> None:
 )
 @pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="there is no /proc")
 def test_the_end_of_the_process_ends_the_compiler(tmp_path: Path, end: str) -> None:
-    compiler = tmp_path / "cc"
-    alive = tmp_path / "alive"
+    compiler, alive = tmp_path / "cc", tmp_path / "alive"
     # The number of its group is the fifth in what the system says of a process.
     write = f"cut -d' ' -f5 /proc/$$/stat > {alive}.$$; mv {alive}.$$ {alive}"
     compiler.write_text(f"#!/bin/sh\n({write}; while :; do sleep 0.1; done) & wait\n")

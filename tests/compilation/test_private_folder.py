@@ -347,8 +347,7 @@ def test_a_folder_of_decompositions_that_leads_elsewhere_is_not_used(
 def test_a_decomposition_that_is_a_link_counts_as_absent(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    inside = private_subfolder("decompositions")
-    target = tmp_path / "target"
+    inside, target = private_subfolder("decompositions"), tmp_path / "target"
     target.write_bytes(b"content")
     (inside.path / "abc-def.hulls").symlink_to(target)
     with caplog.at_level(logging.WARNING, "kineverse.geometry"):

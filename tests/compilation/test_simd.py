@@ -27,8 +27,7 @@ def program() -> Program:
 @pytest.fixture(scope="module")
 def inputs() -> np.ndarray:
     """Pairs of numbers on which reductions are hard, and all pairs of special ones; shape (N, 2)."""
-    rng = np.random.default_rng(0)
-    n = 6000
+    rng, n = np.random.default_rng(0), 6000
     kinds = [
         rng.uniform(-4, 4, n),
         rng.uniform(-1, 1, n),
@@ -42,8 +41,7 @@ def inputs() -> np.ndarray:
     ]
     first = np.concatenate(kinds)
     pairs = np.stack([first, rng.permutation(first)], axis=1)
-    special = np.array([(u, v) for u in SPECIAL for v in SPECIAL])
-    return np.concatenate([pairs, special])
+    return np.concatenate([pairs, np.array([(u, v) for u in SPECIAL for v in SPECIAL])])
 
 
 @pytest.fixture(scope="module")

@@ -44,8 +44,7 @@ def test_tiers_agree_to_the_bit_on_an_arm() -> None:
 def test_tiers_agree_to_the_bit_on_every_operation() -> None:
     symbols, values = every_operation(depth=6).expressions()
     slow = kv.compile([kv.array(values)], symbols, tier="interpreter")
-    fast = kv.compile([kv.array(values)], symbols, tier="c", wait=True)
-    agree(slow, fast, points(3000, 5))
+    agree(slow, kv.compile([kv.array(values)], symbols, tier="c", wait=True), points(3000, 5))
 
 
 @pytest.mark.compiler
@@ -54,8 +53,7 @@ def test_tiers_agree_to_the_bit_on_every_operation() -> None:
 def test_tiers_agree_to_the_bit_on_random_programs(program) -> None:
     symbols, values = program.expressions()
     slow = kv.compile([kv.array(values)], symbols, tier="interpreter")
-    fast = kv.compile([kv.array(values)], symbols, tier="c", wait=True)
-    agree(slow, fast, points(300, 5))
+    agree(slow, kv.compile([kv.array(values)], symbols, tier="c", wait=True), points(300, 5))
 
 
 EXTREMES = (*(np.nan, -np.nan, 0.0, -0.0, np.inf, -np.inf, 5e-324, -5e-324, 1e-310, -2.2e-308), *(1.0, -1.0, 0.5),
@@ -136,8 +134,7 @@ def test_switch_to_c_during_calls_from_many_threads() -> None:
     stop = threading.Event()
 
     def work(offset: int) -> None:
-        i = offset
-        calls_in_c = 0
+        i, calls_in_c = offset, 0
         while not stop.is_set() or calls_in_c < 200:
             i = (i + 1) % len(rows)
             calls_in_c += f.tier == "c"
@@ -210,8 +207,7 @@ def test_functions_stay_interpreted_if_the_compiler_fails(
     monkeypatch.setenv("CC", broken_compiler(tmp_path, "echo 'cannot do that' >&2; exit 3"))
     monkeypatch.setattr(build_queue, "_worker", build_queue._Worker())
     with caplog.at_level(logging.WARNING, "kineverse.compile"):
-        f = kv.compile(a * b * 4.5, wait=True)
-        g = kv.compile(a * b * 5.5, wait=True)
+        f, g = kv.compile(a * b * 4.5, wait=True), kv.compile(a * b * 5.5, wait=True)
     assert (f.tier, g.tier) == ("interpreter", "interpreter")
     assert f([1.0, 2.0]) == 9.0
     assert len(caplog.records) == 1

@@ -57,8 +57,7 @@ def load(program: VectorProgram, path: str) -> VectorProgram:
 @pytest.fixture(scope="module")
 def inputs() -> np.ndarray:
     """Floats on which reductions are hard, and all pairs of special ones; shape (N, 2)."""
-    rng = np.random.default_rng(0)
-    n = 1500
+    rng, n = np.random.default_rng(0), 1500
     kinds = [
         rng.uniform(-4, 4, n),
         rng.uniform(-1, 1, n),
@@ -185,8 +184,7 @@ def test_closed_loops_close_in_float() -> None:
     model = kv.load("articulations/four_bar")
     outputs = [model.fk(frame) for frame in model.frames if frame != "world"]
     symbols = sorted(set().union(*(o.symbols for o in outputs)), key=str)
-    start = model.default_state().vector(symbols)
-    rows = start + np.linspace(-0.05, 0.05, 20)[:, None]
+    rows = model.default_state().vector(symbols) + np.linspace(-0.05, 0.05, 20)[:, None]
     results = VectorProgram(outputs, symbols).evaluate(rows)
     wanted = kv.compile(outputs, symbols, tier="interpreter").batch(rows)
     assert all(np.abs(r - w).max() < 1e-5 for r, w in zip(results, wanted, strict=True))

@@ -1,7 +1,5 @@
 """Constraints of near pairs: equal in C and in numpy, as distances change, and at parallel faces."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,8 +28,7 @@ def either_library(request, monkeypatch):
 def test_rows_are_the_rates_of_distances(either_library):
     rng, n, pairs, bodies = np.random.default_rng(0), 7, 5, 6
     group, twists = rng.integers(4, size=bodies), rng.normal(size=(4, 6, n))
-    margins = rng.uniform(-0.1, 0.1, (bodies, bodies))
-    witnesses = rng.normal(size=(pairs, 9))
+    margins, witnesses = rng.uniform(-0.1, 0.1, (bodies, bodies)), rng.normal(size=(pairs, 9))
     witnesses[:, 6:] /= np.linalg.norm(witnesses[:, 6:], axis=1)[:, None]
     owners = np.array([rng.choice(bodies, 2, replace=False) for _ in range(pairs)], dtype=np.int32)
     distances = np.array([-0.2, 0.0, 0.02, 0.3, 0.4])
@@ -96,8 +93,7 @@ def least_distance(model):
     ]
     controller = Controller(model, tasks, dt=0.02, scene=Scene(model), contacts=8)
     state = model.default_state().updated({x: 0.793})
-    scene = Scene(model)
-    least = np.inf
+    scene, least = Scene(model), np.inf
     for k in range(200):
         controller.set(swing, 0.3 * (-1.0) ** (k // 3))
         state = model.integrate(state, controller.step(state).speeds, 0.02)

@@ -143,8 +143,7 @@ def test_speeds_go_to_zero_if_states_are_stale(stamped: bool) -> None:
     assert_smooth(world, accelerations)
     times, arm = np.array(world.times), world.of(A)
     assert (arm[times < 0.39] == 0.5).all()
-    slowing = (times > 0.42) & (times < 0.89)
-    assert (np.diff(arm[slowing]) < 0).all()
+    assert (np.diff(arm[(times > 0.42) & (times < 0.89)]) < 0).all()
     assert (arm[(times > 0.93) & (times < 1.19)] == 0.0).all()
     assert (world.of(B)[(times > 0.68) & (times < 1.19)] == 0.0).all()
     assert (arm[(times > 1.22) & (times < 1.49)] == 0.5).all()
@@ -194,8 +193,7 @@ def test_errors_of_the_controller_slow_down_and_are_reported(kind: str) -> None:
 
 @pytest.mark.parametrize("part", ["controller", "source", "until", "on_error"])
 def test_other_exceptions_stop_the_robot_and_are_raised(part: str) -> None:
-    world = World()
-    error = RuntimeError("cable")
+    world, error = World(), RuntimeError("cable")
     options: dict[str, Any] = {}
 
     def late(*arguments: Any) -> Any:

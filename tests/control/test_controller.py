@@ -41,8 +41,7 @@ def test_goal_of_a_pose_converges_and_its_speed_is_limited() -> None:
     goal = Goal(same_pose(model.fk("tip"), target), speed=0.2, gain=5.0, name="reach")
     controller = Controller(model, [goal], dt=DT)
     state = model.default_state().updated({"joint2": 0.4})
-    before = model.fk("tip")(state)
-    command = controller.step(state)
+    before, command = model.fk("tip")(state), controller.step(state)
     after = model.fk("tip")(model.integrate(state, command.speeds, DT))
     assert np.linalg.norm(after[:3, 3] - before[:3, 3]) <= 0.2 * DT * 1.01
     state, commands = follow(controller, state, 20.0)
@@ -68,8 +67,7 @@ def test_nothing_moves_once_goals_are_reached() -> None:
     model = planar_arm()
     state = model.default_state().updated({"joint1": 1.9, "joint2": 0.5, "joint3": 0.2})
     target = model.fk("tip")(state)[:3, 3]
-    controller = Controller(model, [Goal(model.fk("tip")[:3, 3], target)], dt=DT)
-    _, commands = follow(controller, state, 1.0)
+    _, commands = follow(Controller(model, [Goal(model.fk("tip")[:3, 3], target)], dt=DT), state, 1.0)
     assert max(abs(v) for c in commands for v in c.speeds.values()) < 1e-9
 
 
@@ -87,8 +85,7 @@ def test_hold_keeps_its_relation_while_a_goal_moves() -> None:
     tip = model.fk("tip")
     state = model.default_state().updated({"joint1": 0.3, "joint2": 0.9, "joint3": -1.2, "joint4": 0.5})
     held = Hold(tip[:2, 3], tip(state)[:2, 3], name="pin")
-    controller = Controller(model, [held, Goal(model.symbol("joint1"), 0.9)], dt=DT)
-    end, commands = follow(controller, state, 4.0)
+    end, commands = follow(Controller(model, [held, Goal(model.symbol("joint1"), 0.9)], dt=DT), state, 4.0)
     assert max(c.residuals["pin"] for c in commands) < 2e-3
     assert end["joint1"] == pytest.approx(0.9, abs=1e-2)
     assert all(c.progress > 0.99 for c in commands)
@@ -97,8 +94,7 @@ def test_hold_keeps_its_relation_while_a_goal_moves() -> None:
 def test_hold_that_is_violated_is_approached_with_progress() -> None:
     model = planar_arm(3)
     state = model.default_state().updated({"joint2": 0.6, "joint3": 0.6})
-    held = Hold(model.fk("tip")[:2, 3], [1.2, 1.5], name="pin")
-    controller = Controller(model, [held], dt=DT)
+    controller = Controller(model, [Hold(model.fk("tip")[:2, 3], [1.2, 1.5], name="pin")], dt=DT)
     end, commands = follow(controller, state, 6.0)
     residuals = [c.residuals["pin"] for c in commands]
     assert all(b <= a + 1e-9 for a, b in pairwise(residuals))
@@ -109,8 +105,7 @@ def test_hold_that_is_violated_is_approached_with_progress() -> None:
 
 def test_keep_bounds_positions_and_speeds() -> None:
     model = planar_arm()
-    x = model.fk("tip")[0, 3]
-    q = model.symbol("joint1")
+    x, q = model.fk("tip")[0, 3], model.symbol("joint1")
     tasks = [Goal(q, 1.5, gain=10.0), Keep(1.8, x, math.inf, name="reach"), Keep(-1, q.derivative(), 0.3)]
     controller = Controller(model, tasks, dt=DT, fixed=["joint2", "joint3"])
     state, commands = follow(controller, model.default_state(), 10.0)
@@ -130,8 +125,7 @@ def test_keep_with_equal_bounds_is_a_hold() -> None:
 
 
 def test_look_at_turns_the_axis_to_the_point() -> None:
-    model = planar_arm(2)
-    point = np.array([1.0, -2.5, 0.0])
+    model, point = planar_arm(2), np.array([1.0, -2.5, 0.0])
     e = look_at(model.fk("tip"), point)
     controller = Controller(model, [Goal(e, name="look")], dt=DT)
     state, _ = follow(controller, model.default_state().updated({"joint1": 0.4}), 6.0)
@@ -182,10 +176,8 @@ def test_targets_gains_and_weights_are_parameters() -> None:
 def test_command_at_rate_of_a_moving_target_has_no_lag() -> None:
     model = planar_arm(velocity=None)
     q, time = model.symbol("joint1"), kv.parameter("time", 0.0)
-    goal = Goal(q, np.sin(time), rate=np.cos(time), gain=5.0)
-    controller = Controller(model, [goal], dt=DT, smooth=0)
-    state = model.default_state()
-    errors = []
+    controller = Controller(model, [Goal(q, np.sin(time), rate=np.cos(time), gain=5.0)], dt=DT, smooth=0)
+    state, errors = model.default_state(), []
     for k in range(100):
         command = controller.step(state.extended({time: k * DT}))
         state = model.integrate(state, command.speeds, DT)
@@ -200,8 +192,7 @@ def test_wheels_are_found_from_gradients(name: str) -> None:
     frame = {"fetch": "fetch/gripper_link", "pr2": "pr2/r_gripper_tool_frame", "hsr": "hsr/hand_palm_link"}[
         name
     ]
-    p = model.fk(frame)[:3, 3]
-    start = model.default_state()
+    p, start = model.fk(frame)[:3, 3], model.default_state()
     controller = Controller(model, [Goal(p, p(start) + np.array([0.5, 0.0, 0.0]))], dt=DT)
     assert set(controller.speeds) <= set(model.speeds)
     assert any("base" in str(s) or "wheel" in str(s) for s in controller.speeds)
@@ -240,8 +231,7 @@ def test_accelerations_are_limited() -> None:
 
 def test_jerk_and_smoothness_reduce_differences_of_commands() -> None:
     model = planar_arm()
-    speed = model.symbol("joint1").derivative()
-    sizes = []
+    speed, sizes = model.symbol("joint1").derivative(), []
     for options in ({"smooth": 0.0}, {"smooth": 1.0}, {"smooth": 0.0, "jerk": 1.0}):
         controller = Controller(model, [Goal(model.symbol("joint1"), 0.5)], dt=DT, **options)
         _, commands = follow(controller, model.default_state(), 0.2)
@@ -253,8 +243,7 @@ def test_jerk_and_smoothness_reduce_differences_of_commands() -> None:
 def test_weights_choose_among_redundant_joints() -> None:
     model = planar_arm()
     state = model.default_state().updated({"joint2": 0.8, "joint3": 0.8})
-    x = model.fk("tip")[0, 3]
-    speeds = []
+    x, speeds = model.fk("tip")[0, 3], []
     for weights in ({"joint3": 1e-3}, {"joint3": 1e3}):
         controller = Controller(model, [Goal(x, 1.0, gain=0.1)], dt=DT, weights=weights, posture=0)
         command = controller.step(state)

@@ -84,8 +84,7 @@ def test_gain_above_one_over_dt_is_that(gain: float) -> None:
 
 
 def test_goal_pauses_at_speed_zero() -> None:
-    model = planar_arm()
-    speed = kv.parameter("speed", 0.2)
+    model, speed = planar_arm(), kv.parameter("speed", 0.2)
     controller = Controller(model, [Goal(model.symbol("joint1"), 0.0, speed=speed)], dt=DT)
     controller.set("speed", 0.0)
     assert controller.step(model.default_state()).speeds[model.symbol("joint1").derivative()] == 0.0
@@ -263,8 +262,7 @@ def test_bodies_are_seen_in_time_at_long_steps() -> None:
 
 def test_posture_does_not_keep_a_goal_from_being_reached() -> None:
     model = kv.load("fetch")
-    pose = model.fk("fetch/gripper_link")
-    goal = Target("goal", np.eye(4))
+    pose, goal = model.fk("fetch/gripper_link"), Target("goal", np.eye(4))
     controller = Controller(
         model,
         [Goal(same_pose(pose, goal.expression), name="reach")],

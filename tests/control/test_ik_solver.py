@@ -69,8 +69,7 @@ def test_robots_with_bases_reach_the_poses_of_random_states(name: str, frames: t
     targets = [pose_target(f"target{k}") for k in range(len(frames))]
     errors = [same_pose(model.fk(f), t.expression) for f, t in zip(frames, targets, strict=True)]
     solver = InverseKinematics(model, [Goal(e) for e in errors])
-    base = {f"{name}/base/{c}" for c in ("x", "y", "angle")}
-    assert base <= set(map(str, solver.coordinates))
+    assert {f"{name}/base/{c}" for c in ("x", "y", "angle")} <= set(map(str, solver.coordinates))
     for _ in range(8):
         state = random_state(model, generator)
         values = {
@@ -152,8 +151,7 @@ def test_keep_is_a_row() -> None:
 
 @pytest.mark.parametrize("distance", [3.5, 5.0, 50.0])
 def test_unreachable_point_ends_with_a_stretched_arm(distance: float) -> None:
-    model = planar_arm(3)
-    direction = np.array([math.cos(0.4), math.sin(0.4)])
+    model, direction = planar_arm(3), np.array([math.cos(0.4), math.sin(0.4)])
     start = {"joint1": -0.5, "joint2": 0.9, "joint3": -1.0}
     result = inverse_kinematics(model, [Goal(model.fk("tip")[:2, 3], distance * direction)], values=start)
     assert not result.solved
@@ -212,8 +210,7 @@ def test_contradictory_holds_are_named() -> None:
 def test_goal_that_is_impossible_alone_is_named() -> None:
     model = planar_arm(2)
     tasks = [Goal(model.symbol("joint1"), 5.0, name="far"), Goal(model.fk("tip")[0, 3], 9.0, name="reach")]
-    result = inverse_kinematics(model, tasks)
-    assert "Not even alone can 'far', 'reach' be done." in result.why
+    assert "Not even alone can 'far', 'reach' be done." in inverse_kinematics(model, tasks).why
 
 
 def test_range_that_is_impossible_is_named_and_no_other_task() -> None:
@@ -235,8 +232,7 @@ def test_start_outside_of_limits_is_allowed() -> None:
 
 
 def test_parameters_are_values_and_a_batch_is_its_parts() -> None:
-    model = planar_arm(3)
-    point = Target("point", [1.0, 0.0])
+    model, point = planar_arm(3), Target("point", [1.0, 0.0])
     weight = kv.parameter("weight", 1.0)
     solver = InverseKinematics(
         model,
@@ -296,8 +292,7 @@ def test_floating_base_keeps_its_quaternion_of_unit_length() -> None:
         edit.apply(kv.Floating(name="base", parent="world", child="base"))
         edit.apply(kv.Revolute(name="arm", parent="base", child="arm", axis=(0, 0, 1), lower=-1, upper=1))
         edit.add_frame("tip", parent="arm", transform=kv.translation(1, 0, 0))
-    generator = np.random.default_rng(2)
-    target = pose_target("target")
+    generator, target = np.random.default_rng(2), pose_target("target")
     solver = InverseKinematics(model, [Goal(same_pose(model.fk("tip"), target.expression))])
     for _ in range(10):
         q = generator.standard_normal(4)
@@ -312,8 +307,7 @@ def test_floating_base_keeps_its_quaternion_of_unit_length() -> None:
 
 def test_loop_that_is_solved() -> None:
     model = kv.load("articulations/four_bar")
-    rocker = model.fk("four_bar/rocker_end")
-    place = pose_target("place")
+    rocker, place = model.fk("four_bar/rocker_end"), pose_target("place")
     solver = InverseKinematics(model, [Goal(same_pose(rocker, place.expression))])
     for crank in np.random.default_rng(5).uniform(-3, 3, 6):
         target = rocker({"four_bar/crank": float(crank)})
@@ -341,8 +335,7 @@ def test_loop_kept_as_a_constraint_is_closed() -> None:
 
 def test_start_that_leaves_the_domain_of_a_loop_is_halved() -> None:
     """An expression that is defined up to a = 1 only, with its target near the end."""
-    model = kv.Model()
-    a = kv.position("a")
+    model, a = kv.Model(), kv.position("a")
     with model.edit() as edit:
         edit.add_frame("f", parent="world", transform=kv.translation(np.sqrt(1 - a * a), 0, 0))
         edit.constrain("a/range", -3, a, 3)
@@ -536,5 +529,4 @@ def test_solutions_of_arms_are_confirmed_by_pinocchio(file: str, frame: str) -> 
         result = solver.solve(target.values(np.vstack([wanted[:3], [0, 0, 0, 1]])), starts=20)
         assert result.solved
         assert not model.violations(result.best)
-        found = place({str(s): v for s, v in result.best.items()})
-        assert np.abs(found - wanted).max() < 1e-4
+        assert np.abs(place({str(s): v for s, v in result.best.items()}) - wanted).max() < 1e-4

@@ -21,8 +21,7 @@ def feasible(A: Any, lower: Any, upper: Any) -> bool:
     if (lower > upper).any():
         return False
     rows, right = np.concatenate([A, -A]), np.concatenate([upper[n:], -lower[n:]])
-    finite = np.isfinite(right)
-    bounds = np.stack([lower[:n], upper[:n]], axis=1)
+    finite, bounds = np.isfinite(right), np.stack([lower[:n], upper[:n]], axis=1)
     return bool(linprog(np.zeros(n), rows[finite], right[finite], bounds=bounds).status == 0)
 
 

@@ -183,8 +183,7 @@ def test_infinite_costs_and_indefinite_ones_fail() -> None:
 
 def test_soft_rows_give_way_by_their_weights() -> None:
     """Of ``x <= 0`` and ``x >= 1`` at weights 1 and 3 the optimum is 3/4; hard bounds hold."""
-    soft = np.array([False, True, True])
-    solver = QpSolver(1, 2, soft=soft, soft_weight=[1.0, 1.0, 3.0])
+    solver = QpSolver(1, 2, soft=np.array([False, True, True]), soft_weight=[1.0, 1.0, 3.0])
     H, f, A = np.array([[1e-7]]), np.zeros(1), np.ones((2, 1))
     low, high = np.array([-np.inf, -np.inf, 1.0]), np.array([np.inf, 0.0, np.inf])
     solution = solver.solve(H, f, A, low, high)
@@ -203,8 +202,7 @@ def test_soft_rows_with_a_linear_weight_are_kept_if_they_can_be() -> None:
     hard = QpSolver(2, 1).solve(H, f, A, low, high)
     for linear, held in ((0.5, False), (1.5, True)):
         solver = QpSolver(2, 1, soft=[False, False, True], soft_weight=1.0, soft_linear=linear)
-        x = solver.solve(H, f, A, low, high).x
-        assert (abs(x - hard.x).max() < 1e-6) == held
+        assert (abs(solver.solve(H, f, A, low, high).x - hard.x).max() < 1e-6) == held
 
 
 def test_arrays_are_read_in_place() -> None:

@@ -41,8 +41,7 @@ def first_moves(trace, least=0.1):
 
 def reversals(trace, name):
     """Return how often a coordinate turned round."""
-    values = [state[kv.position(name)] for state in trace]
-    ways = [b > a for a, b in pairwise(values) if abs(b - a) > 1e-9]
+    ways = [b > a for a, b in pairwise([state[kv.position(name)] for state in trace]) if abs(b - a) > 1e-9]
     return sum(a != b for a, b in pairwise(ways))
 
 
@@ -115,8 +114,7 @@ def test_demand_is_needed_where_a_key_has_to_be_on_both_sides():
 
 
 @pytest.mark.parametrize(
-    ("name", "goal"),
-    [("latch", "gate/door"), ("microwave", "oven/door"), ("garage_door", "garage/door")],
+    ("name", "goal"), [("latch", "gate/door"), ("microwave", "oven/door"), ("garage_door", "garage/door")]
 )
 def test_unlock_opens_doors_of_the_gallery(name, goal):
     model = kv.load(f"articulations/{name}", "it")

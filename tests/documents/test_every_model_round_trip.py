@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from trace_models import read_document
 
 import kineverse as kv
 from kineverse import gallery
-from kineverse.formats.document import read_operations, to_json
+from kineverse.formats.document import to_json
 
 FOLDERS = {
     "articulated_objects": 5,
@@ -39,14 +40,6 @@ MOST = 3
 """Expressions of a kind that are compared for one model."""
 
 
-def read(text: str) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for tag, operation in read_operations(text):
-            edit.apply(operation, tag)
-    return model
-
-
 def sample(model: kv.Model) -> kv.Expression:
     """Return the elements of poses, Jacobians, constraints, bounds, and their gradients; of large models a part."""
     draw = random.Random(1)
@@ -69,7 +62,7 @@ def sample(model: kv.Model) -> kv.Expression:
 def survives(model: kv.Model) -> None:
     """Compare a model with what its document and its packed document say."""
     text = to_json(model)
-    again = read(text)
+    again = read_document(text)
     assert again.snapshot() == model.snapshot()
     assert to_json(again) == text
     assert kv.formats.from_bytes(kv.formats.to_bytes(model)).snapshot() == model.snapshot()
@@ -79,8 +72,7 @@ def survives(model: kv.Model) -> None:
     values = np.array([home.get(s, 0.3 if s.value is None else s.value) for s in ours.symbols])
     for scale in (0.0, 0.02):
         moved = values + np.random.default_rng(5).uniform(-scale, scale, len(values))
-        at = dict(zip(ours.symbols, moved, strict=True))
-        results = []
+        at, results = dict(zip(ours.symbols, moved, strict=True)), []
         for elements in (ours, theirs):
             try:
                 results.append(elements(at).tobytes())

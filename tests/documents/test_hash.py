@@ -95,7 +95,6 @@ def test_hash_detects_a_change_of_the_text() -> None:
 
 
 def test_document_without_hash_is_accepted() -> None:
-    """Without the hash a document is what it says."""
     tree = json.loads(to_json(kv.load("shelf_door")))
     del tree["sha256"]
     assert read_operations(json.dumps(tree)) == read_operations(to_json(kv.load("shelf_door")))

@@ -27,8 +27,7 @@ TRANSFORMS = (
 
 
 def read_again(model: kv.Model) -> kv.Model:
-    text = to_json(model)
-    result = kv.Model()
+    text, result = to_json(model), kv.Model()
     with result.edit() as edit:
         for tag, operation in read_operations(text):
             edit.apply(operation, tag)
@@ -50,8 +49,7 @@ def assert_same_bits(model: kv.Model, other: kv.Model) -> None:
 
 @pytest.mark.parametrize("axis", AXES, ids=str)
 def test_jacobian_of_joints_by_any_amount_survives_a_document(axis: tuple[float, float, float]) -> None:
-    model = kv.Model()
-    parent = "world"
+    model, parent = kv.Model(), "world"
     with model.edit() as edit:
         for k, amount in enumerate(AMOUNTS):
             for kind in (kv.Prismatic, kv.Revolute):
@@ -62,8 +60,7 @@ def test_jacobian_of_joints_by_any_amount_survives_a_document(axis: tuple[float,
 
 
 def test_one_axis_transforms_are_recognised_in_documents() -> None:
-    model = kv.Model()
-    parent = "world"
+    model, parent = kv.Model(), "world"
     with model.edit() as edit:
         for k, transform in enumerate(TRANSFORMS):
             edit.add_frame(f"f{k}", parent=parent, transform=transform)

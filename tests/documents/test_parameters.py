@@ -89,8 +89,7 @@ def test_every_kind_of_operation_is_rebuilt_from_its_parameters() -> None:
 
 
 def test_limits_follow_a_prefix_only_where_they_are_expressions() -> None:
-    model = hand_made()
-    rod = dict(read_operations(to_json(model), prefix="left"))["left/joint rod"]
+    rod = dict(read_operations(to_json(hand_made()), prefix="left"))["left/joint rod"]
     q = kv.position("left/q")
     assert rod.parameters["slide"] == kv.articulations.Limits(-q, q + 2, 1.5)
     assert rod.parameters["name"] == "rod"
@@ -126,8 +125,7 @@ def test_record_of_an_unknown_class_stays_opaque() -> None:
 
 
 def test_joint_from_a_document_is_replaced_by_a_rebuilt_one() -> None:
-    model = build_scene("scissor_lift")
-    tag = "scissor lift lift"
+    model, tag = build_scene("scissor_lift"), "scissor lift lift"
     read = kv.Model()
     with read.edit() as edit:
         for name, operation in read_operations(to_json(model)):

@@ -1,7 +1,5 @@
 """What is no document gives one error that names the place; nothing is half read or half written."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os

@@ -1,7 +1,5 @@
 """A model that was saved and loaded is the same model, to the last bit, with none of the classes that made it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -90,8 +88,7 @@ def test_document_is_read_without_the_classes_that_made_it(tmp_path):
         "print(m.data['twice'], m.history.entry('mine').operation.kind)"
     )
     command = [sys.executable, "-c", script, tmp_path / "rich.kv.json"]
-    other = subprocess.run(command, capture_output=True, check=True, text=True)
-    assert other.stdout == "42 Doubled\n"
+    assert subprocess.run(command, capture_output=True, check=True, text=True).stdout == "42 Doubled\n"
 
 
 def test_document_is_read_under_a_prefix(tmp_path):
@@ -104,8 +101,7 @@ def test_document_is_read_under_a_prefix(tmp_path):
         read.fk("there/bent")({f"there/{name}": value for name, value in state.items()}),
         model.fk("bent")(state),
     )
-    twice = kv.Model()
-    path = tmp_path / "model.kv.json"
+    twice, path = kv.Model(), tmp_path / "model.kv.json"
     twice.include(path, prefix="left")
     twice.include(path, prefix="right")
     assert len(twice.constraints) == 2 * len(model.constraints)

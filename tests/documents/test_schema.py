@@ -179,7 +179,6 @@ def test_schema_is_in_the_package() -> None:
 
 
 def test_every_definition_of_the_schema_is_used() -> None:
-    """Every definition is used."""
     text = json.dumps(SCHEMA)
     unused: list[Any] = [name for name in DEFINITIONS if f'"#/$defs/{name}"' not in text]
     assert unused == []

@@ -44,23 +44,19 @@ SOME = ("at rest", "curved", "augmented", "upper symbol", "zero", "negative", "s
 """Changes of each kind, of which some are followed and others are not, whatever decides."""
 
 of_changes = pytest.mark.parametrize(
-    "changes",
-    [pytest.param(SOME, id="some"), pytest.param(tuple(CHANGES), id="all", marks=pytest.mark.long)],
+    "changes", [pytest.param(SOME, id="some"), pytest.param(tuple(CHANGES), id="all", marks=pytest.mark.long)]
 )
 
 
 def said(value: Callable[[kv.model.ReadRecorder], Any]) -> Code:
-    """Return code that writes one datum."""
     return lambda model: kv.model.Writes(data={"said": value(model)})
 
 
 def placed(value: Callable[[kv.model.ReadRecorder], Any]) -> Code:
-    """Return code that places one frame."""
     return lambda model: kv.model.Writes(frames={"knob": ("car", value(model))})
 
 
 def limited(value: Callable[[kv.model.ReadRecorder], Any]) -> Code:
-    """Return code that writes one constraint."""
     return lambda model: kv.model.Writes(constraints={"near": value(model)})
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from trace_models import Custom, build
+from trace_models import Custom, build, read_document
 
 import kineverse as kv
 from kineverse.formats.document import read_operations, to_json, traces
@@ -45,11 +45,7 @@ def custom(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def read(content: dict[str, Any], prefix: str | None = None) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for tag, operation in read_operations(sealed(content), prefix=prefix):
-            edit.apply(operation, tag)
-    return model
+    return read_document(sealed(content), prefix)
 
 
 def without_reads(content: dict[str, Any]) -> None:
@@ -106,8 +102,7 @@ def test_listed_names_count_as_reads_even_if_the_document_omits_them() -> None:
 
 
 def test_a_consistent_document_has_its_recorded_reads() -> None:
-    content = tree()
-    assert to_json(read(content)) == to_json(build(placed))
+    assert to_json(read(tree())) == to_json(build(placed))
     stripped = tree()
     without_reads(stripped)
     assert to_json(read(stripped)) == to_json(build(placed))
@@ -138,8 +133,7 @@ def frozen_too(content: dict[str, Any]) -> None:
 
 def gone(content: dict[str, Any]) -> None:
     """Let the trace be about an answer that the document's own model does not give."""
-    questions = custom(content)["trace"]["questions"]
-    next(q for q in questions if q[0] == "datum")[2] = "nowhere"
+    next(q for q in custom(content)["trace"]["questions"] if q[0] == "datum")[2] = "nowhere"
 
 
 def not_written(content: dict[str, Any]) -> None:

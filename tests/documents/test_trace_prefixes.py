@@ -26,8 +26,7 @@ def branching(model: kv.model.ReadRecorder) -> kv.model.Writes:
 
 
 def test_nested_prefixes_follow() -> None:
-    text = to_json(build(derived))
-    model = kv.Model()
+    text, model = to_json(build(derived)), kv.Model()
     for prefix in ("a", "b/c", None):
         _include(model, text, prefix)
     outer = kv.Model()
@@ -80,8 +79,7 @@ def test_a_trace_is_made_once_for_each_run() -> None:
 
 def test_a_loop_is_closed_again_when_what_it_reads_changes() -> None:
     model = build_scene("four_bar")
-    read = reloaded(model)
-    below = kv.Model()
+    read, below = reloaded(model), kv.Model()
     _include(below, to_json(model), "left")
     board = kv.translation(0, 0, 0.01) @ model.fk("board")
     for other, prefix in ((model, ""), (read, ""), (below, "left/")):

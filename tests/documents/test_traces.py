@@ -21,10 +21,8 @@ from kineverse.formats.document import OpaqueOperation, read_operations, to_json
 
 def follower(model: kv.model.ReadRecorder) -> kv.model.Writes:
     """Read one of everything, compute with it, augment it and differentiate it."""
-    pose = model.fk("car")
-    place = model.frames["car"].transform
-    upper = model.constraints["range"].upper
-    slope = pose[:3, 3].jacobian([LIFT])[2, 0]
+    pose, place = model.fk("car"), model.frames["car"].transform
+    upper, slope = model.constraints["range"].upper, pose[:3, 3].jacobian([LIFT])[2, 0]
     rolling = (KNOB * pose[0, 3]).augment({WHEEL: pose[2, 3]})
     flap = model.articulations["hinge"].position
     assert flap is not None
@@ -49,8 +47,7 @@ CHANGES: tuple[dict[str, Any], ...] = (
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_trace_follows_upstream_changes(change: dict[str, Any]) -> None:
-    read = reloaded(build(follower))
-    live = build(follower, **change)
+    read, live = reloaded(build(follower)), build(follower, **change)
     changed(read, live)
     agree(read, live)
     assert read.data["twice"] == live.data["twice"]
@@ -121,8 +118,7 @@ def programs(draw: st.DrawFn) -> Callable[[kv.model.ReadRecorder], kv.model.Writ
 @settings(max_examples=attempts(15), deadline=None)
 def test_any_code_is_followed_rightly_or_the_change_refused(code: Any, change: dict[str, Any]) -> None:
     read = reloaded(build(code))
-    before = read.snapshot()
-    live = build(code, **change)
+    before, live = read.snapshot(), build(code, **change)
     try:
         changed(read, live)
     except kv.errors.EditError:
@@ -156,10 +152,7 @@ def gambling(model: kv.model.ReadRecorder) -> kv.model.Writes:
     return kv.model.Writes(data={"length": len(repr(model.fk("car")))})
 
 
-@pytest.mark.parametrize(
-    ("code", "change"),
-    [(branching, {"number": 0.5}), (gambling, CHANGES[0])],
-)
+@pytest.mark.parametrize(("code", "change"), [(branching, {"number": 0.5}), (gambling, CHANGES[0])])
 def test_a_value_that_the_operation_depends_on_must_stay(code: Any, change: dict[str, Any]) -> None:
     read = reloaded(build(code))
     before = read.snapshot()
@@ -189,8 +182,7 @@ def test_names_that_it_listed_must_stay() -> None:
 
 
 def test_a_frozen_one_is_replaced_in_the_same_edit() -> None:
-    read = reloaded(build(branching))
-    live = build(branching, number=0.5)
+    read, live = reloaded(build(branching)), build(branching, number=0.5)
     with read.edit() as edit:
         edit.replace("data number", kv.model.SetData("number", 0.5))
         edit.replace("custom", Custom(branching))

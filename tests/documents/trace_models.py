@@ -62,11 +62,11 @@ def reloaded(model: kv.Model) -> kv.Model:
     return read_document(to_json(model))
 
 
-def read_document(text: str) -> kv.Model:
+def read_document(text: str, prefix: str | None = None) -> kv.Model:
     """Return what a process without the code makes of the document of a model."""
     result = kv.Model()
     with result.edit() as edit:
-        for tag, operation in read_operations(text):
+        for tag, operation in read_operations(text, prefix=prefix):
             edit.apply(operation, tag)
     return result
 

@@ -10,16 +10,14 @@ from kineverse.estimation.recordings import correlation_time, effective_sample_s
 
 def errors(count: int, correlation: float, seed: int) -> np.ndarray:
     """Return errors (count, 6) with the autocorrelation ``correlation``^k."""
-    random = np.random.default_rng(seed)
-    result = random.normal(size=(count, 6))
+    result = np.random.default_rng(seed).normal(size=(count, 6))
     for k in range(1, count):
         result[k] = correlation * result[k - 1] + np.sqrt(1.0 - correlation**2) * result[k]
     return result
 
 
 def test_independent_errors_count_fully() -> None:
-    kept = [effective_sample_size(errors(300, 0.0, seed)) for seed in range(20)]
-    assert np.median(kept) == 300
+    assert np.median([effective_sample_size(errors(300, 0.0, seed)) for seed in range(20)]) == 300
 
 
 @pytest.mark.parametrize("correlation", [0.5, 0.8])

@@ -1,7 +1,5 @@
 """Reading of pose tables in every form, and refusals that name the line."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -28,8 +26,7 @@ def write_table(tmp_path, text, name="poses.csv"):
 
 
 def random_poses(seed, count=6):
-    rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4), (count, 1, 1))
+    rng, poses = np.random.default_rng(seed), np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
     poses[:, :3, 3] = rng.normal(size=(count, 3))
     return poses
@@ -107,8 +104,7 @@ def test_rows_without_times_pair_in_order(tmp_path):
 
 
 def test_single_part_takes_any_name(tmp_path):
-    recording = read_recording(write_table(tmp_path, "1 2 3\n4 5 7\n"))
-    assert recording.pair(child="door").child == "door"
+    assert read_recording(write_table(tmp_path, "1 2 3\n4 5 7\n")).pair(child="door").child == "door"
 
 
 @pytest.mark.parametrize("column", ["part", "name", "link", "body", "object", "frame", "child_frame_id"])
@@ -122,8 +118,7 @@ def test_part_named_world_is_a_part(tmp_path):
     recording = read_recording(
         write_table(tmp_path, "part,x,y,z,rx,ry,rz\nworld,1,0,0,0,0,0\ndoor,2,0,0,0,0,0\n")
     )
-    pair = recording.pair(child="door")
-    assert pair.parent_poses[0, 0, 3] == 1
+    assert recording.pair(child="door").parent_poses[0, 0, 3] == 1
 
 
 def test_unknown_columns_are_listed(tmp_path):

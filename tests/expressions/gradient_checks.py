@@ -1,7 +1,5 @@
 """What is compared between library and oracle; shared by the law tests and by the mutants that must fail them."""
 
-from __future__ import annotations
-
 import itertools
 
 import gradient_oracle as oracle
@@ -34,8 +32,7 @@ def close(actual, wanted, scale=1.0):
 
 def check(expression, value, values, order=2):
     """Compare value, D in both modes, and D of a few entries in both modes, with the oracle."""
-    wanted = [(expression, value)]
-    layer = [(expression, value)]
+    wanted, layer = [(expression, value)], [(expression, value)]
     for _ in range(order):
         following = []
         for (e, v), mode in itertools.product(layer, MODES):
@@ -93,7 +90,6 @@ def examples(count, **options):
 
 
 def law(strategy, vocabulary, count, order=2):
-    """Return a test of the programs of a strategy."""
 
     @examples(count)
     @given(strategy)

@@ -4,8 +4,6 @@ A :class:`Value` is an array of numbers and a function that gives its D in one o
 (``heuristic=True``) or with facts alone. Entries of D are values again, so derivatives of any order follow.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -4,8 +4,6 @@ A program is a nested tuple ``(operation, options, *operands)``. Functions that 
 program, so no example is thrown away for it.
 """
 
-from __future__ import annotations
-
 import functools
 import operator
 
@@ -247,7 +245,6 @@ EVERYTHING = (*SMOOTH, "augmented", "augmented", "truth", "selection")
 @functools.cache
 @st.composite
 def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
-    """Draw a program of a shape out of some kinds of operations."""
     if depth == 0:
         return draw(leaf(shape))
 
@@ -281,8 +278,7 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
         return apply(kind, a, b)
 
     def selection():
-        kind = draw(choice("where", "clip"))
-        if kind == "where":
+        if draw(choice("where", "clip")) == "where":
             return apply("where", truth(), inner(), fitting())
         return apply("clip", inner(), const(-0.513), const(0.467))
 

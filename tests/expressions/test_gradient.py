@@ -1,7 +1,5 @@
 """The law of augmented gradients: random programs against dual numbers and finite differences."""
 
-from __future__ import annotations
-
 import gradient_checks as lc
 import numpy as np
 import pytest
@@ -34,8 +32,7 @@ def test_third_order():
 @lc.examples(20)
 @lc.given(lc.SHAPES.flatmap(lambda shape: lp.programs(shape, 3, lp.SMOOTH)))
 def test_finite_differences(program):
-    e = array(lp.build(program, WORDS))
-    step = 1e-5
+    e, step = array(lp.build(program, WORDS)), 1e-5
     points = [{**WORDS.values, s: WORDS.values[s] + sign * step} for s in WORDS.symbols for sign in (1, -1)]
     values = [e(p) for p in points]
     jacobian, partial = e.jacobian(WORDS.symbols[:5]), e.partial(WORDS.symbols)

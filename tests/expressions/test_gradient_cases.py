@@ -1,7 +1,5 @@
 """What went wrong in earlier implementations, and the rest of the law that is said in single cases."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -75,8 +73,7 @@ def test_the_override_belongs_to_the_node(g):
 
 
 def test_matrices_of_overridden_entries(g):
-    m = array([[g, b], [1.0, g]])
-    n = array([[c, g], [g, 2.0]])
+    m, n = array([[g, b], [1.0, g]]), array([[c, g], [g, 2.0]])
     product, slope = (m @ n)(AT), (m @ n).gradient()[da](AT)
     assert product == pytest.approx(m(AT) @ n(AT))
     dm, dn = m.gradient()[da](AT), n.gradient()[da](AT)

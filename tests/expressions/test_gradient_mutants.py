@@ -5,8 +5,6 @@ single cases. It is killed if anything disagrees with the oracle or raises. Ever
 because equal nodes are shared and remember their gradients.
 """
 
-from __future__ import annotations
-
 import functools
 
 import casadi as ca
@@ -82,8 +80,7 @@ def cases(vocabulary):
         {da: 3 * at[c], vocabulary.keys[2]: 1.5, wheel: 1.5}
     )
     lc.close(array([a * b, c]).jacobian([c, a])(at), np.array([[0, 0.5], [1, 0]]))
-    triple = a & (b & c)
-    assert gradient_at(triple) == pytest.approx(gradient_at((a & b) & c))
+    assert gradient_at(a & (b & c)) == pytest.approx(gradient_at((a & b) & c))
     fact, trend, whole = (
         a.augment({wheel: 1}),
         a.augment({wheel: 1}, heuristic=True),

@@ -1,7 +1,5 @@
 """Implicit functions: values by closed forms, derivatives by the theorem, of any order and augmented."""
 
-from __future__ import annotations
-
 import gradient_checks as lc
 import gradient_oracle as oracle
 import implicit_functions as known
@@ -55,8 +53,7 @@ def test_values_equal_closed_forms():
     cubic = known.cubic().apply([u])
     for p in np.linspace(-30, 30, 61):
         assert_allclose(cubic({u: p}), [known.cubic_root(p)], rtol=0, atol=1e-14)
-    polar = known.polar().apply([u, v])
-    spherical = known.spherical().apply([u, v, w])
+    polar, spherical = known.polar().apply([u, v]), known.spherical().apply([u, v, w])
     for p in points(known.spherical()):
         wanted = [np.linalg.norm(p), np.arctan2(p[1], p[0]), np.arctan2(p[2], np.hypot(p[0], p[1]))]
         assert_allclose(at(spherical, known.spherical(), p), wanted, rtol=0, atol=1e-14)
@@ -69,8 +66,7 @@ def test_kepler_equation_by_its_inverse(eccentricity):
     anomalies = np.linspace(-7, 7, 101)
     solve = kv.compile(known.kepler().apply([u, v]), tier="interpreter")
     means = anomalies - eccentricity * np.sin(anomalies)
-    found = [solve([m, eccentricity])[0] for m in means]
-    assert_allclose(found, anomalies, rtol=0, atol=1e-14)
+    assert_allclose([solve([m, eccentricity])[0] for m in means], anomalies, rtol=0, atol=1e-14)
 
 
 def test_residuals_are_zero_with_expressions_as_inputs(function):
@@ -108,8 +104,7 @@ def test_derivatives_equal_the_implicit_function_theorem_in_numpy(function):
     n, k = len(function.unknowns), len(function.inputs)
     everything = [*function.unknowns, *function.inputs]
     first = function.equations.partial(everything)
-    second = first.partial(everything)
-    numbers = kv.compile([first, second], everything, tier="interpreter")
+    numbers = kv.compile([first, first.partial(everything)], everything, tier="interpreter")
     itself = function.apply(function.inputs)
     jacobian = itself.jacobian(function.inputs)
     hessian = jacobian.jacobian(function.inputs)
@@ -208,8 +203,7 @@ def test_gradients_with_augmented_inputs_and_trends(kind, first, second, wrapped
 @given(st.sampled_from(["Kepler", "polar"]), ARGUMENTS, ARGUMENTS)
 def test_substitution_is_composition(kind, first, second):
     """The function of plain symbols, with programs in their places afterwards."""
-    symbols = [a, WORDS.symbols[-1]]
-    inside = [("symbol", 0), ("symbol", 5)]
+    symbols, inside = [a, WORDS.symbols[-1]], [("symbol", 0), ("symbol", 5)]
     try:
         with np.errstate(all="ignore"):
             replacements = {
@@ -237,8 +231,7 @@ def test_nested_implicit_functions():
     cubic, kepler = known.cubic(), known.kepler()
     inner = cubic.apply([a * b])[0]
     nested = kepler.apply([inner, 0.3 * inner])
-    later = kepler.apply([c, 0.3 * c]).substitute({c: inner})
-    assert nested == later
+    assert nested == kepler.apply([c, 0.3 * c]).substitute({c: inner})
     assert implicit_nodes([nested])[0].function is not implicit_nodes([nested])[1].function
     assert [n.label for n in implicit_nodes([nested])] == ["cubic", "Kepler"]
     values = {a: 1.7, b: 2.1}

@@ -1,7 +1,5 @@
 """Implicit functions as nodes: equal ones are one, they can be sent, and bad ones are refused."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import pickle
@@ -65,8 +63,7 @@ def test_pickled_copied_and_deep_copied(function):
         assert other == [itself, jacobian]
         assert other[1](values).tobytes() == jacobian(values).tobytes()
     assert copy.copy(itself) == itself
-    again = pickle.loads(pickle.dumps(function))
-    assert again.key == function.key
+    assert pickle.loads(pickle.dumps(function)).key == function.key
 
 
 def test_an_implicit_node_prints_its_name():

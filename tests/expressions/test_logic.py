@@ -1,7 +1,5 @@
 """Continuous boolean logic: values, trends by the table of the papers, De Morgan. ``test_trends`` follows them."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -91,8 +89,7 @@ def test_less_of_any_shapes(contrast):
     steepness = 1e10 if contrast is None else contrast
     left, right = array([[a], [b * b], [1.0]]), array([a + 0.5, c])
     at = {a: 0.3, b: -0.9, c: 0.81}
-    e = less(left, right, **options)
-    difference = right(at) - left(at)
+    e, difference = less(left, right, **options), right(at) - left(at)
     assert e.shape == (3, 2)
     np.testing.assert_allclose(e(at), (1 + np.tanh(difference * steepness)) / 2, atol=1e-15)
     # The trend is that of the difference, whatever the contrast.

@@ -1,7 +1,5 @@
 """Trends: following them makes a condition true, and as facts conditions are constant."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -46,8 +44,7 @@ STATES = [dict(zip((a, b, c), x, strict=True)) for x in itertools.product([-0.5,
 @pytest.mark.parametrize("at", STATES, ids=str)
 def test_the_trend_opens_a_lock_box(at):
     """A door that opens if latch and bolt are open, or a master switch is on (2020 paper, III-C)."""
-    unlocked = (LATCH & BOLT) | MASTER
-    way = follow(unlocked, at)
+    way = follow((LATCH & BOLT) | MASTER, at)
     assert (len(way) > 1) == (not ((at[a] > 0.5 and at[b] > 0.5) or at[c] > 0.5))
     assert np.all(np.diff(way, axis=0) >= 0)
     # What was open stays where it is.
@@ -58,8 +55,7 @@ def test_the_trend_opens_a_lock_box(at):
 
 @pytest.mark.parametrize("at", STATES, ids=str)
 def test_the_trend_locks_it_again(at):
-    way = follow(~((LATCH & BOLT) | MASTER), at)
-    assert np.all(np.diff(way, axis=0) <= 0)
+    assert np.all(np.diff(follow(~((LATCH & BOLT) | MASTER), at), axis=0) <= 0)
 
 
 def test_the_product_rule_does_not_open_the_lock():
@@ -108,8 +104,7 @@ def test_a_window_is_entered_from_both_sides_and_has_no_preferred_way_out():
 def test_facts_are_constant_at_every_nesting():
     inner = less(a * b, c, contrast=2)
     at = {a: 0.3, b: 0.4, c: 0.1, d: 0.9}
-    levels = [inner, ~inner, inner & d, ~(inner | d) & a, less(inner & d, a | b, contrast=3)]
-    for e in levels:
+    for e in [inner, ~inner, inner & d, ~(inner | d) & a, less(inner & d, a | b, contrast=3)]:
         assert e.gradient()
         assert not e.gradient(heuristic=False)
         assert total_derivative(e) == 0

@@ -3,8 +3,6 @@
 What is not available is the subject of ``test_numpy_refusals``, gradients that of ``test_law``.
 """
 
-from __future__ import annotations
-
 import operator
 import re
 import warnings
@@ -251,8 +249,7 @@ def test_rearranging(data):
 @given(st.data())
 def test_joining(data):
     x = data.draw(arrays(min_dims=1))
-    axis = data.draw(st.integers(-x.ndim, x.ndim - 1))
-    which = data.draw(SOME)
+    axis, which = data.draw(st.integers(-x.ndim, x.ndim - 1)), data.draw(SOME)
     longer = np.concatenate([x, x], axis=axis) + 9
     same(lambda y, z: np.concatenate([y, z], axis=axis), x, longer, which=which)
     same(lambda y, z: np.concatenate((z, y, z), axis), x, longer, which=which)
@@ -299,8 +296,7 @@ def call_quietly(function, x, axis):
 @given(arrays())
 def test_reductions(x):
     x = x - 3
-    axes = [None, *range(-x.ndim, x.ndim), tuple(range(x.ndim)), ()]
-    for axis in axes:
+    for axis in [None, *range(-x.ndim, x.ndim), tuple(range(x.ndim)), ()]:
         for function in (np.sum, np.prod, np.mean, np.min, np.max, np.amin, np.amax, np.ptp):
             found = call_quietly(function, x, axis)
             if found is None:
@@ -446,12 +442,7 @@ def test_every_function_is_compared():
     """What is added to the tables is to be added here."""
     names = {
         f.__name__
-        for f in (
-            *protocol._FUNCTIONS,
-            *protocol._REARRANGING,
-            *protocol._SPREADING,
-            *protocol._JOINING,
-        )
+        for f in (*protocol._FUNCTIONS, *protocol._REARRANGING, *protocol._SPREADING, *protocol._JOINING)
     }
     here = Path(__file__).read_text(encoding="utf-8")
     assert [name for name in sorted(names) if not re.search(rf"\b{name}\b", here)] == []

@@ -3,8 +3,6 @@
 Nothing becomes an array of objects in silence, and nothing is written into arrays of numbers.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -79,8 +79,7 @@ def test_extremum_of_many_is_one_node() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.constrain("c", 0, e, 1)
-    text = to_json(model)
-    again = kv.Model()
+    text, again = to_json(model), kv.Model()
     with again.edit() as edit:
         for tag, operation in read_operations(text):
             edit.apply(operation, tag)

@@ -122,11 +122,9 @@ ALL = pytest.mark.parametrize("name", CASES)
 
 def points(count, size):
     """Numbers whose first three are a rotation by 0.3 to 2.9 rad."""
-    rng = np.random.default_rng(11)
-    result = rng.uniform(-1.5, 1.5, (count, size))
+    result = np.random.default_rng(11).uniform(-1.5, 1.5, (count, size))
     if size == 6:
-        angles = np.linspace(0.3, 2.9, count)
-        result[:, :3] *= (angles / np.linalg.norm(result[:, :3], axis=1))[:, None]
+        result[:, :3] *= (np.linspace(0.3, 2.9, count) / np.linalg.norm(result[:, :3], axis=1))[:, None]
     return result
 
 
@@ -156,8 +154,7 @@ def test_values_and_gradients(name):
     e = function(array(symbols))
     jacobian = e.jacobian(symbols)
     for x in points(4, size):
-        at = dict(zip(symbols, x, strict=True))
-        expected = numbers(x)
+        at, expected = dict(zip(symbols, x, strict=True)), numbers(x)
         assert e.shape == np.shape(expected)
         np.testing.assert_allclose(e(at), expected, atol=1e-13, err_msg=str(x))
         np.testing.assert_allclose(jacobian(at), slopes(numbers, x), atol=1e-9, err_msg=str(x))
@@ -176,8 +173,7 @@ def test_arrays_lists_and_expressions_are_accepted(name):
 @ALL
 def test_augmented_arguments_keep_their_entries(name):
     size, function, _ = CASES[name]
-    symbols = X[:size]
-    share = np.linspace(-1, 2, size)
+    symbols, share = X[:size], np.linspace(-1, 2, size)
     given = array([s.augment({W: k, s.derivative(): 3}) for s, k in zip(symbols, share, strict=True)])
     plain, e = function(array(symbols)).jacobian(symbols), function(given)
     at = dict(zip(symbols, points(2, size)[1], strict=True))

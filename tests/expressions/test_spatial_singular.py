@@ -4,8 +4,6 @@ The oracle of derivatives is scipy's matrix exponential along the imaginary axis
 for logarithms the inverse right Jacobian: log(R·exp(δ)) = v + J⁻¹δ.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -83,8 +81,7 @@ def inverse_right_jacobian(v):
 
 def at_matrix(function):
     """Compile a function of a rotation: its value at a matrix, and its derivative by a turn of the matrix in b."""
-    a_R_b = array(ENTRIES).reshape(3, 3) @ spatial.exp_so3(DELTA)[:3, :3]
-    e = function(a_R_b)
+    e = function(array(ENTRIES).reshape(3, 3) @ spatial.exp_so3(DELTA)[:3, :3])
     f = kv.compile([e, e.jacobian(DELTA)], [*ENTRIES, *DELTA], tier="interpreter")
     return lambda numbers: f(np.append(numbers[:3, :3], [0, 0, 0]))
 
@@ -227,8 +224,7 @@ def test_log_se3_inverts_exp_se3(angle, direction, position):
 
 
 def test_gradients_of_inverse_functions_cancel():
-    there_and_back = spatial.log_se3(spatial.exp_se3(X)).jacobian(X)
-    f = kv.compile(there_and_back, X, tier="interpreter")
+    f = kv.compile(spatial.log_se3(spatial.exp_se3(X)).jacobian(X), X, tier="interpreter")
     for axis in AXES:
         for angle in (*ANGLES[:-2], 3.14):
             found = f(np.array([0.3, -2.0, 0.7, *angle * axis]))

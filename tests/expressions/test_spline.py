@@ -19,8 +19,7 @@ x, y = kv.position("x"), kv.position("y")
 
 def profile(seed: int, n: int, periodic: bool) -> tuple[list[float], list[float]]:
     rng = np.random.default_rng(seed)
-    knots = np.cumsum(rng.uniform(0.05, 1.0, n)) - 2
-    values = rng.normal(size=n)
+    knots, values = np.cumsum(rng.uniform(0.05, 1.0, n)) - 2, rng.normal(size=n)
     if periodic:
         values[-1] = values[0]
     return knots.tolist(), values.tolist()
@@ -87,15 +86,12 @@ def test_compiled_code_gives_the_same_bits_as_the_interpreter() -> None:
 
 def test_gradients_obey_the_chain_rule() -> None:
     knots, values = profile(5, 7, True)
-    wheel = kv.velocity("wheel")
-    oracle = CubicSpline(knots, values, bc_type="periodic")
-    inner = (x * np.sin(y)).augment({wheel: 4 * x, y.derivative(): 3.0})
-    e = kv.spline(inner, knots, values, True) * x
+    wheel, oracle = kv.velocity("wheel"), CubicSpline(knots, values, bc_type="periodic")
+    e = kv.spline((x * np.sin(y)).augment({wheel: 4 * x, y.derivative(): 3.0}), knots, values, True) * x
     at = {x: 0.7, y: 1.1}
     u = 0.7 * np.sin(1.1)
     s, ds = float(oracle(u)), float(oracle(u, 1))
-    gradient = {key: entry(at) for key, entry in e.gradient().items()}
-    assert gradient == pytest.approx(
+    assert {key: entry(at) for key, entry in e.gradient().items()} == pytest.approx(
         {x.derivative(): s + 0.7 * ds * np.sin(1.1), y.derivative(): 0.7 * ds * 3, wheel: 0.7 * ds * 2.8}
     )
     assert e.partial([y])(at)[0] == pytest.approx(0.7 * ds * 0.7 * np.cos(1.1))

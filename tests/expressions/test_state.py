@@ -1,7 +1,5 @@
 """States: immutable mappings from symbols to numbers, asked by symbol or by name."""
 
-from __future__ import annotations
-
 import copy
 import math
 import pickle
@@ -238,8 +236,7 @@ def test_construction_does_not_search_for_similar_names(monkeypatch):
 
 @given(VALUES, STAMPS, st.sampled_from(["", "encoder"]), st.randoms())
 def test_equal_states(values, stamp, source, random):
-    state = State(values, stamp=stamp, source=source)
-    items = list(values.items())
+    state, items = State(values, stamp=stamp, source=source), list(values.items())
     random.shuffle(items)
     same = State(dict(items), stamp=stamp, source=source)
     assert state == same

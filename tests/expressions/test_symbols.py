@@ -1,7 +1,5 @@
 """Symbols: interned, sorted alike in every process, with names that are read back."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import json

@@ -53,8 +53,7 @@ class MujocoReference:
 
     def pose(self, body: str) -> Matrix:
         """Return world_T_body."""
-        there = self.data.body(body)
-        result = np.eye(4)
+        there, result = self.data.body(body), np.eye(4)
         result[:3, :3], result[:3, 3] = there.xmat.reshape(3, 3), there.xpos
         return result
 

@@ -149,8 +149,7 @@ class Pair:
             at = int(self.engine.jnt_dofadr[number])
             record = self.model.articulations[joint.name]
             if joint.kind in ("hinge", "slide"):
-                gradient = self.model.rates.resolve(record.position).gradient()
-                for key, slope in gradient.items():
+                for key, slope in self.model.rates.resolve(record.position).gradient().items():
                     to_engine[at, speeds.index(key)] = slope({s: state[s] for s in slope.symbols})
                 continue
             block = np.eye(len(record.speeds))

@@ -21,10 +21,7 @@ FORMS = {
     "world": pin.ReferenceFrame.WORLD,
     "body": pin.ReferenceFrame.LOCAL,
 }
-COORDINATES = {
-    "planar": ("x", "y", "angle"),
-    "floating": ("x", "y", "z", "qx", "qy", "qz", "qw"),
-}
+COORDINATES = {"planar": ("x", "y", "angle"), "floating": ("x", "y", "z", "qx", "qy", "qz", "qw")}
 
 
 class PinocchioReference:

@@ -53,8 +53,7 @@ def sampled_errors(model: kv.Model, read: kv.Model, count: int = 60) -> dict[str
         for name, a, b in zip(frames, ours(values), theirs(values), strict=True):
             chord = np.linalg.norm(a[:3, :3] - b[:3, :3]) / np.sqrt(8)  # that is sin(angle / 2)
             angle = 2 * np.arcsin(min(1.0, chord))
-            distance = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
-            before = found[name]
+            distance, before = float(np.linalg.norm(a[:3, 3] - b[:3, 3])), found[name]
             found[name] = FrameDeviation(max(before.position, distance), max(before.angle, float(angle)))
     return found
 
@@ -87,8 +86,7 @@ def test_taylor_series_enclose_the_function_and_the_series_at_all_points(
 def test_taylor_series_enclose_implicit_functions() -> None:
     model = kv.load("articulations/four_bar")
     terms = TermGraph({})
-    enclosures = Enclosures(terms)
-    crank = model.symbol("four_bar/crank")
+    enclosures, crank = Enclosures(terms), model.symbol("four_bar/crank")
     for follower in model.rates.dependent.values():
         (whole,) = enclosures.enclose([terms.term(follower)], {crank: taylor_variable((0.5, 0.51))})
         values = [float(follower({crank: x})) for x in np.linspace(0.5, 0.51, 9)]
@@ -133,8 +131,7 @@ def test_error_bounds_hold_and_are_tight(
     assert 0 < max(report.error.position, report.error.angle) <= tolerance
     read = kv.load(file)
     assert read.degrees_of_freedom == model.degrees_of_freedom
-    found = sampled_errors(model, read)
-    for name, error in found.items():
+    for name, error in sampled_errors(model, read).items():
         promised = report.errors.get(name, FrameDeviation())
         assert error.position <= promised.position + 1e-12, name
         assert error.angle <= promised.angle + 1e-7, name  # an arc sine of rounding
@@ -186,8 +183,7 @@ def test_frame_errors_grow_with_the_distance_from_the_approximated_joint(tmp_pat
         edit.add_frame("far", parent="near", transform=kv.translation(1.9, 0, 0))
     report = model.save(tmp_path / "m.urdf", tolerance=0.2)
     assert report.errors["bend"].position == 0
-    ratio = report.errors["far"].position / report.errors["near"].position
-    assert ratio == pytest.approx(20)
+    assert report.errors["far"].position / report.errors["near"].position == pytest.approx(20)
     with pytest.raises(kv.errors.FormatError, match="'far' would be off by up to"):
         model.save(tmp_path / "m.urdf", tolerance=report.errors["far"].position * 0.9)
     with model.edit() as edit:

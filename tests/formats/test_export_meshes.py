@@ -77,8 +77,7 @@ def test_mujoco_loads_written_meshes(reference: str, name: str, package: Path, t
     (tmp_path / "out").mkdir()
     target = tmp_path / "out" / "r.xml"
     saved = robot(package, said(reference, name, package)).save(target)
-    found = corners(target)
-    expected = np.array(mesh_bytes.CORNERS) * (1, 2, 1)
+    found, expected = corners(target), np.array(mesh_bytes.CORNERS) * (1, 2, 1)
     distances = np.linalg.norm(found[:, None] - expected[None], axis=-1)
     assert distances.min(axis=1).max() < 1e-6
     assert distances.min(axis=0).max() < 1e-6
@@ -99,8 +98,7 @@ def test_missing_and_invalid_meshes_are_left_out(package: Path, tmp_path: Path) 
     (package / "meshes" / "notes.txt").write_text("hello")
     names = ("missing.stl", "noise.stl", "noise.dae", "noise.obj", "notes.txt", "cup.stl")
     model = robot(package, *(f"package://cups/meshes/{name}" for name in names), "https://a.b/c.stl")
-    saved = model.save(tmp_path / "r.xml")
-    again = kv.load(tmp_path / "r.xml").bodies["b"]
+    saved, again = model.save(tmp_path / "r.xml"), kv.load(tmp_path / "r.xml").bodies["b"]
     assert [Path(s.geometry.uri).name for s in again.visuals] == ["cup.stl"]  # type: ignore[union-attr]
     for name in names[:-1]:
         assert any(name in r and "is left out" in r for r in saved.remarks), name
@@ -165,10 +163,9 @@ def test_without_mesh_reader_meshes_to_convert_are_left_out(
         raise kv.errors.MissingDependencyError("reading meshes needs trimesh: install it")
 
     monkeypatch.setattr(mesh_files, "read_faces", missing)
-    saved = robot(package, "../meshes/cup.dae", "../meshes/cup.stl").save(tmp_path / "r.xml")
     assert any(
         "cup.dae is left out: MuJoCo cannot read it, and reading meshes needs trimesh" in r
-        for r in saved.remarks
+        for r in robot(package, "../meshes/cup.dae", "../meshes/cup.stl").save(tmp_path / "r.xml").remarks
     )
     assert len(kv.load(tmp_path / "r.xml").bodies["b"].visuals) == 1
 
@@ -187,8 +184,7 @@ def test_missing_textures_are_left_out_and_shapes_kept(tmp_path: Path) -> None:
             "cup", parent="world", transform=kv.rotation_z(kv.position("q")), body=Body(tuple(shapes))
         )
     (tmp_path / "out").mkdir()
-    saved = model.save(tmp_path / "out" / "m.xml")
-    assert [r for r in saved.remarks if r.startswith("the texture")] == [
+    assert [r for r in model.save(tmp_path / "out" / "m.xml").remarks if r.startswith("the texture")] == [
         "the texture no.png is left out: it is not there",
         "the texture wood.jpg is left out: it is not there",
     ]
@@ -204,8 +200,7 @@ def test_save_in_another_folder_warns_of_the_root_to_give(ending: str, package: 
     model = robot(
         package, "../meshes/cup.stl", "package://cups/meshes/cup.STL", "package://cups/meshes/cup.stl"
     )
-    saved = model.save(there / f"r.{ending}")
-    (said,) = [r for r in saved.remarks if "outside" in r]
+    (said,) = [r for r in model.save(there / f"r.{ending}").remarks if "outside" in r]
     assert said.endswith(f"are outside of {there}: give root='{tmp_path}' to open them from there")
     again = kv.load(there / f"r.{ending}", root=tmp_path).bodies["b"].visuals
     assert {locate_mesh(s.geometry).resolve().parent for s in again} == {package / "meshes"}  # type: ignore[arg-type]
@@ -269,8 +264,7 @@ def test_mesh_references_are_relative_to_the_written_file(
 ) -> None:
     there = tmp_path / "some" / "where"
     there.mkdir(parents=True)
-    model = robot(package, said(reference, "cup.stl", package))
-    model.save(there / f"r.{ending}")
+    robot(package, said(reference, "cup.stl", package)).save(there / f"r.{ending}")
     (shape,) = kv.load(there / f"r.{ending}").bodies["b"].visuals
     assert isinstance(shape.geometry, Mesh)
     found = locate_resource(shape.geometry.uri, shape.geometry.folder)
@@ -297,6 +291,5 @@ def test_mesh_addresses_stay_if_they_lead_to_the_same_file(
 
 def test_missing_meshes_keep_their_reference(tmp_path: Path) -> None:
     (tmp_path / "urdf").mkdir()
-    model = robot(tmp_path, "package://nobody/a.stl")
-    model.save(tmp_path / "r.urdf")
+    robot(tmp_path, "package://nobody/a.stl").save(tmp_path / "r.urdf")
     assert "package://nobody/a.stl" in (tmp_path / "r.urdf").read_text()

@@ -137,8 +137,7 @@ LARGE = {f"articulations/{n}" for n in ("delta_robot", "jansen_leg", "parallel_g
 )
 @pytest.mark.sampled(2)
 def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path) -> None:
-    model = load_cached(name)
-    file = tmp_path / "m.xml"
+    model, file = load_cached(name), tmp_path / "m.xml"
     if name in REFUSED:
         with pytest.raises(kv.errors.FormatError) as info:
             model.save(file, strict=True)
@@ -151,8 +150,7 @@ def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path
     again = kv.load(file)
     assert_same_motion(model, again, tolerance=1e-10 if model.rates.dependent else 1e-12)
     assert model.rates.dependent.keys() == again.rates.dependent.keys()
-    without = {frame for frame in model.frames if frame not in model.bodies}
-    assert not without & set(again.bodies)
+    assert not {frame for frame in model.frames if frame not in model.bodies} & set(again.bodies)
 
 
 @settings(max_examples=attempts(6), deadline=None)
@@ -167,8 +165,7 @@ def test_random_trees_saved_as_mjcf_move_alike_in_mujoco(
 
 
 def test_polynomial_followers_are_exact_up_to_degree_four(tmp_path: Path) -> None:
-    q = kv.position("q")
-    model = kv.Model()
+    q, model = kv.position("q"), kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=-1, upper=1))
         bends = 0.3 - q + 0.5 * q**2 - q**4 / 3
@@ -209,8 +206,7 @@ def test_home_position_becomes_a_key(tmp_path: Path) -> None:
             )
         )
     model.save(tmp_path / "m.xml")
-    compiled = MujocoReference(tmp_path / "m.xml").model
-    assert compiled.key("home").qpos[0] == 0.5
+    assert MujocoReference(tmp_path / "m.xml").model.key("home").qpos[0] == 0.5
     assert kv.load(tmp_path / "m.xml").default_state()["q"] == 0.5
 
 

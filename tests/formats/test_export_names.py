@@ -103,8 +103,7 @@ def test_home_positions_of_names_with_colons_are_kept(name: str, kind: str, tmp_
     (tmp_path / "in.xml").write_text(text)
     model = kv.load(tmp_path / "in.xml")
     model.save(tmp_path / "out.xml")
-    again = kv.load(tmp_path / "out.xml")
-    expected = model.default_state()
+    again, expected = kv.load(tmp_path / "out.xml"), model.default_state()
     assert again.degrees_of_freedom == model.degrees_of_freedom
     found = again.default_state()
     for symbol in model.degrees_of_freedom:

@@ -33,8 +33,7 @@ def moving(mass: float, moments: tuple[float, ...], turn: kv.Expression | None =
 
 def in_mujoco(model: kv.Model, folder: Path) -> tuple[float, np.ndarray, tuple[str, ...]]:
     """Return mass, tensor in axes of the frame, and remarks of what MuJoCo reads."""
-    mujoco = pytest.importorskip("mujoco")
-    saved = model.save(folder / "m.xml")
+    mujoco, saved = pytest.importorskip("mujoco"), model.save(folder / "m.xml")
     read = mujoco.MjModel.from_xml_path(str(folder / "m.xml"))
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, read.body_iquat[1])
@@ -62,8 +61,7 @@ SMALL = [
 def test_small_inertia_is_loaded_by_mujoco(
     mass: float, moments: tuple[float, ...], turn: kv.Expression | None, tmp_path: Path
 ) -> None:
-    model = moving(mass, moments, turn)
-    found, tensor, remarks = in_mujoco(model, tmp_path)
+    found, tensor, remarks = in_mujoco(moving(mass, moments, turn), tmp_path)
     assert found == pytest.approx(mass, abs=1e-3)
     r = np.eye(3) if turn is None else np.asarray(turn({}))[:3, :3]
     np.testing.assert_allclose(tensor, r @ np.diag(moments) @ r.T, rtol=0, atol=1.1e-6 + 1e-9 * max(moments))

@@ -140,8 +140,7 @@ def test_random_trees_saved_as_urdf_move_alike_in_pinocchio(
 
 
 def test_custom_frames_become_joints(tmp_path: Path) -> None:
-    a = kv.position("lift")
-    model = kv.Model()
+    a, model = kv.position("lift"), kv.Model()
     with model.edit() as edit:
         edit.add_frame("plate", parent="world", transform=kv.translation(0, 0, 2 * a))
         edit.constrain("range", 0, a, 0.4)
@@ -154,8 +153,7 @@ def test_custom_frames_become_joints(tmp_path: Path) -> None:
 
 def test_translations_along_ellipses_become_chains_of_rotations(tmp_path: Path) -> None:
     """A shelf that swings without turning, a slider by a cosine, and an ellipse."""
-    q = kv.position("q")
-    model = kv.Model()
+    q, model = kv.position("q"), kv.Model()
     with model.edit() as edit:
         edit.add_frame(
             "shelf", parent="world", transform=kv.translation(0, 0.3 * np.cos(2 * q), 0.3 * np.sin(2 * q))
@@ -191,8 +189,7 @@ def test_transforms_in_one_matrix_are_decomposed(tmp_path: Path) -> None:
 
 
 def test_parameters_are_written_with_their_values_and_a_remark(tmp_path: Path) -> None:
-    length = kv.parameter("length", 0.7)
-    q = kv.position("q")
+    length, q = kv.parameter("length", 0.7), kv.position("q")
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("tip", parent="world", transform=kv.rotation_z(q) @ kv.translation(length, 0, 0))
@@ -258,8 +255,7 @@ def test_frames_held_by_loops_are_refused_with_that_reason(tmp_path: Path) -> No
 
 
 def test_contradicting_limits_are_refused(tmp_path: Path) -> None:
-    q = kv.position("q")
-    model = kv.Model()
+    q, model = kv.position("q"), kv.Model()
     with model.edit() as edit:
         edit.add_frame("f", parent="world", transform=kv.rotation_z(q))
         edit.constrain("one", 0, q, 1)
@@ -269,8 +265,7 @@ def test_contradicting_limits_are_refused(tmp_path: Path) -> None:
 
 
 def test_names_with_xml_characters_are_escaped(tmp_path: Path) -> None:
-    name = """a<b>&"c" 'd' 50% : é -- 漢"""
-    model = kv.Model()
+    name, model = """a<b>&"c" 'd' 50% : é -- 漢""", kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name=name, parent="world", child=name, lower=0, upper=1))
         edit.add_frame(f"{name}/x", parent=name, transform=kv.rotation_z(2 * kv.position(name)))

@@ -55,8 +55,7 @@ def mesh_of(model: kv.Model):
 @pytest.mark.parametrize("mark", [".git/HEAD", "package.xml", "model.config", "__init__.py"])
 def test_a_repository_or_package_around_a_file_is_its_root(put, tmp_path, mark):
     put(f"top/{mark}")
-    folder = put("top/a/b/r.urdf").parent
-    assert find_root(folder) == str(tmp_path / "top")
+    assert find_root(put("top/a/b/r.urdf").parent) == str(tmp_path / "top")
     assert find_root(tmp_path) == str(tmp_path)
 
 
@@ -261,8 +260,7 @@ def test_files_in_declared_folders_may_be_named_by_path(put, tmp_path, monkeypat
 @pytest.mark.parametrize("name", ["etc", "home", "tmp"])
 def test_common_folders_are_no_packages(put, tmp_path, name, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home/me"))
-    file = put("home/me/secret")
-    folder = str(put("home/me/robot/r.urdf").parent)
+    file, folder = put("home/me/secret"), str(put("home/me/robot/r.urdf").parent)
     uris = [
         f"package://{tmp_path.parts[1]}/x",
         "package://etc/hostname",

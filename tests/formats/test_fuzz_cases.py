@@ -22,7 +22,6 @@ INVISIBLE = "\U000e0001"
 
 
 def loaded(tmp_path, text: str, name: str = "input.urdf", strict: bool = True) -> kv.Model | str:
-    """Return the model or the message of the error."""
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
     try:
@@ -243,8 +242,7 @@ def test_rate_tables_are_read_back_unchanged(rows):
             [12, None, None, 11, None, 12, None, None, None, None, 12, None, 10, None, None, 10],
         ],
     ]
-    writes = {"frames": {"h": {"parent": "world", "factors": [13]}}}
-    text = to_json(built(document(nodes, writes)))
+    text = to_json(built(document(nodes, {"frames": {"h": {"parent": "world", "factors": [13]}}})))
     assert to_json(built(text)) == text
 
 

@@ -1,7 +1,5 @@
 """The cache of loaded files: a file that is loaded again is not parsed again."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

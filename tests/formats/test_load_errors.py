@@ -1,7 +1,5 @@
 """Errors for invalid files and prefixes."""
 
-from __future__ import annotations
-
 import logging
 import os
 

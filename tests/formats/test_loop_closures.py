@@ -57,9 +57,7 @@ LEG = body(
     "thigh",
     hinge("hip", "0 1 0", 'range="-40 40"')
     + body(
-        "rod",
-        '<joint name="ball" type="ball"/>' + '<site name="rod_end" pos="0 0 -.39"/>',
-        'pos=".1 0 0"',
+        "rod", '<joint name="ball" type="ball"/>' + '<site name="rod_end" pos="0 0 -.39"/>', 'pos=".1 0 0"'
     )
     + body(
         "shin",
@@ -98,8 +96,7 @@ def left_in_mujoco(text: str, model: kv.Model, state: kv.State) -> np.ndarray:
 @pytest.mark.parametrize("loops", ["solve", "constraint"])
 def test_robots_with_loops_load_and_are_closed_by_projection(tmp_path, text, kept, loops):
     model, remarks = load(tmp_path, text, loops=loops)
-    kept_here = [n for n, r in model.articulations.items() if r.kind == "loopconstraint"]
-    assert len(kept_here) == kept
+    assert len([n for n, r in model.articulations.items() if r.kind == "loopconstraint"]) == kept
     assert len([r for r in remarks if "closes a loop" in r]) == kept
     # The default state is closed already, and so is what is made of any other.
     default = model.default_state()
@@ -143,8 +140,7 @@ def test_loops_refuse_raises_for_unsolved_loops(tmp_path):
         with pytest.raises(kv.errors.FormatError, match="closes a loop"), kv.Model().edit() as edit:
             (edit if place == "edit" else model).include(tmp_path / "x.xml", "leg", loops="refuse")
     with model.edit() as edit:
-        tags = edit.include(tmp_path / "x.xml", "leg")
-        assert tags == list(model.history.tags)
+        assert edit.include(tmp_path / "x.xml", "leg") == list(model.history.tags)
     model.include(tmp_path / "x.xml", "other", loops="constraint")
     assert {"leg/rod/x", "other/rod/x"} <= set(model.constraints)
     assert len(model.violations(model.default_state())) == 0
@@ -164,8 +160,7 @@ def test_two_pins_on_one_axis_are_a_hinge(tmp_path):
         "x.xml: the equality 'again' is left out: it adds nothing, since what it connects coincides in every state."
     ]
     assert twice.degrees_of_freedom == once.degrees_of_freedom == (kv.position("crank"),)
-    pose = twice.fk("rocker")({"crank": 0.2})
-    np.testing.assert_array_equal(pose, once.fk("rocker")({"crank": 0.2}))
+    np.testing.assert_array_equal(twice.fk("rocker")({"crank": 0.2}), once.fk("rocker")({"crank": 0.2}))
     strict, _ = load(tmp_path, (tmp_path / "x.xml").read_text(), loops="refuse")
     assert strict.degrees_of_freedom == once.degrees_of_freedom
     # Asked for as constraints, both are one, and do not hinder each other.

@@ -229,8 +229,7 @@ def test_joint_dynamics_are_data():
     <muscle joint="u" range=".7 1.1"/></actuator>"""
     # MuJoCo itself fails here, since such a muscle cannot be as long as it is said to be.
     model = model_of(parse_mjcf(mjcf(f"<worldbody>{body('a', joints)}</worldbody>", actuators)))
-    data = {name: dict(record.dynamics) for name, record in model.articulations.items()}
-    assert data == {
+    assert {name: dict(record.dynamics) for name, record in model.articulations.items()} == {
         "h": {"damping": 2.0, "friction": 0.5, "armature": 0.1, "spring_stiffness": 3.0, "spring_reference": pytest.approx(np.radians(20))},
         "s": {"effort": 8.0},
         "m": {"effort": 6.0},

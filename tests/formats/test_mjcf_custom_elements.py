@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mujoco_oracle import model_of
 from round_trip import assert_same_motion, load_cached
-
-pytest.importorskip("mujoco")
 
 import kineverse as kv
 from kineverse.formats.mjcf import parse_mjcf
-from kineverse.formats.mjcf.operations import mjcf_operations
 from kineverse.model.body import Body, Box, Inertia, Shape
 
 LINKAGE = "articulations/slider_crank"
@@ -24,16 +22,11 @@ def written(model: kv.Model, folder: Path) -> str:
 
 
 def read(text: str, prefix: str | None = None) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for operation in mjcf_operations(parse_mjcf(text), prefix):
-            edit.apply(operation)
-    return model
+    return model_of(parse_mjcf(text), prefix)
 
 
 def test_velocity_limits_are_read_back(tmp_path: Path) -> None:
-    model = kv.Model()
-    q = kv.position("q")
+    model, q = kv.Model(), kv.position("q")
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=0, upper=1, velocity=2.5))
         edit.apply(kv.Prismatic(name="p", parent="q", child="p", position=3 * q, velocity=4))
@@ -78,8 +71,7 @@ def test_loops_are_solved_again_when_read_back(saved: str, tmp_path: Path) -> No
     model = load_cached("articulations/parallel_gripper")
     if saved != "as it is":
         model.save(tmp_path / "m.kv.json")
-        prefix = "left/a:b" if "prefix" in saved else None
-        model = kv.load(tmp_path / "m.kv.json", prefix=prefix)
+        model = kv.load(tmp_path / "m.kv.json", prefix="left/a:b" if "prefix" in saved else None)
     again = read(written(model, tmp_path))
     assert set(again.frames) == set(model.frames)
     assert model.rates.dependent.keys() == again.rates.dependent.keys()

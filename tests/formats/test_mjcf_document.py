@@ -1,7 +1,5 @@
 """Models from MJCF are saved as documents, which are read without MuJoCo."""
 
-from __future__ import annotations
-
 import pytest
 from mujoco_oracle import model_of
 from test_mjcf_bodies import HOMED

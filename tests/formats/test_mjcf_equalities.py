@@ -134,8 +134,7 @@ BARS = body("crank", '<joint name="crank" axis="0 1 0" range="-8 8"/>' + body("c
 
 def bars(ref: float = 0.0) -> str:
     # The tip of the coupler is at (cos 20°, 0, .3 + sin 20°), and so is the top of the rocker.
-    tip = np.array([np.cos(np.radians(20)), 0.3 + np.sin(np.radians(20))])
-    reach = tip - [1.0, 0.0]
+    reach = np.array([np.cos(np.radians(20)), 0.3 + np.sin(np.radians(20))]) - [1.0, 0.0]
     lean = np.degrees(np.arctan2(reach[0], reach[1]))
     return BARS.format(ref=ref, turn=-20, length=float(np.hypot(*reach)), lean=lean)
 

@@ -250,8 +250,7 @@ def test_names_and_numbers_reach_mujoco_unchanged():
     escaped = name.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
     text = f'<?xml version="1.0" encoding="iso-8859-1"?><mujoco><worldbody><body name="{escaped}">{GEOM}<!-- <body/> --></body></worldbody></mujoco>'
     assert [link.name for link in parse_mjcf(text.encode("latin-1")).links] == ["world", name]
-    model = model_of(parse_mjcf(text.encode("latin-1")), "p")
-    assert f"p/{name}" in model.frames
+    assert f"p/{name}" in model_of(parse_mjcf(text.encode("latin-1")), "p").frames
 
 
 def test_truncated_files_are_format_errors(published):

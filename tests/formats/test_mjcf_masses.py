@@ -90,8 +90,7 @@ CASES = {
 
 def assert_bodies_are_those_of_mujoco(text: str, tolerance: float = 2e-6) -> list[str]:
     """Compare mass, centre and tensor of all bodies; return the remarks. Meshes are single precision."""
-    engine = mujoco.MjModel.from_xml_string(text)
-    scene = parse_mjcf(text, "x.xml")
+    engine, scene = mujoco.MjModel.from_xml_string(text), parse_mjcf(text, "x.xml")
     for link in scene.links[1:]:
         number = engine.body(link.name).id
         mass, moments = engine.body_mass[number], engine.body_inertia[number]

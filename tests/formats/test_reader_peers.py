@@ -1,7 +1,5 @@
 """Files that pinocchio and MuJoCo read are read: a short run of ``tools/fuzz/peers.py``."""
 
-from __future__ import annotations
-
 import sys
 from itertools import islice
 from pathlib import Path

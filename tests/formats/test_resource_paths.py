@@ -172,8 +172,7 @@ def test_dots_that_stay_inside_of_a_package_are_allowed(make, tmp_path):
 def test_a_miss_says_where_it_looked_and_what_to_set(tmp_path):
     with pytest.raises(FormatError) as info:
         locate_resource("package://arm/a.stl", tmp_path / "urdf")
-    message = str(info.value)
-    first, *places = message.splitlines()
+    first, *places = str(info.value).splitlines()
     assert first == (
         '"package://arm/a.stl": there is no package "arm". '
         "Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds it. Looked in:"
@@ -297,8 +296,7 @@ def test_meshes_of_an_mjcf_may_lie_beside_its_folder(tmp_path: Path):
 
 
 def test_a_document_opens_no_meshes_beside_a_folder_that_it_states(tmp_path: Path):
-    path = robot_beside_meshes(tmp_path, "../meshes/a.stl")
-    mesh = kv.load(path).bodies["l"].visuals[0].geometry
+    mesh = kv.load(robot_beside_meshes(tmp_path, "../meshes/a.stl")).bodies["l"].visuals[0].geometry
     (tmp_path / "elsewhere").mkdir()
     for uri in ("../meshes/a.stl", "package://some_robot/meshes/a.stl"):
         with pytest.raises(FormatError):

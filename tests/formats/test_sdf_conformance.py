@@ -20,8 +20,7 @@ DRAKE = json.loads((Path(__file__).parent / "sdf_poses_of_drake.json").read_text
 @pytest.mark.parametrize("file", OUTCOMES)
 @pytest.mark.sampled(2)
 def test_frames_and_dofs_or_errors_of_all_files(file: str, published: Callable[..., Path]):
-    path = published(file)
-    expected = OUTCOMES[file]
+    path, expected = published(file), OUTCOMES[file]
     if expected[0].isdecimal():
         model = kv.load(path, prefix="p")
         assert f"{len(model.frames)} {len(model.degrees_of_freedom)}" == expected
@@ -50,8 +49,7 @@ def test_poses_are_those_of_drake(file: str, published: Callable[..., Path]):
     model = kv.load(published(file))
     state = dict(model.default_state())
     for name, values in DRAKE[file]["q"].items():
-        joints = {n.removesuffix("/first") for n in model.articulations}
-        at = known(name, joints)
+        at = known(name, {n.removesuffix("/first") for n in model.articulations})
         names = [at] if len(values) == 1 else [f"{at}/first", f"{at}/second"]
         state |= {kv.position(n): value for n, value in zip(names, values, strict=True)}
     for body, rows in DRAKE[file]["poses"].items():

@@ -51,8 +51,7 @@ def file(folder: Path, text: str) -> Path:
 def test_included_models_are_read(tmp_path, uri):
     inside = "<name>left</name>" + pose("0 2 0 0 0 0", 'relative_to="f"')
     text = sdf(link("l"), '<frame name="f">' + pose("1 0 0 0 0 0") + "</frame>", include(uri, inside))
-    model = kv.load(file(tmp_path, text))
-    assert set(model.frames) == {"l", "f", "left", "left/base", "left/tip"}
+    assert set(kv.load(file(tmp_path, text)).frames) == {"l", "f", "left", "left/base", "left/tip"}
     scene = read_sdf(file(tmp_path, text))
     assert {known.name: known.pose.matrix[:3, 3].tolist() for known in scene.links} == {
         "l": [0, 0, 0],

@@ -63,8 +63,7 @@ def test_revolute2_joint_becomes_two_hinges():
     ],
 )
 def test_screw_pitches_are_read(inside, pitch):
-    model = one("screw", Z + inside)
-    assert at(model, "b", j=math.tau)[2, 3] == pytest.approx(pitch)
+    assert at(one("screw", Z + inside), "b", j=math.tau)[2, 3] == pytest.approx(pitch)
 
 
 def test_sdf_limits_and_dynamics_are_read():
@@ -110,10 +109,9 @@ def mimic(
 
 
 def test_sdf_mimic_joints_follow():
-    links = "".join(link(name) for name in "abcd")
     model = model_of(
         sdf(
-            links,
+            "".join(link(name) for name in "abcd"),
             joint("c1", "revolute", "c", "d", Z.replace("</axis>", mimic("inner::q", 2, 1, 0.5))),
             joint("u", "universal", "a", "b", Z + "<axis2><xyz>0 1 0</xyz></axis2>"),
             joint("p", "prismatic", "b", "c", Z.replace("</axis>", mimic("u", -3, axis="axis2"))),
@@ -123,8 +121,7 @@ def test_sdf_mimic_joints_follow():
             + joint("on", "fixed", "a", "inner::x"),
         )
     )
-    names = {str(s) for s in model.degrees_of_freedom}
-    assert names == {"inner/q", "u/first", "u/second"}
+    assert {str(s) for s in model.degrees_of_freedom} == {"inner/q", "u/first", "u/second"}
     assert model.articulations["p"].position({"u/second": 0.5}) == -1.5
     assert model.articulations["c1"].position({"inner/q": 2.0}) == 2 * (2.0 - 0.5) + 1
 
@@ -180,19 +177,23 @@ def bar(name: str, x: float, y: float, angle: float) -> str:
     return link(name, pose(f"{x} {y} 0 0 0 {angle!r}"))
 
 
-def test_sdf_loops_are_closed():
-    # A parallelogram: crank and rocker of length 1 on a base of length 2, the coupler from one to the other.
+def parallelogram(second: str) -> str:
+    """Crank and rocker of length 1 on a base of length 2, the coupler from one to the other."""
     axis = "<axis><xyz>0 0 1</xyz><limit><lower>-0.5</lower><upper>0.5</upper></limit></axis>"
-    text = sdf(
+    return sdf(
         link("base"),
         bar("crank", 0, 0, math.pi / 2),
         bar("coupler", 0, 1, 0.0),
         bar("rocker", 2, 0, math.pi / 2),
         joint("q1", "revolute", "base", "crank", axis),
-        joint("q2", "revolute", "crank", "coupler", Z),
+        second,
         joint("q3", "revolute", "base", "rocker", axis),
         joint("q4", "revolute", "coupler", "rocker", pose("1 0 0 0 0 0") + Z),
     )
+
+
+def test_sdf_loops_are_closed():
+    text = parallelogram(joint("q2", "revolute", "crank", "coupler", Z))
     assert [loop.name for loop in parse_sdf(text).loops] == ["q4"]
     model = model_of(text)
     (free,) = model.degrees_of_freedom
@@ -204,17 +205,7 @@ def test_sdf_loops_are_closed():
 
 @pytest.mark.parametrize("name", ["q2", "q:2"])
 def test_home_positions_of_ball_joints_in_loops_are_set(name):
-    axis = "<axis><xyz>0 0 1</xyz><limit><lower>-0.5</lower><upper>0.5</upper></limit></axis>"
-    text = sdf(
-        link("base"),
-        bar("crank", 0, 0, math.pi / 2),
-        bar("coupler", 0, 1, 0.0),
-        bar("rocker", 2, 0, math.pi / 2),
-        joint("q1", "revolute", "base", "crank", axis),
-        joint(name, "ball", "crank", "coupler"),
-        joint("q3", "revolute", "base", "rocker", axis),
-        joint("q4", "revolute", "coupler", "rocker", pose("1 0 0 0 0 0") + Z),
-    )
+    text = parallelogram(joint(name, "ball", "crank", "coupler"))
     # A quaternion does not follow, and nobody knows its range.
     with pytest.raises(kv.KineverseError, match=f"needs limits of '{name.replace(':', '%3A')}/qz'"):
         model_of(text)

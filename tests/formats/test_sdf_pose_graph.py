@@ -83,8 +83,7 @@ def test_placement_frames_place_models(frame: str):
     model = model_of(text.replace('name="__"', 'name="origin"'))
     name = {"__model__": "origin", "inner::l": "inner/l"}.get(frame, frame)
     expected = matrix((1, 2, 3, 0.1, 0.2, 0.3))
-    got = model.fk(name)(dict(model.default_state()))
-    np.testing.assert_allclose(got, expected, atol=1e-14)
+    np.testing.assert_allclose(model.fk(name)(dict(model.default_state())), expected, atol=1e-14)
 
 
 def test_scopes_become_paths():
@@ -112,8 +111,7 @@ WORLD = f"""<sdf version="1.8"><world name="w">
 
 
 def test_first_world_is_read():
-    scene = parse_sdf(WORLD)
-    model = model_of(WORLD)
+    scene, model = parse_sdf(WORLD), model_of(WORLD)
     assert set(model.frames) == {
         "table",
         "table/top",
@@ -251,14 +249,12 @@ def said(m: np.ndarray, relative: str) -> str:
 def written(tree: list, about: list[int]) -> str:
     """Write a tree of hinges, each pose relative to the frame that ``about`` returns."""
     places = {"__model__": np.eye(4), "l0": np.eye(4)}
-    parts = [link("l0")]
-    names = ["__model__", "l0"]
+    parts, names = [link("l0")], ["__model__", "l0"]
     for n, (above, joint, child, axis) in enumerate(tree, start=1):
         parent = f"l{above % n}"
         j = places[f"j{n}"] = places[parent] @ matrix(joint)
         c = places[f"l{n}"] = j @ matrix(child)
-        pick = names[about[2 * n] % len(names)]
-        other = names[about[2 * n + 1] % len(names)]
+        pick, other = names[about[2 * n] % len(names)], names[about[2 * n + 1] % len(names)]
         names += [f"l{n}"]
         a = np.array(axis) if np.linalg.norm(axis) > 0.1 else np.array([0, 0, 1.0])
         expressed = places[other][:3, :3].T @ j[:3, :3] @ a

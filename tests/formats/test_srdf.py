@@ -251,8 +251,7 @@ def test_an_empty_description_is_none_of_these_errors(model: kv.Model) -> None:
 def test_published_descriptions(
     robot: str, rules: int, group: str, free: int, published: Callable[..., Path]
 ) -> None:
-    folder = published("planning_problems", robot)
-    model = kv.Model()
+    folder, model = published("planning_problems", robot), kv.Model()
     model.include(folder / f"{robot}_spherized.urdf", "one")
     srdf = read_srdf(folder / f"{robot}.srdf", model, "one")
     assert len(srdf.rules) == rules

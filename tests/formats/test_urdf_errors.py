@@ -37,10 +37,7 @@ CASES = {
     "version 1.3": (robot(links=1, attributes='name="r" version="1.3"'), "1.0, 1.1, 1.2 are"),
     "version 1": (robot(links=1, attributes='name="r" version="1"'), 'version="1" is not one that is read'),
     "no version": (robot(links=1, attributes='name="r" version=""'), 'version="" is not one that is read'),
-    "capital robot": (
-        robot(links=1).replace("robot", "Robot"),
-        "is not <robot>, the root element of a URDF",
-    ),
+    "capital robot": (robot(links=1).replace("robot", "Robot"), "is not <robot>, the root element of a URDF"),
     "spherical": (pair(kind="spherical"), J + 'type="spherical" is no joint type of URDF'),
     "1.2 without lower": (
         pair('<limit upper="1"/>', attributes='name="r" version="1.2"'),
@@ -248,8 +245,7 @@ def test_zero_axis_fixes_a_joint_and_makes_a_plane_horizontal():
 
 def test_rpy_precedes_quaternion_and_zero_quaternion_is_the_identity():
     attributes = 'name="r" version="1.1"'
-    both = pair('<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>', "fixed", attributes)
-    (joint,) = parse_urdf(both).joints
+    (joint,) = parse_urdf(pair('<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>', "fixed", attributes)).joints
     assert joint.origin == parse_urdf(pair('<origin rpy="0 0 1"/>', "fixed", attributes)).joints[0].origin
     (joint,) = parse_urdf(pair('<origin xyz="1 2 3" quat_xyzw="0 0 0 0"/>', "fixed", attributes)).joints
     np.testing.assert_array_equal(joint.origin.matrix[:3, :3], np.eye(3))

@@ -36,8 +36,7 @@ def test_truncated_urdf_is_read_or_a_format_error(kind):
 
 
 def test_truncation_error_names_the_open_element():
-    message = outcome(SMALL[: SMALL.index("<axis")])
-    assert message == (
+    assert outcome(SMALL[: SMALL.index("<axis")]) == (
         'r.urdf, line 19, column 5, in <joint name="elbow"> of line 16: not well-formed XML: '
         "no element found. The text is cut off."
     )
@@ -92,8 +91,7 @@ def test_unknown_entities_are_refused():
 @pytest.mark.parametrize("outer", ["{}", "<gazebo>{}</gazebo>", "<link name='l'>{}</link>"])
 def test_deep_nesting_is_refused(outer):
     depth = 100_000
-    text = "<robot name='r'>" + outer.format("<a>" * depth + "</a>" * depth) + "</robot>"
-    assert outcome(text) == (
+    assert outcome("<robot name='r'>" + outer.format("<a>" * depth + "</a>" * depth) + "</robot>") == (
         "r.urdf, line 1, <a>: elements are nested more than 200 deep; no robot description needs that."
     )
 

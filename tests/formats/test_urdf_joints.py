@@ -8,20 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from urdf_texts import LIMIT, joint, pair, robot
+from urdf_texts import LIMIT, joint, model_of, pair, robot
 
 import kineverse as kv
 from kineverse.errors import FormatError
 from kineverse.formats.urdf import UrdfDynamics, UrdfLimits, UrdfMimic, UrdfSafetyController, parse_urdf
-from kineverse.formats.urdf.operations import urdf_operations
-
-
-def model_of(text: str) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for operation in urdf_operations(parse_urdf(text)):
-            edit.apply(operation)
-    return model
 
 
 def test_defaults_are_those_of_the_specification():

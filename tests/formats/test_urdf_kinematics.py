@@ -99,8 +99,7 @@ def assert_equal_to_pinocchio(reference: PinocchioReference, description: UrdfRo
     jacobians = [(link, form) for link in leaves for form in FORMS]
     poses = [model.fk(frame, root) for frame in frames.values()]
     columns = [model.jacobian(frames[link], root, form) for link, form in jacobians]
-    symbols = [*model.degrees_of_freedom]
-    f = kv.compile([*poses, *columns], symbols, tier="interpreter")
+    f = kv.compile([*poses, *columns], [*model.degrees_of_freedom], tier="interpreter")
     rng = np.random.default_rng(seed)
     for _ in range(CONFIGURATIONS):
         values = reference.random_values(rng)

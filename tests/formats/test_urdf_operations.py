@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from urdf_texts import LIMIT, SMALL, chain, joint, pair, robot
+from urdf_texts import LIMIT, SMALL, chain, joint, model_of, pair, robot
 
 import kineverse as kv
 from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.urdf import parse_urdf
 from kineverse.formats.urdf.operations import urdf_operations
-
-
-def model_of(text: str, prefix: str | None = None, parent: str = "world") -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        if parent != "world":
-            edit.add_frame(parent, "world", kv.translation(0, 0, 1))
-        for operation in urdf_operations(parse_urdf(text), prefix, parent):
-            edit.apply(operation)
-    return model
 
 
 def bounds(model: kv.Model, name: str) -> tuple[float, float]:
@@ -38,8 +28,7 @@ def test_operations_have_prefixed_names_and_tags():
 
 
 def test_names_without_prefix_are_those_of_the_file():
-    model = model_of(SMALL)
-    assert model.history.tags == ["frame base", "body base", "joint elbow"]
+    assert model_of(SMALL).history.tags == ["frame base", "body base", "joint elbow"]
 
 
 def test_a_file_is_loaded_by_its_path(tmp_path):
@@ -65,8 +54,7 @@ def test_a_root_called_world_is_a_frame_with_prefix():
 
 
 def test_a_root_can_be_attached_elsewhere():
-    model = model_of(SMALL, "p", parent="table")
-    assert model.fk("p/arm")({"p/elbow": 0.0})[:3, 3].tolist() == [1, 0, 1]
+    assert model_of(SMALL, "p", parent="table").fk("p/arm")({"p/elbow": 0.0})[:3, 3].tolist() == [1, 0, 1]
     with pytest.raises(kv.errors.FormatError, match="its root link is the world"):
         model_of(WORLD, parent="table")
 
@@ -217,8 +205,7 @@ def test_joints_that_follow_have_no_degree_of_freedom_and_keep_their_limits():
         joint("b", "l1", "l2", "prismatic", LIMIT + FOLLOWING.format("a", -2, 1)),
         links=4,
     )
-    model = model_of(text, "p")
-    a = kv.position("p/a")
+    model, a = model_of(text, "p"), kv.position("p/a")
     assert model.degrees_of_freedom == (a,)
     # b = -2 a + 1 and c = 3 b + 0.5 = -6 a + 3.5, each within [-1, 2] and at most 3 fast.
     for name, value in (("b", -2 * a + 1), ("c", -6 * a + 3.5)):
@@ -266,5 +253,4 @@ def test_planar_joints_move_in_the_plane_of_their_axis(axis):
 
 
 def test_a_long_chain_becomes_a_model():
-    model = model_of(chain(2000, "", "continuous"))
-    assert len(model.degrees_of_freedom) == 2000
+    assert len(model_of(chain(2000, "", "continuous")).degrees_of_freedom) == 2000

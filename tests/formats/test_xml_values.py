@@ -1,7 +1,5 @@
 """Numbers and poses as descriptions write them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A quaternion of zeros is the identity, as in MuJoCo and libsdformat, so every state has a pose."""
 
-from __future__ import annotations
-
 import json
 
 import mujoco

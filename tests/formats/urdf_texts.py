@@ -2,7 +2,21 @@
 
 from __future__ import annotations
 
+import kineverse as kv
+from kineverse.formats.urdf import parse_urdf
+from kineverse.formats.urdf.operations import urdf_operations
+
 LIMIT = '<limit lower="-1" upper="2" effort="10" velocity="3"/>'
+
+
+def model_of(text: str, prefix: str | None = None, parent: str = "world") -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        if parent != "world":
+            edit.add_frame(parent, "world", kv.translation(0, 0, 1))
+        for operation in urdf_operations(parse_urdf(text), prefix, parent):
+            edit.apply(operation)
+    return model
 
 
 def joint(name: str, parent: str, child: str, kind: str = "revolute", inside: str = LIMIT) -> str:
@@ -17,7 +31,6 @@ def robot(*parts: str, links: int = 0, attributes: str = 'name="r"') -> str:
 
 
 def pair(inside: str = LIMIT, kind: str = "revolute", attributes: str = 'name="r"') -> str:
-    """Return two links and one joint ``j`` on line 4."""
     return robot(joint("j", "l0", "l1", kind, inside), links=2, attributes=attributes)
 
 

@@ -55,8 +55,7 @@ def test_generate_kitchen_numbers_are_those_of_the_documentation():
     kinds, counts, aisles = set(), [], []
     for seed in range(1000, 1030):
         model = kitchens.generate_kitchen(seed)
-        shut = model.default_state()
-        objects = model.degrees_of_freedom
+        shut, objects = model.default_state(), model.degrees_of_freedom
         counts.append(len(objects))
         assert layout.OBJECTS[0] <= len(objects) <= layout.OBJECTS[1]
         for q in objects:
@@ -98,8 +97,7 @@ def _check_bar(body: Body):
 
 def test_generate_kitchen_spring_of_a_flap_carries_it_wide_open():
     """At 90° the spring's torque is the weight's: k π/2 = m g d, with d from the body's inertia."""
-    model = kitchens.generate_kitchen(1)
-    flap = "kitchen/oven_door"
+    model, flap = kitchens.generate_kitchen(1), "kitchen/oven_door"
     inertia, dynamics = model.bodies[flap].inertia, dict(model.articulations[flap].dynamics)
     weight = inertia.mass * 9.81 * inertia.origin.matrix[2, 3]
     assert dynamics["spring_stiffness"] * math.pi / 2 == pytest.approx(weight, rel=1e-3)
@@ -118,8 +116,7 @@ def test_generate_kitchen_inertia_is_that_of_mujoco():
     xml = f"""<mujoco><compiler inertiafromgeom='true'/><worldbody><body><freejoint/>
       <geom type='box' size='.15 .15 .025' pos='{x} {y} {z}' density='450'/>
       <geom type='cylinder' size='.02' fromto='0 .1 0 0 .5 0' density='450'/></body></worldbody></mujoco>"""
-    m = mujoco.MjModel.from_xml_string(xml)
-    found = compute_inertia((box, bar))
+    m, found = mujoco.MjModel.from_xml_string(xml), compute_inertia((box, bar))
     xx, xy, xz, yy, yz, zz = found.tensor
     own = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     assert found.mass == pytest.approx(m.body_mass[1], rel=1e-5)

@@ -66,8 +66,7 @@ def test_load_lockbox_by_name():
 
 def test_thesis_lock_rates():
     model = make_lockbox_model(THESIS)
-    shut = model.default_state()
-    speed = kv.position("lockbox/a").derivative()
+    shut, speed = model.default_state(), kv.position("lockbox/a").derivative()
     limits = model.constraints["lockbox/a/velocity"]
     assert (float(limits.lower(shut)), float(limits.upper(shut))) == (0.0, 0.0)
     opened = {**shut, kv.position("lockbox/b"): 0.5, kv.position("lockbox/c"): 0.7}

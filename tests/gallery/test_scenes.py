@@ -1,7 +1,5 @@
 """Every articulation that can be opened by name: it loads, shows something, and all of it moves within its limits."""
 
-from __future__ import annotations
-
 import json
 import re
 from functools import cache
@@ -66,8 +64,7 @@ def test_scene_moves_over_the_whole_range_of_every_slider(name):
             rows[:, poses.inputs.index(freedom)] = path
         for pose in poses.batch(rows):
             assert np.isfinite(pose).all()
-            rotation = pose[:, :3, :3]
-            identity = np.tile(np.eye(3), (len(path), 1, 1))
+            rotation, identity = pose[:, :3, :3], np.tile(np.eye(3), (len(path), 1, 1))
             np.testing.assert_allclose(rotation @ np.swapaxes(rotation, 1, 2), identity, atol=1e-9)
             moved[freedom] = max(moved[freedom], float(np.abs(pose - pose[0]).max()))
     # One element of a quaternion is its length only.
@@ -96,8 +93,7 @@ def test_commands_take_the_name_of_a_scene(name, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["counts"]["dof"] == len(model.degrees_of_freedom)
     assert told["counts"]["shapes"] == sum(len(body.visuals) for body in model.bodies.values())
-    frame = next(iter(model.bodies))
-    assert main(["fk", f"articulations/{name}", frame, "--json"]) == 0
+    assert main(["fk", f"articulations/{name}", next(iter(model.bodies)), "--json"]) == 0
     assert np.shape(json.loads(capsys.readouterr().out)["transform"]) == (4, 4)
 
 
@@ -161,8 +157,7 @@ def test_unknown_scene_error_suggests_names():
     }.items():
         with pytest.raises(UnknownNameError, match=f"Did you mean .*'{meant}'") as caught:
             kv.load(name)
-        suggested = re.findall("'([^']*)'", str(caught.value).split("Did you mean")[1].split("?")[0])
-        for one in suggested:
+        for one in re.findall("'([^']*)'", str(caught.value).split("Did you mean")[1].split("?")[0]):
             kv.load(one)  # each can be typed as it is told
     with pytest.raises(UnknownNameError, match=r"no model 'articulations/zzz'\. Available: .*jansen_leg"):
         kv.load("articulations/zzz")

@@ -20,8 +20,7 @@ def body(*geometries: Geometry, at: tuple[float, float, float] = (0, 0, 0)) -> B
 
 def arm_among_boxes(links: int = 5, boxes: int = 8, seed: int = 0) -> kv.Model:
     """A chain of capsules with a hand of two shapes that slides on a rail, among boxes; and a free ball."""
-    rng = np.random.default_rng(seed)
-    model = kv.Model()
+    rng, model = np.random.default_rng(seed), kv.Model()
     with model.edit() as edit:
         rail = kv.position("rail")
         edit.add_frame("base", "world", kv.translation(rail, 0, 0.1), body(Box((0.2, 0.2, 0.2))))
@@ -49,8 +48,7 @@ def random_state(model: kv.Model, rng: np.random.Generator) -> kv.State:
 
 def brute_force(scene: Scene, state: kv.State) -> dict[tuple[str, str], float]:
     """Return the distances of all checked pairs of bodies, every pair of shapes measured."""
-    model = scene.model
-    placed = []
+    model, placed = scene.model, []
     for name in scene.bodies:
         world_T_body = model.fk(name)(state)
         shapes = model.bodies[name].collisions or model.bodies[name].visuals

@@ -1,7 +1,5 @@
 """Convex decomposition: results of CoACD, the cache, and the measured accuracy."""
 
-from __future__ import annotations
-
 import functools
 import os
 import signal
@@ -118,8 +116,7 @@ def test_decomposition_excess_is_within_the_error(name):
     # An oracle of its own: the hulls' corners outside of the mesh, and how far they are from it.
     corners = np.concatenate(result.hulls)
     _, distances, _ = trimesh.proximity.closest_point(mesh, corners)
-    solid = trimesh.boolean.union(mesh.split(), engine="manifold")
-    outside = ~solid.contains(corners)
+    outside = ~trimesh.boolean.union(mesh.split(), engine="manifold").contains(corners)
     assert distances[outside].max(initial=0.0) <= result.accuracy.excess + 2e-5
 
 
@@ -261,8 +258,7 @@ def test_find_hulls_without_settings_returns_the_latest(file, plain):
 
 
 def test_decompose_applies_scale_and_mirroring(file, plain):
-    mesh = file(ell(), scale=(-1.0, 2.0, 0.5))
-    (hull,) = decompose(mesh).decomposition.hulls
+    (hull,) = decompose(file(ell(), scale=(-1.0, 2.0, 0.5))).decomposition.hulls
     np.testing.assert_allclose(hull.min(axis=0), [-0.2, 0, 0], atol=1e-7)
     np.testing.assert_allclose(hull.max(axis=0), [0, 0.4, 0.025], atol=1e-7)
 

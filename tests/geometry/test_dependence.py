@@ -1,7 +1,5 @@
 """Dependence of bodies and distances on symbols."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scene_models import arm_among_boxes, body, brute_force, random_state
@@ -54,9 +52,7 @@ def test_bodies_moved_by_a_crank_include_those_of_dependent_coordinates():
 
 def test_pairs_affected_by_contains_every_pair_whose_distance_changes():
     model = arm_among_boxes()
-    scene = Scene(model)
-    rng = np.random.default_rng(0)
-    state = random_state(model, rng)
+    scene, state = Scene(model), random_state(model, np.random.default_rng(0))
     for symbol in ("rail", "j2", "ball/x", "ball/wz:velocity"):
         listed = {frozenset(pair) for pair in scene.pairs_affected_by(symbol)}
         if ":" in symbol:

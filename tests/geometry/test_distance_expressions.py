@@ -1,7 +1,5 @@
 """Distances as expressions: value, gradient against finite differences, across contact, in documents."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scene_models import arm_among_boxes, body, random_state
@@ -26,8 +24,7 @@ def slopes(scene, state, pair, symbols, step=1e-5):
 
 def test_gradient_of_a_distance_expression_matches_finite_differences():
     model = arm_among_boxes()
-    scene = Scene(model)
-    rng = np.random.default_rng(7)
+    scene, rng = Scene(model), np.random.default_rng(7)
     symbols = [kv.position(name) for name in ("rail", "j0", "j1", "j2", "j3", "j4", "ball/x", "ball/y")]
     signs = set()
     for k in range(8):
@@ -119,8 +116,7 @@ def test_gradient_in_a_plane_is_between_the_one_sided_slopes_whichever_body_is_f
 
 def test_distance_expression_as_constraint_survives_a_document(tmp_path):
     model = arm_among_boxes(boxes=2)
-    scene = Scene(model)
-    state = random_state(model, np.random.default_rng(3))
+    scene, state = Scene(model), random_state(model, np.random.default_rng(3))
     scene.update(state)
     distance = scene.expression("hand", "box0")
     with model.edit() as edit:
@@ -133,14 +129,12 @@ def test_distance_expression_as_constraint_survives_a_document(tmp_path):
     # Without other values the parameters have those of where it was made.
     assert constraint.expression(state) == pytest.approx(float(constraint.expression(values)))
     assert "clear" in again.constraints_for(again.fk("hand"))
-    rows = again.velocity_rows(0.1, distance.expression)
-    assert rows is not None
+    assert again.velocity_rows(0.1, distance.expression) is not None
 
 
 def test_distance_expression_reuses_its_symbols():
     model = arm_among_boxes(boxes=2)
-    scene = Scene(model)
-    rng = np.random.default_rng(3)
+    scene, rng = Scene(model), np.random.default_rng(3)
     scene.update(random_state(model, rng))
     one = scene.expression("hand", "box0")
     scene.update(random_state(model, rng))
@@ -151,8 +145,7 @@ def test_distance_expression_reuses_its_symbols():
 
 def test_distance_expressions_of_different_pairs_have_different_symbols():
     """The word that stands between two names may be a part of them too."""
-    model = kv.Model()
-    slide = kv.position("slide")
+    model, slide = kv.Model(), kv.position("slide")
     names = (
         "a",
         "b",

@@ -1,7 +1,5 @@
 """Excluded shapes and pairs with their reasons; surfaces of solids."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -68,8 +66,7 @@ def test_find_unusable_shapes_names_them_and_leave_out_excludes_them(tmp_path):
     # The ball, at (0, 0, 1) of the base, is there, in each of them.
     for name in ("lost", "empty", "flat"):
         found = scene.distance(f"bad/{name}", "box0")
-        only = Scene(model, leave_out=[f"bad/{name}", *problems])
-        assert f"bad/{name}" not in only.bodies
+        assert f"bad/{name}" not in Scene(model, leave_out=[f"bad/{name}", *problems]).bodies
         assert found.shape_a == 0
     assert find_unusable_shapes(arm_among_boxes()) == {}
 
@@ -110,8 +107,7 @@ def test_excluded_pairs_have_a_reason_and_checked_pairs_none():
 @given(st.integers(0, 2**32 - 1), st.integers(4, 60))
 def test_solid_surface_of_a_hull_is_closed_and_faces_outwards(seed, count):
     points = np.random.default_rng(seed).normal(size=(count, 3))
-    solid = solid_from_geometry(Box((1, 1, 1)))
-    assert solid_surface(solid) == Box((1, 1, 1))
+    assert solid_surface(solid_from_geometry(Box((1, 1, 1)))) == Box((1, 1, 1))
     surface = solid_surface(solid_from_points(points))
     a, b, c = np.moveaxis(surface.vertices[surface.faces], 1, 0)
     # By the divergence theorem; a face turned inward would take its part away.

@@ -1,7 +1,5 @@
 """Support functions and the search for the widest gap, against closed forms."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -34,8 +34,7 @@ def saved(mesh: trimesh.Trimesh, folder, name: str) -> Mesh:
 
 @pytest.mark.parametrize("ending", ["stl", "obj", "dae", "ply"])
 def test_mesh_is_its_hull_or_its_triangles(tmp_path, ending):
-    torus = trimesh.creation.torus(0.5, 0.1)
-    mesh = saved(torus, tmp_path, f"torus.{ending}")
+    mesh = saved(trimesh.creation.torus(0.5, 0.1), tmp_path, f"torus.{ending}")
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("torus", "world", kv.translation(0, 0, kv.position("z")), body(mesh))
@@ -218,8 +217,7 @@ def test_scale_with_a_factor_of_zero_is_refused(tmp_path, scale):
 
 def test_mesh_file_above_the_limit_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_files, "LARGEST_FILE", 100)
-    mesh = saved(trimesh.creation.icosphere(), tmp_path, "large.stl")
-    check(with_a_bad_one(mesh), "large.stl", "MiB")
+    check(with_a_bad_one(saved(trimesh.creation.icosphere(), tmp_path, "large.stl")), "large.stl", "MiB")
 
 
 def test_error_lists_several_unusable_shapes(tmp_path):
@@ -233,8 +231,7 @@ def test_error_lists_several_unusable_shapes(tmp_path):
 
 
 def test_update_with_poses_that_are_not_finite_moves_nothing():
-    model = kv.Model()
-    x = kv.position("x")
+    model, x = kv.Model(), kv.position("x")
     with model.edit() as edit:
         edit.add_frame("odd", "world", kv.translation(np.sqrt(x), 0, 0), body(Box((1, 1, 1))))
         edit.add_frame("ball", "world", kv.translation(3, 0, 0), body(Sphere(0.5)))

@@ -1,7 +1,5 @@
 """Distances of pairs against MuJoCo, and against the definition of a distance."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 import sys
@@ -197,8 +195,7 @@ def test_distances_scale_with_the_solids(one, other, shapes):
         for spread in (0.05, 0.3):
             poses = np.stack([random_pose(rng, spread), random_pose(rng, spread)])
             distance, *_ = measured(a, b, poses)
-            there = poses * (1, 1, 1, factor)
-            narrow = Narrowphase(small, there)
+            narrow = Narrowphase(small, poses * (1, 1, 1, factor))
             assert narrow.distance(0, 1) / factor == pytest.approx(distance, abs=3e-5)
             point_a, point_b, normal = narrow.witness()
             assert normal @ (point_b - point_a) == pytest.approx(factor * distance, abs=3e-5 * factor)
@@ -229,8 +226,7 @@ def test_triangle_meshes_have_distances_and_contact_normals():
 
 
 def test_distances_of_a_triangle_mesh_match_its_hull(shapes):
-    rng = np.random.default_rng(11)
-    apart = 0
+    rng, apart = np.random.default_rng(11), 0
     for _ in range(150):
         a, b = shapes["hull"][rng.integers(EACH)], shapes["hull"][rng.integers(EACH)]
         poses = np.stack([random_pose(rng, 0.4), random_pose(rng, 0.4)])

@@ -1,7 +1,5 @@
 """Distances against Bullet, which keeps a margin of a millimetre around or inside most of its shapes."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -32,8 +30,7 @@ EACH, SAMPLES, RADIUS = 3, 60, 0.1
 @pytest.fixture(scope="module")
 def shapes():
     """Shapes by their kind, each with its number in Bullet."""
-    rng = np.random.default_rng(5)
-    client = bullet.connect(bullet.DIRECT)
+    rng, client = np.random.default_rng(5), bullet.connect(bullet.DIRECT)
     yield {
         kind: [(shape, body_of(shape, client)) for shape in (random_shape(kind, rng) for _ in range(EACH))]
         for kind in FURTHER

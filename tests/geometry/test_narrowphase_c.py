@@ -1,7 +1,5 @@
 """Distances in C: bounded by their witnesses, equal to coal's, and to brute force in a scene."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -172,8 +170,7 @@ def test_depth_of_polytopes_matches_their_minkowski_difference(seed, kinds, spre
         (shape.points if shape.kind == "hull" else CORNERS * shape.sizes) @ pose[:, :3].T + pose[:, 3]
         for shape, pose in zip(shapes, poses, strict=True)
     ]
-    differences = (corners[1][None] - corners[0][:, None]).reshape(-1, 3)
-    heights = -ConvexHull(differences).equations[:, 3]
+    heights = -ConvexHull((corners[1][None] - corners[0][:, None]).reshape(-1, 3)).equations[:, 3]
     distance, _ = measured(placed(shapes, poses))
     if heights.min() > 1e-6:
         assert distance == pytest.approx(-heights.min(), abs=1e-8)
@@ -202,8 +199,7 @@ def test_static_pairs_are_not_measured_again():
     scene, fresh = Scene(model), Scene(model)
     for s in (scene, fresh):
         s.update(state)
-    found = scene.pairs_within(0.3)
-    memory = scene.collision_world.table.memory
+    found, memory = scene.pairs_within(0.3), scene.collision_world.table.memory
     assert (memory["pair"] > 0).sum() >= len(found) > 5
     memory["numbers"][:, 2] += 1.0
     np.testing.assert_allclose(
@@ -262,8 +258,7 @@ def test_rank_pairs_agrees_in_numpy_and_c(seed, count, radius):
 
 
 def test_measure_without_a_compiler_leaves_all_pairs_to_coal():
-    library = CollisionLibrary()
-    rng = np.random.default_rng(0)
+    library, rng = CollisionLibrary(), np.random.default_rng(0)
     table = placed([random_shape("box", rng)] * 2, [random_pose(rng, 1.0) for _ in range(2)])
     distances, _ = library.measure(table, np.array([[0, 1]], dtype=np.int32), 1.0)
     assert np.isnan(distances).all()
@@ -282,8 +277,7 @@ def narrower():
 @given(counts=st.tuples(*[st.integers(8, 90)] * 2), seed=seeds, spread=st.sampled_from([0.0, 0.3, 2.0]))
 def test_support_of_many_corners_is_independent_of_the_vector_width(narrower, counts, seed, spread):
     """Each corner is the furthest one in its direction: a ball of them leaves none out of what is measured."""
-    rng = np.random.default_rng(seed)
-    solids = []
+    rng, solids = np.random.default_rng(seed), []
     for count in counts:
         points = rng.normal(size=(count, 3))
         solids.append(_hull_solid(np.round(points / np.linalg.norm(points, axis=1)[:, None], 1 + seed % 8)))

@@ -20,7 +20,6 @@ def model():
 
 @pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
 def either_search(request, monkeypatch):
-    """Search in numpy and in C."""
     library = bindings.CollisionLibrary()
     if request.param == "c":
         assert library.prepare(wait=True)
@@ -129,8 +128,7 @@ def test_motions_match_a_query_at_each_configuration(rows, monkeypatch, tmp_path
             distances.append(near.distances[0] if len(near) else np.inf)
         scene.update(state)
         assert query.least_distance(coordinates, Q, radius) == min(distances)
-        before = query(1.0).distances
-        first = query.first_within(coordinates, Q, radius)
+        before, first = query(1.0).distances, query.first_within(coordinates, Q, radius)
         assert first == next((k for k, d in enumerate(distances) if d <= radius), None)
         if first is None:
             assert np.array_equal(query(1.0).distances, before)
@@ -195,12 +193,9 @@ def test_neighbours_are_found_by_boxes_of_bodies_or_by_a_sweep(shapes):
             edit.add_frame(
                 f"body{k}", "carriage" if k % 3 else "world", at, body=Body(collisions=tuple(parts))
             )
-    scene = Scene(model)
-    watch = scene.watch(radius=0.4, moving=[rail])
-    counts = set()
+    watch, counts = Scene(model).watch(radius=0.4, moving=[rail]), set()
     for value in np.cumsum(rng.normal(0.0, 0.2, 40)):
-        found = watch.at(np.array([value]))
-        fresh = Scene(model)
+        found, fresh = watch.at(np.array([value])), Scene(model)
         fresh.update({rail: value})
         want = fresh.watch(radius=0.4, moving=[rail])()
         np.testing.assert_array_equal(found.body_indices, want.body_indices)
@@ -243,8 +238,7 @@ def test_watch_matches_a_query_from_scratch_along_a_random_motion(model, step, m
     assert library.prepare(wait=True)
     for module in (collision_world, distance_queries):
         monkeypatch.setattr(module, "collision_library", library)
-    searches = []
-    scene = Scene(model)
+    searches, scene = [], Scene(model)
     watches = [scene.watch("link*", radius=0.1), scene.watch(radius=0.1, moving="j2", per_shape=True)]
     fresh = Scene(model)
     anew = [fresh.watch("link*", radius=0.1), fresh.watch(radius=0.1, moving="j2", per_shape=True)]

@@ -1,7 +1,5 @@
 """Rays against MuJoCo and trimesh, points against the definition of a distance."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest
@@ -25,8 +23,7 @@ def test_ray_hits_match_mujoco(kind):
     tolerance = 1e-3 if kind == "cone" else 1e-9  # theirs is a pyramid of 256 sides
     normal, hits, number = np.zeros(3), 0, np.zeros(1, dtype=np.int32)
     for _ in range(300):
-        k = int(rng.integers(4))
-        pose = random_pose(rng, 0.3)
+        k, pose = int(rng.integers(4)), random_pose(rng, 0.3)
         pairs._place(k, pose)
         # Only one of them is in the way.
         for other in range(4):
@@ -90,22 +87,19 @@ def test_point_distance_matches_the_support_function(kind):
 
 def test_ray_returns_the_first_of_several_hits():
     model = arm_among_boxes()
-    scene = Scene(model)
-    rng = np.random.default_rng(2)
+    scene, rng = Scene(model), np.random.default_rng(2)
     hits = 0
     for _ in range(10):
         state = random_state(model, rng)
         scene.update(state)
         origin = rng.normal(size=3) * 2
         way = 0.2 * rng.normal(size=3) - origin
-        hit = scene.ray(origin, way, 5.0)
-        near = scene.point(origin + 0.5 * way)
+        hit, near = scene.ray(origin, way, 5.0), scene.point(origin + 0.5 * way)
         assert near is not None
         assert (near.distance < 0) == near.inside
         alone = []
         for name in scene.bodies:
-            others = [other for other in scene.bodies if other != name]
-            single = Scene(model, leave_out=others)
+            single = Scene(model, leave_out=[other for other in scene.bodies if other != name])
             single.update(state)
             if (found := single.ray(origin, way, 5.0)) is not None:
                 alone.append((found.distance, found.body))

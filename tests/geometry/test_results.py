@@ -1,7 +1,5 @@
 """Sequences of distance results, whose entries are made on access."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scene_models import arm_among_boxes, random_state

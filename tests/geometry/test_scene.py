@@ -1,7 +1,5 @@
 """Queries of a scene match brute force, at every state, after every edit, in every thread."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 
@@ -22,7 +20,6 @@ def model():
 
 @pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
 def either_broadphase(request, monkeypatch):
-    """Broad phase in numpy and in C."""
     library = bindings.CollisionLibrary()
     if request.param == "c":
         assert library.prepare(wait=True)
@@ -34,15 +31,13 @@ def either_broadphase(request, monkeypatch):
 
 
 def test_pairs_within_match_brute_force(model, either_broadphase):
-    scene = Scene(model)
-    rng = np.random.default_rng(1)
+    scene, rng = Scene(model), np.random.default_rng(1)
     state = random_state(model, rng)
     for step in range(25):
         size = 0.5 if step % 10 == 9 else 0.01
         state = state.updated({s: v + float(rng.normal()) * size for s, v in state.items()})
         scene.update(state)
-        expected = brute_force(scene, state)
-        radius = (0.0, 0.1, 0.4)[step % 3]
+        expected, radius = brute_force(scene, state), (0.0, 0.1, 0.4)[step % 3]
         near = scene.pairs_within(radius)
         want = {frozenset(names): d for names, d in expected.items() if d <= radius}
         assert by_names(near).keys() == want.keys()
@@ -54,8 +49,7 @@ def test_pairs_within_match_brute_force(model, either_broadphase):
 
 @pytest.mark.parametrize("jump", [1e5, 1e12])
 def test_pairs_within_are_exact_after_jumps_of_any_size(model, either_broadphase, jump):
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     for rail in (0.0, jump, *(np.arange(8) * 3e-5).tolist()):
         there = state.updated({"rail": rail})
         scene.update(there)
@@ -67,8 +61,7 @@ def test_pairs_within_are_exact_after_jumps_of_any_size(model, either_broadphase
 
 
 def test_update_refuses_poses_that_are_too_far_away(model, either_broadphase):
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     scene.update(state)
     near = by_names(scene.pairs_within(0.3))
     for rail in (1e13, 1e200):
@@ -84,31 +77,26 @@ def test_update_refuses_poses_that_are_too_far_away(model, either_broadphase):
 
 
 def test_bounds_spare_most_distance_computations(model):
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     scene.update(state)
     scene.pairs_within(0.3)
     before = scene.collision_world.narrowphase.calls
     for k in range(20):
         scene.update(state.updated({"j0": 0.002 * k}))
         scene.pairs_within(0.3)
-    measured = (scene.collision_world.narrowphase.calls - before) / 20
-    assert measured < 0.3 * len(brute_force(scene, state))
+    assert (scene.collision_world.narrowphase.calls - before) / 20 < 0.3 * len(brute_force(scene, state))
 
 
 def test_distances_to_and_distances_match_brute_force(model):
-    scene = Scene(model)
-    state = random_state(model, np.random.default_rng(4))
+    scene, state = Scene(model), random_state(model, np.random.default_rng(4))
     scene.update(state)
-    expected = brute_force(scene, state)
-    around = scene.distances_to("hand")
+    expected, around = brute_force(scene, state), scene.distances_to("hand")
     assert all(r.a == "hand" for r in around)
     assert {r.b: pytest.approx(r.distance, abs=1e-6) for r in around} == {
         (set(names) - {"hand"}).pop(): d for names, d in expected.items() if "hand" in names
     }
     assert [r.b for r in scene.distances_to("hand", around[1].distance)] == [r.b for r in around[:2]]
-    pairs = [("hand", "box0"), ("box0", "hand"), ("box1", "box2")]
-    one, other, boxes = scene.distances(pairs)
+    one, other, boxes = scene.distances([("hand", "box0"), ("box0", "hand"), ("box1", "box2")])
     assert (one.a, one.b, other.a, other.b) == ("hand", "box0", "box0", "hand")
     assert one.distance == other.distance
     np.testing.assert_array_equal(one.point_a, other.point_b)
@@ -136,8 +124,7 @@ def test_results_do_not_depend_on_earlier_queries(model):
 
 
 def test_self_pairs_and_pairs_between_select_subtrees(model):
-    scene = Scene(model)
-    state = random_state(model, np.random.default_rng(8))
+    scene, state = Scene(model), random_state(model, np.random.default_rng(8))
     scene.update(state)
     everything = by_names(scene.pairs_within(0.5))
     own = {f"link{k}" for k in range(5)} | {"base", "hand"}
@@ -206,8 +193,7 @@ def counted(monkeypatch):
 
 def test_edit_rebuilds_only_the_objects_it_changes(counted):
     model = arm_among_boxes()
-    scene = Scene(model)
-    state = random_state(model, np.random.default_rng(3))
+    scene, state = Scene(model), random_state(model, np.random.default_rng(3))
     scene.update(state)
     scene.pairs_within(0.3)
 
@@ -215,8 +201,7 @@ def test_edit_rebuilds_only_the_objects_it_changes(counted):
         counted.update(dict.fromkeys(counted, 0))
         with model.edit() as edit:
             change(edit)
-        near = scene.pairs_within(0.3)
-        fresh = Scene(model)
+        near, fresh = scene.pairs_within(0.3), Scene(model)
         work = dict(counted)
         fresh.update({**state, **{s: model.default_state()[s] for s in model.symbols if s not in state}})
         assert by_names(near) == by_names(fresh.pairs_within(0.3))
@@ -263,8 +248,7 @@ def test_scenes_of_a_model_share_compiled_poses_until_it_is_edited(counted):
 
 def test_attached_body_moves_with_its_new_parent():
     model = arm_among_boxes(boxes=1)
-    state = random_state(model, np.random.default_rng(5))
-    scene = Scene(model)
+    state, scene = random_state(model, np.random.default_rng(5)), Scene(model)
     scene.update(state)
     assert scene.checks_pair("hand", "box0")
     with model.edit() as edit:
@@ -281,8 +265,7 @@ def test_attached_body_moves_with_its_new_parent():
 
 def test_pose_is_current_right_after_an_edit():
     model = arm_among_boxes(boxes=1)
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     scene.update(state)
     with model.edit() as edit:
         edit.attach("box0", "hand", kv.translation(0, 0, 0.3))
@@ -347,8 +330,7 @@ def test_adjacent_bodies_are_not_checked(model):
 
 
 def test_door_is_adjacent_to_its_cupboard_and_not_to_the_wall():
-    model = kv.load("kitchen")
-    scene = Scene(model)
+    scene = Scene(kv.load("kitchen"))
     assert not scene.checks_pair("kitchen/fridge_door", "kitchen/fridge")
     assert scene.checks_pair("kitchen/fridge_door", "kitchen/wall")
 

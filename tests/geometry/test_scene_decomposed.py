@@ -1,7 +1,5 @@
 """Scenes with decomposed meshes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -19,8 +17,7 @@ def model(tmp_path, monkeypatch):
     """A ball of 1 cm that goes up from the floor of a tray, which is turned about z by a right angle."""
     monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "cache"))
     tray().export(tmp_path / "tray.stl")
-    turned = Pose.from_matrix(kv.rotation_z(np.pi / 2))
-    model = kv.Model()
+    turned, model = Pose.from_matrix(kv.rotation_z(np.pi / 2)), kv.Model()
     with model.edit() as edit:
         shape = Shape(Mesh("tray.stl", folder=str(tmp_path)), turned)
         edit.add_frame("tray", parent="world", transform=kv.rotation_x(0.0), body=Body(collisions=(shape,)))
@@ -30,8 +27,7 @@ def model(tmp_path, monkeypatch):
 
 
 def test_decomposed_tray_is_hollow_and_its_hull_is_not(model):
-    tray_mesh = model.bodies["tray"].collisions[0].geometry
-    decompose(tray_mesh)
+    decompose(model.bodies["tray"].collisions[0].geometry)
     scenes = [kv.geometry.Scene(model, decomposed=which) for which in ((), ("t*",))]
     for height in (0.0, 0.03, 0.2):
         for scene in scenes:

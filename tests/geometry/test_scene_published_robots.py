@@ -1,7 +1,5 @@
 """Scenes of published robots and kitchens with their meshes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scene_models import brute_force, by_names
@@ -14,8 +12,7 @@ from kineverse.geometry import Scene
 def test_scene_of_the_shipped_robot_and_kitchen():
     model = kv.load("kitchen")
     model.include("fetch")
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     rng = np.random.default_rng(0)
     robot = [s for s in model.degrees_of_freedom if str(s).startswith("fetch/")]
     for step in range(3):
@@ -37,11 +34,9 @@ def test_scene_of_the_pr2_in_the_iai_kitchen(monkeypatch, published):
     packages = [published("pr2"), published("iai_kitchen")]
     monkeypatch.setenv("KINEVERSE_PACKAGE_PATH", ":".join(map(str, packages)))
     robot = next(path for path in packages[0].rglob("*.urdf"))
-    kitchen = next(path for path in packages[1].rglob("kitchen.urdf"))
-    model = kv.load(str(kitchen), prefix="kitchen")
+    model = kv.load(str(next(path for path in packages[1].rglob("kitchen.urdf"))), prefix="kitchen")
     model.include(str(robot), prefix="pr2")
-    scene = Scene(model)
-    state = model.default_state()
+    scene, state = Scene(model), model.default_state()
     scene.update(state)
     assert len(scene.bodies) > 150
     moved = scene.bodies_moved_by("pr2/torso_lift_joint")

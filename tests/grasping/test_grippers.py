@@ -72,8 +72,7 @@ def test_pads_of_known_fingers(motions: str, axes: str) -> None:
         hand[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.5, 0.4]).as_matrix()
     elif axes == "zxy":
         hand[:3, :3] = np.eye(3)[:, [2, 0, 1]]
-    model = hand_of_boxes(motions, hand)
-    gripper = find_gripper(model, "r")
+    gripper = find_gripper(hand_of_boxes(motions, hand), "r")
     assert gripper.hand == "r/hand"
     assert set(gripper.bodies) == {"r/hand", "r/right", "r/left"}
     pose = hand @ gripper.grasp_pose  # with x out of the hand and y across, wherever the hand's frame points
@@ -107,8 +106,7 @@ def test_gaps_of_the_shipped_grippers(robot: str) -> None:
         assert find_gripper(model, "pr2", "pr2/l_gripper_tool_frame").hand == "pr2/l_gripper_palm_link"
     for gap in (0.003, 0.015, 0.03, gripper.width):
         scene.update(model.default_state().updated(gripper.values_at(gap)))
-        near = scene.distance(*gripper.pads.frames)
-        assert near.distance == pytest.approx(gap, abs=6e-4)
+        assert scene.distance(*gripper.pads.frames).distance == pytest.approx(gap, abs=6e-4)
         # Between the pads stands the grasp pose: rays along y hit one finger on each side, equally far.
         pose = scene.pose(gripper.hand) @ gripper.grasp_pose_at(gap)
         for finger, sign in zip(gripper.fingers, (-1.0, 1.0), strict=True):
@@ -189,8 +187,7 @@ def test_fingers_without_readable_shapes_are_where_their_frames_are() -> None:
 def test_published_grippers(
     path: str, hand: str, joints: list[str], width: float, published: Callable[..., Path]
 ) -> None:
-    model = kv.load(str(published(*path.split("/"))), prefix="r")
-    gripper = find_grippers(model, "r")[0]
+    gripper = find_grippers(kv.load(str(published(*path.split("/"))), prefix="r"), "r")[0]
     assert gripper.hand == f"r/{hand}"
     assert [str(s) for s in gripper.joints] == [f"r/{name}" for name in joints]
     assert gripper.width == pytest.approx(width, abs=1e-3)

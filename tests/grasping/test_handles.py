@@ -102,8 +102,7 @@ def test_handles_of_the_shipped_kitchen(every: int) -> None:
     model = kv.load("kitchen")
     state = model.default_state()
     for coordinate in model.degrees_of_freedom[::every]:
-        handle = find_handle(model, coordinate)
-        name = str(coordinate)
+        handle, name = find_handle(model, coordinate), str(coordinate)
         assert handle.frame == (name if "knob" in name else f"{name}_handle")
         assert handle.clearance > 0.005
         # The bar points into the room, which lies between the fronts at x = 1.2 and the island at x = -0.9.

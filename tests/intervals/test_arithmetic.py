@@ -1,7 +1,5 @@
 """Interval operations enclose the values of numbers from the intervals."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """Enclosures of implicit functions contain their solutions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Taylor coefficients over an interval enclose those at its points, which automatic differentiation gives."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -126,8 +126,7 @@ def delta_by_spheres(motors: np.ndarray) -> np.ndarray:
     """Return where the platform is: the lower intersection of three spheres."""
     centres = []
     for i, q in enumerate(motors):
-        angle = 2 * math.pi * i / 3
-        reach = BASE + UPPER * math.cos(q) - PLATFORM
+        angle, reach = 2 * math.pi * i / 3, BASE + UPPER * math.cos(q) - PLATFORM
         centres.append([reach * math.cos(angle), reach * math.sin(angle), -UPPER * math.sin(q)])
     c = np.array(centres)
     ex = (c[1] - c[0]) / np.linalg.norm(c[1] - c[0])
@@ -136,8 +135,7 @@ def delta_by_spheres(motors: np.ndarray) -> np.ndarray:
     ey /= np.linalg.norm(ey)
     d, j = np.linalg.norm(c[1] - c[0]), ey @ (c[2] - c[0])
     x, y = d / 2, (i * i + j * j) / (2 * j) - i / j * d / 2
-    z = math.sqrt(FOREARM**2 - x * x - y * y)
-    ez = np.cross(ex, ey)
+    z, ez = math.sqrt(FOREARM**2 - x * x - y * y), np.cross(ex, ey)
     return c[0] + x * ex + y * ey - math.copysign(z, ez[2]) * ez
 
 

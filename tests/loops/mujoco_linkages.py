@@ -22,8 +22,7 @@ def as_mujoco(model: kv.Model) -> tuple[mujoco.MjModel, mujoco.MjData, list[str]
             body, above = place[operation.parent]
             numbers = _pose(above @ operation.origin.matrix)
             kind = "hinge" if isinstance(operation, kv.Revolute) else "slide"
-            axis = " ".join(map(repr, map(float, operation.axis)))
-            name = operation.child
+            axis, name = " ".join(map(repr, map(float, operation.axis))), operation.child
             heads[name] = (
                 f'<body name="{name}" {numbers}><joint name="{operation.name}" type="{kind}" axis="{axis}"/>'
             )

@@ -1,19 +1,11 @@
 """Closed loops in a model: what is free, what follows, what limits mean, and how all of it is edited and sent."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 from linkages import at, bar, four_bar, four_bar_by_circles, limited_four_bar, slider_crank
-from loop_checks import (
-    assert_closed,
-    assert_moves_as_its_jacobian_says,
-    function,
-    record,
-    residual,
-)
+from loop_checks import assert_closed, assert_moves_as_its_jacobian_says, function, record, residual
 
 import kineverse as kv
 
@@ -80,16 +72,14 @@ def test_of_two_branches_that_are_equally_near_rounding_does_not_choose(rounding
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_home_says_which(side):
-    home = {"crank": 0.3, "coupler": 0.6 * side, "rocker": 1.4 * side}
-    bars = four_bar(home=home)
+    bars = four_bar(home={"crank": 0.3, "coupler": 0.6 * side, "rocker": 1.4 * side})
     for angle in (-2.0, 0.3, 5.0):
         wanted = four_bar_by_circles(angle, side=side)
         np.testing.assert_allclose(bars.fk("rocker_tip")({"crank": angle})[:2, 3], wanted, rtol=0, atol=1e-11)
 
 
 def test_home_may_be_turns_away():
-    home = {"crank": 0.3 + 4 * np.pi, "coupler": 0.6, "rocker": 1.4 - 2 * np.pi}
-    bars = four_bar(home=home)
+    bars = four_bar(home={"crank": 0.3 + 4 * np.pi, "coupler": 0.6, "rocker": 1.4 - 2 * np.pi})
     assert bars.rates.carried(rocker)({"crank": 0.3}) == pytest.approx(1.4 - 2 * np.pi, abs=0.3)
     assert_closed(bars, 100)
 
@@ -217,8 +207,7 @@ def test_expressions_move_as_their_gradients_say(model):
     """ė and ë of something about pose and followers, along a motion of the crank."""
     e = model.fk("coupler_tip")[0, 3] * model.rates.carried(rocker) + np.sin(model.rates.carried(coupler))
     first = e.gradient()[crank.derivative()]
-    second = first.gradient()[crank.derivative()]
-    f = function(model, e, first, second)
+    f = function(model, e, first, first.gradient()[crank.derivative()])
     for q in np.linspace(-6, 6, 25):
         before, now, after = (f([q + s]) for s in (-1e-4, 0, 1e-4))
         assert now[1] == pytest.approx((after[0] - before[0]) / 2e-4, abs=1e-6)
@@ -359,8 +348,7 @@ def test_many_inputs():
 
 def test_the_guess_is_periodic_over_full_revolutions():
     """A guess that grew by what rounding leaves of 0 would have no period."""
-    model = slider_crank()
-    (loop,) = model.rates.dependent[kv.position("piston")]._nodes
+    (loop,) = slider_crank().rates.dependent[kv.position("piston")]._nodes
     guess = kv.compile(loop.function.seed[1])
     # Two angles that are the same number, as sine and cosine see it, but a rate of 1e-16 [m/rad] does not.
     far = 1e17
@@ -373,8 +361,7 @@ def test_the_guess_is_periodic_over_full_revolutions():
 def test_branches_that_come_close_are_told_apart(names, lower, upper):
     # The bars are nearly in line on the way. Of twins no determinant shows that both change their branch.
     a, b, c = 0.5707049918, 0.9098700426, 0.6058904411
-    d = b + c - a - 1e-5
-    model = kv.Model()
+    d, model = b + c - a - 1e-5, kv.Model()
     with model.edit() as edit:
         bar(edit, "crank", "world", at(0), lower=lower, upper=upper)
         for name in names:

@@ -1,7 +1,5 @@
 """Steps of Newton's method, against the singular value decomposition of LAPACK."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -124,8 +124,7 @@ def test_a_loop_constraint_follows_earlier_edits_also_without_its_code(tmp_path)
 
 def test_documents_under_a_prefix(tmp_path):
     kept().save(tmp_path / "bars.kv.json")
-    read = kv.load(tmp_path / "bars.kv.json", prefix="left")
-    (loop,) = find_loops(read)
+    (loop,) = find_loops(kv.load(tmp_path / "bars.kv.json", prefix="left"))
     assert loop.constraints == ("left/four-bar/x", "left/four-bar/y")
     assert loop.ends == (("left/coupler_tip", "left/rocker_tip"),)
 
@@ -142,8 +141,7 @@ def test_mjcf_says_it_as_an_equality_and_urdf_names_it(tmp_path):
     pytest.importorskip("mujoco")
     model = kept()
     assert model.save(tmp_path / "bars.xml").remarks == ()
-    text = (tmp_path / "bars.xml").read_text()
-    assert text.count("<connect ") == 1
+    assert (tmp_path / "bars.xml").read_text().count("<connect ") == 1
     read = kv.load(tmp_path / "bars.xml")
     assert set(read.constraints) == set(model.constraints)
     assert read.degrees_of_freedom == model.degrees_of_freedom
@@ -166,8 +164,7 @@ def test_velocity_rows_keep_it_closed():
     model = kept()
     rows = model.velocity_rows(0.1)
     ask = kv.compile([rows.matrix, rows.lower, rows.upper], model.degrees_of_freedom, tier="interpreter")
-    closed = model.project(STATE)
-    for state, is_closed in ((closed, True), (STATE, False)):
+    for state, is_closed in ((model.project(STATE), True), (STATE, False)):
         matrix, lower, upper = ask([state[str(s)] for s in model.degrees_of_freedom])
         for axis in "xy":
             sides = [i for i, n in enumerate(rows.names) if n == f"four-bar/{axis}"]
@@ -187,8 +184,7 @@ def test_velocity_rows_keep_it_closed():
 @pytest.mark.parametrize("kind", [kv.CloseLoop, kv.loops.LoopConstraint])
 def test_masks_and_ends_are_given_alike(kind):
     one = kind(name="l", frame="a", mask="xz", more=[["b", "c"]])
-    other = kind(name="l", frame="a", mask=["x", "z"], more=(("b", "c"),))
-    assert one == other
+    assert one == kind(name="l", frame="a", mask=["x", "z"], more=(("b", "c"),))
     assert (one.mask, one.more) == (("x", "z"), (("b", "c"),))
     for wrong in (5, "bc", ("b", "c"), [("b",)], [("b", "c", "d")], [(1, 2)], None):
         with pytest.raises(

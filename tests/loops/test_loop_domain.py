@@ -49,8 +49,7 @@ def function_of(model: kv.Model, follower: str) -> ImplicitFunction:
 def numbers(expression: kv.Expression, points: Array) -> Array:
     """Return the values of a vector of one symbol, NaN where evaluation is an error."""
     (symbol,) = expression.symbols
-    column = ca.Function("e", [symbol._sx], [dense_column(expression)])
-    return np.array(column(points[None, :])).T
+    return np.array(ca.Function("e", [symbol._sx], [dense_column(expression)])(points[None, :])).T
 
 
 def test_beyond_the_margin_it_is_an_error_that_says_how_far_it_holds(narrow):
@@ -123,8 +122,7 @@ def test_a_four_bar_is_on_its_branch_or_an_error(a, b, c, d, crank, half, up):
             across = side * np.sqrt(b * b - along**2)
         return (pin + (along * way + across * np.stack([-way[1], way[0]])) / distance).T
 
-    edges = circles(np.linspace(crank - half, crank + half, 201))
-    if np.isnan(edges).any():
+    if np.isnan(circles(np.linspace(crank - half, crank + half, 201))).any():
         return
     try:
         model = four_bar(
@@ -151,8 +149,7 @@ def test_a_slider_crank_is_on_its_branch_or_an_error(crank, rod, middle, half):
         model = slider_crank(crank, rod, within={"crank": (middle - half, middle + half)})
     except kv.errors.NoSolutionError:
         return
-    piston = kv.array([model.rates.carried(kv.position("piston"))])
-    check_everywhere(model, piston, middle, half, slide)
+    check_everywhere(model, kv.array([model.rates.carried(kv.position("piston"))]), middle, half, slide)
 
 
 def check_everywhere(
@@ -259,8 +256,7 @@ def test_rows_lead_back_from_anywhere():
         assert -0.6 - 1e-6 <= crank <= 0.9 + 1e-6
         assert len(model.violations({"crank": crank}, tolerance=1e-6)) == 0
     # Where the loop is known, holding it at the edge changes nothing.
-    inside = model.fk("rocker_tip")({"crank": 1.1})
-    assert np.isfinite(inside).all()
+    assert np.isfinite(model.fk("rocker_tip")({"crank": 1.1})).all()
 
 
 def test_a_domain_fits_its_inputs():

@@ -1,7 +1,5 @@
 """Models with closed loops are edited, copied, saved and heard of like any other."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 
@@ -111,8 +109,7 @@ def test_the_loop_is_replaced_by_its_other_branch(model):
 
 def test_a_loop_follows_an_operation_inserted_before(model):
     """A crank that is moved on the ground before the loop is closed: the loop is closed anew."""
-    ground = kv.translation(0.1, 0, 0)
-    attach = four_bar(close=False)
+    ground, attach = kv.translation(0.1, 0, 0), four_bar(close=False)
     with attach.edit() as edit:
         edit.attach("crank", "world", [ground, kv.rotation_z(crank)], tag="moved")
     operation = attach.history.entry("moved").operation
@@ -200,8 +197,7 @@ def test_made_twice_it_is_the_same(limited, model):
     ],
 )
 def test_documents_keep_every_bit(name, tmp_path):
-    model = GALLERY[name]()
-    path = tmp_path / "linkage.kv.json"
+    model, path = GALLERY[name](), tmp_path / "linkage.kv.json"
     model.save(path)
     read = kv.load(path)
     assert read.snapshot() == model.snapshot()

@@ -1,7 +1,5 @@
 """Loops that cannot be: one error of the project's own that names the loop and the number; nothing happened."""
 
-from __future__ import annotations
-
 import math
 import warnings
 
@@ -94,11 +92,7 @@ def closing(model, frame="coupler_tip", to="rocker_tip", *, name=LOOP, **options
         ({"within": {"crank": (math.nan, 1)}}, InvalidValueError, "'four-bar'.*nan <= crank"),
         ({"within": {"crank": (0, math.nan)}}, InvalidValueError, "'four-bar'.*crank <= nan"),
         ({"within": {"crank": 1}}, InvalidValueError, "Loop 'four-bar' takes home=.*within={'crank': 1}"),
-        (
-            {"within": {"rocker": (0, 2)}},
-            InvalidValueError,
-            "'four-bar' has within=.*'rocker' follows crank",
-        ),
+        ({"within": {"rocker": (0, 2)}}, InvalidValueError, "'four-bar' has within=.*'rocker' follows crank"),
         ({"frame": "lid"}, UnknownNameError, "no frame 'lid'"),
         ({"to": "lid"}, UnknownNameError, "no frame 'lid'"),
         ({"more": (("lid", "crank"),)}, UnknownNameError, "no frame 'lid'"),

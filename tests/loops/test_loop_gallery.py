@@ -1,7 +1,5 @@
 """Nine linkages: closed in every configuration, moving as their Jacobians say, on one branch."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
@@ -124,8 +122,7 @@ def test_second_derivatives(name):
 def test_accelerations_of_the_delta_robot():
     """ẍ = J q̈ + q̇ᵀ H q̇ along a path of the motors."""
     model = linkage("delta robot")
-    motors = model.degrees_of_freedom
-    where = model.fk("platform")[:3, 3]
+    motors, where = model.degrees_of_freedom, model.fk("platform")[:3, 3]
     hessian = function(model, where.jacobian(motors).jacobian(motors))
     along = function(model, where)
     q, v = np.array([0.1, 0.3, 0.2]), np.array([1.0, -0.4, 0.7])
@@ -171,8 +168,7 @@ def test_a_whole_turn_changes_nothing(model):
 
 
 def test_the_four_bar_by_circles():
-    model = linkage("four-bar")
-    sides = set()
+    model, sides = linkage("four-bar"), set()
     for q in configurations(model, 200):
         found = model.fk("rocker_tip")({"crank": q[0]})[:2, 3]
         meetings = [four_bar_by_circles(q[0], side=side) for side in (1, -1)]
@@ -222,8 +218,7 @@ def test_the_height_of_the_scissor_lift():
     points = configurations(model, 60)
     tip = poses(model, "tip", points, "board")[:, :3, 3]
     reach, rise = length * np.cos(points), length * np.sin(points)
-    wanted = np.hstack([reach, stages * rise, 0.03 + 0 * rise])
-    np.testing.assert_allclose(tip, wanted, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(tip, np.hstack([reach, stages * rise, 0.03 + 0 * rise]), rtol=0, atol=1e-12)
     slide = poses(model, "slide", points, "board")[:, 0, 3]
     np.testing.assert_allclose(slide, reach[:, 0], rtol=0, atol=1e-12)
 
@@ -251,8 +246,7 @@ DOOR = [
 @pytest.mark.parametrize(("q", "upper", "lower", "handle", "angle"), DOOR)
 def test_the_folding_door_is_where_the_authors_have_it(q, upper, lower, handle, angle):
     model = linkage("folding door")
-    door = model.fk("door")({"door": q})
-    found_upper = (door @ [0.00229, 0, -0.16637, 1])[[0, 2]]
+    found_upper = (model.fk("door")({"door": q}) @ [0.00229, 0, -0.16637, 1])[[0, 2]]
     np.testing.assert_allclose(found_upper, upper, rtol=0, atol=1e-4)
     for frame, where in (("lower_panel", lower), ("handle", handle)):
         np.testing.assert_allclose(model.fk(frame)({"door": q})[[0, 2], 3], where, rtol=0, atol=1e-4)
@@ -285,8 +279,7 @@ def test_the_bars_of_the_jansen_leg_keep_their_lengths():
         np.testing.assert_allclose(apart, length, rtol=0, atol=1e-11, err_msg=f"{first} to {second}")
     steps = poses(model, "foot", np.linspace(0, 2 * np.pi, 400)[:, None], "board")[:, 1, 3]
     # The leg walks: its foot is near the ground for a good part of each turn.
-    on_ground = np.mean(steps < steps.min() + 0.06 * np.ptp(steps))
-    assert on_ground > 0.25
+    assert np.mean(steps < steps.min() + 0.06 * np.ptp(steps)) > 0.25
 
 
 # -- and by somebody else ----------------------------------------------------------------------------------

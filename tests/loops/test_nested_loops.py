@@ -55,8 +55,7 @@ def test_on_a_moving_base():
         robot.fk("coupler_tip")(values), robot.fk("mount")(values) @ still.fk("coupler_tip")({crank: values[crank]}),
         rtol=0, atol=1e-12,
     )  # fmt: skip
-    relative = robot.jacobian("coupler_tip", "mount")
-    assert relative.shape == (6, 1)
+    assert robot.jacobian("coupler_tip", "mount").shape == (6, 1)
     assert_moves_as_its_jacobian_says_at(robot, "coupler_tip", values)
     assert_moves_as_its_jacobian_says_at(robot, "coupler_tip", values, "mount")
 
@@ -87,8 +86,7 @@ def test_wheels_below():
 
 def test_a_crank_that_a_wheel_drives():
     """Rates of what is free reach what follows."""
-    bars = four_bar()
-    wheel = kv.velocity("wheel")
+    bars, wheel = four_bar(), kv.velocity("wheel")
     with bars.edit() as edit:
         edit.set_rate(crank, {wheel: 0.25})
     assert bars.speeds == (wheel,)

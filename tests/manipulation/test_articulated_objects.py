@@ -1,7 +1,5 @@
 """Kinds of articulated objects, from their motions alone."""
 
-from __future__ import annotations
-
 import pytest
 
 import kineverse as kv

@@ -1,7 +1,5 @@
 """Skills in worlds in which something is wrong: each result says what, and the robot stands within 100 ms."""
 
-from __future__ import annotations
-
 import math
 import re
 import sys

@@ -1,7 +1,5 @@
 """Drives of bases on wheels: ways between walls, and their execution in a world."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -151,8 +151,7 @@ def at_the_door():
     """Return a search of placements before a door, the handle, the initial state and grasps."""
     model = make_model("shelf_door")
     gripper, handle = find_gripper(model, "hsr"), find_handle(model, DOOR)
-    state = start(model)
-    grasps = sample_grasps(model, gripper, handle, 32)
+    state, grasps = start(model), sample_grasps(model, gripper, handle, 32)
     return PlacementSearch(model, gripper, state), handle, state, grasps
 
 
@@ -172,8 +171,7 @@ def test_a_hand_from_below_opens_a_door_that_none_from_across_reaches():
     model = make_model("shelf_door", 1.5)
     gripper, handle, state = find_gripper(model, "hsr"), find_handle(model, DOOR), start(model)
     across = sample_grasps(model, gripper, handle, 32)
-    search = PlacementSearch(model, gripper, state)
-    found = search.find(state, across, 1.2)
+    found = PlacementSearch(model, gripper, state).find(state, across, 1.2)
     assert found.failure == "reach"
     assert found.samples < 600  # no arm reached the handle at all
     world = KinematicWorld(model, "hsr")
@@ -214,8 +212,7 @@ def test_placement_says_how_far_it_leads_and_how_the_hand_goes_away(at_the_door)
 
 def test_a_way_is_made_back_where_it_leads_to_the_target(at_the_door):
     search, handle, state, grasps = at_the_door
-    placement = search.find(state, grasps, 1.0, seed=1)
-    door = handle.coordinate
+    placement, door = search.find(state, grasps, 1.0, seed=1), handle.coordinate
     ended = state.updated({door: 1.01})  # not exactly where the way ends
     back = search.retrace(ended, placement, 0.0)
     assert back is not None
@@ -261,8 +258,7 @@ def test_joints_at_their_limits_leave_the_rest_of_a_step_to_the_others():
     model = kv.load("hsr")
     arm = [s for s in model.symbols_of("hsr/hand_palm_link") if s in model.degrees_of_freedom]
     paths = CartesianPaths(model, "hsr/hand_palm_link", arm, (), np.ones(len(arm)))
-    hand = model.fk("hsr/hand_palm_link")
-    low = paths.lower.copy()
+    hand, low = model.fk("hsr/hand_palm_link"), paths.lower.copy()
     low[~np.isfinite(low)] = 0.0
     target = hand(model.default_state().updated(dict(zip(arm, low.tolist(), strict=True))))
     target[0, 3] -= 0.3  # so that the base has to move
@@ -340,8 +336,7 @@ def test_hand_believes_that_a_locked_door_is_open_where_it_is():
     state = model.default_state().updated({door: 0.5, "microwave/oven/button": 0.006})
     hand = SimpleNamespace(hand="world")
     opener = SimpleNamespace(gripper=hand, search=search, approaches=None, controllers={})
-    motion = HandMotion(SimpleNamespace(state=state), opener, handle, None, 0.0)
-    assert motion.state[door] == 0.5
+    assert HandMotion(SimpleNamespace(state=state), opener, handle, None, 0.0).state[door] == 0.5
 
 
 def test_drawer_that_is_locked_on_the_way_is_said_not_to_move():

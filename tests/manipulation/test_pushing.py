@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kineverse as kv
+from cupboards import box
 from kineverse.articulations import OmniBase
 from kineverse.control.contact_constraints import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
@@ -30,19 +31,11 @@ from kineverse.manipulation.pushing.vectors import move_point
 from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.tracked_belief import TrackedBelief
-from kineverse.model.body import Body, Box, Pose, Shape
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 from kineverse_studies.experiments.table1_push import SHIPPED_KITCHEN, make_push_setup
 
 PUSHER = "robot/finger"
 TIP = kv.array([0.0, 0.0, 0.0])
-
-
-def box(*size: float, at: tuple[float, float, float] = (0, 0, 0)) -> Body:
-    pose = np.eye(4)
-    pose[:3, 3] = at
-    shape = Shape(Box(size), Pose.from_matrix(pose))
-    return Body(visuals=(shape,), collisions=(shape,))
 
 
 @cache
@@ -223,8 +216,7 @@ SENSORS = Sensors.parse("3mm+3mm/m,0.5deg,30Hz")
 def test_push_on_estimates_feels_for_the_object() -> None:
     world = KinematicWorld(room(), "robot", sensors=SENSORS)
     world.reset(opened(door=0.3) | {"robot/base/y": 1.0})
-    belief = TrackedBelief(room(), "robot", SENSORS)
-    outcome = push(Session(world, belief=belief), "door", bodies=PUSHER)
+    outcome = push(Session(world, belief=TrackedBelief(room(), "robot", SENSORS)), "door", bodies=PUSHER)
     assert outcome, outcome.reason
     assert outcome.measures["losses"] <= 1
 
@@ -365,8 +357,7 @@ def test_points_beyond_one_that_was_out_of_reach_are_given_up_too() -> None:
         choice.reset()
         choice.chosen = first
         choice.give_up(False, way)
-        after = choice.choose(start, (0.0, 0.0, 0.0))
-        assert (np.array(after.point) - points[first]) @ way <= 1e-9
+        assert (np.array(choice.choose(start, (0.0, 0.0, 0.0)).point) - points[first]) @ way <= 1e-9
         assert choice.blocked == 1
 
 

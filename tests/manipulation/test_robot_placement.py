@@ -1,7 +1,5 @@
 """A robot is put next to furniture: its names, its base, its place, its start."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -41,8 +39,7 @@ def test_robot_without_a_place_has_none():
 
 def test_names_without_a_prefix_get_that_of_the_file(arm):
     model = kv.load("shelf_door")
-    robot = place_robot(model, arm)
-    assert robot.name == "my_arm"
+    assert place_robot(model, arm).name == "my_arm"
     assert {"my_arm/foot", "my_arm/hand"} <= {*model.frames}
     assert place_robot(kv.Model(), arm, prefix="left").name == "left"
 

@@ -45,8 +45,7 @@ def at(model: Model, **values: float) -> State:
 @pytest.mark.parametrize("number", range(6))
 def test_obstacles_are_those_that_coal_finds_along_the_way(number: int, tmp_path: Path) -> None:
     """Cupboards of a generator, with shapes, motions and distances of its own."""
-    drawn = random_cupboards.draw_cupboard(number, seed=7)
-    path = tmp_path / "cupboard.urdf"
+    drawn, path = random_cupboards.draw_cupboard(number, seed=7), tmp_path / "cupboard.urdf"
     path.write_text(drawn.urdf(), encoding="utf-8")
     model, others = kv.load(path), {f"{name}_joint": value for name, value in drawn.values.items()}
     state = at(model, front_joint=drawn.start, **others)
@@ -166,8 +165,11 @@ def test_skills_say_what_is_in_the_way_and_move_nothing() -> None:
         assert outcome.measures["free"] < scene_free.value
 
 
-def test_robots_at_random_cupboards_go_through_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert random_cupboards.main(["--count", "2", "--robots", "hsr"]) == 0, capsys.readouterr().out
+@pytest.mark.parametrize("count", ["2", pytest.param("4", marks=pytest.mark.long)])
+def test_robots_at_random_cupboards_go_through_nothing(
+    capsys: pytest.CaptureFixture[str], count: str
+) -> None:
+    assert random_cupboards.main(["--count", count, "--robots", "hsr"]) == 0, capsys.readouterr().out
 
 
 @pytest.mark.long

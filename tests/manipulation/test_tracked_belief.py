@@ -90,8 +90,7 @@ def test_pictures_average_while_nothing_moves(model):
     for seed in range(10):
         world = HiddenWorld(model, belief.sensors, seed, door=0.7, drawer=0.15)
         belief.update(world)
-        first = belief.deviation(model.symbol("door"))
-        state = run(world, belief, 40)
+        first, state = belief.deviation(model.symbol("door")), run(world, belief, 40)
         for name in ("door", "drawer"):
             deviation = belief.deviation(model.symbol(name))
             squares.append(((state[name] - world.truth[name]) / deviation) ** 2)
@@ -281,6 +280,5 @@ def test_door_with_a_position_lock_is_believed_where_it_is(model):
         lock = kv.articulations.position_lock(door, open_if=bolt > 0.5, lower=0.0, upper=0.0)
         edit.constrain("door/lock", *lock)
     world, belief = start(locked, bolt=1.0, door=0.5)
-    state = run(world, belief, 20)
-    assert state["door"] == pytest.approx(0.5, abs=0.02)
+    assert run(world, belief, 20)["door"] == pytest.approx(0.5, abs=0.02)
     assert belief.deviation(locked.symbol("door")) < 0.02

@@ -136,8 +136,7 @@ def test_hinge_of_a_door_is_guessed_at_the_edge_far_from_its_handle(truth, float
 
 def test_learned_joint_replaces_the_attachment_without_limits(truth):
     random, model = np.random.default_rng(1), forget_joint(truth, DOOR, truth.default_state())
-    door = truth.fk(DOOR, "shelf_door/body")
-    angles = np.linspace(0.0, 1.0, 60)
+    door, angles = truth.fk(DOOR, "shelf_door/body"), np.linspace(0.0, 1.0, 60)
     poses = np.array([look(door({DOOR: q}), random, 0.0) for q in angles])
     fit = identify(None, poses, noise=pose_covariance(0.0045, 0.0087)).best
     coordinate = write_joint(model, DOOR, fit, "shelf_door/body")
@@ -192,8 +191,7 @@ def test_looks_at_a_part_that_slips_through_the_hand_are_those_of_its_joint(trut
     assert belief.is_seen
     belief.hold()
     belief.begin_motion()
-    place = inverse(belief.pose) @ belief.hand_pose
-    angles = np.linspace(0.0, 0.04 / 0.38, 60)
+    place, angles = inverse(belief.pose) @ belief.hand_pose, np.linspace(0.0, 0.04 / 0.38, 60)
     for world.angle in angles:
         world.time += 1 / 30
         belief.update(world)

@@ -10,22 +10,7 @@ from kineverse.gallery.lockboxes import THESIS, draw_tangled_lockbox, make_lockb
 from kineverse.manipulation import execute_unlocking
 from kineverse.worlds import MechanismWorld
 from kineverse_studies.experiments.lockbox.unknown_locks import can_be_opened
-
-A, B, C = map(kv.position, "abc")
-
-
-def three_sliders(**locks):
-    model = kv.Model()
-    with model.edit() as edit:
-        for q in (A, B, C):
-            edit.constrain(f"{q} range", 0, q, 1)
-        for name, open_if in locks.items():
-            edit.constrain(f"lock {name}", -1, kv.position(name).derivative(), open_if)
-    return model
-
-
-def goal_of(box):
-    return {f"lockbox/{name}": value for name, value in box.goal.items()}
+from sliders import A, B, C, goal_of, three_sliders
 
 
 def test_thesis_box_is_opened_in_order():
@@ -43,8 +28,7 @@ def test_thesis_box_is_opened_in_order():
 def test_random_boxes_are_opened_without_violations(seed):
     """Boxes with negations and circles: those that exhaustive search can open are opened, and no others."""
     box = draw_tangled_lockbox(5, 300 + seed)
-    world = MechanismWorld(make_lockbox_model(box))
-    done = execute_unlocking(world, goal_of(box))
+    done = execute_unlocking(MechanismWorld(make_lockbox_model(box)), goal_of(box))
     assert bool(done) == can_be_opened(box)
     assert all(move.done for move in done.moves)
     assert done.violation < 1e-6
@@ -65,8 +49,7 @@ def test_jammed_part_is_left_out_of_the_next_plan():
         assert done
         assert done.stuck in ((), (jammed,))
         assert done.plans == 1 + len(done.stuck)
-        moved = [move.step.coordinate for move in done.moves if move.done]
-        assert moved == [other, A]
+        assert [move.step.coordinate for move in done.moves if move.done] == [other, A]
         assert world.state[jammed] == 0.0
 
 

@@ -235,8 +235,7 @@ def _may_write(operation: kv.Operation, reads: Reads, cell: tuple[str, str]) -> 
 
 def check(model: kv.Model, sequence: Sequence[Sequenced]) -> Fold:
     """Assert that a model is the fold of a sequence, bookkeeping included."""
-    expected = fold(sequence)
-    history = model.history
+    expected, history = fold(sequence), model.history
     assert history.tags == [tag for tag, _ in sequence]
     assert [history.entry(tag).operation for tag in history.tags] == [operation for _, operation in sequence]
     for kind in KINDS:
@@ -253,6 +252,14 @@ def check(model: kv.Model, sequence: Sequence[Sequenced]) -> Fold:
         assert history.readers(path) == readers, path
     assert set(history.reading) <= cells
     return expected
+
+
+def holds(sequence: list[Sequenced]) -> bool:
+    try:
+        fold(sequence)
+    except kv.KineverseError:
+        return False
+    return True
 
 
 def changed(before: Fold, after: Fold, tags: Sequence[str]) -> list[str]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -20,6 +23,16 @@ KINDS = (
     "differential",
     "mimic",
 )
+
+
+def constrained(triples: Mapping[str, tuple[Any, Any, Any]], *operations: kv.Operation) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in operations:
+            edit.apply(operation)
+        for name, triple in triples.items():
+            edit.constrain(name, *triple)
+    return model
 
 
 def random_pose(rng: np.random.Generator) -> kv.model.Pose:
@@ -57,8 +70,7 @@ def joint(kind: str, name: str, parent: str, child: str, rng: np.random.Generato
 
 def random_tree(seed: int, size: int = 9) -> kv.Model:
     """Return a tree of frames joined at random; every kind of joint occurs."""
-    rng = np.random.default_rng(seed)
-    model = kv.Model()
+    rng, model = np.random.default_rng(seed), kv.Model()
     kinds = [*rng.permutation(KINDS), *rng.choice(KINDS, max(0, size - len(KINDS)))]
     frames = ["world"]
     with model.edit() as edit:

@@ -120,8 +120,7 @@ def test_as_state_accepts_the_default_state_of_shipped_models() -> None:
 
 
 def test_rates_by_name() -> None:
-    rates = kv.load("fetch").rates
-    x = kv.position("fetch/base/x")
+    rates, x = kv.load("fetch").rates, kv.position("fetch/base/x")
     assert rates["fetch/base/x"] == rates[x] == rates.get("fetch/base/x") == rates.get(x)
     assert "fetch/base/x" in rates
     assert "fetch/base/z" not in rates

@@ -1,7 +1,5 @@
 """The difference between models: what a commit would report that leads from one to the other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -161,8 +159,7 @@ def test_the_folder_of_a_mesh_is_no_difference(mesh, parts):
 
 
 def test_samples_are_the_same_for_all_models_and_within_limits():
-    kitchen = kv.load("kitchen")
-    door = kv.position("kitchen/fridge_door")
+    kitchen, door = kv.load("kitchen"), kv.position("kitchen/fridge_door")
     values = StateSamples(kitchen).values_of(door)
     np.testing.assert_array_equal(values, StateSamples(kitchen, arm()).values_of(door))
     assert values[0] == kitchen.default_state()[door]

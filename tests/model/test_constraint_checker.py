@@ -53,8 +53,7 @@ def test_it_finds_the_violations_of_the_model(fetch: kv.Model) -> None:
 
 
 def test_speeds_are_checked_where_they_are_in_the_vector(fetch: kv.Model) -> None:
-    home = fetch.default_state()
-    checker = fetch.constraint_checker()
+    home, checker = fetch.default_state(), fetch.constraint_checker()
     assert checker.symbols == fetch.symbols
     x = [home[s] for s in checker.symbols]
     found = checker.violations(x)
@@ -70,8 +69,7 @@ def test_numbers_that_are_none_violate() -> None:
     checker = model.constraint_checker()
     assert checker([1.0, 0.0]) == 0
     assert math.isnan(checker([-1.0, 0.0]))
-    names = [v.name for v in checker.violations([-1.0, 0.0])]
-    assert names == ["high", "low", "value"]
+    assert [v.name for v in checker.violations([-1.0, 0.0])] == ["high", "low", "value"]
     assert checker.violations([-1.0, 0.0]).__repr__() == repr(model.violations({"a": -1.0, "b": 0.0}))
     assert math.isnan(checker([math.nan, 0.0]))
 
@@ -116,8 +114,7 @@ def test_parameters_have_the_value_of_the_vector_or_their_own() -> None:
 
 def test_symbols_of_one_name_have_values_of_their_own() -> None:
     short, long = kv.parameter("width", 1.0), kv.parameter("width", 2.0)
-    model = constrained(short=(0, a, short), long=(0, b, long))
-    checker = model.constraint_checker([a, short, b, long])
+    checker = constrained(short=(0, a, short), long=(0, b, long)).constraint_checker([a, short, b, long])
     assert checker([1.5, 1.0, 1.5, 2.0]) == 0.5
     assert checker([1.5, 1.0, 3.5, 2.0]) == 1.5
 

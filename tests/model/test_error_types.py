@@ -22,9 +22,8 @@ def model() -> kv.Model:
 
 @pytest.mark.parametrize("version", [10**400, 10**4000, 10**7, 2])
 def test_documents_of_later_versions(version: int) -> None:
-    text = f'{{"format": "kineverse", "version": {version}, "nodes": [], "operations": []}}'
     with pytest.raises(kv.errors.FormatError, match="this Kineverse reads up to 1") as caught:
-        read_operations(text)
+        read_operations(f'{{"format": "kineverse", "version": {version}, "nodes": [], "operations": []}}')
     assert len(str(caught.value)) < 200
 
 

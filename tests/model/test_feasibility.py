@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_models import constrained
 from scipy.optimize import linprog
 
 import kineverse as kv
@@ -26,14 +27,6 @@ acc = [s.derivative() for s in v]
 p = kv.parameter("p", 0.0)
 Triples = dict[str, tuple[Any, Any, Any]]
 Numbers = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-def constrained(triples: Triples) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for name, triple in triples.items():
-            edit.constrain(name, *triple)
-    return model
 
 
 def numbers(rows: VelocityRows, at: Mapping[kv.Symbol, float]) -> Numbers:
@@ -283,8 +276,7 @@ def test_other_factors_make_no_rows(expression: kv.Expression) -> None:
 def test_a_row_with_vanishing_gradient_demands_nothing(expression: kv.Expression) -> None:
     """The gradient vanishes at the origin, outside of the bounds, and no speed has a limit."""
     rows = constrained({"n": (1, expression, 2)}).velocity_rows(0.01)
-    at = {q[0]: 0.0, q[1]: 0.0}
-    weights, lower, _ = row(rows, "n", at)
+    weights, lower, _ = row(rows, "n", {q[0]: 0.0, q[1]: 0.0})
     assert not any(weights)
     assert lower <= 0
     near = {q[0]: 1e-3, q[1]: 1e-3}
@@ -349,8 +341,7 @@ def test_a_subject_brings_the_speed_limits_of_all_that_may_move() -> None:
     assert rows.speeds == (v[0], v[1], v[2])
     at = dict.fromkeys(q, 0.0) | {q[0]: 5.0}
     assert row(rows, "bound", at)[2] == pytest.approx(-1.1)
-    fixed = model.velocity_rows(0.1, subject=q[0], speeds=[v[0]])
-    assert fixed.names == ("0", "bound")
+    assert model.velocity_rows(0.1, subject=q[0], speeds=[v[0]]).names == ("0", "bound")
     with model.edit() as edit:
         edit.constrain("brake 0", -2, acc[0], 2)
     rows = model.velocity_rows(0.1, subject=q[0])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from history_operations import Place, Sequenced, check, fold, state_of
+from history_operations import Place, Sequenced, check, holds, state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -66,14 +66,6 @@ def take(edit: kv.model.Edit, wanted: list[Sequenced], kind: str, at: int, tag: 
     else:
         del wanted[at]
         edit.remove(target)
-
-
-def holds(sequence: list[Sequenced]) -> bool:
-    try:
-        fold(sequence)
-    except kv.KineverseError:
-        return False
-    return True
 
 
 def test_a_circle_that_a_later_operation_would_undo() -> None:

@@ -112,8 +112,7 @@ def test_rows_of_any_kind_are_followed(name: str) -> None:
         edit.add_frame("seen", "world", kv.translation(x, y, z))
     start = {x: 1.0, y: 0.3, z: -0.4}
     speeds = dict.fromkeys(model.speeds, 0.9)
-    after = model.integrate(start, speeds, 1.0)
-    expected = oracle(model, start, speeds, 1.0)
+    after, expected = model.integrate(start, speeds, 1.0), oracle(model, start, speeds, 1.0)
     np.testing.assert_allclose(numbers(model, after), expected, rtol=1e-10, atol=1e-11)
 
 
@@ -135,8 +134,7 @@ def test_two_wheels_drive_an_arc(left: float, right: float, heading: float, dt: 
 @settings(max_examples=attempts(20))
 @given(seed=st.integers(0, 10**6), dt=st.floats(-3, 3))
 def test_a_quaternion_moves_by_its_exponential_and_keeps_its_length(seed: int, dt: float) -> None:
-    rng = np.random.default_rng(seed)
-    model = model_of(BASES["floating"])
+    rng, model = np.random.default_rng(seed), model_of(BASES["floating"])
     turn, omega, linear = Rotation.random(rng=rng), rng.normal(size=3), rng.normal(size=3)
     quaternion = [f"base/q{s}" for s in "xyzw"]
     start = dict(zip(quaternion, turn.as_quat(), strict=True)) | {f"base/{s}": 0.5 for s in "xyz"}
@@ -179,8 +177,7 @@ def test_a_quaternion_of_another_length_keeps_it_and_turns_alike(length: float) 
 def test_two_steps_are_one_and_backwards_is_back(seed: int) -> None:
     model = random_tree(seed, 9)
     start, speeds = random_state(model, seed), random_speeds(model, seed)
-    halfway = model.integrate(start, speeds, 0.4)
-    whole = model.integrate(start, speeds, 1.0)
+    halfway, whole = model.integrate(start, speeds, 0.4), model.integrate(start, speeds, 1.0)
     np.testing.assert_allclose(
         numbers(model, model.integrate(halfway, speeds, 0.6)), numbers(model, whole), atol=1e-12
     )
@@ -228,11 +225,9 @@ def test_jacobians_on_a_base_move_as_their_gradients_say(base: str) -> None:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.sampled(2)
 def test_random_expressions_on_a_base_move_as_their_gradients_say(base: str, seed: int) -> None:
-    model = with_arm(base)
-    rng = np.random.default_rng(seed)
+    model, rng = with_arm(base), np.random.default_rng(seed)
     symbols = list(model.degrees_of_freedom)
-    expressions = [model.rates.carry(random_expression(rng, symbols)) for _ in range(4)]
-    assert_motion_law(model, expressions, seed)
+    assert_motion_law(model, [model.rates.carry(random_expression(rng, symbols)) for _ in range(4)], seed)
 
 
 @pytest.mark.parametrize("name", NONLINEAR)

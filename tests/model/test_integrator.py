@@ -71,18 +71,15 @@ def test_vectors_go_where_states_go_and_rows_of_a_batch_too(seed: int) -> None:
 
 def test_a_subset_moves_and_the_rest_stays(diff_drive: kv.Model) -> None:
     whole = diff_drive.integrator()
-    rng = np.random.default_rng(0)
-    q = rng.uniform(-1, 1, len(whole.symbols))
-    symbols = whole.symbols[::-1]
-    wheel = diff_drive.symbol("base/right_wheel:velocity")
+    q = np.random.default_rng(0).uniform(-1, 1, len(whole.symbols))
+    symbols, wheel = whole.symbols[::-1], diff_drive.symbol("base/right_wheel:velocity")
     part = diff_drive.integrator([wheel], symbols)
     assert part.symbols == symbols
     assert set(map(str, part.moving)) == {"base/x", "base/y", "base/angle"}
     v = np.where([s == wheel for s in whole.speeds], 0.8, 0.0)
     np.testing.assert_allclose(part(q[::-1], [0.8], 0.3)[::-1], whole(q, v, 0.3), rtol=0, atol=1e-15)
     arm = diff_drive.symbol("arm")
-    alone = diff_drive.integrator([arm.derivative()], [arm])
-    assert alone([0.25], [2.0], 0.5) == 1.25
+    assert diff_drive.integrator([arm.derivative()], [arm])([0.25], [2.0], 0.5) == 1.25
     heading = diff_drive.symbol("base/angle")
     np.testing.assert_allclose(diff_drive.integrator([wheel], [heading])([0.0], [1.0], 1.0), [0.4])
 
@@ -90,11 +87,9 @@ def test_a_subset_moves_and_the_rest_stays(diff_drive: kv.Model) -> None:
 def test_the_result_is_new_or_in_the_given_array(diff_drive: kv.Model) -> None:
     integrator = diff_drive.integrator()
     q, v = np.full(4, 0.2), np.array([0.5, 1.0, -1.0])
-    start = q.copy()
-    after = integrator(q, v, 0.1)
+    start, after = q.copy(), integrator(q, v, 0.1)
     np.testing.assert_array_equal(q, start)
-    again = integrator(q, v, 0.1)
-    assert again is not after
+    assert integrator(q, v, 0.1) is not after
     assert integrator(q, v, 0.1, out=q) is q
     np.testing.assert_array_equal(q, after)
     np.testing.assert_array_equal(integrator(list(start), tuple(v), 0.1), after)
@@ -104,8 +99,7 @@ def test_a_step_of_a_second_is_a_retraction_of_the_floating_base() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="base", parent="world", child="base"))
-    integrator = model.integrator()
-    home = model.default_state()
+    integrator, home = model.integrator(), model.default_state()
     q = np.array([home[s] for s in integrator.symbols])
     for turn in (1e-3, 0.5, 3.0, 30.0):
         v = np.array([turn if str(s) == "base/wz:velocity" else 0.0 for s in integrator.speeds])

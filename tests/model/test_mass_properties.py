@@ -46,8 +46,7 @@ def is_below(model: kv.Model, name: str, frame: str) -> bool:
 @pytest.mark.parametrize("seed", range(3))
 def test_it_is_the_mean_of_the_bodies_by_forward_kinematics(seed: int) -> None:
     model = random_tree(seed, 12)
-    inertias = with_masses(model, seed)
-    state = random_state(model, seed)
+    inertias, state = with_masses(model, seed), random_state(model, seed)
     for frame in ("world", *list(model.frames)[::3]):
         part = {name: i for name, i in inertias.items() if is_below(model, name, frame)}
         if not part:
@@ -67,8 +66,7 @@ def test_it_is_the_mean_of_the_bodies_by_forward_kinematics(seed: int) -> None:
 
 @pytest.mark.parametrize("file", URDF)
 def test_it_and_its_jacobian_are_those_of_pinocchio(file: str, tmp_path: Path) -> None:
-    pin = pytest.importorskip("pinocchio")
-    path = ROBOTS / file
+    pin, path = pytest.importorskip("pinocchio"), ROBOTS / file
     if not path.exists():
         pytest.skip(f"no {file} of example-robot-data")
     # Joints that mimic others are free in pinocchio's model.
@@ -90,8 +88,7 @@ def test_it_and_its_jacobian_are_those_of_pinocchio(file: str, tmp_path: Path) -
     f = kv.compile([center, center.jacobian([*base, *columns])], [*model.symbols], tier="interpreter")
     rng = np.random.default_rng(0)
     for _ in range(3):
-        values = random_state(model, int(rng.integers(1000)))
-        q = pin.neutral(robot)
+        values, q = random_state(model, int(rng.integers(1000))), pin.neutral(robot)
         q[:7] = [values[kv.position(f"base/{c}")] for c in ("x", "y", "z", "qx", "qy", "qz", "qw")]
         for name, joint in joints.items():
             angle = values[kv.position(name)]

@@ -99,8 +99,7 @@ def names(model: kv.Model, subject: Any, **options: bool) -> list[str]:
 
 
 def test_constraints_for_compares_coordinates_of_any_order() -> None:
-    model = constrained(**LIMITS)
-    about_a = ["a", "a_jerk", "a_speed", "ab"]
+    model, about_a = constrained(**LIMITS), ["a", "a_jerk", "a_speed", "ab"]
     assert (
         names(model, a)
         == names(model, [a])
@@ -112,8 +111,7 @@ def test_constraints_for_compares_coordinates_of_any_order() -> None:
     assert names(model, kv.Expression(1.0)) == names(model, []) == []
     assert names(model, d.augment({c.derivative(): 1})) == ["c_lock", "d"]
     assert names(model, d.with_gradient({a.derivative(): 1})) == [*about_a, "d"]
-    found = model.constraints_for([a])
-    assert found == {name: model.constraints[name] for name in about_a}
+    assert model.constraints_for([a]) == {name: model.constraints[name] for name in about_a}
 
 
 def test_the_formula_of_the_papers() -> None:
@@ -323,8 +321,7 @@ def test_limits_of_a_symbol_are_the_tightest() -> None:
 def test_limits_at_any_state_are_within_those_at_all(low, high) -> None:
     model = constrained(a=(-1, a, 1), b=(-0.5, 2 * b, 4), c=(low, c, high))
     least, most = model.limits(c)
-    rng = np.random.default_rng(0)
-    states = [{"a": x, "b": y} for x, y in rng.uniform([-1, -0.25], [1, 2], (200, 2))]
+    states = [{"a": x, "b": y} for x, y in np.random.default_rng(0).uniform([-1, -0.25], [1, 2], (200, 2))]
     at = np.array([model.limits(c, state) for state in states])
     assert (at[:, 0] >= least).all()
     assert (at[:, 1] <= most).all()
@@ -417,10 +414,8 @@ def test_bounds_that_are_about_other_symbols_are_kept_too() -> None:
     state = model.default_state()
     assert dict(state) == {d: 3, c: 3, b: 4, a: 5}
     assert not model.violations(state)
-    endless = constrained(a=(b + 1, a, 100), b=(a + 1, b, 100))
-    assert set(endless.default_state()) == {a, b}
-    unknown = constrained(a=(b.derivative(), a, 1))
-    assert dict(unknown.default_state()) == {a: 0, b: 0}
+    assert set(constrained(a=(b + 1, a, 100), b=(a + 1, b, 100)).default_state()) == {a, b}
+    assert dict(constrained(a=(b.derivative(), a, 1)).default_state()) == {a: 0, b: 0}
 
 
 def test_home_of_articulations() -> None:
@@ -487,5 +482,4 @@ def test_a_bound_that_is_infinite_where_a_condition_holds_is_a_number_everywhere
     assert [(v.lower, v.upper, v.excess) for v in model.violations({"d": 0.2, "v:velocity": 7.0})] == [
         (0, 0, 7)
     ]
-    again = kv.formats.from_bytes(kv.formats.to_bytes(model))
-    assert again.constraints == model.constraints
+    assert kv.formats.from_bytes(kv.formats.to_bytes(model)).constraints == model.constraints

@@ -24,7 +24,7 @@ from history_operations import (
     Watch,
     changed,
     check,
-    fold,
+    holds,
     state_of,
 )
 from hypothesis import given, settings
@@ -81,7 +81,6 @@ START: tuple[kv.Operation, ...] = (
 def take(
     edit: kv.model.Edit, sequence: list[Sequenced], kind: str, operation: Any, at: int, tag: str
 ) -> None:
-    """Take a step, on the model and on the list."""
     if kind == "append" or not sequence:
         edit.apply(operation, tag)
         sequence.append((tag, operation))
@@ -108,14 +107,6 @@ def started() -> tuple[kv.Model, list[Sequenced]]:
     return model, sequence
 
 
-def holds(sequence: list[Sequenced]) -> bool:
-    try:
-        fold(sequence)
-    except kv.KineverseError:
-        return False
-    return True
-
-
 @given(st.lists(step, min_size=1, max_size=12))
 @settings(max_examples=MANY, derandomize=True)
 def test_single_steps_equal_a_fold_from_the_empty_model(steps: list[Any]) -> None:
@@ -132,8 +123,7 @@ def test_single_steps_equal_a_fold_from_the_empty_model(steps: list[Any]) -> Non
             assert not holds(wanted)
             assert state_of(model) == before
             continue
-        result = check(model, wanted)
-        itself = kind != "remove" or not sequence
+        result, itself = check(model, wanted), kind != "remove" or not sequence
         assert model.history.runs - runs == itself + _dependents(expected, result, sequence, wanted)
         sequence, expected = wanted, result
 
@@ -289,8 +279,7 @@ def test_replacing_the_last_operation_does_not_apply_it_to_its_own_result() -> N
 @pytest.mark.parametrize("where", ["before", "after", "to_affect"])
 def test_many_insertions_at_one_place(count: int, where: str) -> None:
     model = build(Put("a"), Next("b", "a"), Put("z"))
-    kept = model.snapshot()
-    expected = []
+    kept, expected = model.snapshot(), []
     for i in range(count):
         with model.edit() as edit:
             edit.insert(Put("a", i), f"i{i}", **{where: "0" if where == "after" else "1"})

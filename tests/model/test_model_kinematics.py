@@ -19,8 +19,7 @@ def numeric(model: kv.Model, frame: str, values: dict[kv.Symbol, float]) -> np.n
     """Return world_T_frame by multiplying numbers."""
     pose = np.eye(4)
     while frame != "world":
-        pose = model.frames[frame].transform(values) @ pose
-        frame = model.frames[frame].parent
+        pose, frame = model.frames[frame].transform(values) @ pose, model.frames[frame].parent
     return pose
 
 
@@ -38,17 +37,14 @@ def test_poses_in_all_directions_equal_products_of_numbers(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_jacobians_are_the_twists_of_poses_along_every_speed(seed: int) -> None:
-    model = random_tree(seed, 10)
-    rng = np.random.default_rng(seed)
-    values = random_state(model, seed)
-    state, h = kv.State(values), 1e-5
+    model, rng = random_tree(seed, 10), np.random.default_rng(seed)
+    state, h = kv.State(random_state(model, seed)), 1e-5
     names = ["world", *model.frames]
     pairs = [(names[-1], "world"), *((names[i], names[j]) for i, j in rng.integers(0, len(names), (5, 2)))]
     speeds = random_speeds(model, seed)
     forth, back = model.integrate(state, speeds, h), model.integrate(state, speeds, -h)
     for tip, base in pairs:
-        columns = model.speeds_of(tip, base)
-        fk = model.fk(tip, base)
+        columns, fk = model.speeds_of(tip, base), model.fk(tip, base)
         pose, before, after = fk(state), fk(back), fk(forth)
         expected = twist_between(before, after, 2 * h)
         velocity = np.array([speeds[s] for s in columns])
@@ -67,8 +63,7 @@ def test_jacobians_are_the_twists_of_poses_along_every_speed(seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_jacobians_agree_with_the_gradient_of_the_pose_column_by_column(seed: int) -> None:
     model = random_tree(seed, 10)
-    values = random_state(model, seed + 50)
-    names = list(model.frames)
+    values, names = random_state(model, seed + 50), list(model.frames)
     for tip, base in (
         (names[-1], "world"),
         (names[-1], names[0]),
@@ -76,11 +71,9 @@ def test_jacobians_agree_with_the_gradient_of_the_pose_column_by_column(seed: in
         ("world", names[-1]),
     ):
         fk = model.fk(tip, base)
-        gradient = fk.gradient(heuristic=False)
-        columns = model.speeds_of(tip, base)
+        gradient, columns = fk.gradient(heuristic=False), model.speeds_of(tip, base)
         assert set(gradient) <= set(columns)
-        matrix = model.jacobian(tip, base)(values)
-        rotation = fk(values)[:3, :3]
+        matrix, rotation = model.jacobian(tip, base)(values), fk(values)[:3, :3]
         for i, speed in enumerate(columns):
             entry = gradient[speed](values) if speed in gradient else np.zeros((4, 4))
             spin = entry[:3, :3] @ rotation.T
@@ -234,14 +227,11 @@ def test_a_chain_of_thousands_of_moving_frames() -> None:
 
 
 def test_frames_placed_by_several_factors_or_one_matrix_are_the_same() -> None:
-    rng = np.random.default_rng(3)
-    pose = random_pose(rng)
-    model = kv.Model()
+    pose, model = random_pose(np.random.default_rng(3)), kv.Model()
     with model.edit() as edit:
         edit.add_frame("product", "world", [pose, kv.rotation_z(x), kv.translation(y, 0, 0), pose])
         edit.add_frame("matrix", "world", model.fk("product"))
-        rows = [[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]]
-        edit.add_frame("rows", "world", rows)
+        edit.add_frame("rows", "world", [[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]])
     at = {"x": 0.3, "y": 0.4}
     np.testing.assert_allclose(model.fk("product")(at), model.fk("matrix")(at), atol=1e-15)
     np.testing.assert_allclose(model.jacobian("product")(at), model.jacobian("matrix")(at), atol=1e-14)

@@ -48,8 +48,7 @@ def random_expression(rng: np.random.Generator, symbols: list[kv.Symbol], depth:
 
 def path_of(model: kv.Model, start: dict[kv.Symbol, float], speeds: dict[kv.Symbol, float]) -> Any:
     """Return a function from time to values, by somebody else's integrator."""
-    symbols = model.degrees_of_freedom
-    rates = model.rates
+    symbols, rates = model.degrees_of_freedom, model.rates
     rows = kv.array(
         [
             sum((g * s for s, g in rates[c].items()), kv.Expression(0.0)) if c in rates else c.derivative()
@@ -76,9 +75,8 @@ def assert_motion_law(model: kv.Model, expressions: list[kv.Expression], seed: i
     points = [at(k * h) for k in (-2, -1, 0, 1, 2)]
     for e in expressions:
         first = kv.expressions.total_derivative(e)
-        gradient = first.gradient(heuristic=False)
         second = sum(
-            (entry * key for key, entry in gradient.items() if key.order == 1),
+            (entry * key for key, entry in first.gradient(heuristic=False).items() if key.order == 1),
             kv.Expression(np.zeros(e.shape)),
         )
         for below, above in ((e, first), (first, second)):
@@ -97,8 +95,7 @@ def test_poses_move_as_their_gradients_say_and_so_do_their_rates(seed: int) -> N
 
 @pytest.mark.parametrize("seed", range(4))
 def test_random_expressions_move_as_their_gradients_say(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    model = random_tree(seed + 10, 9)
+    rng, model = np.random.default_rng(seed), random_tree(seed + 10, 9)
     symbols = list(model.degrees_of_freedom)
     expressions = [model.rates.carry(random_expression(rng, symbols)) for _ in range(6)]
     given = expressions[0].augment({})
@@ -149,8 +146,7 @@ def test_the_heading_turns_inside_the_rows() -> None:
 
 def test_replacing_the_base_changes_the_gradients_of_frames_from_before() -> None:
     model = based(OMNI)
-    hand = model.fk("hand")
-    kept = model.snapshot()
+    hand, kept = model.fk("hand"), model.snapshot()
     free = {f"base/{c}:velocity" for c in ("x", "y", "angle")} | {"arm:velocity"}
     wheels = {"base/left_wheel:velocity", "base/right_wheel:velocity", "arm:velocity"}
     assert {str(s) for s in hand.gradient()} == {str(s) for s in model.speeds_of("hand")} == free

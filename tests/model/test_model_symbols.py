@@ -38,8 +38,7 @@ def test_a_coordinate_with_only_a_speed_limit_is_a_symbol_of_the_model(order: in
 
 
 def test_a_lock_alone_is_about_the_door() -> None:
-    model = kv.Model()
-    unlocked = b > 0.3
+    model, unlocked = kv.Model(), b > 0.3
     with model.edit() as edit:
         edit.constrain("lock", -unlocked, a.derivative(), unlocked)
     assert model.symbols == (a, b)
@@ -61,8 +60,7 @@ def test_speeds_that_move_other_coordinates_are_none(operation: kv.Operation) ->
 
 
 def test_a_wheel_that_is_somewhere_is_a_coordinate() -> None:
-    model = kv.Model()
-    wheel = kv.position("base/left_wheel")
+    model, wheel = kv.Model(), kv.position("base/left_wheel")
     with model.edit() as edit:
         edit.apply(BASES[1])
         edit.add_frame("wheel", "base", kv.rotation_y(wheel))

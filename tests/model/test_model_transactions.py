@@ -63,8 +63,7 @@ def test_any_exception_in_the_block_undoes_the_edit(error: type[BaseException]) 
 
 
 def test_the_model_shows_the_edit_so_far_inside_the_block() -> None:
-    model = door()
-    x = kv.position("x")
+    model, x = door(), kv.position("x")
     assert model.symbols == (a,)
     with model.edit() as edit:
         edit.add_frame("slider", "door", kv.translation(x, 0, 0))
@@ -305,8 +304,7 @@ def test_a_snapshot_never_changes_and_compares_by_value() -> None:
 )
 def test_copies_go_their_own_way(how: Any) -> None:
     model = door()
-    heard = recorded(model)
-    other = how(model)
+    heard, other = recorded(model), how(model)
     assert other.snapshot() == model.snapshot()
     assert (other.version, other.history.runs) == (1, 0)
     with other.edit() as edit:
@@ -386,8 +384,7 @@ def test_readers_in_other_threads_see_before_or_after_and_never_between() -> Non
 
     def read() -> None:
         while not done.is_set():
-            snapshot = model.snapshot()
-            values = dict(model.data.items())
+            snapshot, values = model.snapshot(), dict(model.data.items())
             pose = model.fk("g")()[1, 3]
             if snapshot.data["x"] != snapshot.data["y"] or values["x"] != values["y"]:
                 wrong.append(values)

@@ -11,8 +11,7 @@ import kineverse as kv
 @pytest.fixture(scope="module")
 def arm() -> kv.Model:
     """A lift on a floating base, with an arm whose names are not in their order; a mimic and a scaled link."""
-    model = kv.Model()
-    length = kv.parameter("length", 0.4)
+    model, length = kv.Model(), kv.parameter("length", 0.4)
     with model.edit() as edit:
         edit.apply(kv.Floating(name="base", parent="world", child="base"))
         edit.apply(kv.Prismatic(name="torso", parent="base", child="torso", axis=(0, 0, 1)))
@@ -68,8 +67,7 @@ def test_symbols_of_a_loop_are_the_free_coordinates() -> None:
 
 
 def test_inputs_in_the_order_of_the_chain(arm: kv.Model) -> None:
-    chain = arm.symbols_of("tip", "torso")
-    pose = arm.fk("tip", "torso")
+    chain, pose = arm.symbols_of("tip", "torso"), arm.fk("tip", "torso")
     ordered, sorted_ = (
         kv.compile(pose, inputs=chain, tier="interpreter"),
         kv.compile(pose, tier="interpreter"),
@@ -78,5 +76,4 @@ def test_inputs_in_the_order_of_the_chain(arm: kv.Model) -> None:
     assert sorted_.names == ("elbow", "length", "shoulder")
     np.testing.assert_array_equal(ordered([0.1, 0.4, 0.7]), sorted_([0.7, 0.4, 0.1]))
     columns = arm.jacobian("tip", "torso", symbols=[s for s in chain if s.has_derivative])
-    by_name = arm.jacobian("tip", "torso")
-    assert columns == by_name[:, [1, 0]]
+    assert columns == arm.jacobian("tip", "torso")[:, [1, 0]]

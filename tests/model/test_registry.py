@@ -1,7 +1,5 @@
 """Tests of the registry of readers and writers."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -33,8 +33,7 @@ def nested(kind: str, levels: int = LEVELS) -> kv.Expression:
 
 @pytest.mark.parametrize("kind", NESTED)
 def test_a_model_of_shared_nodes(kind):
-    e = nested(kind)
-    model = kv.Model()
+    e, model = nested(kind), kv.Model()
     with model.edit() as edit:
         edit.add_frame("f", "world", kv.translation(e, 0, 0))
         edit.constrain("c", 0, e, 1)
@@ -44,8 +43,7 @@ def test_a_model_of_shared_nodes(kind):
     assert to_plain(carried)(values)[0, 3] == e(values)
     assert collect_symbols(carried) == {a, b}
     assert w in carried.gradient()
-    moved = carried.substitute({a: a + b})
-    assert to_plain(moved)(values)[0, 3] == e({"a": 0.75, "b": 0.5})
+    assert to_plain(carried.substitute({a: a + b}))(values)[0, 3] == e({"a": 0.75, "b": 0.5})
     assert model.constraints["c"].expression == carried[0, 3]
     assert read_operations(to_json(model))
 
@@ -53,8 +51,7 @@ def test_a_model_of_shared_nodes(kind):
 def test_rates_of_shared_nodes():
     e = nested("where")
     rates = Rates({a: as_row(a, {w: e})})
-    again = Rates({a: as_row(a, {w: rates.carry(e)})})
-    assert again == rates
+    assert Rates({a: as_row(a, {w: rates.carry(e)})}) == rates
     assert rates.symbols == {a, b, w, w.position}
 
 

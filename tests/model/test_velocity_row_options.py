@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_models import constrained
 
 import kineverse as kv
 from hypothesis_profiles import attempts
@@ -22,14 +23,6 @@ va, vb, vc = (s.derivative() for s in (a, b, c))
 DT = 0.1
 Triples = Mapping[str, tuple[Any, Any, Any]]
 SHIPPED = ("fetch", "hsr", "pr2", "kitchen", "shelf_door")
-
-
-def constrained(triples: Triples) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for name, triple in triples.items():
-            edit.constrain(name, *triple)
-    return model
 
 
 MIXED: Triples = {
@@ -53,7 +46,6 @@ def mixed() -> kv.Model:
 
 
 def values_of(rows: VelocityRows, inputs: Any, points: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return matrix, lower, upper and violation at many points."""
     parts = [rows.matrix, rows.lower, rows.upper, rows.violation]
     return kv.compile(parts, inputs, tier="interpreter").batch(points)
 
@@ -85,8 +77,7 @@ def test_zero_speed_satisfies_all_rows_with_allowed_recovery(
 
 
 def test_allowed_recovery_is_required_recovery_inside_of_bounds() -> None:
-    triples = {name: triple for name, triple in MIXED.items() if name != "level"}
-    model = constrained(triples)
+    model = constrained({name: triple for name, triple in MIXED.items() if name != "level"})
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (200, 3))
     inside = points[[not model.violations(dict(zip((a, b, c), p, strict=True))) for p in points]]
     assert len(inside) > 50
@@ -136,8 +127,7 @@ def test_motion_against_the_violation_leads_back() -> None:
     bound = np.cos(b)
     rows = constrained({"n": (-bound, np.sin(2 * a), bound)}).velocity_rows(DT)
     point = np.array([0.6, 1.2])
-    state = kv.State(dict(zip((a, b), point, strict=True)))
-    excess = np.sin(1.2) - np.cos(1.2)
+    state, excess = kv.State(dict(zip((a, b), point, strict=True))), np.sin(1.2) - np.cos(1.2)
     np.testing.assert_allclose(rows.violation(state), [0, excess])
     step, *_ = np.linalg.lstsq(rows.matrix(state)[1:], -1e-4 * rows.violation(state)[1:])
     after = point + step
@@ -153,11 +143,7 @@ def test_bounds_and_general_rows_admit_the_same_speeds(seed: int, recovery: Any)
     rows = mixed().velocity_rows(DT, recovery=recovery)
     bounds, general = rows.bounds, rows.general
     assert {*general.names} == {"a below b", "b", "sum", "level", "norm"}
-    assert bounds.names == (
-        ("a speed", "a backwards", "a", "a scaled"),
-        ("locked", "b"),
-        (),
-    )
+    assert bounds.names == (("a speed", "a backwards", "a", "a scaled"), ("locked", "b"), ())
     rng = np.random.default_rng(seed)
     state = kv.State(dict(zip((a, b, c), rng.normal(size=3) * 2, strict=True)))
     matrix, lower, upper = rows.matrix(state), rows.lower(state), rows.upper(state)
@@ -199,8 +185,7 @@ def test_merged_bounds_hide_no_nan(order: tuple[str, str]) -> None:
 
 def test_entries_are_the_matrix() -> None:
     model = kv.load("fetch")
-    rows = model.velocity_rows(DT)
-    state = model.default_state()
+    rows, state = model.velocity_rows(DT), model.default_state()
     matrix = np.zeros(rows.matrix.shape)
     for row, column, weight in rows.entries:
         matrix[row, column] = weight(state)
@@ -267,8 +252,7 @@ def test_extra_constraints_are_rows_with_their_columns_and_limits() -> None:
 
 
 def test_extra_constraints_are_about_free_speeds() -> None:
-    model = kv.load("fetch")
-    x = kv.position("fetch/base/x")
+    model, x = kv.load("fetch"), kv.position("fetch/base/x")
     rows = model.velocity_rows(DT, subject=x, extra={"wall": (-math.inf, x, 1.0)})
     assert {*rows.speeds} == {*model.rates[x]}
     assert "wall" in rows.general.names

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from random_models import random_speeds, random_state, random_tree
+from random_models import constrained, random_speeds, random_state, random_tree
 from scipy.optimize import linprog
 from scipy.spatial import HalfspaceIntersection
 
@@ -27,16 +27,6 @@ a, b, c = (kv.position(n) for n in "abc")
 va, vb, vc = (s.derivative() for s in (a, b, c))
 DT = 0.1
 Triples = Mapping[str, tuple[Any, Any, Any]]
-
-
-def constrained(triples: Triples, *operations: kv.Operation) -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        for operation in operations:
-            edit.apply(operation)
-        for name, triple in triples.items():
-            edit.constrain(name, *triple)
-    return model
 
 
 def rows_of(triples: Triples, dt: float = DT, **options: Any) -> VelocityRows:
@@ -57,8 +47,7 @@ class Controlled:
         matrix, lower, upper = self._numbers(q)
         assert not np.isnan(np.hstack([matrix.ravel(), lower, upper])).any()
         both = np.vstack([matrix, -matrix]), np.hstack([upper, -lower])
-        keep = np.isfinite(both[1])
-        free = [(-1e3, 1e3)] * len(wish)
+        keep, free = np.isfinite(both[1]), [(-1e3, 1e3)] * len(wish)
         found = linprog(-wish, both[0][keep], both[1][keep], bounds=free, method="highs")
         assert found.status == 0, (found.message, q, matrix, lower, upper)
         return np.asarray(found.x)
@@ -92,10 +81,8 @@ JOINTS: Triples = {
 @settings(max_examples=attempts(6))
 @given(seed=st.integers(0, 10**6), dt=st.floats(0.01, 1), share=st.floats(0.05, 1))
 def test_velocity_rows_keep_a_feasible_state_feasible(seed: int, dt: float, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    model = constrained(JOINTS)
-    system = Controlled(model, dt, gain=share / dt)
-    q = np.zeros(3)
+    rng, model = np.random.default_rng(seed), constrained(JOINTS)
+    system, q = Controlled(model, dt, gain=share / dt), np.zeros(3)
     for _ in range(25):
         q = system.step(q, rng.normal(size=3))
         assert excess(model, q) == 0
@@ -103,8 +90,7 @@ def test_velocity_rows_keep_a_feasible_state_feasible(seed: int, dt: float, shar
 
 def test_the_bound_is_reached() -> None:
     """Rows that allowed nothing would keep everything inside as well."""
-    system = Controlled(constrained(JOINTS))
-    q = np.zeros(3)
+    system, q = Controlled(constrained(JOINTS)), np.zeros(3)
     for _ in range(60):
         q = system.step(q, np.array([1.0, 0, 0]))
     assert q[0] == pytest.approx(2)
@@ -141,14 +127,12 @@ def test_a_row_is_the_difference_of_gradients() -> None:
 
 
 def test_a_bound_with_a_gradient_of_its_own_moves_by_it() -> None:
-    upper = kv.parameter("u", 1.0).augment({vb: 0.5})
-    rows = rows_of({"n": (-math.inf, a, upper)})
+    rows = rows_of({"n": (-math.inf, a, kv.parameter("u", 1.0).augment({vb: 0.5}))})
     np.testing.assert_array_equal(rows.matrix({"a": 0.0, "u": 1.0}), [[1, -0.5]])
 
 
 def test_heuristic_gradients_make_no_rows() -> None:
-    hint = a.augment({vb: 5.0}, heuristic=True)
-    rows = rows_of({"n": (-1, hint, 2 + ((b < 1) & (c < 1)))})
+    rows = rows_of({"n": (-1, a.augment({vb: 5.0}, heuristic=True), 2 + ((b < 1) & (c < 1)))})
     assert rows.speeds == (va,)
     at = {"a": 0.0, "b": 0.0, "c": 0.0}
     np.testing.assert_array_equal(rows.matrix(at), [[1]])
@@ -202,8 +186,7 @@ FEW = ("alone", "norm, then single", "slow where it is")
 )
 def test_velocity_rows_lead_back_monotonically_from_outside(name: str, share: float) -> None:
     model = constrained(SINGLE[name])
-    system = Controlled(model, gain=share / DT)
-    n = len(model.symbols)
+    system, n = Controlled(model, gain=share / DT), len(model.symbols)
     rng = np.random.default_rng(0)
     q = rng.choice([-1, 1], n) * rng.uniform(2, 4, n)
     outwards = np.sign(q)
@@ -228,8 +211,7 @@ def test_the_way_back_is_as_fast_as_limits_allow() -> None:
     assert rows.lower({"a": -9.0})[row] == 1
     followed = rows_of(SINGLE["speed of what follows"])
     assert followed.lower({"a": -9.0})[followed.names.index("a")] == 0.5
-    norm = rows_of(SINGLE["norm, then single"])
-    inner = 0.5 * math.cos(math.pi / 16)
+    norm, inner = rows_of(SINGLE["norm, then single"]), 0.5 * math.cos(math.pi / 16)
     row = norm.names.index("a")
     assert norm.upper({"a": 9.0, "b": 0.0})[row] == pytest.approx(-inner)
     assert norm.upper({"a": 9.0, "b": 9.0})[row] == pytest.approx(-inner / math.sqrt(2))  # both come back
@@ -243,8 +225,7 @@ def test_the_way_back_is_as_fast_as_limits_allow() -> None:
 @given(seed=st.integers(0, 10**6))
 def test_rows_can_be_obeyed_wherever_it_starts(seed: int) -> None:
     """Random limits on speeds, single, summed, scaled, of norms; positions each limited by itself."""
-    rng = np.random.default_rng(seed)
-    speeds = [va, vb, vc]
+    rng, speeds = np.random.default_rng(seed), [va, vb, vc]
     triples: dict[str, tuple[Any, Any, Any]] = {}
     for s in (a, b, c):
         triples[f"{s}"] = (-rng.uniform(0, 1), rng.choice([-2.0, 0.5, 1]) * s, rng.uniform(0, 1))
@@ -291,8 +272,7 @@ def test_one_sided_limits_give_numbers() -> None:
 def test_velocity_rows_leave_the_braking_distance(
     brake: float, weight: float, dt: float, start: float
 ) -> None:
-    triples = {"range": (-5, weight * a, 5), "brake": (-brake, va.derivative(), 3 * brake)}
-    model = constrained(triples)
+    model = constrained({"range": (-5, weight * a, 5), "brake": (-brake, va.derivative(), 3 * brake)})
     rows = model.velocity_rows(dt)
     assert rows.names == ("range",)
     bounds = kv.compile([rows.lower, rows.upper], [a], tier="interpreter")
@@ -337,8 +317,7 @@ def test_a_brake_without_bounds_is_none() -> None:
 
 
 def test_a_constraint_on_speeds_is_the_row_itself() -> None:
-    expression = 2 * va - np.cos(c) * vb + np.sin(a)
-    rows = rows_of({"n": (-1, expression, b)})
+    rows = rows_of({"n": (-1, 2 * va - np.cos(c) * vb + np.sin(a), b)})
     at = kv.State({"a": 0.4, "b": 3.0, "c": 0.9})
     np.testing.assert_allclose(rows.matrix(at), [[2, -np.cos(0.9)]])
     np.testing.assert_allclose(rows.lower(at), [-1 - np.sin(0.4)])
@@ -362,8 +341,7 @@ def on_the_rim(rows: VelocityRows, directions: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("dimensions", "loss"), [(1, 0), (2, 0.01922), (3, 0.03807)])
 def test_a_norm_becomes_a_body_inside_the_ball(dimensions: int, loss: float) -> None:
-    speeds = [va, vb, vc][:dimensions]
-    rows = rows_of({"n": (0, kv.norm(kv.array(speeds)), 2.0)})
+    rows = rows_of({"n": (0, kv.norm(kv.array([va, vb, vc][:dimensions])), 2.0)})
     assert len(rows.names) == (2, 16, 128)[dimensions - 1]
     directions = np.random.default_rng(0).normal(size=(20_000, dimensions))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -390,8 +368,7 @@ def test_a_norm_of_wheels_is_written_in_wheels() -> None:
         name="base", parent="world", child="base", radius=0.1, track=0.5
     )
     floor = kv.norm(kv.array([kv.velocity("base/x"), kv.velocity("base/y")]))
-    model = constrained({"floor": (-math.inf, floor, 0.3)}, drive)
-    rows = model.velocity_rows(DT)
+    rows = constrained({"floor": (-math.inf, floor, 0.3)}, drive).velocity_rows(DT)
     assert [str(s) for s in rows.speeds] == ["base/left_wheel:velocity", "base/right_wheel:velocity"]
     for angle in np.linspace(-3, 3, 13):
         at = {"base/x": 0.0, "base/y": 0.0, "base/angle": angle}
@@ -437,8 +414,7 @@ def test_rows_of_poses_are_their_rates_in_every_kind_of_joint(seed: int) -> None
         edit.constrain("height", -100, height, 100)
     rows = model.velocity_rows(DT, speeds=model.speeds)
     state, speeds = random_state(model, seed), random_speeds(model, seed)
-    matrix = rows.matrix({s: state[s] for s in rows.matrix.symbols})
-    row = matrix[rows.names.index("height")]
+    row = rows.matrix({s: state[s] for s in rows.matrix.symbols})[rows.names.index("height")]
     forth, back = model.integrate(state, speeds, 1e-4), model.integrate(state, speeds, -1e-4)
     rate = (height(forth) - height(back)) / 2e-4
     assert row @ [speeds[s] for s in rows.speeds] == pytest.approx(rate, rel=1e-5, abs=1e-7)

@@ -1,7 +1,5 @@
 """Sphere covers and trees by the content of shapes: in memory, on the disk, damaged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -34,8 +32,7 @@ def collision_object(geometry, triangles=()):
 @pytest.fixture
 def fits(monkeypatch):
     """Count the covers that are computed."""
-    made = []
-    original = object_covers.cover_solids
+    made, original = [], object_covers.cover_solids
 
     def count(*arguments):
         made.append(arguments)
@@ -118,8 +115,7 @@ def test_the_cache_is_bounded_and_can_be_emptied(monkeypatch):
 
 def test_triangle_meshes_are_refused(tmp_path):
     path = tmp_path / "tetrahedron.stl"
-    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    lines = ["solid x"]
+    corners, lines = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], ["solid x"]
     for face in ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)):
         lines += ["facet normal 0 0 0", "outer loop"]
         lines += ["vertex {} {} {}".format(*corners[k]) for k in face]

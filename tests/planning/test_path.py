@@ -1,7 +1,5 @@
 """Paths with times: trajectories that are free, limits, holds, and errors."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 
@@ -60,8 +58,7 @@ def test_trajectory_stays_free_and_within_the_limits_from_rest_to_rest(planner, 
     trajectory = path.trajectory()
     times = np.linspace(0.0, trajectory.duration, 2000)
     assert _clearance(planner, trajectory.positions_at(times)) > 0
-    limits = motion_limits(model, path.symbols)
-    speeds = trajectory.velocities_at(times)
+    limits, speeds = motion_limits(model, path.symbols), trajectory.velocities_at(times)
     assert (np.abs(speeds) <= limits.velocity * (1 + 1e-6)).all()
     assert (np.abs(np.diff(speeds, axis=0) / np.diff(times)[:, None]) <= limits.acceleration * 1.01).all()
     assert not trajectory.velocities[[0, -1]].any()
@@ -99,8 +96,7 @@ def test_limits_may_be_given(path):
 
 
 def test_trajectory_is_that_of_the_place_where_it_was_planned(planner, path):
-    before = path.trajectory()
-    valid = planner.valid([LEFT, INSIDE, [0.5, 1.0, 0.0]])
+    before, valid = path.trajectory(), planner.valid([LEFT, INSIDE, [0.5, 1.0, 0.0]])
     planner.place({"hinge": 0.8})
     try:
         assert path.trajectory() == before
@@ -123,10 +119,8 @@ def test_motion_along_a_hold_keeps_it_and_does_not_stop(opening):
     trajectory = path.trajectory()
     assert len(path) > 20
     times = np.linspace(0.0, trajectory.duration, 500)
-    residual = kv.compile(hold.error, path.symbols)
-    assert np.abs(residual.batch(trajectory.positions_at(times))).max() <= 1e-5
-    inner = np.linalg.norm(trajectory.velocities[1:-1], axis=1)
-    assert inner.min() > 1e-3
+    assert np.abs(kv.compile(hold.error, path.symbols).batch(trajectory.positions_at(times))).max() <= 1e-5
+    assert np.linalg.norm(trajectory.velocities[1:-1], axis=1).min() > 1e-3
     assert (np.diff(path.times) >= 0).all()
 
 

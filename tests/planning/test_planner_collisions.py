@@ -1,7 +1,5 @@
 """Collision checks of a planner against the collision scene, which computes in double precision."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -20,8 +18,7 @@ def arm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("meshes")
     points = np.random.default_rng(0).normal(size=(30, 3)) * 0.08
     trimesh.Trimesh(points).convex_hull.export(folder / "hull.stl")
-    model = arm_among_shapes(Mesh("hull.stl", folder=str(folder)))
-    return Planner(model, "j*")
+    return Planner(arm_among_shapes(Mesh("hull.stl", folder=str(folder))), "j*")
 
 
 @pytest.fixture(scope="module")
@@ -129,8 +126,7 @@ def test_pair_that_is_apart_in_a_small_gap_only_is_checked():
 
 
 def test_certificate_finds_a_plate_between_two_samples(plate):
-    rng = np.random.default_rng(0)
-    A, B = rng.uniform(0.02, 0.5, (2, 100, 3)).astype(np.float32)
+    A, B = np.random.default_rng(0).uniform(0.02, 0.5, (2, 100, 3)).astype(np.float32)
     B[:, 0] *= -1
     A[:, 2], B[:, 2] = 0.0, 0.0
     column = [str(s) for s in plate.symbols].index("x")
@@ -195,8 +191,7 @@ def test_goal_behind_full_turns_is_checked_where_it_is(plate):
 
 
 def test_edits_of_the_model_are_followed():
-    x = kv.position("x")
-    model = kv.Model()
+    x, model = kv.position("x"), kv.Model()
     with model.edit() as edit:
         edit.add_frame("hand", "world", kv.translation(x, 0, 0), body(Sphere(0.05)))
         edit.add_frame("post", "world", kv.translation(0.5, 0.3, 0), body(Sphere(0.05)))

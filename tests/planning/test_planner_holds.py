@@ -1,7 +1,5 @@
 """Holds, conditions and closed loops of planners."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from planning_models import body, contacts, is_free
@@ -225,11 +223,9 @@ def four_bar():
 
 
 def test_closed_loop_has_the_poses_of_the_model_and_no_collision_is_hidden(four_bar):
-    rng = np.random.default_rng(0)
-    Q = rng.uniform(-3, 3, (120, 2))
+    Q = np.random.default_rng(0).uniform(-3, 3, (120, 2))
     found = four_bar.valid(Q)
-    crank = [str(s) for s in four_bar.symbols].index("crank")
-    assert not found[np.abs(Q[:, crank]) > 1.2].any()
+    assert not found[np.abs(Q[:, [str(s) for s in four_bar.symbols].index("crank")]) > 1.2].any()
     assert 0.1 < found.mean() < 0.9
     # Beyond its limits the loop does not close: lanes without poses.
     np.testing.assert_array_equal(found, [four_bar.valid(q)[0] for q in Q])

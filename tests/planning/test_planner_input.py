@@ -127,8 +127,7 @@ def test_wrong_arguments_are_refused(ball):
 
 def test_goals_out_of_reach_differ_from_blocked_ones():
     planner = Planner(points(2, 30), margin=0.01)
-    q = planner.symbols[0]
-    why = planner.plan([0, 0], kv.control.Hold(q, 50.0, name="far"), seconds=0.05).why
+    why = planner.plan([0, 0], kv.control.Hold(planner.symbols[0], 50.0, name="far"), seconds=0.05).why
     assert why.startswith("Out of reach")
     assert "'far'" in why
     assert "searched within 32 m or rad of the start: 'q00', 'q01'" in why
@@ -204,8 +203,7 @@ def test_rolling_base_is_not_moved():
 
 
 def test_64_coordinates_are_planned_and_65_refused():
-    planner = Planner(points(64))
-    path = planner.plan(np.zeros(64), np.full(64, 0.2))
+    path = Planner(points(64)).plan(np.zeros(64), np.full(64, 0.2))
     assert path, path.why
     with pytest.raises(InvalidValueError, match="65 coordinates"):
         Planner(points(65))
@@ -213,8 +211,7 @@ def test_64_coordinates_are_planned_and_65_refused():
 
 def test_many_obstacles_are_all_seen():
     planner = Planner(points(2, 400))
-    rng = np.random.default_rng(0)
-    Q = rng.uniform(-12, 12, (3000, 2))
+    Q = np.random.default_rng(0).uniform(-12, 12, (3000, 2))
     column = [str(s) for s in planner.symbols].index("q00")
     x, y = Q[:, column], Q[:, 1 - column]
     nearest = np.clip(np.round(x), -10, 9), np.clip(np.round(y + 0.3), -10, 9) - 0.3
@@ -244,8 +241,7 @@ def test_planners_in_two_threads_do_not_meet(ball):
     def work(seed: int) -> list[float]:
         planner = Planner(points(2, 100))
         planner.place({"q00": 0.0})
-        rng = np.random.default_rng(seed)
-        Q = rng.uniform(-12, -6, (20, 2))
+        Q = np.random.default_rng(seed).uniform(-12, -6, (20, 2))
         Q = Q[planner.valid(Q)]
         return [planner.plan(a, b, seed=seed, seconds=5.0).length for a, b in itertools.pairwise(Q)]
 
@@ -256,8 +252,7 @@ def test_planners_in_two_threads_do_not_meet(ball):
 
 def test_threads_share_a_planner_and_its_roadmap():
     planner = Planner(points(2, 100))
-    rng = np.random.default_rng(0)
-    Q = rng.uniform(-12, -6, (12, 2))
+    Q = np.random.default_rng(0).uniform(-12, -6, (12, 2))
     Q = Q[planner.valid(Q)]
 
     def work(k: int) -> None:

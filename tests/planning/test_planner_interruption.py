@@ -56,8 +56,7 @@ def test_goals_some_kilometres_away_are_reached(ball: Planner) -> None:
 
 def test_long_edges_are_certified_throughout(ball: Planner) -> None:
     # A post that a ball of 1 cm meets by far between the intervals of which a way has a limited number.
-    x = kv.position("x")
-    model = kv.Model()
+    x, model = kv.position("x"), kv.Model()
     with model.edit() as edit:
         edit.add_frame("ball", "world", kv.translation(x, 0, 0), body(Sphere(0.01)))
         edit.add_frame("post", "world", kv.translation(4000.3, 0, 0), body(Box((0.01, 0.01, 0.01))))

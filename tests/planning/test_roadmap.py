@@ -148,8 +148,7 @@ def test_an_enclosed_goal_is_a_reason_with_the_best_partial_path(planner: Planne
 
 def test_the_nearest_of_several_goals_is_reached(planner: Planner) -> None:
     place(planner, NARROWED)
-    path = plan(planner, LEFT, [[1.0, 0.0], [-1.0, -1.9]])
-    assert_certain(planner, path, LEFT, [-1.0, -1.9])
+    assert_certain(planner, plan(planner, LEFT, [[1.0, 0.0], [-1.0, -1.9]]), LEFT, [-1.0, -1.9])
 
 
 def test_memory_is_bounded_and_a_full_roadmap_says_so(planner: Planner) -> None:
@@ -160,8 +159,7 @@ def test_memory_is_bounded_and_a_full_roadmap_says_so(planner: Planner) -> None:
     assert path.why.startswith("The search ended")
     assert len(roadmap) <= 256
     place(planner, NARROWED)
-    generator = np.random.default_rng(0)
-    for end in generator.uniform(-1.5, 1.5, (200, 2)):
+    for end in np.random.default_rng(0).uniform(-1.5, 1.5, (200, 2)):
         if planner.valid(end)[0]:
             assert plan(planner, LEFT, end)
     assert 100 < len(roadmap) <= 256

@@ -11,12 +11,7 @@ from hypothesis import strategies as st
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.shapes import Solid, scale_solid, solid_from_geometry, solid_from_points
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
-from kineverse.planning.spheres import (
-    cover_objects,
-    cover_solid,
-    cover_solids,
-    default_protrusion,
-)
+from kineverse.planning.spheres import cover_objects, cover_solid, cover_solids, default_protrusion
 from kineverse.planning.spheres.certificate import find_uncovered
 from kineverse.planning.spheres.polytope import CoverRegion, bound_solid
 
@@ -98,8 +93,7 @@ def random_directions(count: int) -> np.ndarray:
 @settings(max_examples=12, deadline=None)
 @given(solids(), st.sampled_from([None, 0.01, 0.03]), st.sampled_from([1, 6, 32]))
 def test_cover_solid_contains_the_solid_and_keeps_to_its_protrusion(solid, protrusion, most):
-    cover = cover_solid(solid, protrusion, most)
-    points = sample(solid, 400)
+    cover, points = cover_solid(solid, protrusion, most), sample(solid, 400)
     assert distances_outside(cover.centres, cover.radii, points).max() <= 1e-9
     reached = protrusions_by_coal([(solid, np.eye(4))], cover.centres, cover.radii, random_directions(6))
     assert reached <= cover.protrusion + 1e-6
@@ -113,8 +107,7 @@ def test_cover_solid_contains_the_solid_and_keeps_to_its_protrusion(solid, protr
 @settings(max_examples=2, deadline=None)
 @given(st.integers(0, 100), st.sampled_from([0.25, 8.0]))
 def test_cover_solid_scales_with_the_solid(seed, factor):
-    points = np.random.default_rng(seed).normal(size=(20, 3)) * (0.1, 0.05, 0.08)
-    solid = solid_from_points(points)
+    solid = solid_from_points(np.random.default_rng(seed).normal(size=(20, 3)) * (0.1, 0.05, 0.08))
     large = scale_solid(solid, factor)
     one, other = cover_solid(solid, 0.05), cover_solid(large, 0.05 * factor)
     assert other.protrusion <= 0.05 * factor * (1 + 1e-9)
@@ -142,8 +135,7 @@ def test_cover_solids_contains_the_union_and_keeps_to_its_protrusion(drawn, most
 
 def test_shapes_inside_of_others_need_no_spheres():
     box = solid_from_geometry(Box((0.2, 0.2, 0.2)))
-    inside = solid_from_geometry(Cylinder(0.05, 0.1))
-    aside = np.eye(4)
+    inside, aside = solid_from_geometry(Cylinder(0.05, 0.1)), np.eye(4)
     aside[0, 3] = 0.02
     alone, both = (
         cover_solids([(box, np.eye(4))], 0.03),
@@ -179,8 +171,7 @@ def test_cover_solid_takes_a_chain_for_a_capsule(length, most):
 
 def test_cover_solid_covers_a_cube_by_few_spheres():
     """Eight spheres in a lattice reach 18.3 mm."""
-    cover = cover_solid(solid_from_geometry(Box((0.1, 0.1, 0.1))), 0.02)
-    assert len(cover) == 8
+    assert len(cover_solid(solid_from_geometry(Box((0.1, 0.1, 0.1))), 0.02)) == 8
 
 
 @pytest.mark.parametrize(
@@ -217,8 +208,7 @@ def test_find_uncovered_finds_a_gap_between_spheres():
     assert uncovered.growth.max() >= needed
     assert uncovered.growth.max() <= needed + 2e-4
     assert distances_outside(centres, radii, uncovered.points).min() > 0.0
-    grown = find_uncovered(region, centres, radii + uncovered.growth, 1e-4)
-    assert not len(grown.points)
+    assert not len(find_uncovered(region, centres, radii + uncovered.growth, 1e-4).points)
 
 
 EXTREME = [
@@ -232,8 +222,7 @@ EXTREME = [
 @pytest.mark.parametrize("geometry", EXTREME, ids=str)
 def test_covers_of_plates_needles_and_extreme_sizes_contain_them(geometry):
     solid = solid_from_geometry(geometry)
-    cover = cover_solid(solid, most=6)
-    size = solid.radius
+    cover, size = cover_solid(solid, most=6), solid.radius
     assert 1 <= len(cover) <= 6
     assert distances_outside(cover.centres, cover.radii, sample(solid, 200)).max() < 1e-7 * size
     # Centres are inside, so that none sticks out by more than its radius.

@@ -13,7 +13,6 @@ from kineverse.planning.spheres import enclosing_ball, make_sphere_tree
 
 
 def spheres(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random spheres."""
     random = np.random.default_rng(seed)
     return random.normal(size=(count, 3)) * (0.3, 0.1, 0.05), random.uniform(0.01, 0.1, size=count)
 
@@ -46,8 +45,7 @@ def test_enclosing_ball_is_close_to_the_smallest(seed, count):
         return (np.linalg.norm(centres - x, axis=1) + radii).max()
 
     tried = (minimize(reach, x, method="Nelder-Mead", options={"xatol": 1e-7}) for x in centres[:3])
-    best = min(result.fun for result in tried)
-    assert found <= 1.01 * best
+    assert found <= 1.01 * min(result.fun for result in tried)
 
 
 def test_one_sphere_is_its_own_hierarchy():

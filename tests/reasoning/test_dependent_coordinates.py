@@ -109,14 +109,12 @@ def test_lock_on_a_rocker_with_a_limited_crank() -> None:
 def test_lock_that_a_linkage_never_reaches_is_omitted() -> None:
     always = locked("slider_crank", kv.position("slider_crank/slider") > 0.5)
     assert [str(lock) for lock in interlocks(always)] == ["door:velocity stands still: always (lock)"]
-    never = locked("slider_crank", kv.position("slider_crank/slider") > 0.1)
-    assert interlocks(never) == Interlocks([])
+    assert interlocks(locked("slider_crank", kv.position("slider_crank/slider") > 0.1)) == Interlocks([])
 
 
 def test_range_of_a_dependent_coordinate_keeps_its_name() -> None:
     """The condition is about the crank, the bound is where the slider is."""
-    model = kv.load("articulations/slider_crank")
-    slider = kv.position("slider_crank/slider")
+    model, slider = kv.load("articulations/slider_crank"), kv.position("slider_crank/slider")
     with model.edit() as edit:
         edit.constrain("door", 0, DOOR, 0.3)
         edit.constrain("wedge", 0, DOOR, slider)

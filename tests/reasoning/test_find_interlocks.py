@@ -52,8 +52,7 @@ def test_interlock_of_the_garage_door() -> None:
 
 
 def lockbox() -> kv.Model:
-    a = (B > 0.4) & (C > 0.6)
-    c = (D > 0.5) & (E > 1.0)
+    a, c = (B > 0.4) & (C > 0.6), (D > 0.5) & (E > 1.0)
     limits = {"b": (B, 0.7), "c": (C, 0.8), "d": (D, 0.9), "e": (E, 1.1)}
     steps = {"b": (B, D > 0.8), "c": (C, c), "d": (D, E > 0.9), "e": (E, F > 1.2)}
     return model(
@@ -104,8 +103,7 @@ def test_interlocks_of_an_oven_with_a_child_lock() -> None:
 
 
 def test_interlocks_of_nested_locks() -> None:
-    inner = ~((C > 0.5) & (D > 0.5))
-    outer = kv.where(inner, 1 - kv.logic.less(B, 0.3), kv.where(B < 0.1, 0, 1))
+    outer = kv.where(~((C > 0.5) & (D > 0.5)), 1 - kv.logic.less(B, 0.3), kv.where(B < 0.1, 0, 1))
     # Where a selection is by a comparison that is half true, it holds: so some of these include their ends.
     assert said(found(lock=(-outer, v(A), outer))) == [
         "a:velocity stands still: when b <= 0.1 or (b < 0.3 and c <= 0.5) or (b < 0.3 and d <= 0.5) (lock)"
@@ -146,8 +144,7 @@ def test_directions_of_a_speed_are_locked_independently() -> None:
 
 
 def test_two_constraints_combine_to_an_interlock() -> None:
-    result = found(up=(-1, v(A), B > 1), down=(-(C > 1), v(A), 1))
-    assert said(result) == [
+    assert said(found(up=(-1, v(A), B > 1), down=(-(C > 1), v(A), 1))) == [
         "a:velocity cannot increase: when b < 1 (up)",
         "a:velocity stands still: when b < 1 and c < 1 (up, down)",
         "a:velocity cannot decrease: when c < 1 (down)",
@@ -254,8 +251,7 @@ def test_factors_and_negated_expressions_of_speeds() -> None:
 
 
 def test_conditions_on_sums_of_coordinates() -> None:
-    result = found(b=(-1, B, 1), c=(-1, C, 1), lock=(-1, v(A), 2 * B + C < 0.5))
-    (lock,) = result
+    (lock,) = found(b=(-1, B, 1), c=(-1, C, 1), lock=(-1, v(A), 2 * B + C < 0.5))
     ((axis, side),) = lock.when[0].items()
     assert str(lock) == "a:velocity cannot increase: when b + 0.5*c > 0.25 (lock)"
     assert axis == B + 0.5 * C
@@ -313,8 +309,7 @@ def test_interlocks_with_speeds_and_parameters_as_keys() -> None:
 
 
 def test_augmented_conditions_are_read_by_their_value() -> None:
-    handle = B.augment({v(C): 3.0})
-    free = handle > 0.3
+    free = B.augment({v(C): 3.0}) > 0.3
     assert said(found(lock=(-free, v(A), free))) == ["a:velocity stands still: when b < 0.3 (lock)"]
 
 

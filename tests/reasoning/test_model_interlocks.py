@@ -22,8 +22,7 @@ def test_robots_and_kitchens_have_no_interlocks(name: str) -> None:
 
 @pytest.mark.long  # docs/interlocks.md has it, too
 def test_dependent_coordinate_as_key() -> None:
-    model = kv.load("articulations/four_bar")
-    door = kv.position("door")
+    model, door = kv.load("articulations/four_bar"), kv.position("door")
     rocker = max(model.rates.dependent, key=str)
     with model.edit() as edit:
         edit.constrain("lock", -(rocker < 1.9), door.derivative(), rocker < 1.9)

@@ -87,15 +87,13 @@ def test_too_many_cases_are_undecided() -> None:
 
 
 def test_nonlinear_limit_of_several_coordinates_is_undecided() -> None:
-    subject = model(both=(0, A * A + B * B, 1))
-    (unknown,) = interlocks(subject).undecided
+    (unknown,) = interlocks(model(both=(0, A * A + B * B, 1))).undecided
     assert unknown.reason == "it limits several coordinates at once, and they are not just added"
 
 
 def test_condition_on_a_winding_angle_is_undecided() -> None:
     """The angle between crank and coupler comes back after a turn with a turn less: there is no period."""
-    four_bar = kv.load("articulations/four_bar")
-    angle = kv.position("four_bar/coupler")
+    four_bar, angle = kv.load("articulations/four_bar"), kv.position("four_bar/coupler")
     with four_bar.edit() as edit:
         edit.constrain("lock", -1, SPEED, angle < 0.1)
     found = interlocks(four_bar)

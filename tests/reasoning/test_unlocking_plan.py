@@ -18,22 +18,7 @@ from kineverse.gallery.lockboxes import (
 from kineverse.reasoning import Interval, interlocks, plan_unlocking, plan_violations, refutation_gaps
 from kineverse.reasoning.move_search import MoveSearch
 from kineverse_studies.experiments.lockbox.unknown_locks import can_be_opened
-
-A, B, C = map(kv.position, "abc")
-
-
-def goal_of(box):
-    return {f"lockbox/{name}": value for name, value in box.goal.items()}
-
-
-def three_sliders(**locks):
-    model = kv.Model()
-    with model.edit() as edit:
-        for q in (A, B, C):
-            edit.constrain(f"{q} range", 0, q, 1)
-        for name, open_if in locks.items():
-            edit.constrain(f"lock {name}", -1, kv.position(name).derivative(), open_if)
-    return model
+from sliders import A, B, C, goal_of, three_sliders
 
 
 def test_plan_of_thesis_box_gives_its_order_with_reasons():
@@ -103,8 +88,7 @@ def test_plan_of_large_monotone_box_has_no_superfluous_move():
     assert plan.verdict == "found"
     assert plan_violations(model, plan) == []
     for n in range(len(plan.steps)):
-        fewer = replace(plan, steps=plan.steps[:n] + plan.steps[n + 1 :])
-        assert plan_violations(model, fewer), n
+        assert plan_violations(model, replace(plan, steps=plan.steps[:n] + plan.steps[n + 1 :])), n
 
 
 def test_plan_violations_reports_wrong_order():
@@ -145,8 +129,7 @@ def test_bolt_does_not_spring_out_under_the_door():
 
 
 def test_plan_refutes_circle():
-    model = three_sliders(a=B > 0.5, b=(C > 0.3) & (C < 0.9), c=A > 0.1)
-    plan = plan_unlocking(model, {A: 1})
+    plan = plan_unlocking(three_sliders(a=B > 0.5, b=(C > 0.3) & (C < 0.9), c=A > 0.1), {A: 1})
     assert plan.verdict == "refuted"
     assert plan.is_circle
     assert [lock.constraints for lock in plan.blocking] == [("lock a",), ("lock b",), ("lock c",)]
@@ -195,8 +178,7 @@ def test_circle_is_named_where_another_way_is_stuck():
 def test_plan_without_what_does_not_move():
     model = three_sliders(a=(B > 0.5) | (C > 0.5))
     first = plan_unlocking(model, {A: 1}).steps[0].coordinate
-    second = plan_unlocking(model, {A: 1}, fixed=[first]).steps[0].coordinate
-    assert {first, second} == {B, C}
+    assert {first, plan_unlocking(model, {A: 1}, fixed=[first]).steps[0].coordinate} == {B, C}
     refuted = plan_unlocking(model, {A: 1}, fixed=[B, C])
     assert refuted.verdict == "refuted"
     assert str(refuted).startswith("a = 1: cannot be reached without b and c")
@@ -253,8 +235,7 @@ def test_key_stops_before_its_own_latch(way, goal):
 
 
 def test_goal_on_the_threshold_of_two_locks_is_reached():
-    model = three_sliders(b=A > 0.5, c=A < 0.5)
-    plan = plan_unlocking(model, {A: 0.5})
+    plan = plan_unlocking(three_sliders(b=A > 0.5, c=A < 0.5), {A: 0.5})
     assert [str(step) for step in plan.steps] == ["raise a to 0.5: it is the goal"]
 
 
@@ -289,17 +270,15 @@ def test_refutation_gaps_finds_each_flaw():
     model = three_sliders(a=B > 0.5, b=C > 0.3, c=A > 0.1)
     plan = plan_unlocking(model, {A: 1})
     known = plan.invariant
-    open_ = three_sliders(a=B > 0.5, c=A > 0.1)
-    assert refutation_gaps(open_, plan) == ["b may get to 0.5 < b <= 1"]
+    assert refutation_gaps(three_sliders(a=B > 0.5, c=A > 0.1), plan) == ["b may get to 0.5 < b <= 1"]
     assert refutation_gaps(model, replace(plan, goal={A: 0.05})) == ["the goal is inside"]
     assert refutation_gaps(model, plan, {"b": 0.9}) == ["the start is outside"]
     short = replace(known, cells=(known.cells[0][:1], *known.cells[1:]), rests=((True,), *known.rests[1:]))
     assert "the intervals of a do not cover its range" in refutation_gaps(
         model, replace(plan, invariant=short)
     )
-    blind = replace(known, rests=((True, False), *known.rests[1:]))
     assert "the intervals of a do not cover its range" in refutation_gaps(
-        model, replace(plan, invariant=blind)
+        model, replace(plan, invariant=replace(known, rests=((True, False), *known.rests[1:])))
     )
     assert refutation_gaps(model, replace(plan, invariant=None)) != []
 
@@ -338,16 +317,14 @@ def test_conditions_that_contradict_each_other_keep_a_goal_out_of_reach():
 
 def test_plan_after_its_budget_is_undecided():
     box = draw_lockbox(30, 0, negated=0.5)
-    model = make_lockbox_model(box)
-    plan = plan_unlocking(model, goal_of(box), budget=1e-9)
+    plan = plan_unlocking(make_lockbox_model(box), goal_of(box), budget=1e-9)
     assert plan.verdict == "undecided"
     assert not plan.steps
     assert "undecided, since the budget was spent after" in str(plan)
 
 
 def test_plan_of_a_goal_that_is_reached():
-    model = three_sliders(a=B > 0.5)
-    plan = plan_unlocking(model, {A: 0.0})
+    plan = plan_unlocking(three_sliders(a=B > 0.5), {A: 0.0})
     assert (plan.verdict, plan.steps, str(plan)) == ("found", (), "nothing has to move")
 
 
@@ -361,13 +338,11 @@ def test_goal_in_the_interval_of_the_start_has_to_be_reached():
 
 def test_known_interlocks_are_used():
     model = three_sliders(a=B > 0.5)
-    found = interlocks(model)
-    assert plan_unlocking(model, {A: 1}, found=found) == plan_unlocking(model, {A: 1})
+    assert plan_unlocking(model, {A: 1}, found=interlocks(model)) == plan_unlocking(model, {A: 1})
 
 
 def test_coordinates_without_limits_or_locks():
-    door = kv.position("door")
-    model = kv.Model()
+    door, model = kv.position("door"), kv.Model()
     with model.edit() as edit:
         edit.constrain("lock", -1, door.derivative(), A > 3)
     assert [str(step) for step in plan_unlocking(model, {door: 2}).steps] == [

@@ -74,8 +74,7 @@ class Scene:
         """Return lowest and highest corner of every "shapes" or "visuals", each (n, 3)."""
         geometry = getattr(self, kind)
         poses = self._place(geometry, positions)
-        boxes = [g.geometry.aabb_local for g in geometry.geometryObjects]
-        placed = list(zip(poses, boxes, strict=True))
+        placed = list(zip(poses, [g.geometry.aabb_local for g in geometry.geometryObjects], strict=True))
         middle = np.array([pose.act((box.max_ + box.min_) / 2) for pose, box in placed])
         reach = np.array([np.abs(pose.rotation) @ (box.max_ - box.min_) / 2 for pose, box in placed])
         return middle - reach, middle + reach

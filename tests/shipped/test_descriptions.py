@@ -267,21 +267,18 @@ def test_inertias_equal_those_of_solids(name: str) -> None:
 @pytest.mark.parametrize("name", ALL)
 def test_inertias_agree_with_coal(name: str) -> None:
     """Of links of one material, whose density cancels out."""
-    s = scene(name)
-    checked = 0
+    s, checked = scene(name), 0
     for link in s.xml.iterfind("link"):
         if len({material.get("name") for material in link.iterfind("visual/material")}) != 1:
             continue
         frame = s.model.getFrameId(link.get("name"), pin.FrameType.BODY)
-        to_link = s.model.frames[frame].placement.inverse()
-        solids = []
+        to_link, solids = s.model.frames[frame].placement.inverse(), []
         for shape in s.visuals.geometryObjects:
             if shape.parentFrame == frame:
                 volume = shape.geometry.computeVolume()
                 moment = shape.geometry.computeMomentofInertiaRelatedToCOM()
                 solids.append((to_link * shape.placement) * pin.Inertia(volume, np.zeros(3), moment))
-        whole = sum(solids[1:], start=solids[0])
-        inertial = link.find("inertial")
+        whole, inertial = sum(solids[1:], start=solids[0]), link.find("inertial")
         density = float(inertial.find("mass").get("value")) / whole.mass
         centre = [float(v) for v in inertial.find("origin").get("xyz").split()]
         np.testing.assert_allclose(whole.lever, centre, atol=1e-6)

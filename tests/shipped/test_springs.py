@@ -16,8 +16,7 @@ DOORS = ("oven_door", "dishwasher_door")
 
 def torque(model: kv.Model, name: str) -> Array:
     """Return the torque of gravity and spring that opens a door, over its range [N m]."""
-    q = model.symbol(name)
-    height = model.center_of_mass(name)[2]
+    q, height = model.symbol(name), model.center_of_mass(name)[2]
     weight = -model.mass(name) * GRAVITY * height.gradient()[q.derivative()]
     spring = dict(model.articulations[name].dynamics)
     angles = np.linspace(*model.limits(q), 50)

@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 from browsers import launched
+from small_models import cabinet
+
+from kineverse.view import view
 
 
 @pytest.fixture(scope="module")
@@ -14,3 +17,9 @@ def browser(chromium: str) -> Iterator[Any]:
     """A real Chromium."""
     with launched(chromium) as browser:
         yield browser
+
+
+@pytest.fixture
+def page() -> Iterator[Any]:
+    with view(cabinet(), port=0) as viewer:
+        yield viewer

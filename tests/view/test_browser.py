@@ -1,7 +1,5 @@
 """The page in a real Chromium: moving a slider moves the part."""
 
-from __future__ import annotations
-
 import re
 
 import browsers
@@ -202,8 +200,7 @@ def test_nearest_pairs_are_shown_and_follow_the_sliders(opened):
     viewer.collisions.show_near(0.055)
     until(page, lambda: greenish(shot(page)).sum() > 10)
     # Pulled by hand, the drawer comes right above the door.
-    thumb = slider(page, viewer, "cabinet/drawer")
-    thumb.focus()
+    slider(page, viewer, "cabinet/drawer").focus()
     page.keyboard.press("End")
     page.get_by_text("50.0 mm").wait_for()
     viewer.collisions.show_shapes()

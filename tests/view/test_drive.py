@@ -1,7 +1,5 @@
 """Quaternion angles, speeds, locks and closed loops on the page."""
 
-from __future__ import annotations
-
 import math
 import time
 

@@ -1,7 +1,5 @@
 """Files and pages that attack the viewer, in a real Chromium."""
 
-from __future__ import annotations
-
 from html import escape
 
 import pytest
@@ -148,8 +146,7 @@ def test_only_the_own_page_of_a_browser_reaches_the_viewer(browser, monkeypatch)
         assert all("Content Security Policy" in text for text in errors)
         page.close()
 
-        port = own.split(":")[2].split("/")[0]
-        other = browser.new_page()
+        port, other = own.split(":")[2].split("/")[0], browser.new_page()
         other.route(
             "http://evil.example/**",
             lambda route: route.fulfill(body="<p>evil</p>", content_type="text/html"),

@@ -1,7 +1,5 @@
 """The simulation of the demo without a browser: motion, readings, tracking, identification and drawing."""
 
-from __future__ import annotations
-
 import math
 import re
 
@@ -260,8 +258,7 @@ def test_axis_covariances_are_those_of_sampled_axes(chest):
     height = 0.6
     ways = Rotation.from_rotvec(np.pad(drawn[:, 2:], ((0, 0), (0, 1)))).as_matrix()[:, :, 2]
     crossings = drawn[:, :2] + height * ways[:, :2] / ways[:, 2:]
-    expected = np.cov(crossings.T)
-    found = axis_covariances(fit, np.array([height]))[0]
+    expected, found = np.cov(crossings.T), axis_covariances(fit, np.array([height]))[0]
     np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
 
 

@@ -1,7 +1,5 @@
 """The page of the demo: its thread, and a real Chromium that opens it."""
 
-from __future__ import annotations
-
 import socket
 import threading
 
@@ -48,8 +46,7 @@ def test_a_port_in_use_is_refused_without_a_thread_left():
 
 
 def test_a_failed_step_is_logged_and_the_simulation_continues(monkeypatch, caplog):
-    done = threading.Event()
-    moments = iter([True, False])
+    done, moments = threading.Event(), iter([True, False])
 
     def step(self, dt):
         if next(moments, False):

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import logging
 import zipfile
 
@@ -123,8 +121,7 @@ def test_a_mesh_reads_files_inside_of_its_root_only(tetrahedron, tmp_path):
         (inside / f"{k}.obj").write_text(OBJ.replace("two.mtl", name))
         colors = load_mesh(Mesh(f"{k}.obj", folder=str(inside))).surface.colors
         assert colors is None or len({tuple(color) for color in colors.tolist()}) == 1
-    files = trimesh.creation.box().export(file_type="gltf")
-    for name, content in files.items():
+    for name, content in trimesh.creation.box().export(file_type="gltf").items():
         (tmp_path / name).write_bytes(content)
         if name.endswith(".gltf"):
             (inside / name).write_bytes(content.replace(b'"uri":"', b'"uri":"../'))

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import errno
 import os
 import struct
@@ -38,8 +36,7 @@ def test_parts_are_drawn_in_their_colours():
 
 
 def test_opening_the_drawer_moves_red_pixels_and_shows_more_of_it():
-    model = cabinet()
-    side = Camera((-2.0, -3.0, 1.2), (0.0, 0.0, 0.5))
+    model, side = cabinet(), Camera((-2.0, -3.0, 1.2), (0.0, 0.0, 0.5))
     shut = reddish(picture(model, camera=side, size=SMALL))
     open_ = reddish(picture(model, {"cabinet/drawer": 0.4}, camera=side, size=SMALL))
     assert open_.sum() > 1.5 * shut.sum()
@@ -57,8 +54,7 @@ def test_the_automatic_camera_shows_moving_parts():
 
 
 def test_states_are_given_by_symbol_by_name_or_as_larger_states():
-    model = cabinet()
-    door = kv.position("cabinet/door")
+    model, door = cabinet(), kv.position("cabinet/door")
     by_name = picture(model, {"cabinet/door": 1.0}, camera=FRONT, size=SMALL)
     np.testing.assert_array_equal(by_name, picture(model, {door: 1.0}, camera=FRONT, size=SMALL))
     more = kv.State({door: 1.0, kv.position("elsewhere"): 3.0})
@@ -78,16 +74,13 @@ def test_frames_are_drawn_on_demand_and_through_bodies():
 
 
 def test_collision_shapes_on_demand():
-    model = cabinet()
-    image = picture(model, camera=FRONT, size=SMALL, collisions=True)
-    assert bluish(image).sum() == 0
+    assert bluish(picture(cabinet(), camera=FRONT, size=SMALL, collisions=True)).sum() == 0
 
 
 @pytest.mark.parametrize("frames", [False, True])
 def test_models_without_bodies_show_their_frames(frames):
     model = kv.Model()
-    empty = picture(model, size=(64, 48), frames=frames)
-    assert empty.shape == (48, 64, 3)
+    assert picture(model, size=(64, 48), frames=frames).shape == (48, 64, 3)
     with model.edit() as edit:
         edit.add_frame("a", parent="world", transform=kv.translation(1, kv.position("a"), 0))
     assert len(np.unique(picture(model, size=(64, 48)).reshape(-1, 3), axis=0)) > 20
@@ -102,8 +95,7 @@ def test_invalid_picture_sizes_are_refused(size):
 @pytest.mark.parametrize("name", kv.shipped_models())
 @pytest.mark.sampled(3)
 def test_every_shipped_model_makes_a_picture(name):
-    image = picture(kv.load(name), size=SMALL)
-    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 200
+    assert len(np.unique(picture(kv.load(name), size=SMALL).reshape(-1, 3), axis=0)) > 200
 
 
 def test_pictures_are_deterministic():
@@ -119,8 +111,7 @@ def test_save_picture_writes_a_png_that_other_libraries_read(tmp_path):
 
 @pytest.mark.parametrize("channels", [3, 4])
 def test_encode_png_writes_valid_chunks(channels):
-    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, channels), dtype=np.uint8)
-    data = encode_png(pixels)
+    data = encode_png(np.random.default_rng(0).integers(0, 256, (5, 7, channels), dtype=np.uint8))
     assert data.startswith(b"\x89PNG\r\n\x1a\n")
     position, kinds = 8, []
     while position < len(data):

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_models import cabinet
 
 import kineverse as kv
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.planning import Trajectory
-from kineverse.view import view
 from kineverse.view.animation import TrajectoryPlayback
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
@@ -20,12 +18,6 @@ DRAWER, DOOR = kv.position("cabinet/drawer"), kv.position("cabinet/door")
 def opening(duration: float) -> Trajectory:
     """Return a motion that opens the drawer and the door."""
     return Trajectory((DRAWER, DOOR), [0, duration], [[0, 0], [0.4, 1.0]], np.zeros((2, 2)))
-
-
-@pytest.fixture
-def page():
-    with view(cabinet(), port=0) as viewer:
-        yield viewer
 
 
 def test_a_playback_follows_its_clock(page):

@@ -1,7 +1,5 @@
 """Plots of identified joints: views along and across the axis, and the uncertainty of the fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -18,13 +16,10 @@ NOISE = pose_covariance(0.005, 0.02)
 
 
 def hinge(count=25):
-    rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (count, 1, 1))
+    rng, poses = np.random.default_rng(0), np.tile(np.eye(4), (count, 1, 1))
     turns = Rotation.from_rotvec(np.outer(np.linspace(0, 1.2, count), AXIS)).as_matrix()
-    noise = Rotation.from_rotvec(0.02 * rng.standard_normal((count, 3))).as_matrix()
-    poses[:, :3, :3] = noise @ turns
-    lever = np.cross(AXIS, [0.5, 0, 0])
-    poses[:, :3, 3] = POINT + turns @ lever + 0.005 * rng.standard_normal((count, 3))
+    poses[:, :3, :3] = Rotation.from_rotvec(0.02 * rng.standard_normal((count, 3))).as_matrix() @ turns
+    poses[:, :3, 3] = POINT + turns @ np.cross(AXIS, [0.5, 0, 0]) + 0.005 * rng.standard_normal((count, 3))
     return poses
 
 
@@ -84,8 +79,7 @@ def test_axis_covariances_of_a_projection_are_those_of_sampled_axes(found, heigh
 def test_every_family_is_drawn(family, whole):
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
     seen = hinge() if whole else hinge()[:, :3, 3]
-    fit = identify(None, seen, noise=NOISE, families=[family]).best
-    draw_fit(figure, fit, seen, "a title")
+    draw_fit(figure, identify(None, seen, noise=NOISE, families=[family]).best, seen, "a title")
     figure.canvas.draw()
     assert figure.get_suptitle() == "a title"
     assert {"joint values, ±2 σ", "left over"} <= {axes.get_title() for axes in figure.axes}

@@ -168,8 +168,7 @@ def test_drawn_collision_shapes_are_those_of_distances(tmp_path):
 
 
 def test_pictures_show_nearest_pairs_through_bodies():
-    camera = Camera((0.1, -1.0, 0.2), (0.1, 0.0, 0.1))
-    model = two_balls()
+    camera, model = Camera((0.1, -1.0, 0.2), (0.1, 0.0, 0.1)), two_balls()
 
     def colorful(gap):
         image = picture(model, {"gap": gap}, (320, 240), camera, near=0.1).astype(int)

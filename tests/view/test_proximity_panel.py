@@ -1,7 +1,5 @@
 """The proximity panel and its background thread, without a browser."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recorded runs on the page and in pictures: the truth, the belief as a ghost, arrows, and plots."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

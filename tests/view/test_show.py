@@ -1,7 +1,5 @@
 """kv.show in a script, at a prompt and in a notebook; titles of pages."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -69,8 +67,7 @@ def test_show_without_block_returns_at_once(capfd, opened):
 
 def test_show_at_a_prompt_does_not_wait(monkeypatch, opened):
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
-    page = show(cabinet(), port=0)
-    page.stop()
+    show(cabinet(), port=0).stop()
     assert len(opened) == 1
 
 
@@ -91,14 +88,6 @@ def test_show_without_a_screen_opens_no_browser(monkeypatch, opened):
     monkeypatch.setattr(sys, "platform", "linux")
     show(cabinet(), port=0, block=False).stop()
     assert opened == []
-
-
-@pytest.fixture
-def hears_ctrl_c():
-    """Have processes started here hear Ctrl-C, which they would not if this one was started with ``&``."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 def test_a_real_script_ends_with_ctrl_c(hears_ctrl_c):

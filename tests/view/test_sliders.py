@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -79,8 +77,7 @@ def test_units_are_inferred_from_the_motion():
         edit.add_frame("finger", parent="world", transform=kv.translation(0.5 * mimic, 0, 0))
         edit.add_frame("other", parent="world", transform=kv.translation(mimic, 0, 0))
     values = {**complete(model), "rope": 0.5}
-    names = [str(symbol) for symbol in model.degrees_of_freedom]
-    assert infer_units(model, values, names) == {
+    assert infer_units(model, values, [str(symbol) for symbol in model.degrees_of_freedom]) == {
         "cabinet/door": "rad",
         "cabinet/drawer": "m",
         "cabinet/knob": "rad",

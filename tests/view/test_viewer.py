@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import socket
 import sys
 import threading
@@ -15,12 +13,6 @@ from kineverse.model.body import Body, Box, Shape
 from kineverse.view import view
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
-
-
-@pytest.fixture
-def page():
-    with view(cabinet(), port=0) as viewer:
-        yield viewer
 
 
 def sliders(viewer):
@@ -118,8 +110,7 @@ def test_half_transparent_bodies_cast_no_shadows(page):
 
 
 def test_frames_that_differ_by_a_slash_like_character_are_two_nodes():
-    model = kv.Model()
-    cube = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
+    model, cube = kv.Model(), Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
     with model.edit() as edit:
         edit.add_frame("a/b", "world", kv.translation(1, 0, 0), cube)
         edit.add_frame("a∕b", "world", kv.translation(2, 0, 0), cube)

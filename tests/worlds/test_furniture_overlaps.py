@@ -49,8 +49,7 @@ def test_bodies_that_overlap_in_all_of_their_range_are_made_so():
     model = cupboard(0.0, 1.0)
     with model.edit() as edit:
         edit.add_frame("knob", "panel", np.eye(4), solid(Box((0.05, 0.05, 0.05)), (0.0, 0.005, 0)))
-    overlaps = FurnitureOverlaps(Scene(model), "robot")
-    values = np.linspace(0.0, 1.0, 7)
+    overlaps, values = FurnitureOverlaps(Scene(model), "robot"), np.linspace(0.0, 1.0, 7)
     depths = [-distance(model, "box", "knob", q) for q in values]
     assert max(depths) > depths[0] + 0.001
     assert all(excess(overlaps, door=q) == 0.0 for q in values)

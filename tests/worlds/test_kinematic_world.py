@@ -35,7 +35,6 @@ def world(model: Model, hand: Gripper) -> KinematicWorld:
 
 
 def start(world: KinematicWorld, **values: float) -> None:
-    """Reset to a state: names of the robot, or of the room."""
     prefixes = {name: "room" if name in OBJECTS else "robot" for name in values}
     world.reset({"robot/finger": 0.05} | {f"{prefixes[name]}/{name}": v for name, v in values.items()})
 
@@ -134,8 +133,7 @@ def test_fingers_hold_a_handle_and_the_door_follows_the_hand(world, model, hand)
     assert [e.text for e in world.events] == ["'room/door_handle' is held"]
     assert world.state["robot/finger"] == pytest.approx(0.015, abs=1e-5)  # a bar of 1 cm radius
     pose = model.fk("robot/base")
-    before = model.fk("room/door_handle")(world.state)
-    in_door = np.linalg.inv(before) @ pose(world.state)
+    in_door = np.linalg.inv(model.fk("room/door_handle")(world.state)) @ pose(world.state)
     dt, angle = 0.02, world.state["room/door"]
     for k in range(1, 41):
         wanted = angle - 0.012 * k  # opens towards the robot
@@ -389,8 +387,7 @@ def test_mechanisms_of_all_kinds_keep_their_limits(scene):
         {s: float(r.mean()) for s, r in ranges.items() if np.isfinite(r).all()}
     )
     for body in [name for name in model.bodies if name.startswith("thing")][-3:]:
-        middle = model.fk(body)(home)[:3, 3]
-        way = rng.normal(size=3)
+        middle, way = model.fk(body)(home)[:3, 3], rng.normal(size=3)
         way *= 0.25 / np.linalg.norm(way)
         world.reset(home.updated(dict(zip((x, y, z), middle - way, strict=True))))
         judge.reset()

@@ -45,8 +45,7 @@ def test_jammed_part_does_not_move():
 def test_random_motions_violate_no_constraint(seed):
     """Each part is moved as if nothing held it; the violations are those of the model, not of the world."""
     model, rng = make_lockbox_model(draw_tangled_lockbox(6, seed)), np.random.default_rng(seed)
-    world = MechanismWorld(model)
-    moved = 0
+    world, moved = MechanismWorld(model), 0
     for _ in range(120):
         before = world.state
         world.apply({v: rng.uniform(-0.6, 0.6) for v in model.speeds}, 0.2)

@@ -25,8 +25,7 @@ EFFORT = 60.0
 def solid(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]], mass: float = 0.0) -> Body:
     """Return boxes by size and place, whose centre of mass is at the origin of their frame."""
     shapes = tuple(Shape(Box(size), Pose.from_matrix(np.array(kv.translation(*at)()))) for size, at in boxes)
-    inertia = Inertia(mass, (0.4, 0, 0, 0.4, 0, 0.4)) if mass else None
-    return Body(collisions=shapes, inertia=inertia)
+    return Body(collisions=shapes, inertia=Inertia(mass, (0.4, 0, 0, 0.4, 0, 0.4)) if mass else None)
 
 
 def room(*, limited: bool = True, sunk: float = 0.0) -> kv.Model:

@@ -187,8 +187,7 @@ def test_fingers_hold_a_bar_with_the_stated_force_until_they_open(robot: str) ->
     before = world.state
     for _ in range(5):
         world.apply(forward, 0.1)
-    way = world.state["thing/way"] - before["thing/way"]
-    assert way == pytest.approx(-0.05, abs=2e-3)
+    assert world.state["thing/way"] - before["thing/way"] == pytest.approx(-0.05, abs=2e-3)
     assert world.held == "thing/bar"
     world.apply({v: -x for v, x in close.items()}, 0.2)
     assert world.held is None
@@ -306,11 +305,9 @@ def test_loops_move_as_the_model_says() -> None:
 
 
 def simulated_pose(world: MujocoWorld, frame: str) -> Array:
-    """Return the pose of a body in MuJoCo."""
     data, engine = world._data, mujoco
     engine.mj_kinematics(world._compiled, data)
-    body = data.body(frame)
-    pose = np.eye(4)
+    body, pose = data.body(frame), np.eye(4)
     pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos
     return pose
 
@@ -420,8 +417,7 @@ def test_remarks_tell_what_was_added_and_left_out() -> None:
     ],
 )
 def test_descriptions_of_others_stand_still(path: str, still: float, published: Callable[..., Path]) -> None:
-    model = kv.load(published(path), prefix="robot")
-    world = MujocoWorld(model, "robot")
+    world = MujocoWorld(kv.load(published(path), prefix="robot"), "robot")
     before = world.state
     world.apply({}, 0.5)
     assert max(abs(world.state[s] - before[s]) for s in before) < still
@@ -429,8 +425,7 @@ def test_descriptions_of_others_stand_still(path: str, still: float, published: 
 
 
 def test_wrong_arguments_are_refused() -> None:
-    model = kv.load("fetch")
-    hand = gripper("fetch")
+    model, hand = kv.load("fetch"), gripper("fetch")
     for options, words in (
         ({"step": 0.0}, "'step' of a world is a positive number"),
         ({"grip": -1.0}, "'grip'"),

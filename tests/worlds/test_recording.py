@@ -53,8 +53,7 @@ def run(model, tmp_path_factory):
     with Recorder(path, model, {"robot": "robot", "noise": "3mm"}) as recorder:
         for k in range(150):
             seen = Observation(0.02 * k - 0.01, {X: 0.5}, {"cupboard": np.eye(4)}, frozenset({"robot/neck"}))
-            arrows = {"p": (np.zeros(3), np.array([0.0, 0, k]))}
-            recorder(step(model, k, observation=seen, vectors=arrows))
+            recorder(step(model, k, observation=seen, vectors={"p": (np.zeros(3), np.array([0.0, 0, k]))}))
         recorder.write_belief(3.0, {"cupboard/other": 1.0}, {"cupboard/panel": np.eye(4)})
         recorder.write_outcome(Result())
     return path
@@ -145,8 +144,7 @@ def mcap(path, *messages: tuple[str, object], schema: str = "") -> None:
         writer = Writer(file)
         writer.start()
         for topic, content in messages:
-            name = schema or f"kineverse.{TOPICS[topic][0]}"
-            number = writer.register_schema(name, "jsonschema", b"{}")
+            number = writer.register_schema(schema or f"kineverse.{TOPICS[topic][0]}", "jsonschema", b"{}")
             channel = writer.register_channel(topic, "json", number)
             text = content if isinstance(content, bytes) else json.dumps(content).encode()
             writer.add_message(channel, 10**9, text, 10**9)
@@ -195,8 +193,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 def test_chunks_that_are_larger_than_they_say_are_refused(tmp_path):
-    path = tmp_path / "bomb.mcap"
-    packed = zstandard.compress(bytes(1 << 26))
+    path, packed = tmp_path / "bomb.mcap", zstandard.compress(bytes(1 << 26))
     for states in (100, 1 << 40):
         body = struct.pack("<QQQI", 0, 0, states, 0) + struct.pack("<I", 4) + b"zstd"
         body += struct.pack("<Q", len(packed)) + packed
@@ -223,10 +220,8 @@ def test_the_recorder_refuses_what_cannot_be_read_again(model, tmp_path):
 
 
 def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(model, tmp_path):
-    resource = pytest.importorskip("resource")
-    path = tmp_path / "run.mcap"
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    recorder = Recorder(path, model)
+    resource, path = pytest.importorskip("resource"), tmp_path / "run.mcap"
+    before, recorder = resource.getrlimit(resource.RLIMIT_FSIZE), Recorder(path, model)
     recorder.write_state(0.0, state(model))
     recorder.write_state(1.0, state(model))
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 1000, before[1]))

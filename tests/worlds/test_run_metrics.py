@@ -61,8 +61,7 @@ def test_limits_of_positions_and_of_true_speeds(judge):
 
 
 def test_locks_hold_if_they_are_closed_during_a_step():
-    model = pusher(locked=True)
-    judge = Judge(model, "robot")
+    judge = Judge(pusher(locked=True), "robot")
     opens = run(judge, [{"room/bolt": 0.6}, {"room/bolt": 0.4, "room/drawer": 0.002}])
     assert opens["limit_violation"] == 0.0
     shuts = run(judge, [{"room/bolt": 0.4}, {"room/bolt": 0.6, "room/drawer": 0.002}])
@@ -90,8 +89,7 @@ def test_penetration_of_all_pairs_but_the_excepted_ones(judge):
 def test_contacts_that_end_while_pushing_are_losses(judge):
     gaps = (0.0005, 0.002, 0.0005, 0.0, 0.003, 0.0005)
     rows = [{"robot/x": 1.0 - 0.01 - BALL - gap, "robot/y": 0.3} for gap in gaps]
-    pushing = [True, True, True, True, False, True]
-    assert run(judge, rows, pushing=pushing)["contact_losses"] == 1
+    assert run(judge, rows, pushing=[True, True, True, True, False, True])["contact_losses"] == 1
     assert run(judge, rows, pushing=[True] * 6)["contact_losses"] == 2
     assert run(judge, rows)["contact_losses"] == 0
 

@@ -44,8 +44,7 @@ def test_without_settings_readings_are_exact_and_complete(model):
 def test_noise_has_the_deviations_that_are_stated(model):
     """Each at its own distance: 2.06 m to the cupboard's frame, 2.36 m to the drawer."""
     at = state(model)
-    sensors = replace(NOISY, outliers=0.0)
-    every = readings(SensorSampler(sensors, model, "robot", seed=3), at, 1500)
+    every = readings(SensorSampler(replace(NOISY, outliers=0.0), model, "robot", seed=3), at, 1500)
     assert len({o.stamp for o in every}) == len(every)
     for name, distance in (("cupboard", 2.0), ("cupboard/drawer", 2.3)):
         poses = np.array([o.poses[name] for o in every if name in o.poses])
@@ -59,8 +58,7 @@ def test_noise_has_the_deviations_that_are_stated(model):
         np.testing.assert_allclose(moved.std(axis=0), expected, rtol=0.1)
         np.testing.assert_allclose(turned.std(axis=0), math.radians(0.5), rtol=0.1)
         assert abs(moved.mean(axis=0)).max() < 5 * 0.0085 / math.sqrt(len(poses))
-    pans = [o.joints[model.symbol("robot/pan")] for o in every]
-    assert np.std(pans) == pytest.approx(1e-3, rel=0.1)
+    assert np.std([o.joints[model.symbol("robot/pan")] for o in every]) == pytest.approx(1e-3, rel=0.1)
 
 
 def test_outliers_fill_a_cube_about_the_marker(model):
@@ -95,8 +93,7 @@ def test_drift_leaves_what_the_camera_sees_relative_to_itself(model):
     sampler = SensorSampler(Sensors(odometry=0.1, turn=0.1), model, "robot", seed=1)
     sampler.observe(0.0, state(model))
     at = state(model, robot__base__x=1.0, robot__base__y=0.5, robot__base__angle=0.3)
-    seen = sampler.observe(0.1, at)
-    camera = kv.compile(model.fk("robot/head_tilt_link"))
+    seen, camera = sampler.observe(0.1, at), kv.compile(model.fk("robot/head_tilt_link"))
     read = camera({s: seen.joints[s] for s in camera.inputs})
     assert abs(read - camera(at)).max() > 1e-2
     expected = inverse(camera(at)) @ kv.compile(model.fk("cupboard"))(at)
@@ -198,8 +195,7 @@ def test_parse_reads_what_str_writes():
     )
     for text in texts:
         assert str(Sensors.parse(text)) == text
-    read = Sensors.parse(" 0.3 cm + 0.003m/m, 0.01rad,outliers=5%, delay=.03s ")
-    assert read == Sensors(
+    assert Sensors.parse(" 0.3 cm + 0.003m/m, 0.01rad,outliers=5%, delay=.03s ") == Sensors(
         position=0.003, position_per_metre=0.003, orientation=0.01, outliers=0.05, delay=0.03
     )
     assert Sensors.parse("none") == Sensors()

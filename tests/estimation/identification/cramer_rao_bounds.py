@@ -43,8 +43,7 @@ def covariance_bound(data: Recording, family: str, width: float | None = None) -
         common, mixed, own = full[:shared, :shared], full[:shared, shared:], full[shared:, shared:]
         left = common - mixed @ np.linalg.solve(own, mixed.T)
         if width is not None:
-            blind = whitened[:-1, shared:-1]
-            alone = whitened[:-1, -1]
+            blind, alone = whitened[:-1, shared:-1], whitened[:-1, -1]
             alone = alone - blind @ np.linalg.lstsq(blind, alone, rcond=None)[0]
             known = float(alone @ alone)
             left = left * known / (known + width**-2)

@@ -59,8 +59,7 @@ def recording(
     radius: float = 0.5,
 ) -> Recording:
     """Draw a random joint, random joint values and random parent poses, and observe them with noise."""
-    random = np.random.default_rng(seed)
-    joints = JOINTS[family]
+    random, joints = np.random.default_rng(seed), JOINTS[family]
     values = np.zeros((count, 6))
     for joint, size in joints.items():
         values[:, joint] = random.uniform(-0.5, 0.5, count) * (size if extent is None else extent)

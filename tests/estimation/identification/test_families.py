@@ -31,8 +31,7 @@ def test_operation_moves_as_its_fit(family: str) -> None:
     with model.edit() as edit:
         edit.add_frame("body", parent="world", transform=np.eye(4))
         edit.apply(fit.operation("joint", parent="body", child="part"), tag="learned")
-    joint = model.articulations["joint"]
-    pose = model.fk("part", "body")
+    joint, pose = model.articulations["joint"], model.fk("part", "body")
     home = dict(zip(joint.coordinates, joint.home, strict=True))
     np.testing.assert_allclose(pose(home), fit.parameters["reference"], atol=1e-9)
     if family in ("prismatic", "revolute", "screw", "cylindrical"):
@@ -57,8 +56,7 @@ def test_a_screw_of_several_revolutions_is_identified(pitch: float) -> None:
     nut = kv.translation(0.3, 0.1, 0.0) @ kv.translation(0, 0, pitch * turn) @ kv.rotation_z(turn)
     pose = kv.compile([nut @ kv.translation(0.1, 0.0, 0.0)])
     angles = np.linspace(0.0, 20.0, 60)
-    true = pose.batch(angles[:, None])[0]
-    data = noisy(true, 0.002, 0.01, np.random.default_rng(0))
+    data = noisy(pose.batch(angles[:, None])[0], 0.002, 0.01, np.random.default_rng(0))
     result = identify(None, data[np.random.default_rng(1).permutation(60)], noise=COVARIANCE)
     assert result.best.family == "screw"
     assert result.best.parameters["pitch"] == pytest.approx(2 * np.pi * pitch, rel=0.05)
@@ -78,8 +76,7 @@ def garage() -> Family:
 def door_poses(count: int, position: float, orientation: float) -> tuple[np.ndarray, np.ndarray]:
     family = garage()
     (a,), (length,) = family.joints, family.parameters
-    random = np.random.default_rng(0)
-    values = np.linspace(0.05, 1.2, count)
+    random, values = np.random.default_rng(0), np.linspace(0.05, 1.2, count)
     poses = np.stack([family.transform({a: v, length: LENGTH}) for v in values])
     return values, noisy(poses, position, orientation, random)
 

@@ -93,8 +93,7 @@ def test_positions_distinguish_a_circle_from_a_line() -> None:
 
 def test_identify_without_parent_poses_has_the_world_as_parent() -> None:
     data = recording("revolute", count=15, position=0.005, orientation=0.01, seed=5)
-    known = np.linalg.inv(data.true_parent) @ data.child
-    identified = identify(None, known, noise=data.covariance)
+    identified = identify(None, np.linalg.inv(data.true_parent) @ data.child, noise=data.covariance)
     assert identified.best.family == "revolute"
 
 

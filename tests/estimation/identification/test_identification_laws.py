@@ -32,12 +32,11 @@ def some_pose(seed: int) -> np.ndarray:
     return transform(Rotation.random(random_state=random), random.normal(0, 2.0, 3))
 
 
-@settings(max_examples=attempts(4))
+@settings(max_examples=attempts(4, long=6))
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
 def test_identify_is_invariant_to_the_observers_pose(seed: int, family: str) -> None:
     data = seeded(family, seed)
-    before = identify_data(data)
-    elsewhere = some_pose(seed + 1)
+    before, elsewhere = identify_data(data), some_pose(seed + 1)
     turn = np.kron(np.eye(2), elsewhere[:3, :3])
     after = identify(
         elsewhere @ data.parent,
@@ -48,11 +47,10 @@ def test_identify_is_invariant_to_the_observers_pose(seed: int, family: str) -> 
     same_joint(before, after, family)
 
 
-@settings(max_examples=attempts(4))
+@settings(max_examples=attempts(4, long=6))
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
 def test_identify_is_equivariant_to_the_childs_frame(seed: int, family: str) -> None:
-    data = seeded(family, seed)
-    change = np.eye(4)
+    data, change = seeded(family, seed), np.eye(4)
     change[:3, :3] = some_pose(seed)[:3, :3]
     before = identify_data(data)
     after = identify(data.parent, data.child @ change, noise=data.covariance, families=FAMILIES)
@@ -62,7 +60,7 @@ def test_identify_is_equivariant_to_the_childs_frame(seed: int, family: str) -> 
     )
 
 
-@settings(max_examples=attempts(4))
+@settings(max_examples=attempts(4, long=6))
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
 def test_identify_is_invariant_to_the_order_of_poses(seed: int, family: str) -> None:
     data = seeded(family, seed)
@@ -108,8 +106,7 @@ def test_the_likelihood_has_all_true_poses_as_unknowns(family: str) -> None:
         left = transform(Rotation.from_rotvec(unknown[:3]), unknown[3:6])
         right = transform(Rotation.from_rotvec(unknown[6:9]), unknown[9:12])
         values = unknown[12 : 12 + count]
-        parents = unknown[12 + count :].reshape(count, 6)
-        result = []
+        parents, result = unknown[12 + count :].reshape(count, 6), []
         for k in range(count):
             twist = np.zeros(6)
             twist[5 if family == "revolute" else 2] = values[k]

@@ -110,8 +110,7 @@ def test_hinge_agrees_with_scipys_maximum_likelihood() -> None:
         best = least_squares(errors, start, method="lm")
         frame = as_pose(best.x[:6])
         axis = frame[:3, 2] * np.sign(frame[:3, 2] @ fit.parameters["axis"])
-        off = np.linalg.norm(axis - fit.parameters["axis"])
-        assert off < 0.2 * fit.deviation("axis.x")
+        assert np.linalg.norm(axis - fit.parameters["axis"]) < 0.2 * fit.deviation("axis.x")
         across = np.cross(axis, frame[:3, 3] - fit.parameters["point"])
         assert np.linalg.norm(across) < 0.2 * fit.deviation("point.x")
         # Two gauges on either side and one of the joint values leave 5 unknowns of no size.

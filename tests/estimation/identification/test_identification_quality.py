@@ -107,12 +107,10 @@ def test_rigid_evidence_agrees_with_the_integral() -> None:
     """Positions of a child that does not move, of a world that is known: a Gaussian integral in each direction."""
     random = np.random.default_rng(0)
     count, sigma = 7, 0.02
-    data = random.normal(0.3, sigma, (count, 3))
-    covariance = sigma**2 * np.eye(3)
+    data, covariance = random.normal(0.3, sigma, (count, 3)), sigma**2 * np.eye(3)
     problem = check_observations(None, data, covariance, covariance)
     result = solve_families(problem, ["rigid"])["rigid"].log_evidence
-    grid = np.linspace(0.1, 0.5, 4001)
-    expected = 0.0
+    grid, expected = np.linspace(0.1, 0.5, 4001), 0.0
     for axis in range(3):
         off = (data[:, axis, None] - grid) / sigma
         density = np.exp(-0.5 * np.sum(off**2, axis=0)) / (math.sqrt(2 * math.pi) * sigma) ** count
@@ -121,8 +119,7 @@ def test_rigid_evidence_agrees_with_the_integral() -> None:
 
 
 def test_range_evidence_agrees_with_the_integral_over_the_width() -> None:
-    random = np.random.default_rng(1)
-    values, noise = random.normal(0.0, 0.1, 30), 0.05
+    values, noise = np.random.default_rng(1).normal(0.0, 0.1, 30), 0.05
     motion = GroupMotion(JOINT_FAMILIES["prismatic"], 6, np.eye(4), np.eye(4))
     result = fit_joint_ranges(motion, PerObservation(values[:, None], np.full((30, 1, 1), noise**2), 0.0))
     assert result.deviations[0] == pytest.approx(0.1, rel=0.4)
@@ -133,8 +130,7 @@ def test_range_evidence_agrees_with_the_integral_over_the_width() -> None:
 
 def log_integral(values: np.ndarray, noise: float) -> float:
     """Return log ∫∫ Π N(x; μ, s² + noise²) dμ d(log s)."""
-    widths = np.geomspace(1e-5, 10.0, 400)
-    means = np.linspace(-0.6, 0.6, 1201)
+    widths, means = np.geomspace(1e-5, 10.0, 400), np.linspace(-0.6, 0.6, 1201)
     total = widths[:, None, None] ** 2 + noise**2
     logs = -0.5 * ((values - means[:, None]) ** 2 / total + np.log(2 * math.pi * total)).sum(axis=-1)
     return float(np.log(np.mean(np.trapezoid(np.exp(logs), means, axis=1))))

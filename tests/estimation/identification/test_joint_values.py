@@ -84,8 +84,7 @@ def test_less_than_a_revolution_agrees_with_unordered_poses() -> None:
 
 
 def test_revolutions_are_counted_across_outliers() -> None:
-    random = np.random.default_rng(3)
-    data = turning_poses(5.0, 0.004, 80)
+    random, data = np.random.default_rng(3), turning_poses(5.0, 0.004, 80)
     wrong = np.sort(random.choice(80, 12, replace=False))
     data[wrong] = transform(Rotation.random(12, random_state=random), random.uniform(-1, 1, (12, 3)))
     fit = identify_data(data, sequential=True, outliers=True).best

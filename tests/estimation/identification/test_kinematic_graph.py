@@ -30,8 +30,7 @@ SOME = ("rigid", "prismatic", "revolute", "planar", "free")
 
 def data(model: kv.Model, frames: list[str], count: int, seed: int, reach: float = 1.0) -> dict[str, Array]:
     """Return noisy poses of frames while all coordinates move at random."""
-    random = np.random.default_rng(seed)
-    symbols = model.degrees_of_freedom
+    random, symbols = np.random.default_rng(seed), model.degrees_of_freedom
     points = random.uniform(0.0, reach, (count, len(symbols)))
     return {
         frame: noisy(kv.compile(model.fk(frame), symbols).batch(points), POSITION, ORIENTATION, random)
@@ -46,7 +45,6 @@ def at(x: float, y: float, z: float) -> kv.model.Pose:
 
 @pytest.fixture(scope="module")
 def cart() -> kv.Model:
-    """Return a cart with a drawer, and a door on it with a handle that turns."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="cart", parent="world", child="cart"))
@@ -106,8 +104,7 @@ def test_model_of_a_graph_moves_as_the_true_model(cart: kv.Model, poses: dict[st
     assert {f"learned/{part}" for part in PARTS} <= set(model.frames)
     assert model.articulations["learned/door"].kind == "floating"
     truth = kv.compile([cart.fk("handle", "cart"), cart.fk("sticker", "cart")], cart.degrees_of_freedom)
-    random = np.random.default_rng(0)
-    points = random.uniform(0.0, 1.0, (40, len(cart.degrees_of_freedom)))
+    points = np.random.default_rng(0).uniform(0.0, 1.0, (40, len(cart.degrees_of_freedom)))
     for k in (0, 17):
         values = {f"learned/{edge.child}": float(edge.fit.joint_values[k, 0]) for edge in graph.edges}
         handle, sticker = truth(points[k])
@@ -228,8 +225,7 @@ def test_a_free_point_is_a_sliding_point() -> None:
     assert {str(s) for s in model.degrees_of_freedom} == {"fly/x", "fly/y", "fly/z", "ant/x", "ant/y"}
     for edge in graph.edges:
         values = dict(zip((f"{edge.child}/{c}" for c in "xyz"), edge.fit.joint_values[7], strict=False))
-        result = model.fk(edge.child)[:3, 3](values)
-        assert np.allclose(result, places[edge.child][7], atol=5.0 * POSITION)
+        assert np.allclose(model.fk(edge.child)[:3, 3](values), places[edge.child][7], atol=5.0 * POSITION)
         everywhere = {str(x): value for x, value in model.default_state().items()} | values
         assert not model.violations(everywhere)
 
@@ -301,15 +297,13 @@ def all_trees(gains: Gains) -> dict[tuple[frozenset[int], ...], float]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_spanning_tree_agrees_with_scipy(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    nodes = list(range(7))
+    random, nodes = np.random.default_rng(seed), list(range(7))
     gains = {frozenset(pair): float(random.uniform(1.0, 9.0)) for pair in combinations(nodes, 2)}
     matrix = np.zeros((7, 7))
     for connection, gain in gains.items():
         a, b = sorted(connection)
         matrix[a, b] = 10.0 - gain
-    wanted = minimum_spanning_tree(matrix).tocoo()
-    tree = spanning_tree(nodes, gains)
+    wanted, tree = minimum_spanning_tree(matrix).tocoo(), spanning_tree(nodes, gains)
     assert set(tree) == {frozenset(map(int, ends)) for ends in zip(wanted.row, wanted.col, strict=True)}
     one, other = split_tree(tree[2], tree)
     assert one | other == set(nodes)
@@ -323,8 +317,7 @@ def test_spanning_tree_agrees_with_scipy(seed: int) -> None:
 def test_edge_probabilities_agree_with_the_sum_over_all_trees(count: int, spread: float) -> None:
     gains = all_gains(count, spread, seed=count, missing=count // 4)
     trees = all_trees(gains)
-    total = logsumexp(list(trees.values()))
-    result = edge_probabilities(range(count), gains)
+    total, result = logsumexp(list(trees.values())), edge_probabilities(range(count), gains)
     assert sum(result.values()) == pytest.approx(len(next(iter(trees))))
     for connection, probability in result.items():
         logs = [log for tree, log in trees.items() if connection in tree]
@@ -351,8 +344,7 @@ def test_spanning_tree_of_an_unconnected_graph_is_a_forest() -> None:
 def test_replacement_probabilities_agree_with_the_sum_over_all_trees(seed: int) -> None:
     gains = all_gains(5, 1.0, seed)
     trees = all_trees(gains)
-    total = logsumexp(list(trees.values()))
-    best = spanning_tree(range(5), gains)
+    total, best = logsumexp(list(trees.values())), spanning_tree(range(5), gains)
     assert set(best) == set(max(trees, key=trees.__getitem__))
     for connection in best:
         one, other = split_tree(connection, best)
@@ -374,11 +366,9 @@ def test_leaves_have_one_connection(seed: int) -> None:
         for tree, log in all_trees(gains).items()
         if all(sum(leaf in c for c in tree) == 1 for leaf in leaves)
     }
-    total = logsumexp(list(trees.values()))
-    best = spanning_tree(range(5), gains, leaves)
+    total, best = logsumexp(list(trees.values())), spanning_tree(range(5), gains, leaves)
     assert set(best) == set(max(trees, key=trees.__getitem__))
-    result = edge_probabilities(range(5), gains, leaves)
-    for connection, probability in result.items():
+    for connection, probability in edge_probabilities(range(5), gains, leaves).items():
         logs = [log for tree, log in trees.items() if connection in tree]
         assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
     for connection in best:
@@ -388,7 +378,6 @@ def test_leaves_have_one_connection(seed: int) -> None:
 
 
 def test_orient_tree_lists_parents_before_children() -> None:
-    tree = [frozenset("ab"), frozenset("bc"), frozenset("de")]
-    roots, directed = orient_tree("bdac", "abcde", tree)
+    roots, directed = orient_tree("bdac", "abcde", [frozenset("ab"), frozenset("bc"), frozenset("de")])
     assert roots == ("b", "d")
     assert directed == [("b", "a"), ("b", "c"), ("d", "e")]

@@ -69,8 +69,7 @@ def test_evidence_is_that_of_a_sum_over_noises_with_a_solution_for_each(family: 
     )
     one = solve_with_inliers(data, {family: WEIGHTS[family]})[family]
     solution, spread, step = one.scored.solution, math.log(5.0), 0.1
-    axis = np.arange(-1.0, 1.01, step)
-    total = []
+    axis, total = np.arange(-1.0, 1.01, step), []
     for shift in itertools.product(axis, axis):
         logs = np.log(one.noise.factors) + shift
         identified = solver.continue_from(
@@ -133,12 +132,7 @@ def test_the_report_counts_right_answers_and_sure_errors() -> None:
     report = report_answers({Setting(True, False): answers})
     assert report.tables[0].rows[0][1:4] == (50.0, 50.0, 25.0)
     assert report.tables[0].rows[0][-1] == "no"
-    assert [row[1] for row in report.tables[1].rows][1:] == [
-        "100.0 of 1 (0)",
-        "-",
-        "33.3 of 3 (1)",
-        "-",
-    ]
+    assert [row[1] for row in report.tables[1].rows][1:] == ["100.0 of 1 (0)", "-", "33.3 of 3 (1)", "-"]
 
 
 RANDOM = np.random.default_rng(0)

@@ -72,8 +72,7 @@ def test_lengths_of_a_fit_scale_with_the_poses(family: str) -> None:
 
 
 def test_a_crane_is_identified_as_a_hinge() -> None:
-    random = np.random.default_rng(5)
-    q = kv.position("q")
+    random, q = np.random.default_rng(5), kv.position("q")
     boom = kv.compile([kv.translation(3, 1, 20) @ kv.rotation_z(q) @ kv.translation(40, 0, 0)])
     data = noisy(boom.batch(np.linspace(0.0, 0.6, 25)[:, None])[0], 0.1, 0.02, random)
     identified = identify(None, data, noise=pose_covariance(0.1, 0.02))
@@ -121,8 +120,7 @@ def exact_poses(kind: str, scale: float, far: float, count: int, seed: int) -> n
     right = pose(Rotation.random(random_state=rng), scale * rng.normal(size=3))
     poses = []
     for q in rng.uniform(-1.5, 1.5, count):
-        turn = Rotation.from_rotvec([0.0, 0.0, q])
-        free = scale * rng.uniform(-1.0, 1.0, 3)
+        turn, free = Rotation.from_rotvec([0.0, 0.0, q]), scale * rng.uniform(-1.0, 1.0, 3)
         moved = {
             "rigid": pose(Rotation.identity(), np.zeros(3)),
             "prismatic": pose(Rotation.identity(), [0.0, 0.0, scale * q]),
@@ -140,8 +138,7 @@ def exact_poses(kind: str, scale: float, far: float, count: int, seed: int) -> n
 @pytest.mark.parametrize("count", [10, pytest.param(80, marks=pytest.mark.long)])
 def test_family_of_exact_poses_is_found_in_any_unit(kind: str, scale: float, count: int) -> None:
     """Millimetres, and a frame far away. The noise is none, and may not be taken for less than rounding."""
-    poses = exact_poses(kind, scale, 10.0 * scale, count, seed=count)
-    result = identify(None, poses)
+    result = identify(None, exact_poses(kind, scale, 10.0 * scale, count, seed=count))
     assert result.best.family == kind
     assert result.noise is not None
     assert result.noise.position < 2e-3 * max(scale, 5.0)

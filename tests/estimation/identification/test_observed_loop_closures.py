@@ -34,8 +34,7 @@ SOME = ("rigid", "prismatic", "revolute", "planar", "free")
 
 def data(model: kv.Model, frames: list[str], values: Array, seed: int) -> dict[str, Array]:
     """Return noisy poses of frames at values (N, n) of the degrees of freedom."""
-    random = np.random.default_rng(seed)
-    symbols = model.degrees_of_freedom
+    random, symbols = np.random.default_rng(seed), model.degrees_of_freedom
     compiled = [kv.compile(model.fk(frame), symbols, tier="interpreter") for frame in frames]
     return {
         frame: noisy(f.batch(values), POSITION, ORIENTATION, random)
@@ -61,10 +60,8 @@ def left(model: kv.Model, poses: dict[str, Array]) -> float:
             off = (observed[:, :3, 3] - poses[:, :3, 3]) / POSITION
             return np.concatenate([off, turned.as_rotvec() / ORIENTATION]).ravel()
 
-        starts = np.linspace(lower, upper, 9)
-        start = min(starts, key=lambda q: float(np.sum(errors(q) ** 2)))
-        identified = least_squares(errors, start, bounds=(lower, upper))
-        squares += 2.0 * identified.cost
+        start = min(np.linspace(lower, upper, 9), key=lambda q: float(np.sum(errors(q) ** 2)))
+        squares += 2.0 * least_squares(errors, start, bounds=(lower, upper)).cost
         count += 6 * len(poses) - len(start)
     return squares / count
 
@@ -110,7 +107,6 @@ def four_bar() -> kv.Model:
 
 
 def slider_crank() -> kv.Model:
-    """Return a crank, a rod, and a slider on a rail."""
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("stand", "world", kv.translation(0.3, -0.2, 0.5) @ kv.rpy(-0.4, 0.6, 0.8))
@@ -139,10 +135,7 @@ def two_cylinders() -> kv.Model:
             )
             edit.apply(slide)
             edit.close_loop(
-                f"{side}_rod_end",
-                side,
-                mask=("x", "y"),
-                home={f"{side}_rod_hinge": 0, "crank_hinge": 0.3},
+                f"{side}_rod_end", side, mask=("x", "y"), home={f"{side}_rod_hinge": 0, "crank_hinge": 0.3}
             )
     return model
 
@@ -248,8 +241,7 @@ def test_a_loop_of_balls_is_reported_and_left_open() -> None:
 
 
 def test_dependent_coordinates_are_resolved_transitively() -> None:
-    random = np.random.default_rng(0)
-    times = np.arange(7)
+    random, times = np.random.default_rng(0), np.arange(7)
     twists = Twists(("a", "b", "c", "d"), times, random.normal(size=(7, 6, 4)))
     b_by_a, b_by_c, c_by_a, c_by_d = random.normal(size=(4, 7))
     followers = DependentCoordinates()

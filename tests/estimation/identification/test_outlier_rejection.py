@@ -17,8 +17,7 @@ TOLD = ("revolute", "prismatic", "rigid", "screw")
 
 def with_wrong(data: Recording, fraction: float, seed: int) -> tuple[Array, Array]:
     """Return poses of the child, some of them anywhere within two metres, and which."""
-    random = np.random.default_rng(seed)
-    count = round(fraction * len(data.child))
+    random, count = np.random.default_rng(seed), round(fraction * len(data.child))
     wrong = np.sort(random.choice(len(data.child), count, replace=False))
     child = data.child.copy()
     anywhere = transform(Rotation.random(count, random_state=random), random.uniform(-1.0, 1.0, (count, 3)))

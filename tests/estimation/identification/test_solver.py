@@ -142,8 +142,7 @@ def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> No
         part, solve_from_best_start(part, [*initial_guesses(family, MotionStatistics(part))])
     ).solution
     start = InitialGuess(before.motion, np.concatenate([before.values, slow.solution.values[10:]]))
-    parent = np.concatenate([before.parent, data.parent[10:]])
-    arguments = data, start, parent, before.joint_prior, 10
+    arguments = data, start, np.concatenate([before.parent, data.parent[10:]]), before.joint_prior, 10
     same(marginal_likelihood.continue_from(*arguments), solver.continue_from(*arguments), atol=0.02)
 
 

@@ -35,7 +35,6 @@ def observe_frames(
 
 
 def shift_origin(joint: kv.Joint, x: float = 0.0, y: float = 0.0) -> kv.model.Pose:
-    """Return the shifted origin of a joint."""
     matrix = np.array(joint.origin.matrix)
     matrix[:2, 3] += (x, y)
     return kv.model.Pose.from_matrix(matrix)

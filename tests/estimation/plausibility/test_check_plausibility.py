@@ -40,7 +40,6 @@ def make_slider(joint: kv.Revolute) -> kv.Operation:
 
 
 def repair_model(model: kv.Model, report: Plausibility) -> kv.Model:
-    """Return the model with its replacements."""
     result = model.copy()
     with result.edit() as edit:
         for tag, operation in report.replacements.items():
@@ -140,8 +139,7 @@ def test_door_beyond_its_limits_is_rejected(kitchen: kv.Model) -> None:
     report = check_plausibility(kitchen, observations, noise=NOISE, families=SOME)
     assert report[TAG].implausible_since is not None
     assert report[TAG].implausible_since >= 40
-    model = repair_model(kitchen, report)
-    assert model.limits(DOOR)[1] == pytest.approx(2.2, abs=0.1)
+    assert repair_model(kitchen, report).limits(DOOR)[1] == pytest.approx(2.2, abs=0.1)
 
 
 def corrupt(observations: dict[str, np.ndarray], rows: list[int], seed: int) -> None:
@@ -195,8 +193,7 @@ def test_small_motion_is_undetermined(kitchen: kv.Model) -> None:
 
 
 def test_fixed_frame_that_moves_is_rejected(kitchen: kv.Model) -> None:
-    loose = kitchen.copy()
-    tag = "joint kitchen/fridge_joint"
+    loose, tag = kitchen.copy(), "joint kitchen/fridge_joint"
     joint = loose.history.operation(tag)
     assert isinstance(joint, kv.Fixed)
     with loose.edit() as edit:
@@ -349,8 +346,7 @@ def test_ball_joint_is_tested() -> None:
     with model.edit() as edit:
         edit.apply(kv.articulations.Ball(name="shoulder", parent="world", child="arm"), tag="ball")
         edit.add_frame("hand", parent="arm", transform=kv.translation(0.6, 0, 0))
-    random = np.random.default_rng(13)
-    turns = random.normal(size=(30, 4))
+    turns = np.random.default_rng(13).normal(size=(30, 4))
     values = dict(zip(map(str, model.degrees_of_freedom), turns.T, strict=True))
     observations = observe_frames(model, ["hand"], values, 14)
     report = check_plausibility(model, observations, noise=NOISE, families=("spherical", "free"))
@@ -363,8 +359,7 @@ def test_ball_joint_is_tested() -> None:
 
 
 def test_missing_poses_and_a_moving_observer_are_handled(kitchen: kv.Model) -> None:
-    values = np.random.default_rng(0).uniform(0.0, 0.4, 60)
-    frames = [HANDLE, FRIDGE]
+    values, frames = np.random.default_rng(0).uniform(0.0, 0.4, 60), [HANDLE, FRIDGE]
     before = observe_frames(kitchen, frames, {DOOR: values[:30]}, 15)
     after = observe_frames(replace_hinge(kitchen, make_slider), frames, {DOOR: values[30:]}, 16)
     camera_T_world = np.stack([kv.rotation_z(0.1 * k)() @ kv.translation(k, 1, 0)() for k in range(60)])

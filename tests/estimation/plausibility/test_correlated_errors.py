@@ -179,8 +179,7 @@ def test_tracker_is_checked_and_its_model_repaired(kitchen: kv.Model) -> None:
     assert again.repair(model) == ()
 
     # Outliers only: nothing is proposed, and the repair says so.
-    random = np.random.default_rng(0)
-    wrong = np.tile(poses[HANDLE][0], (20, 1, 1))
+    random, wrong = np.random.default_rng(0), np.tile(poses[HANDLE][0], (20, 1, 1))
     wrong[:, :3, 3] = random.uniform(-1.0, 1.0, (20, 3))
     lost = check_plausibility(track(model, wrong), families=SOME)
     assert lost[TAG].probabilities == {}
@@ -228,10 +227,7 @@ def test_exchanged_frames_are_told(kitchen: kv.Model) -> None:
     monitor = PlausibilityMonitor(kitchen, FRAMES, noise=NOISE, families=SOME)
     for k in range(30):
         monitor.update({frame: track[k] for frame, track in exchanged.items()})
-    for report in (
-        check_plausibility(kitchen, exchanged, noise=NOISE, families=SOME),
-        monitor.report(),
-    ):
+    for report in (check_plausibility(kitchen, exchanged, noise=NOISE, families=SOME), monitor.report()):
         assert report.implausible
         assert not report.replacements
         assert all("exchanged" in verdict.reason for verdict in report)

@@ -45,8 +45,7 @@ def test_false_alarm_rate_is_bounded(resting: KnownResiduals, wrong: float) -> N
     corrupt = np.random.default_rng(9).uniform(size=RUNS * LONG) < wrong
     normal = np.where(corrupt[:, None], 40.0, left.orthogonal)
     beyond = np.where(corrupt[:, None], 40.0, left.bound_excess)
-    stated = 0.2
-    alarms = 0
+    stated, alarms = 0.2, 0
     for run in range(RUNS):
         test = SequentialTest(stated, wrong)
         for k in range(run * LONG, (run + 1) * LONG):
@@ -97,16 +96,14 @@ def make_bounded_slider(upper: float) -> tuple[kv.Model, KnownJoint]:
 
 def test_log_evidence_equals_the_integral_over_joint_values() -> None:
     _, served = make_bounded_slider(2.0)
-    noise = pose_covariance(0.05, 0.1)
-    poses = np.tile(np.eye(4), (2, 1, 1))
+    noise, poses = pose_covariance(0.05, 0.1), np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[0.7, 0.03, 0.0], [1.1, -0.02, 0.05]]
     result = log_evidence(served, compute_residuals(served, check_observations(None, poses, None, noise)))
 
     across = stats.norm(0.0, 0.05).logpdf(poses[:, 1:3, 3]).sum() + 6 * stats.norm(0.0, 0.1).logpdf(0.0)
     values = np.linspace(0.0, 2.0, 401)
     likelihood = stats.norm(values[:, None], 0.05).pdf(poses[:, 0, 3])
-    total = 0.0
-    widths = np.geomspace(1e-5, 10.0, 43)
+    total, widths = 0.0, np.geomspace(1e-5, 10.0, 43)
     for width in widths:
         if width < 0.01:
             # Narrower than grid and noise: both values equal the mean.
@@ -135,8 +132,7 @@ def test_log_displacement_gain_equals_a_normal_density(resting: KnownResiduals) 
 
 def test_densities_compare_with_those_of_identification() -> None:
     # With many poses the evidence of a rigid connection is its likelihood times the posterior volume.
-    random = np.random.default_rng(4)
-    poses = np.tile(np.eye(4), (200, 1, 1))
+    random, poses = np.random.default_rng(4), np.tile(np.eye(4), (200, 1, 1))
     poses[:, :3, 3] = random.normal(0.0, 0.01, (200, 3))
     noise = pose_covariance(0.01, 0.02)
     fit = identify(None, poses, noise=noise, families=["rigid"]).best
@@ -156,8 +152,7 @@ def test_monitor_agrees_with_check_plausibility(kitchen: kv.Model) -> None:
     with truth.edit() as edit:
         sliding = kv.Prismatic(name=DOOR, parent=joint.parent, child=joint.child, origin=joint.origin)
         edit.replace(TAG, sliding)
-    frames = [HANDLE, FRIDGE]
-    angles = np.random.default_rng(0).uniform(0.0, 0.4, 40)
+    frames, angles = [HANDLE, FRIDGE], np.random.default_rng(0).uniform(0.0, 0.4, 40)
     before, after = (
         observe_frames(model, frames, {DOOR: values}, 5 + k)
         for k, (model, values) in enumerate(((kitchen, angles[:20]), (truth, angles[20:])))

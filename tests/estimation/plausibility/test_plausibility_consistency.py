@@ -68,13 +68,11 @@ def is_standard_normal(z: Array) -> bool:
 
 
 def test_limit_set_by_another_coordinate_is_tested() -> None:
-    model = make_cupboard()
-    random = np.random.default_rng(0)
+    model, random = make_cupboard(), np.random.default_rng(0)
     doors = random.uniform(0.1, 1.4, 40)
     inside = random.uniform(0.0, 1.0, 40) * (0.1 + 0.3 * np.sin(doors))
     for drawers, explained in ((inside, True), (np.minimum(inside + 0.25, 0.55), False)):
-        values = {"door": doors, "drawer": drawers}
-        observations = observe_frames(model, ["handle", "drawer"], values, 1)
+        observations = observe_frames(model, ["handle", "drawer"], {"door": doors, "drawer": drawers}, 1)
         report = check_plausibility(model, observations, noise=NOISE, families=SOME)
         assert report["door"].explains
         assert report["drawer"].explains is explained
@@ -89,8 +87,7 @@ def test_limit_set_by_another_coordinate_is_tested() -> None:
 
 def test_limit_excess_is_standard_normal_at_the_limit() -> None:
     """Both coordinates contribute; without the door's share the deviation would be 1.4."""
-    model = make_cupboard()
-    doors = np.random.default_rng(2).uniform(0.3, 1.2, 400)
+    model, doors = make_cupboard(), np.random.default_rng(2).uniform(0.3, 1.2, 400)
     observations = observe_frames(
         model, ["handle", "drawer"], {"door": doors, "drawer": 0.1 + 0.3 * np.sin(doors)}, 3
     )
@@ -160,12 +157,11 @@ def make_gripper(factor: float = -1.0, shift: float = 0.0) -> kv.Model:
     with model.edit() as edit:
         finger = kv.Prismatic(name="left", parent="world", child="left", axis=(0, 1, 0), lower=0, upper=0.4)
         edit.apply(finger, tag="left")
-        place = kv.model.Pose.from_matrix(kv.translation(0.1, shift, 0)())
         other = replace(
             finger,
             name="right",
             child="right",
-            origin=place,
+            origin=kv.model.Pose.from_matrix(kv.translation(0.1, shift, 0)()),
             position=factor * kv.position("left"),
             lower=-0.4,
         )
@@ -202,8 +198,7 @@ def test_wrong_mimic_joint_is_replaced(factor: float, shift: float) -> None:
 
 
 def test_replacement_of_a_mimic_joint_follows_an_unobserved_leader() -> None:
-    served = make_gripper()
-    truth = make_gripper()
+    served, truth = make_gripper(), make_gripper()
     with truth.edit() as edit:
         turned = kv.model.Pose.from_matrix((kv.translation(0.1, 0, 0) @ kv.rotation_z(0.4))())
         edit.replace("right", replace(truth.history.operation("right"), origin=turned))
@@ -219,7 +214,6 @@ def test_replacement_of_a_mimic_joint_follows_an_unobserved_leader() -> None:
 
 
 def make_linkage(pivot: float = 1.0, coupler: float = 1.1) -> kv.Model:
-    """Return a crank that revolves, and a rocker."""
     model = kv.Model()
     with model.edit() as edit:
         bars = [

@@ -21,6 +21,15 @@ def add_pose_noise(poses: Any, position: float, orientation: float, rng: np.rand
     return data
 
 
+def make_slides() -> kv.Model:
+    """Return two coordinates with linear observations."""
+    model = kv.Model()
+    a, b = kv.position("a"), kv.position("b")
+    with model.edit() as edit:
+        edit.add_frame("cart", parent="world", transform=kv.translation(a, b, 0))
+    return model
+
+
 class NoisyObserver:
     """Noisy measurements of frames of a model, in the form that a tracker takes."""
 
@@ -39,7 +48,6 @@ class NoisyObserver:
         self._poses = kv.compile([model.fk(f, relative_to) for f in frames])
 
     def truth(self, state: Mapping[Any, float]) -> Any:
-        """Return the true poses."""
         return np.array(self._poses(kv.State(state)))
 
     def array(self, state: Mapping[Any, float]) -> Any:

@@ -32,7 +32,6 @@ def make_arm() -> kv.Model:
 
 
 def make_tip_tracker(model: kv.Model, observer: NoisyObserver, deviation: float, **options) -> Tracker:
-    """Return a tracker of the arm's tip."""
     observed = [ObservedPose("tip", covariance=observer.covariance)]
     return Tracker(model, observed, start=BENT, uncertainty=dict.fromkeys(BENT, deviation), **options)
 
@@ -165,8 +164,7 @@ def test_linear_model_keeps_its_covariance_in_unobservable_directions():
         estimate = tracker.update({"sum": value})
     information = np.eye(2) / 9 + 300 * np.ones((2, 2))
     assert np.allclose(estimate.covariance, np.linalg.inv(information), rtol=1e-9)
-    spread = 0.1**2 * np.eye(3) + 18 * np.ones((3, 3))
-    data = np.array([1.0, 1.2, 0.9])
+    spread, data = 0.1**2 * np.eye(3) + 18 * np.ones((3, 3)), np.array([1.0, 1.2, 0.9])
     density = -data @ np.linalg.inv(spread) @ data / 2 - np.linalg.slogdet(2 * np.pi * spread)[1] / 2
     assert tracker.log_evidence == pytest.approx(density, rel=1e-9)
 
@@ -197,21 +195,17 @@ def test_groups_with_affine_measurements_have_a_single_minimum():
         edit.apply(kv.Prismatic(name="box", parent="drawer", child="box", axis=(0, 1, 0), lower=0, upper=0.4))
         edit.apply(kv.Revolute(name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=1.5))
     drawer, door = kv.position("drawer"), kv.position("door")
-    dial = ObservedExpression("dial", drawer, 0.01, period=0.1)
-    curve = ObservedExpression("curve", np.sin(drawer), 0.01)
-    number = ObservedExpression("number", 2 * door + 1, 0.01)
     for observed, expected in (
         (["drawer", "box"], [True]),
         (["door"], [False]),
         (["drawer", "door"], [True, False]),
-        (["drawer", dial], [False]),
-        (["drawer", curve], [False]),
-        ([number], [True]),
+        (["drawer", ObservedExpression("dial", drawer, 0.01, period=0.1)], [False]),
+        (["drawer", ObservedExpression("curve", np.sin(drawer), 0.01)], [False]),
+        ([ObservedExpression("number", 2 * door + 1, 0.01)], [True]),
         ([ObservedPosition("door", (1, 0, 0))], [False]),
         ([ObservedPose("box", relative_to="door")], [False]),
     ):
-        tracker = Tracker(model, observed)
-        layout = tracker._layout
+        layout = Tracker(model, observed)._layout
         result = {group.coordinates[-1]: layout.is_affine(k) for k, group in enumerate(layout.groups)}
         assert sorted(result.values()) == sorted(expected), observed
 
@@ -295,8 +289,7 @@ def test_equally_likely_components_are_kept(kind, truth):
 def test_estimate_at_a_limit_has_the_bias_of_the_truncated_gaussian():
     """The estimate is max(0, z) with z about 0: biased by 0.4 deviations, with a NEES of one half."""
     model, rng = make_hinge(lower=0.0, upper=1.5), np.random.default_rng(0)
-    q = model.symbol("q")
-    first = Tracker(model, [ObservedExpression("dial", q, 0.02**2)])
+    first = Tracker(model, [ObservedExpression("dial", model.symbol("q"), 0.02**2)])
     errors, means = [], []
     for _ in range(400):
         tracker = first.copy()

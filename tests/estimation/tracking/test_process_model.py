@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from synthetic_observations import NoisyObserver
+from synthetic_observations import NoisyObserver, make_slides
 
 import kineverse as kv
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError
@@ -32,8 +32,7 @@ def make_drive() -> kv.Model:
 def test_flow_and_its_derivatives_equal_model_integration(make):
     model = make()
     (frame,) = [f for f in model.frames if model.speeds_of(f)][:1]
-    process_model = Tracker(model, [frame])._update_step.process_model
-    motion = process_model._flows[0]
+    motion = Tracker(model, [frame])._update_step.process_model._flows[0]
     rng, h = np.random.default_rng(0), 1e-5
 
     def integrated(q, u):
@@ -70,15 +69,6 @@ def test_floating_body_is_found_at_any_pose(place):
         said = Rotation.from_quat([estimate.state[f"box/q{c}"] for c in "xyzw"])
         assert (said * turn.inv()).magnitude() < np.radians(4)
         assert np.allclose([estimate.state[f"box/{c}"] for c in "xyz"], place, atol=0.05)
-
-
-def make_slides() -> kv.Model:
-    """Return two coordinates with linear observations."""
-    model = kv.Model()
-    a, b = kv.position("a"), kv.position("b")
-    with model.edit() as edit:
-        edit.add_frame("cart", parent="world", transform=kv.translation(a, b, 0))
-    return model
 
 
 def make_body(*, wheels: bool) -> kv.Model:
@@ -124,8 +114,7 @@ def test_linear_model_equals_a_constant_velocity_kalman_filter():
             x, P = F @ x, F @ P @ F.T + Q
         z = rng.standard_normal(2)
         estimate = tracker.update({"z": z}, at=time)
-        S = H @ P @ H.T + R
-        r = z - H @ x
+        S, r = H @ P @ H.T + R, z - H @ x
         log_density -= 0.5 * (r @ np.linalg.solve(S, r) + np.linalg.slogdet(2 * np.pi * S)[1])
         K = P @ H.T @ np.linalg.inv(S)
         x, P = x + K @ r, P - K @ S @ K.T
@@ -172,8 +161,7 @@ def test_speed_of_a_periodic_angle_does_not_jump_after_a_turn():
         edit.apply(kv.Continuous(name="q", parent="world", child="part"))
     tracker, observer = Tracker(model, ["part"], process="velocity"), NoisyObserver(model, ["part"])
     result = [tracker.update(observer({"q": 2.0 * 0.05 * k}), at=0.05 * k).speeds for k in range(100)]
-    speeds = np.array([next(iter(one.values())) for one in result])
-    np.testing.assert_allclose(speeds[20:], 2.0, atol=0.5)
+    np.testing.assert_allclose(np.array([next(iter(one.values())) for one in result])[20:], 2.0, atol=0.5)
     assert tracker.estimate.state["q"] == pytest.approx(9.9, abs=0.1)
 
 
@@ -272,8 +260,7 @@ def test_covariances_of_an_array_are_those_of_pairs(model):
     rng = np.random.default_rng(0)
     by_array, by_pairs = Tracker(model, FRAMES), Tracker(model, FRAMES)
     for step in range(5):
-        poses = look(model, rng, left=0.5, right=1.0)
-        factors = rng.normal(size=(2, 6, 6))
+        poses, factors = look(model, rng, left=0.5, right=1.0), rng.normal(size=(2, 6, 6))
         covariances = 1e-4 * (factors @ np.swapaxes(factors, 1, 2) + np.eye(6))
         data = np.array([True, step % 2 == 0])
         covariances[~data] = np.nan  # those of missing poses are not read
@@ -315,8 +302,7 @@ def test_late_measurements_repeat_steps_with_their_own_noise(model):
 
 
 def test_refuted_groups_are_those_that_moved(model):
-    rng = np.random.default_rng(3)
-    tracker = Tracker(model, FRAMES, process="static")
+    rng, tracker = np.random.default_rng(3), Tracker(model, FRAMES, process="static")
     covariances = np.tile(pose_covariance(0.01, 0.01), (2, 1, 1))
     for step in range(10):
         poses = look(model, rng, left=0.5, right=1.0)

@@ -1,7 +1,5 @@
 """Refusals of a tracker: each names the input and leaves the belief unchanged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -9,20 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, nnls
 from scipy.spatial.transform import Rotation
-from synthetic_observations import NoisyObserver, add_pose_noise
+from synthetic_observations import NoisyObserver, add_pose_noise, make_slides
 
 import kineverse as kv
 from kineverse.estimation import ObservedExpression, ObservedPose, Outliers, Tracker, pose_covariance
 from kineverse.estimation.tracking.bounds import solve_bounded_qp
-
-
-def make_slides() -> kv.Model:
-    """Return two coordinates with linear observations."""
-    model = kv.Model()
-    a, b = kv.position("a"), kv.position("b")
-    with model.edit() as edit:
-        edit.add_frame("cart", parent="world", transform=kv.translation(a, b, 0))
-    return model
 
 
 def make_arm(tilt: object = None) -> kv.Model:
@@ -121,8 +112,7 @@ def test_estimate_is_invariant_to_the_world_frame():
 
 def residuals(x, model, data, covariance, prior):
     """Compute whitened residuals of a state with scipy."""
-    parts = [(x - prior[0]) / prior[1]]
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    parts, whiten = [(x - prior[0]) / prior[1]], np.linalg.inv(np.linalg.cholesky(covariance))
     for frame, T in data.items():
         said = model.fk(frame)(
             {str(s): v for s, v in zip(model.symbols, x, strict=True) if s in model.fk(frame).symbols}
@@ -134,8 +124,7 @@ def residuals(x, model, data, covariance, prior):
 
 @pytest.mark.parametrize("truth", [(0.4, -0.7), (1.5, 1.5), (1.45, -1.5)])
 def test_estimate_minimises_the_cost_inside_the_limits(truth):
-    model = make_arm()
-    covariance = pose_covariance(0.1, np.radians(10))
+    model, covariance = make_arm(), pose_covariance(0.1, np.radians(10))
     observer = NoisyObserver(model, ["lower", "tip"], 0.1, np.radians(10), seed=3)
     prior = np.zeros(2), np.full(2, 1.5)
     for _ in range(3):
@@ -157,8 +146,7 @@ def test_estimate_minimises_the_cost_inside_the_limits(truth):
 def test_jacobians_equal_finite_differences_of_residuals():
     """Geometric Jacobian and Jr⁻¹ equal finite differences of the residual, also for large residuals."""
     model = make_arm()
-    tracker = Tracker(model, ["tip"])
-    rng = np.random.default_rng(0)
+    tracker, rng = Tracker(model, ["tip"]), np.random.default_rng(0)
     update_step = tracker._update_step
     for _ in range(20):
         x = rng.uniform(-1.4, 1.4, 2)
@@ -243,8 +231,7 @@ def test_limits_that_depend_on_coordinates_hold():
 
 
 def test_estimate_leaves_a_limit_when_measurements_do():
-    a = kv.position("a")
-    model = make_slides()
+    a, model = kv.position("a"), make_slides()
     with model.edit() as edit:
         edit.constrain("a/position", 0, a, 1)
     tracker = Tracker(model, [ObservedExpression("z", a, 1.0)], uncertainty={"a": 100.0})
@@ -347,8 +334,7 @@ def test_compiled_and_numpy_updates_agree_on_outliers(gross, steps, monkeypatch)
     fast, slow = (Tracker(model, observed, outliers=Outliers(0.3)) for _ in range(2))
     slow._update_step.native = None
     assert fast.wait()
-    left = []
-    explain = fast._update_step._explain
+    left, explain = [], fast._update_step._explain
     monkeypatch.setattr(fast._update_step, "_explain", lambda *a: left.extend(a[3]) or explain(*a))
     rng = np.random.default_rng(3)
     truth = {str(s): rng.uniform(*fast.limits[s]) for s in fast.symbols}
@@ -359,8 +345,7 @@ def test_compiled_and_numpy_updates_agree_on_outliers(gross, steps, monkeypatch)
         turns = Rotation.from_rotvec(gross * rng.standard_normal((len(data), 3))).as_matrix()
         data[wrong, :3, 3] += gross * rng.choice([-1, 1], (wrong.sum(), 3))
         data[wrong, :3, :3] = turns[wrong] @ data[wrong, :3, :3]
-        b = slow.update_poses(data, mask)
-        a = fast.update_poses(data, mask)
+        b, a = slow.update_poses(data, mask), fast.update_poses(data, mask)
         assert step < 5 or gross < 1 or len(left) <= 2
         assert a.outliers == b.outliers
         assert a.dof == b.dof
@@ -372,8 +357,7 @@ def test_compiled_and_numpy_updates_agree_on_outliers(gross, steps, monkeypatch)
 @pytest.mark.compiler
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_compiled_and_numpy_agree_about_groups_with_several_active_bounds(seed):
-    model = kv.Model()
-    rng = np.random.default_rng(seed)
+    model, rng = kv.Model(), np.random.default_rng(seed)
     with model.edit() as edit:
         before = "world"
         for name in "abcde":

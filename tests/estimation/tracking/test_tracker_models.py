@@ -122,8 +122,7 @@ def test_positions_and_expressions_from_a_moving_camera_are_tracked():
     )
     point = model.fk(handle, "camera") @ [0.1, 0, 0, 1]
     for pan_now in np.linspace(0, 1, 10):
-        truth = {door: 0.9, "pan": pan_now}
-        data = {handle: point(truth)[:3], "potentiometer": 1.8}
+        data = {handle: point({door: 0.9, "pan": pan_now})[:3], "potentiometer": 1.8}
         estimate = tracker.update(data, inputs={"pan": pan_now})
     assert estimate.state[door] == pytest.approx(0.9, abs=1e-3)
     assert estimate.dof == 4

@@ -51,8 +51,7 @@ def test_kitchen_is_consistent_and_efficient(position, degrees):
     errors, bounds, normalised, innovations = [], [], [], []
     for _ in range(CONFIGURATIONS):
         truth = rng.uniform(*limits.T)
-        state = dict(zip(names, truth.tolist(), strict=True))
-        tracker = first.copy()
+        state, tracker = dict(zip(names, truth.tolist(), strict=True)), first.copy()
         for step in range(STEPS):
             estimate = tracker.update_poses(observer.array(state))
             if step:  # the start is uniform and no Gaussian
@@ -70,7 +69,8 @@ def test_kitchen_is_consistent_and_efficient(position, degrees):
     assert low < np.mean(innovations) / estimate.dof < high
 
 
-def test_covariance_of_a_free_body_equals_the_sample_covariance():
+@pytest.mark.parametrize("count", [20, pytest.param(40, marks=pytest.mark.long)])
+def test_covariance_of_a_free_body_equals_the_sample_covariance(count):
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
@@ -81,7 +81,7 @@ def test_covariance_of_a_free_body_equals_the_sample_covariance():
     state = dict(zip(("box/x", "box/y", "box/z"), (1.0, -2.0, 0.5), strict=True)) | {"lid": 0.4}
     state |= dict(zip(("box/qx", "box/qy", "box/qz", "box/qw"), turn.as_quat(), strict=True))
     nees = []
-    for _ in range(20):
+    for _ in range(count):
         tracker = first.copy()
         for _ in range(5):
             estimate = tracker.update(observer(state))
@@ -107,8 +107,7 @@ def test_process_noise_on_wheels_is_consistent():
         )
     wheels, spread, dt = model.speeds, 0.5, 0.1
     start = {"base/x": 0.0, "base/y": 0.0, "base/angle": 0.3}
-    rng = np.random.default_rng(0)
-    speeds = dict(zip(wheels, (8.0, 6.0), strict=True))
+    rng, speeds = np.random.default_rng(0), dict(zip(wheels, (8.0, 6.0), strict=True))
     tracker = Tracker(model, ["base"], start=start, uncertainty=dict.fromkeys(start, 1e-6),
                       process_noise=dict.fromkeys(wheels, spread**2 * dt))  # fmt: skip
     for _ in range(20):
@@ -163,8 +162,7 @@ def test_first_measurement_as_outlier_is_corrected():
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
     observer = NoisyObserver(model, ["box"])
-    tracker = Tracker(model, ["box"], outliers=True)
-    truth = model.default_state()
+    tracker, truth = Tracker(model, ["box"], outliers=True), model.default_state()
     tracker.update({"box": anywhere(np.random.default_rng(1))})
     estimate = tracker.update(observer(truth))
     assert max(estimate.confidence.values()) < 0.9
@@ -189,8 +187,7 @@ def test_hypothesis_bank_tells_hinge_from_drawer():
             name: Tracker(m, ["part"], process_noise={"q:velocity": 0.05})
             for name, m in (("hinge", hinge), ("drawer", drawer))
         }
-        hypotheses = HypothesisBank(trackers)
-        observer = NoisyObserver(model, ["part"])
+        hypotheses, observer = HypothesisBank(trackers), NoisyObserver(model, ["part"])
         for k in range(10):
             probabilities = hypotheses.update(observer({"q": reach * k / 10}), at=0.1 * k)
         assert sum(probabilities.values()) == pytest.approx(1.0)
@@ -298,12 +295,13 @@ def test_one_point_of_a_body_leaves_its_angle_unknown(seed):
         assert abs(estimate.state[name] - truth[name]) < 3 * estimate.deviation[name]
 
 
-def test_two_alternating_points_determine_a_body():
+@pytest.mark.parametrize("count", [12, pytest.param(20, marks=pytest.mark.long)])
+def test_two_alternating_points_determine_a_body(count):
     points = {"p": (0.1, 0.2, 0.3), "q": (-0.4, 0.1, 0.0)}
     model, first = make_vehicle(points)
     first.wait()
     result = []
-    for seed in range(12):
+    for seed in range(count):
         tracker, rng = first.copy(), np.random.default_rng(seed)
         truth = {"b/x": rng.normal(), "b/y": rng.normal(), "b/angle": rng.uniform(-3, 3)}
         body = model.fk("b")(truth)

@@ -87,7 +87,8 @@ def test_estimate_after_loss_has_the_turn_nearest_to_the_prediction():
 
 
 @pytest.mark.parametrize(("ratio", "turns"), [(-1.5, 2), (1 / 3, 3)])
-def test_turns_that_no_gear_determines_are_those_nearest_to_the_prediction_after_loss(ratio, turns):
+@pytest.mark.parametrize("steps", [15, pytest.param(30, marks=pytest.mark.long)])
+def test_turns_that_no_gear_determines_are_those_nearest_to_the_prediction_after_loss(ratio, turns, steps):
     """A gear next to its driver stands as before after several turns."""
     model = make_pinion()
     with model.edit() as edit:
@@ -96,8 +97,9 @@ def test_turns_that_no_gear_determines_are_those_nearest_to_the_prediction_after
     tracker = Tracker(model, frames, process="static", outliers=True, lost_after=3)
     assert tracker.periodic == {model.symbol("q")}
     observer, far = NoisyObserver(model, frames), 3.0 * turns * np.pi
-    for k in range(15):
-        tracker.update(observer({"q": far * k / 14}), at=DT * k, commands={"q:velocity": far / 14 / DT})
+    step = far / (steps - 1)
+    for k in range(steps):
+        tracker.update(observer({"q": step * k}), at=DT * k, commands={"q:velocity": step / DT})
     estimates = [tracker.update(observer({"q": far + 0.8}), at=4.0 + DT * k) for k in range(6)]
     assert any(estimate.lost for estimate in estimates)
     assert estimates[-1].state["q"] == pytest.approx(far + 0.8, abs=0.2)

@@ -44,8 +44,7 @@ def test_blends_stay_within_the_deviation_and_do_not_overlap(seed: int, deviatio
 
 
 def test_each_corner_has_a_deviation_of_its_own() -> None:
-    points = [[0, 0], [1, 0], [1, 1], [2, 1]]
-    path = round_corners(points, [9, 0.01, 0.0, 9])
+    path = round_corners([[0, 0], [1, 0], [1, 1], [2, 1]], [9, 0.01, 0.0, 9])
     np.testing.assert_allclose(path.deviation, [0.01, 0.0])
     assert path.turns.all()
 

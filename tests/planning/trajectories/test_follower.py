@@ -58,8 +58,7 @@ def test_coordinates_without_limits_have_a_given_speed() -> None:
 
 def test_a_controller_follows_a_trajectory(hsr: kv.Model, columns: list[kv.Symbol]) -> None:
     state = hsr.default_state()
-    begin = state.vector(columns)
-    points = begin + np.array(
+    points = state.vector(columns) + np.array(
         [[0, 0, 0, 0, 0, 0], [0.4, 0.3, 0.2, -0.8, 0.5, -0.5], [0.9, 0, 0.3, -1.5, 1.2, -0.2]]
     )
     trajectory = time_parameterize(points, *motion_limits(hsr, columns), columns, deviation=0.05)

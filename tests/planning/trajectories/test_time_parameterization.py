@@ -108,8 +108,7 @@ def test_backwards_takes_as_long(seed: int) -> None:
 
 def fastest(path: BlendedPath, velocity: Array, acceleration: Array, steps: int) -> float:
     """Return the duration of the fastest motion, by linear programs on an even grid (Pham & Pham 2018)."""
-    ends = np.concatenate(([0.0], path.reach, [0.0]))
-    parts = []
+    ends, parts = np.concatenate(([0.0], path.reach, [0.0])), []
     for k, length in enumerate(path.lengths):
         parts.append((length - ends[k] - ends[k + 1], path.directions[k], 0 * path.directions[k]))
         if k < len(path.reach):
@@ -125,8 +124,7 @@ def fastest(path: BlendedPath, velocity: Array, acceleration: Array, steps: int)
     def rows(cell: tuple[float, Array, Array, Array]) -> tuple[Array, Array]:
         h, first, last, bend = cell
         p = np.concatenate([bend - first / (2 * h), -last / (2 * h)])
-        q = np.concatenate([first / (2 * h), bend + last / (2 * h)])
-        A = np.stack([p, q], axis=1)
+        A = np.stack([p, np.concatenate([first / (2 * h), bend + last / (2 * h)])], axis=1)
         return np.concatenate([A, -A]), np.tile(acceleration, 4)
 
     x = np.zeros(len(cells) + 1)
@@ -176,13 +174,11 @@ def test_repeated_points_change_nothing() -> None:
 
 
 def test_speeds_may_be_unlimited() -> None:
-    t = time_parameterize([[0.0], [8.0]], np.inf, 2.0, names(1))
-    assert t.duration == pytest.approx(4.0)
+    assert time_parameterize([[0.0], [8.0]], np.inf, 2.0, names(1)).duration == pytest.approx(4.0)
 
 
 def test_a_turn_of_one_coordinate_is_followed() -> None:
-    t = time_parameterize([[0.0], [1.0], [0.0]], 1.0, 2.0, names(1))
-    assert t.duration == pytest.approx(3.0)
+    assert time_parameterize([[0.0], [1.0], [0.0]], 1.0, 2.0, names(1)).duration == pytest.approx(3.0)
     rounded = time_parameterize([[0.0], [1.0], [0.0]], 1.0, 2.0, names(1), deviation=0.1)
     assert rounded.positions.max() == pytest.approx(0.9, abs=1e-3)
     check_limits(rounded, np.ones(1), 2 * np.ones(1))

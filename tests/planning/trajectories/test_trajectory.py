@@ -77,8 +77,7 @@ def test_parts_joined_are_the_whole(seed: int, x: float, y: float) -> None:
 @given(seeds)
 def test_reversed_is_its_own_inverse_and_goes_back(seed: int) -> None:
     t = make(5, seed)
-    back = t.reversed()
-    times = np.linspace(0, t.duration, 17)
+    back, times = t.reversed(), np.linspace(0, t.duration, 17)
     np.testing.assert_allclose(back.positions_at(times), t.positions_at(t.duration - times), atol=1e-9)
     np.testing.assert_allclose(
         back.velocities_at(times)[1:-1], -t.velocities_at(t.duration - times)[1:-1], atol=1e-6
@@ -163,8 +162,7 @@ def test_a_jump_is_refused() -> None:
 @settings(max_examples=attempts(10))
 @given(seeds)
 def test_files_are_exact(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
-    path = tmp_path_factory.getbasetemp() / "t.json"
-    t = make(4, seed)
+    path, t = tmp_path_factory.getbasetemp() / "t.json", make(4, seed)
     t.save(path)
     assert Trajectory.load(path) == t
 

@@ -1,7 +1,5 @@
 """Small robot, and minimal settings of benchmarks."""
 
-from __future__ import annotations
-
 import sys
 from functools import cache
 

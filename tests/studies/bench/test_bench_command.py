@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -138,8 +136,7 @@ def test_tables_have_ratios_of_times():
 
 def test_tables_of_targets_say_whether_they_are_met():
     lines = format_benchmark(RESULT, targets=True).partition("target ")[2].splitlines()
-    by_name = {line.partition("  ")[0]: line.partition("  ")[2].split() for line in lines[2:]}
-    assert by_name == {
+    assert {line.partition("  ")[0]: line.partition("  ")[2].split() for line in lines[2:]} == {
         "good, beside peer": ["4", "x", ">=", "2", "x", "met"],
         "bad": ["30", "ms", "<=", "20", "ms", "missed"],
         "away, beside nobody": ["-", ">=", "2", "x", "missing"],

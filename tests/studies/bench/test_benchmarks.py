@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import importlib.util
 import math
 import re
@@ -194,8 +192,7 @@ def test_a_joint_is_replaced_in_a_copy(tiny):
     from kineverse_studies.bench.workloads import find_benchmark_robot
 
     robot = find_benchmark_robot(tiny)
-    before = robot.model.snapshot()
-    values = dict.fromkeys(robot.chain, 0.3)
+    before, values = robot.model.snapshot(), dict.fromkeys(robot.chain, 0.3)
     contender = replace_joint(robot)
     (moved,) = contender.results()
     assert contender.sample() > 0.0

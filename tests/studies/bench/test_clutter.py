@@ -1,7 +1,5 @@
 """Arm among boxes: all searches find equal pairs, and differences are errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -103,8 +101,7 @@ def test_check_distances_refuses_a_missed_pair(arm, scene):
     check_distances([whole, whole], arm.angles)
     with pytest.raises(DisagreementError, match="'incomplete' and 'whole' differ by"):
         check_distances([whole, SearchEntry("incomplete", IncompleteSearch(scene, 0), 1e-6)], arm.angles)
-    furthest = max(distance for *_, distance in whole.search.distances())
-    assert furthest > 0.9 * RADIUS
+    assert max(distance for *_, distance in whole.search.distances()) > 0.9 * RADIUS
     # A pair near the radius may be missing.
     check_distances([whole, SearchEntry("incomplete", IncompleteSearch(scene, -1), 2e-2)], arm.angles[:1])
 

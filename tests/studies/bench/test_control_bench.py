@@ -1,7 +1,5 @@
 """Control loops of the benchmarks: ours and those of pink and mink do the same task, one step each."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

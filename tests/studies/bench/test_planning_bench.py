@@ -1,7 +1,5 @@
 """Planning problems and queries: what they contain, and a tiny run of the planners."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -145,8 +143,7 @@ def test_sampled_paths_have_steps_below_the_density_and_contain_the_points():
 
 def test_queries_are_free_of_contacts_and_the_same_for_a_seed(posts):
     arm = make_kitchen_arm(*PAIR)
-    queries = list(arm.queries(3))
-    scene = Scene(arm.model)
+    queries, scene = list(arm.queries(3)), Scene(arm.model)
     watch = scene.watch("robot/*", "kitchen/*", radius=CLEARANCE)
     lower, upper = arm.limits
     for query, again in zip(queries[:2], arm.queries(2), strict=True):

@@ -1,7 +1,5 @@
 """Estimation grid: noise of samples, Cramér-Rao bound, report."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -55,8 +53,7 @@ def test_the_noise_has_the_stated_deviation(cell):
 
 @by_cell
 def test_without_noise_the_child_moves_about_the_axis(cell):
-    exact = Cell(cell.joint, 0.0, 0.0, 7, cell.range)
-    samples = draw_samples(exact, 4, np.random.default_rng(1))
+    samples = draw_samples(Cell(cell.joint, 0.0, 0.0, 7, cell.range), 4, np.random.default_rng(1))
     poses = relative(samples.seen_parents, samples.seen_children)
     np.testing.assert_allclose(poses[:, 0], samples.zero, atol=1e-12)
     since = poses @ np.linalg.inv(poses[:, :1])
@@ -81,12 +78,10 @@ def test_without_noise_the_child_moves_about_the_axis(cell):
 def everything_seen(cell, unknown):
     """Return the measurements as a function of all unknowns: axis, point, zero pose, joint values, parents."""
     axis, point, zero = unknown[:3] / np.linalg.norm(unknown[:3]), unknown[3:6], pose(unknown[6:12])
-    values = unknown[12 : 12 + cell.count]
-    seen = []
+    values, seen = unknown[12 : 12 + cell.count], []
     for k, value in enumerate(values):
         start = 12 + cell.count + 6 * k
-        parent = pose(unknown[start : start + 6])
-        moved = np.eye(4)
+        parent, moved = pose(unknown[start : start + 6]), np.eye(4)
         if cell.joint == "prismatic":
             moved[:3, 3] = value * axis
         else:
@@ -134,8 +129,7 @@ def test_the_bound_is_that_of_all_unknowns_at_once(cell):
         there, back = (errors(everything_seen(cell, truth + s * step), true) for s in (1, -1))
         columns.append((there - back).ravel() / 2e-6 * weights)
     covariance = np.linalg.pinv(np.array(columns) @ np.array(columns).T, rcond=1e-12, hermitian=True)
-    sides = orthonormal_complement(samples.axis)[0]
-    found = compute_bound(samples)
+    sides, found = orthonormal_complement(samples.axis)[0], compute_bound(samples)
     np.testing.assert_allclose(found.direction[0], sides.T @ covariance[:3, :3] @ sides, rtol=1e-3)
     if cell.joint == "revolute":
         # The true point is in the plane across the axis in which the places of the axes are compared.
@@ -145,8 +139,7 @@ def test_the_bound_is_that_of_all_unknowns_at_once(cell):
 def test_attainable_bound_equals_that_of_gaussian_joint_values():
     """The principal direction of N Gaussian points has the variance σ²(s² + σ²)/(N s⁴)."""
     # Only positions matter where orientations are exact; the errors of both poses add up.
-    cell = Cell("prismatic", 0.05, 1e-7, 50, 0.1)
-    samples = draw_samples(cell, 2, np.random.default_rng(4))
+    samples = draw_samples(Cell("prismatic", 0.05, 1e-7, 50, 0.1), 2, np.random.default_rng(4))
     spread, noise = samples.joint_values[0].var(), 2 * 0.05**2
     expected = noise * (spread + noise) / (50 * spread**2)
     np.testing.assert_allclose(
@@ -195,8 +188,7 @@ def test_the_grid_has_18900_fits():
 def made_up(cell, ratio, right=True, count=40):
     """Return a result with a given ratio of errors to the attainable bound, which is 1.2 times the other."""
     bounds = np.full(count, 2.0)
-    errors = ratio * 1.2 * bounds
-    turns = cell.joint == "revolute"
+    errors, turns = ratio * 1.2 * bounds, cell.joint == "revolute"
     return CellResult(
         cell=cell,
         degrees=errors,

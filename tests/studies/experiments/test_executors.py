@@ -49,15 +49,9 @@ def check_error(options: Options) -> None:
 
 def test_trials_run_in_threads() -> None:
     with ThreadPoolExecutor(2) as executor:
-        check_error(Options(executor=executor))
-        assert run_jobs(range, [1, 3, 2], silent, "ranges", "range", Options(executor=executor)) == [
-            0,
-            0,
-            1,
-            2,
-            0,
-            1,
-        ]
+        options = Options(executor=executor)
+        check_error(options)
+        assert run_jobs(range, [1, 3, 2], silent, "ranges", "range", options) == [0, 0, 1, 2, 0, 1]
 
 
 @pytest.mark.long

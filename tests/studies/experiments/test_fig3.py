@@ -1,7 +1,5 @@
 """Fig. 3 of the 2022 paper: path of the garage door, and its lock."""
 
-from __future__ import annotations
-
 import json
 import sys
 
@@ -104,8 +102,7 @@ def test_reproduce_as_json_is_one_object(tmp_path, monkeypatch, capsys):
 def test_the_lock_opens_at_the_threshold_of_the_paper(fig3):
     """Equation 13 has b < .3; at a = 1 the door is never locked."""
     table = next(table for table in fig3.tables if "unlocked from b =" in table.head)
-    opens = {row[0]: row[-1] for row in table.rows}
-    assert opens == {1.0: 0.0, 2.0: pytest.approx(0.3, abs=1e-9)}
+    assert {row[0]: row[-1] for row in table.rows} == {1.0: 0.0, 2.0: pytest.approx(0.3, abs=1e-9)}
 
 
 def test_reproduce_in_markdown_prints_tables_and_writes_nothing(tmp_path, monkeypatch, capsys):

@@ -1,7 +1,5 @@
 """Fig. 4 of the papers: noise, order of groups, bounds, errors of the published filter."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -106,8 +104,7 @@ def test_the_tracker_has_no_process_noise_as_in_the_papers(kitchen):
     """The deviation stays as it is between two measurements, however long."""
     tracker = make_tracker(kitchen, NOISE)
     q = kitchen.configurations(np.random.default_rng(8), 1)
-    before = tracker.update_poses(kitchen.poses(q)[0])
-    after = tracker.predict(1000.0)
+    before, after = tracker.update_poses(kitchen.poses(q)[0]), tracker.predict(1000.0)
     for symbol in kitchen.symbols:
         assert after.deviation[symbol] == pytest.approx(before.deviation[symbol], rel=1e-9)
         assert after.state[symbol] == before.state[symbol]
@@ -245,7 +242,6 @@ def test_experiment_is_deterministic(report, commanded):
 
 
 def leaves(value):
-    """Return all numbers in lists and mappings."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
     if inside is None:
         return [value] if isinstance(value, float) else []

@@ -5,14 +5,7 @@ import json
 import pytest
 
 import kineverse as kv
-from kineverse.gallery.lockboxes import (
-    THESIS,
-    Condition,
-    Lockbox,
-    Slider,
-    draw_tangled_lockbox,
-    make_rings,
-)
+from kineverse.gallery.lockboxes import THESIS, Condition, Lockbox, Slider, draw_tangled_lockbox, make_rings
 from kineverse_studies.experiments import Options
 from kineverse_studies.experiments.lockbox import (
     ExplorerJob,
@@ -49,10 +42,7 @@ def test_jobs_are_those_of_the_documentation():
 def test_exhaustive_search_of_known_boxes():
     assert can_be_opened(THESIS)
     assert can_be_opened(make_rings(4))
-    circle = {
-        "a": Slider(groups=((Condition("b", 0.5),),)),
-        "b": Slider(groups=((Condition("a", 0.5),),)),
-    }
+    circle = {"a": Slider(groups=((Condition("b", 0.5),),)), "b": Slider(groups=((Condition("a", 0.5),),))}
     assert not can_be_opened(Lockbox(circle, {"a": 1.0}))
     assert can_be_opened(Lockbox({**circle, "b": Slider()}, {"a": 1.0}))
 

@@ -1,7 +1,5 @@
 """Experiments about manipulation: trials and their summary, the papers' programs, locks, set-ups."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -120,8 +118,7 @@ def test_exception_table_lists_all_pairs_once():
         ("pr2/tip", "kitchen/handle"),
         ("kitchen/x", "kitchen/y"),
     ]
-    trials = [replace(_trial("a"), measures={"excepted": pairs})] * 2
-    assert make_exception_table(trials).rows == (
+    assert make_exception_table([replace(_trial("a"), measures={"excepted": pairs})] * 2).rows == (
         ("pr2", "pr2: a", "b, c"),
         ("pr2", "handle that is grasped or pushed", "pr2: tip"),
         ("pr2", "kitchen: x", "y"),
@@ -195,8 +192,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
 @pytest.mark.long
 def test_leader_follower_opens_the_drawer_within_the_papers_tolerance():
     setup = make_opening_setup(SHIPPED["hsr"], OBJECTS["drawer"])
-    start = setup.find_start()
-    program = LeaderFollower(setup)
+    start, program = setup.find_start(), LeaderFollower(setup)
     found = open_by_program(program, setup, start)
     assert found.done
     assert found.position_error <= 1e-3
@@ -329,14 +325,12 @@ def test_trial_watch_keeps_commands_of_the_last_session_and_records(tmp_path):
         for speeds in ({x: 0.1}, {lift: 0.05}, {}):
             session.act(speeds)
         watch.write_outcome(Outcome(True, 0.0, "", "kinematic", 0.06, 3))
-    series = list_series(watch.commands)
-    assert series == {
+    assert list_series(watch.commands) == {
         "time": pytest.approx([0.0, 0.02, 0.04]),
         str(x): [0.1, 0.0, 0.0],
         str(lift): [0.0, 0.05, 0.0],
     }
-    run = read_run_recording(tmp_path / "new" / "a_b-x_y.mcap")
-    assert run.duration >= 0.06 - 1e-9
+    assert read_run_recording(tmp_path / "new" / "a_b-x_y.mcap").duration >= 0.06 - 1e-9
 
 
 def test_setting_believes_the_truth_only_without_noise():

@@ -1,7 +1,5 @@
 """The papers' filter: its equations, implemented a second time, and its refusals."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -71,8 +69,7 @@ def door_slopes(q):
 
 
 def test_hinge_follows_the_published_equations(furniture):
-    rng = np.random.default_rng(1)
-    published = PaperEkf(furniture, HINGE)
+    rng, published = np.random.default_rng(1), PaperEkf(furniture, HINGE)
     training = seen(poses(furniture, HINGE, door=0.3), rng, 400)
     published.learn_noise(training)
     R = np.cov(np.array([entries_of(t) for t in training]), rowvar=False)
@@ -87,8 +84,7 @@ def test_hinge_follows_the_published_equations(furniture):
 
     lost = 0.0
     for _ in range(20):
-        z = seen(true, rng)
-        H = door_slopes(q)[:, None]
+        z, H = seen(true, rng), door_slopes(q)[:, None]
         S = variance * H @ H.T + R
         # By information, which rounds hardly at all; as published, 1 - K H cancels what the inverse of S got wrong.
         remaining = 1 / (1 + variance * float((H.T @ np.linalg.solve(R, H))[0, 0]))
@@ -110,8 +106,7 @@ def test_nested_drawers_equal_weighted_least_squares(furniture):
     assert len(published.groups) == 1
     training = seen(poses(furniture, frames, drawer=0.1, inner=0.1), rng, 50)
     published.learn_noise(training)
-    true = poses(furniture, frames, drawer=0.3, inner=0.05)
-    observed = seen(true, rng, 8)
+    observed = seen(poses(furniture, frames, drawer=0.3, inner=0.05), rng, 8)
     for z in observed:
         published.update(z)
     # What a linear filter ends with is weighted least squares on prior and all but the first observation.
@@ -186,8 +181,7 @@ def test_start_is_the_middle_of_the_limits(furniture):
 
 
 def test_reset_keeps_only_the_noise(furniture):
-    rng = np.random.default_rng(6)
-    published = PaperEkf(furniture, HINGE)
+    rng, published = np.random.default_rng(6), PaperEkf(furniture, HINGE)
     true = poses(furniture, HINGE, door=1.0)
     published.learn_noise(seen(true, rng, 50))
     observed = seen(true, rng, 4)
@@ -211,8 +205,7 @@ def test_commanded_speeds_move_the_prediction(furniture):
 def test_parameters_keep_their_values():
     model = kv.Model()
     with model.edit() as edit:
-        length = kv.parameter("length", 0.5)
-        turn = kv.rotation_z(kv.position("lid"))
+        length, turn = kv.parameter("length", 0.5), kv.rotation_z(kv.position("lid"))
         edit.add_frame("lid", parent="world", transform=turn @ kv.translation(length, 0, 0))
     published = PaperEkf(model, ["lid"])
     assert published.symbols == (kv.position("lid"),)
@@ -224,8 +217,7 @@ def test_parameters_keep_their_values():
 
 
 def test_invalid_observations_are_refused_without_effect(furniture):
-    rng = np.random.default_rng(7)
-    published = PaperEkf(furniture, HINGE)
+    rng, published = np.random.default_rng(7), PaperEkf(furniture, HINGE)
     true = poses(furniture, HINGE, door=1.0)
     published.update(true)
     with pytest.raises(InvalidValueError, match="noise of what shows door is not known"):
@@ -243,8 +235,7 @@ def test_invalid_observations_are_refused_without_effect(furniture):
 
 
 def test_singular_innovation_covariance_is_refused(furniture):
-    published = PaperEkf(furniture, HINGE)
-    true = poses(furniture, HINGE, door=1.0)
+    published, true = PaperEkf(furniture, HINGE), poses(furniture, HINGE, door=1.0)
     published.learn_noise([true, true])
     published.update(true)
     with pytest.raises(InvalidValueError, match="expected for door is singular"):

@@ -1,7 +1,8 @@
-"""Streams of a door: the short form of ``kineverse reproduce stream``."""
+"""Streams of a door, and monitoring of them: the short form of ``kineverse reproduce stream``."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -10,10 +11,13 @@ import pytest
 
 import kineverse as kv
 from kineverse_studies.experiments.stream import (
+    PERIOD,
     StreamErrors,
     correlated_errors,
     make_report,
     make_streams,
+    measure_monitoring,
+    repeated_motion,
     run_trackers,
     summarize_trackers,
 )
@@ -34,8 +38,7 @@ def test_errors_are_correlated_as_stated():
     errors = correlated_errors(40_000, (4,), np.random.default_rng(0), StreamErrors())
     assert errors.std() == pytest.approx(1.0, abs=0.03)
     for lag in (1, 10):
-        correlation = np.mean(errors[lag:] * errors[:-lag])
-        assert correlation == pytest.approx(0.7 * 0.95**lag, abs=0.04)
+        assert np.mean(errors[lag:] * errors[:-lag]) == pytest.approx(0.7 * 0.95**lag, abs=0.04)
 
 
 @pytest.mark.long
@@ -57,3 +60,25 @@ def test_report_has_a_row_for_each_filter(tracked, tmp_path):
     assert report.numbers["tracking"][2]["mean_time"] is None
     report.figure.save(tmp_path / "stream.png")
     assert (tmp_path / "stream.png").stat().st_size > 10_000
+
+
+def test_repeated_motion_is_smooth() -> None:
+    angles = repeated_motion(np.arange(0.0, 3.0 * PERIOD, 1.0 / 30.0))
+    assert np.abs(np.diff(angles)).max() < 0.03
+    assert angles[0] == 0.0
+    assert angles.max() == pytest.approx(1.3)
+
+
+@pytest.mark.long
+def test_monitor_on_correlated_streams() -> None:
+    rows = {
+        row.case: row
+        for row in measure_monitoring(kv.load("kitchen"), seeds=1, minutes=0.2, displacements=(0.02,))
+    }
+    for case, row in rows.items():
+        assert row.alarms == (0 if case.startswith("as modelled") else 1), case
+        assert row.cpu < math.inf
+        assert case in str(row)
+    for case, most in (("axis 2 cm off", 120), ("axis 2 cm off, white noise", 40)):
+        assert rows[case].worst <= most
+        assert rows[f"{case}, door too"].worst <= most

@@ -1,7 +1,5 @@
 """Recordings of doors and drawers: labels, classification, figure."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
