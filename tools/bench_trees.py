@@ -107,16 +107,13 @@ def _fresh_load(kv: object, name: str) -> object:
     return kv.load(name)  # type: ignore[attr-defined]
 
 
-def _until_compiled(work: Callable[[], object], seconds: float = 120.0) -> None:
-    """Work until it takes a tenth of the first time: C is compiled in the background."""
-    begin = perf_counter()
+def _until_compiled(work: Callable[[], object], seconds: float = 60.0) -> None:
+    """Work until a call takes less than .3 s: C is compiled in the background."""
+    begin = start = perf_counter()
     work()
-    first = perf_counter() - begin
-    while first > 0.1 and perf_counter() - begin < seconds:
+    while perf_counter() - start > 0.3 and perf_counter() - begin < seconds:
         start = perf_counter()
         work()
-        if perf_counter() - start < first / 10:
-            break
 
 
 def _edit(kv: object, model: object) -> None:
