@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import runpy
+import sys
 import tomllib
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -14,6 +15,10 @@ import pytest
 import kineverse as kv
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+
+from inventory.size import imports  # noqa: E402  - it is no part of the package
+
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 LARGEST, SMALLEST, MOST_FILES = 650, 100, 26
 LARGE = {"kineverse.expressions.expression"}
@@ -54,7 +59,7 @@ def test_modules_and_folders_have_a_good_size() -> None:
     """Large modules are divided, and small ones belong into the module that imports them."""
     modules, importers = _modules(), defaultdict(set)
     for name, path in modules.items():
-        for imported in _imports(name, path, modules):
+        for imported in {*imports(name, path, modules)} - {name}:
             importers[imported].add(name)
     lines = {name: len(path.read_text("utf-8").splitlines()) for name, path in modules.items()}
     assert {name for name, n in lines.items() if n > LARGEST} == LARGE
@@ -76,20 +81,6 @@ def _modules() -> dict[str, Path]:
         for top in (ROOT / "src", ROOT / "studies")
         for path in sorted(top.rglob("*.py"))
     }
-
-
-def _imports(name: str, path: Path, modules: dict[str, Path]) -> set[str]:
-    """Return the modules that a module imports names of, or as a whole."""
-    package = name if path.stem == "__init__" else name.rpartition(".")[0]
-    imported = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            source = ".".join([*above, *([node.module] if node.module else [])])
-            imported |= {
-                whole if (whole := f"{source}.{alias.name}") in modules else source for alias in node.names
-            }
-    return imported
 
 
 def test_the_package_does_not_import_its_studies() -> None:

@@ -53,7 +53,7 @@ def _rooms(folder: Path) -> dict[str, Any]:
     files = {_module(f): f for f in sorted(folder.rglob("*.py"))}
     importers: dict[str, set[str]] = {name: set() for name in files}
     for name, file in files.items():
-        for imported in _imports(name, file, files):
+        for imported in imports(name, file, files):
             if imported != name:
                 importers[imported].add(name)
     inner = {
@@ -73,7 +73,8 @@ def _rooms(folder: Path) -> dict[str, Any]:
     }
 
 
-def _imports(name: str, file: Path, files: dict[str, Path]) -> Iterator[str]:
+def imports(name: str, file: Path, files: dict[str, Path]) -> Iterator[str]:
+    """Yield the modules, among some, that a module imports or names in a text such as ``module:function``."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
     for node in ast.walk(ast.parse(file.read_text("utf-8"))):
         found: list[str] = []
