@@ -80,7 +80,7 @@ _NEGATIVE_VALUE = re.compile(r"-\s*(\d|\.\d|(pi|π|inf|nan)\b)")
 VERBOSE = "print more messages on standard error"
 
 # The commands report missing meshes themselves; a missing compiler does not change their results.
-QUIET = ("kineverse.view.meshes", "kineverse.compilation.toolchain")
+QUIET = ("kineverse.view.meshes", "kineverse.compile.toolchain")
 
 EXAMPLES = """\
 A MODEL is the name of a shipped model (kitchen, pr2, articulations/screw ...) or the path of a file.
@@ -227,13 +227,14 @@ def load_command(name: str) -> CommandModule:
     distribution = point.dist.name if point.dist else point.value
     try:
         command = point.load()
-    except Exception as error:  # somebody else's code
+    except (Exception, SystemExit) as error:  # somebody else's code
         reason = join_lines(error) or "no reason given"
         raise MissingDependencyError(
             f"'kineverse {name}' is a command of {distribution}, and {point.value} cannot be imported "
             f"({type(error).__name__}: {reason}). Install {distribution} again."
         ) from error
-    lacking = [part for part in ("HELP", "add_arguments", "run") if not hasattr(command, part)]
+    parts = ("HELP", "add_arguments", "run")
+    lacking = [part for part in parts if getattr(command, part, None) is None]
     if lacking:
         raise MissingDependencyError(
             f"'kineverse {name}' is a command of {distribution}, and {point.value} has no "
@@ -269,7 +270,8 @@ def make_parser(name: str | None = None) -> argparse.ArgumentParser:
     )
     command.add_arguments(sub)
     if "--verbose" not in sub._option_string_actions:
-        sub.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS, help=VERBOSE)
+        words = [word for word in ("-v", "--verbose") if word not in sub._option_string_actions]
+        sub.add_argument(*words, action="store_true", default=argparse.SUPPRESS, help=VERBOSE)
     sub.set_defaults(run=command.run, command=sub)
     return top
 
