@@ -116,7 +116,7 @@ def read_implicit(graph: NodeGraph, node: list[Any]) -> None:
     graph.budget.spend(work)
     graph.check_elements(r.shape)
     function = ImplicitFunction(
-        name=check_entity_name(label),
+        name=graph.before + check_entity_name(label),
         unknowns=x,
         inputs=u,
         residual=r,
