@@ -206,7 +206,12 @@ def find_added_commands() -> Mapping[str, EntryPoint]:
     """Return the entry points of commands that other distributions add, by name, without importing them."""
     from importlib.metadata import entry_points  # for start-up time
 
-    found = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    try:
+        found = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    except Exception as error:  # of a damaged file of any installed distribution
+        reason = f"the entry points of one cannot be read ({join_lines(error)})"
+        print(f"kineverse: commands of other distributions are left out, as {reason}", file=sys.stderr)
+        return {}
     return {name: found[name] for name in sorted(found) if name not in COMMANDS}
 
 
