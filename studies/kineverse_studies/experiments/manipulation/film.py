@@ -155,9 +155,11 @@ def make_push_picture(
         handles.insert(
             0, Line2D([], [], color=_POINT, marker="o", linestyle="", label="p on the object, r on the robot")
         )
-        canvas.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+        canvas.legend(
+            handles=handles, loc="outside lower center", ncols=min(3, 1 + len(panels)), frameon=False
+        )
 
-    return Figure(draw, (6.0 * len(panels), 6.0 * size[1] / size[0] + 0.9))
+    return Figure(draw, (6.0 * len(panels), 6.0 * size[1] / size[0] + 1.2))
 
 
 def find_telling_moment(film: Sequence[Moment]) -> tuple[float, Moment | None]:

@@ -299,19 +299,23 @@ def make_trial_numbers(trials: Sequence[Trial]) -> dict[str, Any]:
 def make_success_figure(trials: Sequence[Trial], measure: str, label: str) -> Figure:
     def draw(canvas: Canvas) -> None:
         axes = canvas.add_subplot()
-        robots = list(dict.fromkeys(t.robot for t in trials))
+        robots, skills = (list(dict.fromkeys(getattr(t, of) for t in trials)) for of in ("robot", "skill"))
         colors = {"": "0.7", "collision": "tab:red", "reach": "tab:blue", "time": "tab:orange", "other": "k"}
         for failure, color in colors.items():
             own = [t for t in trials if t.failure == failure and measure in t.measures]
             # Points of one robot are spread by skill, so that opening and closing do not hide each other.
-            y = [robots.index(t.robot) + (0.12 if t.skill == "close" else -0.12) for t in own]
-            marker, size = ("|", 60) if not failure else ("o", 30)
-            axes.scatter(
-                [t.measures[measure] for t in own], y, c=color, s=size, marker=marker, label=failure or "done"
+            y = [robots.index(t.robot) + 0.24 * (skills.index(t.skill) - (len(skills) - 1) / 2) for t in own]
+            style = (
+                {"marker": "o", "s": 30, "label": failure}
+                if failure
+                else {"marker": "|", "s": 60, "label": "done"}
             )
+            if own:
+                axes.scatter([t.measures[measure] for t in own], y, c=color, **style)
         axes.set_yticks(range(len(robots)), robots)
+        axes.set_ylim(len(robots) - 0.5, -0.5)
         axes.set_xlabel(label)
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        canvas.legend(loc="outside right upper", frameon=False)
 
     return Figure(draw, (9.0, 3.5))
 
