@@ -52,13 +52,13 @@ def check_data(data: Path | None) -> Path | None:
 
 
 def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[RobotSource, ...]:
-    """Return robots by name, by default those that ship, and the authors' in a folder."""
-    known = dict(SHIPPED)
+    """Return robots by name, the authors' in a folder first; by default these and those that ship."""
+    known, own = dict(SHIPPED), dict[str, RobotSource]()
     for name, (like, file, hand) in _AUTHORS.items() if data is not None else ():
         source = (data or Path()) / file
         if source.is_file():
-            known[name] = replace(SHIPPED[like], name=name, source=str(source), hand=hand)
-    return tuple(find_robot(name, known) for name in tuple(names) or known)
+            known[name] = own[like] = replace(SHIPPED[like], name=name, source=str(source), hand=hand)
+    return tuple(own.get(name) or find_robot(name, known) for name in tuple(names) or known)
 
 
 SettingOptions = ("world", "noise", "record")  # options of experiments that are read here
@@ -332,19 +332,19 @@ class PushJudge:
         self._judge = Judge(model, world.robot, find_gripper(model, world.robot), handle)
         self._scene = Scene(model, rules=(*pushing.overlapping, *pushing.rules), leave_out=pushing.leave_out)
         self._pair = self._scene.watch(pushing.pusher, pushing.object_bodies, radius=0.0)
-        self._watch, self._touching = watch, False
+        self._watch, self.touching = watch, False
         self._force = self._pressed = 0.0
         self._session: Session | None = None
 
     def watch_controller(self, pushing: Pushing) -> None:
-        self._touching, self._watch.view = pushing.touching, pushing.view
+        self.touching, self._watch.view = pushing.touching, pushing.view
 
     def __call__(self, session: Session) -> None:
         if session is not self._session:
-            self._session, self._touching, self._force, self._pressed = session, False, 0.0, 0.0
+            self._session, self.touching, self._force, self._pressed = session, False, 0.0, 0.0
             self._judge.reset()
         world = session.world
-        self._judge.update(world.state, session.commands, held=world.held, pushing=self._touching)
+        self._judge.update(world.state, session.commands, held=world.held, pushing=self.touching)
         self._force = max(self._force, getattr(world, "peak_force", math.nan))
         self._scene.update(world.state)
         if len(found := self._pair()):

@@ -190,6 +190,13 @@ ROW = (
     Column("dof", "DoF", lambda trials: trials[0].dof, 4),
 )
 """Columns with which each table begins; their keys are attributes of trials, by which rows are grouped."""
+_PAPER_DOF = {"hsr": 23, "fetch": 18, "pr2": 49}
+PAPER_DOF = Column(
+    "published_dof",
+    "paper DoF",
+    lambda trials: _PAPER_DOF.get(trials[0].robot.partition(" ")[0], math.nan),
+    4,
+)
 SUCCESS = (
     Column("objects", "objects", lambda trials: count_objects(trials).objects, 6),
     Column("done", "done", lambda trials: count_objects(trials).done, 6),
@@ -305,13 +312,13 @@ def make_success_figure(trials: Sequence[Trial], measure: str, label: str) -> Fi
             own = [t for t in trials if t.failure == failure and measure in t.measures]
             # Points of one robot are spread by skill, so that opening and closing do not hide each other.
             y = [robots.index(t.robot) + 0.24 * (skills.index(t.skill) - (len(skills) - 1) / 2) for t in own]
-            style = (
-                {"marker": "o", "s": 30, "label": failure}
-                if failure
-                else {"marker": "|", "s": 60, "label": "done"}
-            )
             if own:
-                axes.scatter([t.measures[measure] for t in own], y, c=color, **style)
+                x, marker, size = (
+                    [t.measures[measure] for t in own],
+                    "|o"[bool(failure)],
+                    30 if failure else 60,
+                )
+                axes.scatter(x, y, c=color, s=size, marker=marker, label=failure or "done")
         axes.set_yticks(range(len(robots)), robots)
         axes.set_ylim(len(robots) - 0.5, -0.5)
         axes.set_xlabel(label)

@@ -32,6 +32,7 @@ from kineverse_studies.experiments.manipulation.skills import (
     open_then_close,
 )
 from kineverse_studies.experiments.manipulation.trials import (
+    PAPER_DOF,
     ROW,
     TIMES,
     Column,
@@ -150,6 +151,7 @@ PROGRAM_COLUMNS = (
     ROW[0],
     Column("program", "program", lambda trials: trials[0].skill),
     ROW[3],
+    PAPER_DOF,
     Column("opened", "opened", lambda trials: sum(t.done for t in trials), 6),
     Column("runs", "of", len, 6),
     Column("solve_mean_ms", "solver mean (wall)", lambda trials: _solver_times(trials).mean),
