@@ -30,7 +30,6 @@ from kineverse.worlds.run_metrics import CONTACT_GAP
 
 from .execution import run_jobs
 from .manipulation.film import find_telling_moment, make_film, make_push_picture, make_row
-from .manipulation.paper_push import run_paper_push
 from .manipulation.skills import (
     SettingOptions,
     TrialCase,
@@ -306,5 +305,5 @@ def run_push(job: PushJob) -> list[Trial]:
     )
     world = job.setting.make_world(setup.model, job.robot.prefix, setup.start, dt=dt)
     skill = f"{PAPERS if job.baseline else 'push'} ({job.paper})"
-    act = run_paper_push if job.baseline else partial(run_push_trial, logic=job.logic)
-    return [act(case, setup.model, world, setup.start, skill, dt=dt, steps=steps)]
+    push = partial(run_push_trial, dt=dt, steps=steps, logic=job.logic, baseline=job.baseline)
+    return [push(case, setup.model, world, setup.start, skill)]

@@ -29,9 +29,11 @@ from kineverse_studies.bench.control_workloads import (
     drive,
     figure_eight,
     grasp,
+    hold_start,
     joint_speeds,
     lean,
     loop,
+    measure_error,
     nod,
     orbit,
     split_coordinate,
@@ -131,11 +133,6 @@ def _body_task(frame: str, position: float, orientation: float, lm_damping: floa
     )
 
 
-def _at_start(robot: MinkRobot, tasks: Iterable[Any]) -> None:
-    for task in tasks:
-        task.set_target_from_configuration(robot.configuration)
-
-
 def _at(pose: Any, position: Array) -> Any:
     return mink.SE3.from_rotation_and_translation(pose.rotation(), position)
 
@@ -156,7 +153,7 @@ def _speed_limit(robot: MinkRobot) -> Any:
 def _freeze(robot: MinkRobot, period: float) -> MinkLoop:
     gripper, posture = _body_task("panda_link8", 1.0, 1.0), mink.PostureTask(robot.model, cost=0.1)
     frozen = [mink.DofFreezingTask(robot.model, dof_indices=[0, 1, 2])]
-    _at_start(robot, (gripper, posture))
+    hold_start(robot, (gripper, posture))
     start = gripper.transform_target_to_world
 
     def move(time: float) -> None:
@@ -183,7 +180,7 @@ def _work_at_a_table(robot: MinkRobot, period: float) -> MinkLoop:
         *feet,
         *hands,
     ]
-    _at_start(robot, tasks)
+    hold_start(robot, tasks)
     starts = [hand.transform_target_to_world for hand in hands]
 
     def names(spheres: Iterable[CollisionSphere]) -> list[str]:
@@ -212,17 +209,14 @@ def _stand_with_closed_loops(robot: MinkRobot, period: float) -> MinkLoop:
     centre = mink.ComTask(cost=200.0)
     feet = [_body_task(f"{side}-foot", 200.0, 10.0) for side in ("left", "right")]
     tasks = [_body_task("pelvis", 0.0, 10.0, 0.0), mink.PostureTask(model, cost=1.0), centre, *feet]
-    _at_start(robot, tasks)
+    hold_start(robot, tasks)
     tasks.append(mink.EqualityConstraintTask(model, cost=500.0, gain=0.5, lm_damping=1e-3))
     start = np.array(robot.configuration.data.subtree_com[1])
 
     def move(time: float) -> None:
         centre.set_target(start + nod(time))
 
-    def error() -> float:
-        return float(np.linalg.norm(centre.compute_error(robot.configuration)))
-
-    return MinkLoop(robot, period, tasks, move, error, 0.1)
+    return MinkLoop(robot, period, tasks, move, measure_error(robot, centre), 0.1)
 
 
 def _grasp(robot: MinkRobot, period: float) -> MinkLoop:
@@ -234,7 +228,7 @@ def _grasp(robot: MinkRobot, period: float) -> MinkLoop:
         )
         for finger in FINGERS
     ]
-    _at_start(robot, (arm, posture, *fingers))
+    hold_start(robot, (arm, posture, *fingers))
     start: Any = arm.transform_target_to_world
     tips: list[Any] = [finger.transform_target_to_root for finger in fingers]
 
@@ -250,16 +244,13 @@ def _look_at(robot: MinkRobot, period: float) -> MinkLoop:
     model = robot.model
     gaze = mink.LookAtTask("camera", "body", axis=(0.0, 0.0, 1.0), cost=1.0, lm_damping=1e-3)
     posture = mink.PostureTask(model, cost=0.01)
-    _at_start(robot, (posture,))
+    hold_start(robot, (posture,))
 
     def move(time: float) -> None:
         gaze.set_target(loop(time))
 
-    def error() -> float:
-        return float(np.linalg.norm(gaze.compute_error(robot.configuration)))
-
     limits = [mink.ConfigurationLimit(model), _speed_limit(robot)]
-    return MinkLoop(robot, period, [gaze, posture], move, error, 1e-3, limits)
+    return MinkLoop(robot, period, [gaze, posture], move, measure_error(robot, gaze), 1e-3, limits)
 
 
 def _hold_the_base(robot: MinkRobot, period: float) -> MinkLoop:
@@ -269,7 +260,7 @@ def _hold_the_base(robot: MinkRobot, period: float) -> MinkLoop:
     posture_cost, base_cost = np.full(model.nv, 1e-3), np.zeros(model.nv)
     posture_cost[base[:2]], base_cost[base] = 0.0, 100.0
     posture, damping = mink.PostureTask(model, posture_cost), mink.DampingTask(model, base_cost)
-    _at_start(robot, (gripper, posture))
+    hold_start(robot, (gripper, posture))
     start = gripper.transform_target_to_world
     tasks = [gripper, posture]
 
@@ -294,15 +285,11 @@ def _open_fridge(robot: MinkRobot, period: float) -> MinkLoop:
         GRIPPERS["pr2"], "body", GRASP, "body", position_cost=1.0, orientation_cost=1.0, gain=0.5
     )
     held.set_target(mink.SE3.identity())
-    _at_start(robot, (posture,))
-
-    def error() -> float:
-        return float(np.linalg.norm(held.compute_error(robot.configuration)[:3]))
+    hold_start(robot, (posture,))
 
     limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, dict(robot.speeds))]
-    return MinkLoop(
-        robot, period, [opening, posture], lambda time: None, error, 1e-6, limits, lambda time: [held]
-    )
+    tasks, error = [opening, posture], measure_error(robot, held)
+    return MinkLoop(robot, period, tasks, lambda time: None, error, 1e-6, limits, lambda time: [held])
 
 
 MINK_LOOPS: Mapping[str, tuple[Callable[[ControlWorkload], Any], Callable[[MinkRobot, float], MinkLoop]]] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,6 +29,8 @@ from kineverse_studies.bench.control_workloads import (
     WORKLOADS,
     ControlWorkload,
     PeerLoop,
+    hold_start,
+    measure_error,
     reachable_targets,
     split_coordinate,
     squat,
@@ -76,11 +78,6 @@ def make_loop(name: str, workload: ControlWorkload) -> PinkLoop:
     return PINK_LOOPS[name](PinkRobot(workload), workload.period)
 
 
-def _at_start(robot: PinkRobot, tasks: Iterable[Any]) -> None:
-    for task in tasks:
-        task.set_target_from_configuration(robot.configuration)
-
-
 def _distance(robot: PinkRobot, task: Any) -> Callable[[], float]:
     def error() -> float:
         target = task.transform_target_to_world.translation
@@ -100,14 +97,14 @@ def _swing(*tasks: Any) -> Callable[[float], None]:
 def _reach(robot: PinkRobot, period: float) -> PinkLoop:
     gripper = FrameTask("ee_link", position_cost=1.0, orientation_cost=1.0, lm_damping=1.0)
     posture = PostureTask(cost=1e-3)
-    _at_start(robot, (gripper, posture))
+    hold_start(robot, (gripper, posture))
     return PinkLoop(robot, period, [gripper, posture], _swing(gripper), _distance(robot, gripper))
 
 
 def _reach_smoothly(robot: PinkRobot, period: float) -> PinkLoop:
     gripper = FrameTask("ee_link", position_cost=1.0, orientation_cost=1.0, lm_damping=1.0)
     smooth = LowAccelerationTask(cost=0.1)
-    _at_start(robot, (gripper,))
+    hold_start(robot, (gripper,))
 
     def after(velocity: Array) -> None:
         smooth.set_last_integration(velocity, period)
@@ -123,7 +120,7 @@ def _fly(robot: PinkRobot, period: float) -> PinkLoop:
         for side in ("left", "right")
     ]
     tasks = [base, *arms, PostureTask(cost=1e-3)]
-    _at_start(robot, tasks)
+    hold_start(robot, tasks)
     swing_arms = _swing(*arms)
 
     def move(time: float) -> None:
@@ -143,17 +140,15 @@ def _squat_on_two_legs(robot: PinkRobot, period: float) -> PinkLoop:
         *(FrameTask(foot, position_cost=200.0, orientation_cost=10.0) for foot in FEET),
         *hands,
     ]
-    _at_start(robot, tasks)
+    hold_start(robot, tasks)
     for hand in hands:
         hand.transform_target_to_world.translation += np.array([-0.1, 0.0, -0.2])
 
     def move(time: float) -> None:
         centre.set_target(np.array([0.0, 0.0, 0.55 + 0.05 * np.sin(np.pi * time)]))
 
-    def error() -> float:
-        return float(np.linalg.norm(centre.compute_error(robot.configuration)))
-
-    return PinkLoop(robot, period, tasks, move, error, {"damping": 0.01, "safety_break": False})
+    options = {"damping": 0.01, "safety_break": False}
+    return PinkLoop(robot, period, tasks, move, measure_error(robot, centre), options)
 
 
 def _squat_on_four_legs(robot: PinkRobot, period: float) -> PinkLoop:
@@ -167,7 +162,7 @@ def _squat_on_four_legs(robot: PinkRobot, period: float) -> PinkLoop:
         safe_displacement_gain=1.0,
     )
     tasks = [trunk, PostureTask(cost=1e-5), *feet]
-    _at_start(robot, tasks)
+    hold_start(robot, tasks)
 
     def move(time: float) -> None:
         trunk.transform_target_to_world.translation[1:] = squat(time)
@@ -216,13 +211,10 @@ def _open_fridge(robot: PinkRobot, period: float) -> PinkLoop:
     posture = PostureTask(cost=0.01)
     held = RelativeFrameTask(GRIPPERS["pr2"], GRASP, position_cost=1.0, orientation_cost=1.0, gain=0.5)
     held.set_target(pin.SE3.Identity())
-    _at_start(robot, (posture,))
-
-    def error() -> float:
-        return float(np.linalg.norm(held.compute_error(robot.configuration)[:3]))
+    hold_start(robot, (posture,))
 
     options = {"constraints": [held], "damping": 1e-6}
-    return PinkLoop(robot, period, [opening, posture], lambda time: None, error, options)
+    return PinkLoop(robot, period, [opening, posture], lambda time: None, measure_error(robot, held), options)
 
 
 PINK_LOOPS: Mapping[str, Callable[[PinkRobot, float], PinkLoop]] = {

@@ -7,6 +7,7 @@ numbers in each step. As in the authors' code, other parts that will move are no
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -17,23 +18,19 @@ from kineverse.geometry import Scene
 from kineverse.grasping import find_handle
 from kineverse.lie import inverse
 from kineverse.logic import less
-from kineverse.manipulation import Outcome
-from kineverse.manipulation.pushing import Pushing
-from kineverse.model.model import Model
+from kineverse.manipulation import Outcome, Session
+from kineverse.manipulation.robot_sources import RobotSource
+from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import World
-
-from .skills import PushJudge, TrialCase, TrialWatch
-from .trials import Trial
 
 CONTACT = 0.01  # gap below which the object may move, ε of the 2020 paper [m]
 _FAR, _ANY, _TOLERANCE = 20.0, 1e3, 0.02
 
 
 class PaperPush:
-    def __init__(self, model: Model, what: Symbol, link: str, handle: str, dt: float) -> None:
-        self.touching = False
+    def __init__(self, model: ModelView, what: Symbol, link: str, handle: str, dt: float) -> None:
+        self.touching, self.view = False, None  # as of :class:`.Pushing`, without a view
         self._scene, self._link, self._frames = Scene(model), link, (model.fk(link), model.fk(handle))
         self._nearest = self._scene.watch(link, handle, _FAR)
         self._numbers = Target("push/contact", np.zeros((3, 3)))
@@ -62,28 +59,20 @@ class PaperPush:
         return self.controller.step(state)
 
 
-def run_paper_push(
-    case: TrialCase, model: Model, world: World, start: State, skill: str, *, dt: float, steps: int
-) -> Trial:
-    """Return the trial of the papers' controller in a world."""
-
-    def act(watch: TrialWatch) -> Outcome:
-        what, robot = model.symbol(case.what), case.robot
-        link = f"{robot.prefix}/{robot.push_link}"
-        pushing = Pushing(model, what, link, start, target=0.0, robot=robot.prefix, dt=dt)
-        push = PaperPush(model, what, link, find_handle(model, what).frame, dt)
-        judge = PushJudge(pushing, world, watch)
-        world.reset(start)
-        session = watch.open_session(world, dt, judge)
-        while session.steps < steps and abs(world.state[what]) >= _TOLERANCE:
-            with session.timed("push"):
-                command = push.step(session.state)
-            judge.touching = push.touching
-            session.act(command.speeds)
-        value = world.state[what]
-        done = abs(value) < _TOLERANCE
-        reason = "shut" if done else "not shut in time"
-        measures = judge.measures if done else judge.measures | {"failure": "time"}
-        return Outcome(done, value, reason, world.name, world.time, session.steps, measures)
-
-    return case.run(skill, model, act)
+def push_as_published(
+    session: Session, robot: RobotSource, what: Symbol, steps: int, on_step: Callable[[PaperPush], object]
+) -> Outcome:
+    """Push an object to 0 by the papers' controller alone, in at most so many steps."""
+    world, link = session.world, f"{robot.prefix}/{robot.push_link}"
+    push = PaperPush(world.model, what, link, find_handle(world.model, what).frame, session.dt)
+    while session.steps < steps and abs(world.state[what]) >= _TOLERANCE:
+        with session.timed("push"):
+            command = push.step(session.state)
+        on_step(push)
+        session.act(command.speeds)
+    value = world.state[what]
+    done = abs(value) < _TOLERANCE
+    reason = f"'{what}' is at {value:.3g}" + ("" if done else ", out of time")
+    return Outcome(
+        done, value, reason, world.name, world.time, session.steps, {} if done else {"failure": "time"}
+    )

@@ -26,6 +26,7 @@ from kineverse.worlds import Judge, KinematicWorld, MujocoWorld, Recorder, Senso
 from kineverse.worlds.recorder import import_mcap
 from kineverse_studies.experiments.registry import BOTH, WORLDS, Options
 
+from .paper_push import PaperPush, push_as_published
 from .trials import Failure, Moment, Trial, find_failure
 
 _AUTHORS = {
@@ -299,23 +300,29 @@ def run_push_trial(
     dt: float = DT,
     steps: int = 1200,
     logic: str | None = "and",
+    baseline: bool = False,
 ) -> Trial:
-    """Return the trial of a push in a world: from a start, or from one that base placement finds."""
+    """Return the trial of a push: from a start, or from one that base placement finds; or as published."""
 
     def act(watch: TrialWatch) -> Outcome:
         bodies = find_gripper(model, world.robot).bodies
         coordinate = find_object_coordinate(world, case.what)
         pushing = Pushing(model, coordinate, bodies, start, target=0.0, robot=world.robot, dt=dt, logic=logic)
         judge = PushJudge(pushing, world, watch)
-        outcome, placed, first = try_push(
-            pushing,
-            world,
-            start,
-            lambda: watch.open_session(world, dt, judge),
-            seconds=steps * dt,
-            seed=case.seed,
-            on_step=judge.watch_controller,
-        )
+        if baseline:
+            world.reset(start)
+            session, placed, first = watch.open_session(world, dt, judge), 0, ""
+            outcome = push_as_published(session, case.robot, coordinate, steps, judge.watch_controller)
+        else:
+            outcome, placed, first = try_push(
+                pushing,
+                world,
+                start,
+                lambda: watch.open_session(world, dt, judge),
+                seconds=steps * dt,
+                seed=case.seed,
+                on_step=judge.watch_controller,
+            )
         more = {"placed": placed, "first": first, **judge.measures}
         return replace(outcome, measures={**outcome.measures, **more})
 
@@ -332,19 +339,19 @@ class PushJudge:
         self._judge = Judge(model, world.robot, find_gripper(model, world.robot), handle)
         self._scene = Scene(model, rules=(*pushing.overlapping, *pushing.rules), leave_out=pushing.leave_out)
         self._pair = self._scene.watch(pushing.pusher, pushing.object_bodies, radius=0.0)
-        self._watch, self.touching = watch, False
+        self._watch, self._touching = watch, False
         self._force = self._pressed = 0.0
         self._session: Session | None = None
 
-    def watch_controller(self, pushing: Pushing) -> None:
-        self.touching, self._watch.view = pushing.touching, pushing.view
+    def watch_controller(self, pushing: Pushing | PaperPush) -> None:
+        self._touching, self._watch.view = pushing.touching, pushing.view
 
     def __call__(self, session: Session) -> None:
         if session is not self._session:
-            self._session, self.touching, self._force, self._pressed = session, False, 0.0, 0.0
+            self._session, self._touching, self._force, self._pressed = session, False, 0.0, 0.0
             self._judge.reset()
         world = session.world
-        self._judge.update(world.state, session.commands, held=world.held, pushing=self.touching)
+        self._judge.update(world.state, session.commands, held=world.held, pushing=self._touching)
         self._force = max(self._force, getattr(world, "peak_force", math.nan))
         self._scene.update(world.state)
         if len(found := self._pair()):
