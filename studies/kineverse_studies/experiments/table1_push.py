@@ -187,7 +187,6 @@ _NAMED = 6  # number of the fastest joints that have their names in the figure
 
 
 def meets_bars(trial: Trial) -> bool:
-    """Return whether a push was done within the bars."""
     m = trial.measures
     return bool(
         trial.done

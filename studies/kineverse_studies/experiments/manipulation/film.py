@@ -41,7 +41,6 @@ class FilmRow:
 
 
 def make_film(rows: Sequence[FilmRow], size: tuple[int, int] = (420, 420)) -> Figure:
-    """Return the figure of rows of pictures, each picture of a size [pixel]."""
     count = max(len(row.states) for row in rows)
     scale = 3.0 / size[0]
 
@@ -93,7 +92,6 @@ class RowView:
         return RowView(scenes, wanted, points)
 
     def camera(self, direction: tuple[float, float], aspect: float) -> Camera:
-        """Return the camera from an elevation and an azimuth [rad]."""
         elevation, azimuth = direction
         return fit_camera(self.points, azimuth, elevation, aspect, margin=0.04)
 

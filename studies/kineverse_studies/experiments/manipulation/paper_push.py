@@ -69,10 +69,8 @@ def push_as_published(
         with session.timed("push"):
             command = push.step(session.state)
         on_step(push)
-        session.act(command.speeds)
+        session.act(command.speeds, command)
     value = world.state[what]
     done = abs(value) < _TOLERANCE
-    reason = f"'{what}' is at {value:.3g}" + ("" if done else ", out of time")
-    return Outcome(
-        done, value, reason, world.name, world.time, session.steps, {} if done else {"failure": "time"}
-    )
+    reason = f"'{what}' is at {value:.3g}" if done else f"Out of time at {value:.3g}."
+    return Outcome(done, value, reason, world.name, world.time, session.steps)

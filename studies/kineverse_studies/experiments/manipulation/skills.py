@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -38,7 +39,6 @@ DATA_FOLDERS = ("pr2", "fetch", "hsrb", "iai_kitchen")
 
 
 def check_data(data: Path | None) -> Path | None:
-    """Return the folder of the authors' files; None if none is given."""
     if data is None:
         return None
     if not data.is_dir():
@@ -54,9 +54,9 @@ def check_data(data: Path | None) -> Path | None:
 
 def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[RobotSource, ...]:
     """Return robots by name, the authors' in a folder first; by default these and those that ship."""
-    known, own = dict(SHIPPED), dict[str, RobotSource]()
-    for name, (like, file, hand) in _AUTHORS.items() if data is not None else ():
-        source = (data or Path()) / file
+    known, own, folder = dict(SHIPPED), dict[str, RobotSource](), check_data(data)
+    for name, (like, file, hand) in _AUTHORS.items() if folder is not None else ():
+        source = (folder or Path()) / file
         if source.is_file():
             known[name] = own[like] = replace(SHIPPED[like], name=name, source=str(source), hand=hand)
     return tuple(own.get(name) or find_robot(name, known) for name in tuple(names) or known)
@@ -309,19 +309,15 @@ def run_push_trial(
         coordinate = find_object_coordinate(world, case.what)
         pushing = Pushing(model, coordinate, bodies, start, target=0.0, robot=world.robot, dt=dt, logic=logic)
         judge = PushJudge(pushing, world, watch)
+        look, seconds, placed, first = judge.watch_controller, steps * dt, 0, ""
         if baseline:
             world.reset(start)
-            session, placed, first = watch.open_session(world, dt, judge), 0, ""
-            outcome = push_as_published(session, case.robot, coordinate, steps, judge.watch_controller)
+            session = watch.open_session(world, dt, judge)
+            outcome = push_as_published(session, case.robot, coordinate, steps, look)
         else:
+            begin = partial(watch.open_session, world, dt, judge)
             outcome, placed, first = try_push(
-                pushing,
-                world,
-                start,
-                lambda: watch.open_session(world, dt, judge),
-                seconds=steps * dt,
-                seed=case.seed,
-                on_step=judge.watch_controller,
+                pushing, world, start, begin, seconds=seconds, seed=case.seed, on_step=look
             )
         more = {"placed": placed, "first": first, **judge.measures}
         return replace(outcome, measures={**outcome.measures, **more})

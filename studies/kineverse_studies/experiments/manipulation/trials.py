@@ -43,7 +43,6 @@ class StepTimeStatistics:
 
     @staticmethod
     def from_seconds(cpu: Sequence[float], wall: Sequence[float] = ()) -> StepTimeStatistics:
-        """Return the statistics of durations [s]; ``wall`` is the mean wall time."""
         if not len(cpu):
             return StepTimeStatistics()
         ms = 1e3 * np.asarray(cpu, dtype=float)
@@ -166,7 +165,6 @@ def worst(key: str, scale: float = 1.0) -> Callable[[Sequence[Trial]], float]:
 
 
 def step_times(trials: Sequence[Trial]) -> StepTimeStatistics:
-    """Return the statistics of all control steps of some trials [ms]."""
     return StepTimeStatistics.from_seconds(
         [t for trial in trials for t in trial.cpu], [t for trial in trials for t in trial.wall]
     )
