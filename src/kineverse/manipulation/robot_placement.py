@@ -172,7 +172,7 @@ def _choose_prefix(
     taken = next((name for name in known if name.startswith(f"{own}/")), None)
     if taken is not None:
         raise InvalidValueError(
-            f"The model has '{taken}', which would be of the robot '{own}' of {source}. "
+            f"The model has '{taken}', and the names of {source} begin with '{own}/', too. "
             "Give the furniture alone as the model, or a robot with another name."
         )
     return prefix, own
