@@ -267,9 +267,7 @@ def open_as_unknown(
     model, coordinate, start = scene.model, scene.coordinate, scene.start
     part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
     if part is None:
-        raise InvalidValueError(
-            f"--unknown: no joint has the coordinate '{coordinate}', so the part is not known."
-        )
+        raise InvalidValueError(f"--unknown: no joint moves '{coordinate}', so no part belongs to it.")
     far = None if arguments.to is None else abs(scene.target - start[coordinate])
     outcome: Outcome = open_unknown(
         Session(world, on_step=look),

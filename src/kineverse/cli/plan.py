@@ -153,8 +153,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Planning problem."""
-
     model: kv.Model
     planner: Planner  # planner, placed at the start
     state: kv.State  # state at the start, but for what --from says of frames

@@ -122,7 +122,7 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
             model.fk(hand)  # raises for an unknown frame
         # Hands come last in a tree, and first in the message.
         lines = [f"\n  {line}" for line in why[: -_MOST_LINKS - 1 : -1]]
-        lines += [f"\n  {len(why) - _MOST_LINKS} further links carry no fingers."] * (len(why) > _MOST_LINKS)
+        lines += [f"\n  Further links without fingers: {len(why) - _MOST_LINKS}."] * (len(why) > _MOST_LINKS)
         reasons = "".join(lines) or " None of its links carries two moving branches."
         raise UnknownNameError(f"{name} has no gripper with two opposed fingers.{reasons}")
     if hand is None:

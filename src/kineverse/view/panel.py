@@ -37,10 +37,7 @@ STYLE = """
     [data-dock-root] > div:first-child { bottom: 3.5em !important }
 }
 """
-"""Sliders below their names, which do not fit beside them; the names include the range.
-
-On a phone the panel is a sheet at the bottom, open or folded, and the scene ends above it.
-"""
+"""Sliders below their names, which include the range; on a phone the panel is a sheet below the scene."""
 
 
 class Panel:
