@@ -296,7 +296,7 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
             )
         if not word.startswith("-"):
             raise UnknownNameError(
-                f"{sub.prog} has no use for {word!r}. '{sub.prog} --help' says what it takes."
+                f"{sub.prog} takes no argument {word!r}. '{sub.prog} --help' lists those that it takes."
             )
         options = [option for option in sub._option_string_actions if option.startswith("--")]
         raise UnknownNameError(f"{sub.prog} has no option {word!r}. {suggest(word, options, 'option')}")
