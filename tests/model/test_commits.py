@@ -8,9 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from history_operations import Fragile, Next, Place, Put, Row, Sequenced, Sum, Watch, state_of
+from history_operations import Next, Place, Put, Row, Sequenced, Sum, Watch, state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_models import random_state, random_tree
 from test_model_history import FRAMES, started, step, take
 
 import kineverse as kv
@@ -24,6 +25,9 @@ index = st.integers(0, 40)
 action = st.one_of(
     step,
     st.tuples(st.just("move"), index, index),
+    st.tuples(
+        st.just("append"), st.builds(Row, frame, st.sampled_from(("a", "b", "g")), st.just("a")), index
+    ),
     st.tuples(st.just("attach"), st.tuples(frame, st.sampled_from(("world", *FRAMES))), index),
 )
 actions = st.lists(action, min_size=1, max_size=5)
@@ -64,6 +68,10 @@ def plain(diff: kv.model.Diff) -> Any:
     return changes, replace(diff, changes=(), reruns=0, **groups)  # type: ignore[arg-type]
 
 
+def poses_of(model: kv.Model) -> dict[str, Any]:
+    return {name: model.fk(name) if name in model.frames else None for name in FRAMES}
+
+
 def whole(model: kv.Model) -> Any:
     """Return everything about a model, with what each operation read."""
     history = model.history
@@ -77,8 +85,10 @@ def test_net_changes_and_undo_on_the_model_and_on_a_replica(transactions: list[A
     model, _ = started()
     replica = model.copy()
     heard, heard_there = heard_by(model), heard_by(replica)
+    moved: list[kv.model.Diff] = []
+    replica.listen(moved.append, frames=FRAMES)
     for number, steps in enumerate(transactions):
-        before, order = model.snapshot(), model.history.tags
+        before, order, poses = model.snapshot(), model.history.tags, poses_of(model)
         try:
             with model.edit() as edit:
                 for k, one in enumerate(steps):
@@ -91,6 +101,9 @@ def test_net_changes_and_undo_on_the_model_and_on_a_replica(transactions: list[A
         assert replica.history.runs == runs
         assert whole(replica) == whole(model)
         assert [*map(plain, heard_there)] == [*map(plain, heard)]
+        differ = tuple(name for name, pose in poses_of(replica).items() if poses[name] != pose)
+        assert tuple(name for diff in moved for name in diff.poses) == differ
+        assert not any(diff.poses == () for diff in moved)
         if net.is_empty:
             continue
         after, version = model.snapshot(), model.version
@@ -105,6 +118,8 @@ def test_net_changes_and_undo_on_the_model_and_on_a_replica(transactions: list[A
             again = edit.net()
         (replica if salt % 2 else model).adopt(pickle.loads(pickle.dumps(again)) if salt % 3 == 0 else again)
         assert model.snapshot() == replica.snapshot() == after
+        assert [diff.poses for diff in moved] == [differ] * 3 * bool(differ)
+        moved.clear()
         assert [*map(plain, heard_there)] == [*map(plain, heard)]
 
 
@@ -129,9 +144,287 @@ def test_a_savepoint_that_is_rolled_back_leaves_no_trace(first: Any, undone: Any
                 for k, one in enumerate(last):
                     do(edit, *one, f"v{k}")
             results.append(None)
-        except kv.errors.EditError as error:
+        except kv.KineverseError as error:
             results.append(str(error))
     assert results[0] == results[1]
     assert whole(model) == whole(twin)
     assert results[0] is None or state_of(model) == before
     assert [(plain(d), d.reruns) for d in heard] == [(plain(d), d.reruns) for d in heard_there]
+
+
+def build(*operations: kv.Operation) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        for number, operation in enumerate(operations):
+            edit.apply(operation, str(number))
+    return model
+
+
+def net_of(model: kv.Model, change: Callable[[Edit], object]) -> NetChanges:
+    """Return what an edit would change; it is rolled back."""
+    with model.edit() as edit:
+        start = edit.savepoint()
+        change(edit)
+        net = edit.net()
+        start.roll_back()
+    return net
+
+
+def test_net_changes_name_what_is_put_with_its_anchor() -> None:
+    model = build(Put("a", 1), Put("b"), Next("c", "a"), Put("d"))
+
+    def change(edit: Edit) -> None:
+        edit.replace("0", Put("a", 5))
+        edit.insert(Put("x"), "x", before="0")
+        edit.insert(Put("y"), "y", after="2")
+        operation = edit.model.history.operation("1")  # type: ignore[attr-defined]
+        edit.remove("1")
+        edit.apply(operation, "1")
+        edit.apply(Put("z"), "z")
+        edit.remove("3")
+        edit.apply(Put("never"), "never")
+        edit.remove("never")
+
+    before = state_of(model)
+    net = net_of(model, change)
+    assert state_of(model) == before
+    placed = [(one.entry.tag, one.after, one.at_end) for one in net.put]
+    assert placed == [
+        *(("x", None, False), ("0", "x", False), ("2", "0", False)),
+        *(("y", "2", True), ("1", "y", True), ("z", "1", True)),
+    ]
+    assert (net.added, net.replaced, net.moved) == (("x", "y", "z"), ("0", "1"), ("1",))
+    assert (net.rerun, net.removed, net.is_empty) == (("2",), ("3",), False)
+    with model.edit() as edit:  # what others have appended meanwhile comes first
+        edit.apply(Put("other"), "other")
+    model.adopt(net)
+    assert model.history.tags == ["x", "0", "2", "other", "y", "1", "z"]
+
+
+def test_an_edit_that_does_nothing_is_no_commit() -> None:
+    model = build(Put("a", 1))
+    heard = heard_by(model)
+    with model.edit() as edit:
+        start = edit.savepoint()
+        edit.apply(Next("b", "a"))
+        inner = edit.savepoint()
+        edit.remove("0")
+        start.roll_back()
+        assert edit.net() == NetChanges()
+        with pytest.raises(kv.errors.EditError, match="savepoint is gone"):
+            inner.roll_back()
+    model.adopt(NetChanges())
+    assert (model.version, heard) == (1, [])
+    with pytest.raises(kv.errors.EditError, match="over"):
+        start.roll_back()
+
+
+def entry(tag: str, operation: kv.Operation, reads: Reads | None = None, **writes: Any) -> HistoryEntry:
+    cells = {tuple(name.split("__", 1)): value for name, value in writes.items()}
+    return HistoryEntry(tag, operation, 0, reads or Reads(), cells)  # type: ignore[arg-type]
+
+
+def put(*entries: HistoryEntry, after: str | None = None, **more: Any) -> NetChanges:
+    return NetChanges(tuple(PlacedEntry(one, after) for one in entries), **more)
+
+
+FRAME = kv.model.Frame.from_transform
+WRONG: dict[str, tuple[Any, str]] = {
+    "no changes": ("a", "adopts kv.model.NetChanges"),
+    "a taken tag": (put(entry("0", Put("x"), data__x=1)), "'0' is taken"),
+    "a missing tag": (put(entry("x", Put("x"), data__x=1), replaced=("x",)), "'x' is not there"),
+    "a missing tag to remove": (NetChanges(removed=("x",)), "no operation 'x'"),
+    "an unknown anchor": (put(entry("x", Put("x"), data__x=1), after="y"), "no operation 'y'"),
+    "a missing parent": (
+        put(entry("x", Place("x", "nothing"), frames__x=FRAME("nothing", kv.translation(1, 0, 0)))),
+        "parent of frame 'x' is missing",
+    ),
+    "a cycle of frames": (
+        put(
+            entry("1", Place("f", "g"), frames__f=FRAME("g", kv.translation(1, 0, 0))),
+            replaced=("1",),
+        ),
+        "parent of frame 'f' is missing",
+    ),
+    "a cycle of frames at the end": (
+        put(entry("x", Place("f", "g"), frames__f=FRAME("g", kv.translation(1, 0, 0))), after="2"),
+        "Cyclic frames",
+    ),
+    "a cycle of rates": (
+        put(
+            entry(
+                "x",
+                Row("a", "a", "q"),
+                rates__a=(kv.position("a"), ((kv.velocity("a"), kv.array(2.0)),)),
+            )
+        ),
+        "Cyclic rates",
+    ),
+    "a frame of others": (
+        put(entry("x", Put("x"), frames__f=FRAME("world", kv.translation(1, 0, 0))), after="2"),
+        "There is a frame 'f' already",
+    ),
+    "a reader that is left out": (NetChanges(removed=("0",)), "'3' reads data/a"),
+    "a value of another type": (put(entry("x", Put("x"), frames__x=3)), "writes 3 into"),
+    "an unknown kind": (put(entry("x", Put("x"), things__x=3)), "writes 3 into"),
+    "no entry": (NetChanges((PlacedEntry("x", None),)), "no entry"),  # type: ignore[arg-type]
+    "no operation": (put(entry("x", 3, data__x=1)), "no operation"),  # type: ignore[arg-type]
+    "a tag twice": (put(*[entry("x", Put("x"), data__x=1)] * 2), "twice"),
+    "a move of nothing": (NetChanges(moved=("0",)), "is not put"),
+    "a name that is none": (put(entry("x", Put("x"), **{"data__x//y": 1})), "not a name"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_changes_are_refused_and_nothing_happens(case: str) -> None:
+    model = build(Put("a", 1), Place("f", "world"), Place("g", "f"), Next("b", "a"))
+    before, heard = whole(model), heard_by(model)
+    changes, message = WRONG[case]
+    with pytest.raises(kv.errors.EditError, match=message) as info:
+        model.adopt(changes)
+    assert type(info.value) is kv.errors.EditError
+    assert (whole(model), heard) == (before, [])
+    with model.edit() as edit:
+        edit.replace("0", Put("a", 2))
+    assert model.data["b"] == 3
+
+
+def test_changes_adopted_in_an_edit_run_what_reads_them() -> None:
+    model = build(Put("a", 1), Next("b", "a"), Sum("c", ("b",)))
+    net = net_of(model, lambda edit: edit.replace("0", Put("a", 5)))
+    only = replace(net, put=net.put[:1], rerun=())  # of a client that does not know the others
+    runs = model.history.runs
+    with model.edit() as edit:
+        edit.adopt(only)
+    assert (dict(model.data), model.history.runs - runs) == ({"a": 5, "b": 6, "c": 6}, 2)
+
+
+def test_an_operation_from_elsewhere_is_linked_and_run_if_it_read_something_else() -> None:
+    model = build(Put("a", 1))
+    reads = Reads()
+    reads.add(("data", "a"), Read.VALUE)
+    reads.add(("data", "q"), Read.EXISTENCE)
+    history = model.history
+    for tag, seen, runs in (
+        ("x", None, 0),
+        ("y", {("data", "a"): 1, ("data", "q"): ABSENT}, 0),
+        ("z", {("data", "a"): 3}, 1),
+        ("w", {("data", "q"): 1}, 1),
+    ):
+        before = history.runs
+        with model.edit():
+            history.link(entry(tag, Next(tag, "a"), reads, **{f"data__{tag}": 9}), seen=seen)
+        assert (history.runs - before, model.data[tag]) == (runs, 2 if runs else 9)
+    with model.edit() as edit:
+        edit.replace("0", Put("a", 4))
+    assert {model.data[tag] for tag in "xyzw"} == {5}
+    for wrong, message in (
+        (entry("x", Put("x"), data__x=1), "taken"),
+        (entry("f", Place("f", "no"), frames__f=FRAME("no", kv.translation(1, 0, 0))), "parent of frame"),
+    ):
+        with pytest.raises(kv.KineverseError, match=message), model.edit():
+            history.link(wrong)
+
+
+def test_a_commit_is_taken_back_below_later_ones_and_not_through_them() -> None:
+    model = build(Put("a", 1), Put("b", 1), Next("c", "a"))
+    with model.edit() as edit:  # version 2
+        edit.replace("0", Put("a", 5))
+        edit.insert(Put("x", 1), "x", before="1")
+    with model.edit() as edit:  # version 3
+        edit.remove("1")
+        edit.apply(Sum("s", ("c", "a")), "s")
+    with model.edit() as edit:
+        edit.undo(2)
+    assert model.history.tags == ["0", "2", "s"]
+    assert dict(model.data) == {"a": 1, "c": 2, "s": 3}
+    with model.edit() as edit:
+        edit.undo(4)
+    assert dict(model.data) == {"a": 5, "c": 6, "s": 11, "x": 1}
+    with model.edit() as edit:  # version 6
+        edit.replace("0", Put("a", 7))
+    before = state_of(model)
+    for version, message in (
+        (2, "Version 2 .*'0'.*version 6 since then. Undo version 6 first"),
+        (1, "Version 1 .*'0'.*version 6"),
+        (7, "Version 7 .*last 1000 commits .*1 to 6"),
+        (0, "Version 0"),
+        ("2", "not '2'"),
+        (True, "not True"),
+    ):
+        with pytest.raises(kv.errors.EditError, match=message), model.edit() as edit:
+            edit.undo(version)  # type: ignore[arg-type]
+    with pytest.raises(kv.errors.EditError, match="this edit"), model.edit() as edit:
+        edit.remove("s")
+        edit.undo(3)
+    assert state_of(model) == before
+    branch = model.copy()
+    with branch.edit() as edit:
+        edit.undo(6)
+        edit.undo(3)
+    assert branch.history.tags == ["0", "x", "1", "2"]
+    model = build(Place("f", "world"))
+    with model.edit() as edit:
+        edit.apply(Place("g", "f"), "g")
+    with pytest.raises(kv.errors.EditError, match="parent of frame 'g' is missing"), model.edit() as edit:
+        edit.undo(1)
+
+
+def test_only_the_last_commits_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kineverse.model.commits.undo.UNDO_LIMIT", 3)
+    model = kv.Model()
+    for number in range(5):
+        with model.edit() as edit:
+            edit.write("x", number, str(number))
+    with pytest.raises(kv.errors.EditError, match=r"the last 3 commits .* 3 to 5"), model.edit() as edit:
+        edit.undo(2)
+    with model.edit() as edit:
+        edit.undo(5)
+    assert model.data["x"] == 3
+
+
+def test_places_of_what_was_removed_survive_a_renumbering() -> None:
+    model = build(Put("a"), Put("b"), Put("c"), Put("d"))
+    with model.edit() as edit:
+        edit.remove("1")
+        edit.remove("2")
+    operation = model.history.operation("0")
+    with model.edit() as edit:
+        edit.remove("0")
+        edit.apply(operation, "0")
+    for number in range(70):
+        with model.edit() as edit:
+            edit.insert(Put("x", number), f"x{number}", before="3")
+    with model.edit() as edit:
+        edit.undo(3)
+        edit.undo(2)
+    xs = [f"x{number}" for number in range(70)]
+    tags = model.history.tags
+    assert tags[0] == "0"
+    assert [tag for tag in tags if tag[0] == "x"] == xs
+    assert tags.index("1") < tags.index("2") < tags.index("3")
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_replica_of_a_document_has_equal_poses_and_an_equal_digest(seed: int) -> None:
+    model = kv.load("articulations/garage_door") if seed else random_tree(seed)
+    replica = kv.formats.from_bytes(kv.formats.to_bytes(model))
+    frames = list(model.frames)
+    edits: list[Callable[[Edit], object]] = [
+        lambda edit: edit.attach(frames[-1], "world", kv.translation(0, 1, seed)),
+        lambda edit: edit.constrain("more", 0, kv.position("more"), 1),
+        lambda edit: edit.insert(Watch("pose", frames[0]), before=edit.model.history.tags[-1]),  # type: ignore[attr-defined]
+        lambda edit: edit.remove("constraint more"),
+        lambda edit: edit.undo(edit.model.version),
+    ]
+    for change in edits:
+        with model.edit() as edit:
+            change(edit)
+            net = edit.net()
+        replica.adopt(net)
+        assert replica.history.tags == model.history.tags
+        assert kv.formats.document_hash(replica) == kv.formats.document_hash(model)
+    values = kv.State(random_state(model, seed))
+    poses = [kv.compile([each.fk(name) for name in frames])(values) for each in (model, replica)]
+    for one, other in zip(*poses, strict=True):
+        assert (one == other).all()

@@ -122,11 +122,11 @@ class Edit:
 
         Raises
         ------
-        EditError
-            If operations fail after the edit, as at its end.
+        EditError, ModelError
+            If the edit would be refused at its end.
         """
         history = self._check_open()
-        self._model._settle()
+        self._model.rates  # noqa: B018 - settles, and raises for cyclic rates
         return find_net_changes(history)
 
     def adopt(self, changes: NetChanges) -> None:

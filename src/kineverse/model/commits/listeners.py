@@ -52,7 +52,7 @@ class Commit:
         found: dict[str, Change] = {}
         if frame in frames or any(name in frames for name in after):
             before = self._chain(frame, frames)
-            if not _have_equal_motion(before.values(), after.values()):
+            if not _have_equal_motion(list(before.values()), list(after.values())):
                 found = {name: frames[name] for name in (*before, *after) if name in frames}
         if rates:
             moving = [x for f in after.values() for x in f.factors if isinstance(x, Expression)]
@@ -97,8 +97,13 @@ class Commit:
         return found
 
 
-def _have_equal_motion(before: Iterable[Frame], after: Iterable[Frame]) -> bool:
+def _have_equal_motion(before: list[Frame], after: list[Frame]) -> bool:
     """Return whether two chains, from the tip upwards, multiply to the same motion, factor by factor."""
+    if not before or not after:
+        return before is after
+    for end in (-1, 0):
+        while before and after and before[end] is after[end]:
+            del before[end], after[end]
     one, other = list(_multiply_constants(before)), list(_multiply_constants(after))
     return len(one) == len(other) and all(
         a is b or (type(a) is type(b) and np.array_equal(a, b)) if isinstance(a, np.ndarray) else a == b
@@ -106,12 +111,10 @@ def _have_equal_motion(before: Iterable[Frame], after: Iterable[Frame]) -> bool:
     )
 
 
-def _multiply_constants(chain: Iterable[Frame]) -> Iterator[Any]:
+def _multiply_constants(chain: list[Frame]) -> Iterator[Any]:
     """Yield the moving factors of a chain from the root to its tip, and the products of constants between."""
-    frames = list(chain)[::-1]
-    yield bool(frames)
     constant = np.eye(4)
-    for frame in frames:
+    for frame in chain[::-1]:
         for factor in frame.factors:
             if isinstance(factor, Pose):
                 constant = constant @ factor.matrix
