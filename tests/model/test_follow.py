@@ -229,4 +229,4 @@ def test_a_controller_a_tracker_and_a_scene_are_built_from_what_a_follower_passe
         assert follower.wait(timeout=60), follower.error
         controller, tracker, _ = follower.value
         assert controller.step({x: 0.0, y: 0.0}).speeds[x.derivative()] < 0
-        assert tracker.estimate.symbols == (x,)
+        assert tracker.symbols == (x,)
