@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
-from history_operations import Next, Place, Put, Row, Sequenced, Sum, Watch, state_of
+from history_operations import Next, Place, Put, Row, Sequenced, Sum, Watch, check, state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_models import random_state, random_tree
@@ -35,11 +36,11 @@ actions = st.lists(action, min_size=1, max_size=5)
 
 def do(edit: Edit, kind: str, what: Any, at: int, tag: str) -> None:
     """Do one thing in an edit, if it can be done."""
-    tags = edit.model.history.tags  # type: ignore[attr-defined]
+    tags = edit.model.history.tags
     try:
         if kind == "move" and tags:
             moved = tags[what % len(tags)]
-            operation = edit.model.history.operation(moved)  # type: ignore[attr-defined]
+            operation = edit.model.history.operation(moved)
             others = [one for one in tags if one != moved]
             edit.remove(moved)
             if others:
@@ -65,7 +66,7 @@ def plain(diff: kv.model.Diff) -> Any:
     """Return a diff without the order of its changes and of the edit, and without the number of runs."""
     changes = {c.path: (c.before, c.after) for c in diff.changes}
     groups = {name: tuple(sorted(getattr(diff, name))) for name in ("added", "removed", "replaced")}
-    return changes, replace(diff, changes=(), reruns=0, **groups)  # type: ignore[arg-type]
+    return changes, replace(diff, changes=(), reruns=0, **groups)
 
 
 def poses_of(model: kv.Model) -> dict[str, Any]:
@@ -123,6 +124,24 @@ def test_net_changes_and_undo_on_the_model_and_on_a_replica(transactions: list[A
         assert [*map(plain, heard_there)] == [*map(plain, heard)]
 
 
+@given(st.lists(st.tuples(actions, index), min_size=2, max_size=6))
+@settings(max_examples=attempts(40), derandomize=True)
+def test_undo_of_any_commit_equals_a_fold_or_is_refused(transactions: list[Any]) -> None:
+    model, _ = started()
+    for number, (steps, which) in enumerate(transactions):
+        with contextlib.suppress(kv.KineverseError), model.edit() as edit:
+            for k, one in enumerate(steps):
+                do(edit, *one, f"t{number}.{k}")
+        before = state_of(model)
+        try:
+            with model.edit() as edit:
+                edit.undo(which % model.version + 1)
+        except kv.KineverseError:
+            assert state_of(model) == before
+        history = model.history
+        check(model, [(tag, history.operation(tag)) for tag in history.tags])
+
+
 @given(actions, actions, actions)
 @settings(max_examples=attempts(40), derandomize=True)
 def test_a_savepoint_that_is_rolled_back_leaves_no_trace(first: Any, undone: Any, last: Any) -> None:
@@ -177,7 +196,7 @@ def test_net_changes_name_what_is_put_with_its_anchor() -> None:
         edit.replace("0", Put("a", 5))
         edit.insert(Put("x"), "x", before="0")
         edit.insert(Put("y"), "y", after="2")
-        operation = edit.model.history.operation("1")  # type: ignore[attr-defined]
+        operation = edit.model.history.operation("1")
         edit.remove("1")
         edit.apply(operation, "1")
         edit.apply(Put("z"), "z")
@@ -221,7 +240,7 @@ def test_an_edit_that_does_nothing_is_no_commit() -> None:
 
 def entry(tag: str, operation: kv.Operation, reads: Reads | None = None, **writes: Any) -> HistoryEntry:
     cells = {tuple(name.split("__", 1)): value for name, value in writes.items()}
-    return HistoryEntry(tag, operation, 0, reads or Reads(), cells)  # type: ignore[arg-type]
+    return HistoryEntry(tag, operation, 0, reads or Reads(), cells)
 
 
 def put(*entries: HistoryEntry, after: str | None = None, **more: Any) -> NetChanges:
@@ -267,8 +286,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "a reader that is left out": (NetChanges(removed=("0",)), "'3' reads data/a"),
     "a value of another type": (put(entry("x", Put("x"), frames__x=3)), "writes 3 into"),
     "an unknown kind": (put(entry("x", Put("x"), things__x=3)), "writes 3 into"),
-    "no entry": (NetChanges((PlacedEntry("x", None),)), "no entry"),  # type: ignore[arg-type]
-    "no operation": (put(entry("x", 3, data__x=1)), "no operation"),  # type: ignore[arg-type]
+    "no entry": (NetChanges((PlacedEntry("x", None),)), "no entry"),
+    "no operation": (put(entry("x", 3, data__x=1)), "no operation"),
     "a tag twice": (put(*[entry("x", Put("x"), data__x=1)] * 2), "twice"),
     "a move of nothing": (NetChanges(moved=("0",)), "is not put"),
     "a name that is none": (put(entry("x", Put("x"), **{"data__x//y": 1})), "not a name"),
@@ -353,7 +372,7 @@ def test_a_commit_is_taken_back_below_later_ones_and_not_through_them() -> None:
         (True, "not True"),
     ):
         with pytest.raises(kv.errors.EditError, match=message), model.edit() as edit:
-            edit.undo(version)  # type: ignore[arg-type]
+            edit.undo(version)
     with pytest.raises(kv.errors.EditError, match="this edit"), model.edit() as edit:
         edit.remove("s")
         edit.undo(3)
@@ -413,7 +432,7 @@ def test_a_replica_of_a_document_has_equal_poses_and_an_equal_digest(seed: int) 
     edits: list[Callable[[Edit], object]] = [
         lambda edit: edit.attach(frames[-1], "world", kv.translation(0, 1, seed)),
         lambda edit: edit.constrain("more", 0, kv.position("more"), 1),
-        lambda edit: edit.insert(Watch("pose", frames[0]), before=edit.model.history.tags[-1]),  # type: ignore[attr-defined]
+        lambda edit: edit.insert(Watch("pose", frames[0]), before=edit.model.history.tags[-1]),
         lambda edit: edit.remove("constraint more"),
         lambda edit: edit.undo(edit.model.version),
     ]

@@ -103,7 +103,7 @@ def test_what_carries_a_coordinate_is_heard_of_as_the_coordinate_is() -> None:
     assert heard[-1].poses == ("lamp", "hand")
     for wrong in ([3], [("a",)]):
         with pytest.raises(kv.KineverseError, match="followed by its name"):
-            model.listen(print, frames=wrong)  # type: ignore[arg-type]
+            model.listen(print, frames=wrong)
 
 
 class Follows(kv.Operation):
@@ -190,7 +190,7 @@ def test_a_builder_that_fails_keeps_the_old_value_until_one_succeeds(
     with pytest.raises(ValueError, match="too high"):
         kv.follow(model, build)
     assert model._listeners.witnesses == []
-    for wrong in (lambda: kv.follow(model.snapshot(), build), lambda: kv.follow(model, 3)):  # type: ignore[arg-type]
+    for wrong in (lambda: kv.follow(model.snapshot(), build), lambda: kv.follow(model, 3)):
         with pytest.raises(kv.errors.ExpressionError):
             wrong()
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Container, Sequence
+from collections.abc import Container, Hashable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 from kineverse.expressions.expression import Expression
 
@@ -93,7 +93,10 @@ class Diff:
         return frozenset((*self.added, *self.removed, *self.replaced, *self.moved, *self.rerun))
 
 
-def find_moved_tags(before: Sequence[str], after: Sequence[str], among: Container[str]) -> tuple[str, ...]:
+Tag = TypeVar("Tag", bound=Hashable)
+
+
+def find_moved_tags(before: Sequence[Tag], after: Sequence[Tag], among: Container[Tag]) -> tuple[Tag, ...]:
     """Return a smallest set of tags whose removal makes both orders equal, in the new order."""
     present = set(after)
     place = {tag: i for i, tag in enumerate(tag for tag in before if tag in present)}
@@ -109,15 +112,14 @@ def _longest_in_order(places: Sequence[int], wanted: Sequence[bool]) -> set[int]
     for end in (*(i for i, is_wanted in enumerate(wanted) if is_wanted), len(places)):
         high = places[end] if end < len(places) else max(places, default=0) + 1
         inside = [i for i in range(start, end) if low < places[i] < high]
-        kept.update(inside[k] for k in find_longest_increasing([places[i] for i in inside]))
+        kept.update(inside[k] for k in _longest([places[i] for i in inside]))
         if end < len(places):
             kept.add(end)
             low, start = high, end + 1
     return kept
 
 
-def find_longest_increasing(places: Sequence[int]) -> set[int]:
-    """Return the indices of a longest increasing part."""
+def _longest(places: Sequence[int]) -> set[int]:
     ends: list[int] = []  # ends[k]: the least end of an increasing part of k + 1 places
     lengths: list[int] = []
     for place in places:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Generic, NamedTuple, TypeVar
 
-from kineverse.errors import ExpressionError
+from kineverse.errors import EditError, ExpressionError
 from kineverse.model.model import Model, Snapshot
 from kineverse.symbols import Symbol
 
@@ -92,6 +93,8 @@ class Follower(Generic[T]):
         self._is_building = True
         self.error = None
         with model._lock:
+            if model._edit is not None:
+                raise EditError("A model is followed from a commit on: call follow() after the edit.")
             snapshot = model.snapshot()
             self._heard = self._relevant = self._tried = snapshot.version
             model._listeners.witnesses.append(self._hear)
@@ -139,8 +142,8 @@ class Follower(Generic[T]):
 
     def close(self) -> None:
         """End the following; the value stays. A second call has no effect."""
-        witnesses = self._model._listeners.witnesses
-        self._model._listeners.witnesses = [one for one in witnesses if one != self._hear]
+        with suppress(ValueError):
+            self._model._listeners.witnesses.remove(self._hear)
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()

@@ -99,15 +99,14 @@ class Commit:
 
 def _have_equal_motion(before: list[Frame], after: list[Frame]) -> bool:
     """Return whether two chains, from the tip upwards, multiply to the same motion, factor by factor."""
-    if not before or not after:
-        return before is after
+    if not (before and after):
+        return False
     for end in (-1, 0):
         while before and after and before[end] is after[end]:
             del before[end], after[end]
     one, other = list(_multiply_constants(before)), list(_multiply_constants(after))
     return len(one) == len(other) and all(
-        a is b or (type(a) is type(b) and np.array_equal(a, b)) if isinstance(a, np.ndarray) else a == b
-        for a, b in zip(one, other, strict=True)
+        np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in zip(one, other, strict=True)
     )
 
 
@@ -230,7 +229,7 @@ class Listeners:
 
     def post(self, commit: Commit) -> None:
         """Queue what each listener gets of the present commit; called in the order of versions."""
-        for witness in self.witnesses:
+        for witness in tuple(self.witnesses):
             witness(commit)
         parts = [(listener, listener.filter.select(commit)) for listener in self._listeners]
         heard = [(listener, part) for listener, part in parts if part is not None]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ from kineverse.errors import EditError
 from kineverse.expressions.expression import Expression
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Body
-from kineverse.model.changes import find_longest_increasing
+from kineverse.model.changes import find_moved_tags
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
 from kineverse.model.operation import (
@@ -142,23 +143,21 @@ def _find_moved(history: History) -> list[str]:
     again = [(b, n) for b, n in pairs if b is not None and b.place != n.place]
     if not again:
         return []
-    again.sort(key=lambda pair: pair[1].place)
     strangers = sorted(n.place for b, n in pairs if b is None or b.place != n.place)
 
     def rank(place: int) -> int:
         """Return how many of the entries that stand still are before a place."""
         return bisect_left(history.sequence, place, key=_PLACE) - bisect_left(strangers, place)
 
-    groups: dict[int, list[tuple[HistoryEntry, HistoryEntry]]] = {}
-    for before, now in again:
-        if rank(before.place) == rank(now.place):
-            groups.setdefault(rank(now.place), []).append((before, now))
-    kept = {
-        group[k][1].tag
-        for group in groups.values()
-        for k in find_longest_increasing([before.place for before, _ in group])
-    }
-    return [now.tag for _, now in again if now.tag not in kept]
+    ranks = {rank(one.place) for pair in again for one in pair}
+
+    def order(entries: Iterable[HistoryEntry]) -> list[str | int]:
+        """Return tags in order, and a number for the entries that stand still between two of them."""
+        tags = [(rank(entry.place), entry.place, entry.tag) for entry in entries]
+        return [name for *_, name in sorted([*tags, *((r, -math.inf, r) for r in ranks)])]
+
+    moved = find_moved_tags(order(b for b, _ in again), order(n for _, n in again), {n.tag for _, n in again})
+    return [str(tag) for tag in moved]
 
 
 def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
