@@ -429,6 +429,11 @@ def test_a_replica_of_a_document_has_equal_poses_and_an_equal_digest(seed: int) 
     model = kv.load("articulations/garage_door") if seed else random_tree(seed)
     replica = kv.formats.from_bytes(kv.formats.to_bytes(model))
     frames = list(model.frames)
+    for _ in range(2 * seed):  # the second one is remembered
+        loaded = kv.load("articulations/garage_door")
+        with loaded.edit() as edit:
+            edit.undo(1)
+        assert loaded.history.tags == []
     edits: list[Callable[[Edit], object]] = [
         lambda edit: edit.attach(frames[-1], "world", kv.translation(0, 1, seed)),
         lambda edit: edit.constrain("more", 0, kv.position("more"), 1),

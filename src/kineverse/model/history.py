@@ -57,6 +57,9 @@ class HistoryEntry:
         return HistoryEntry(self.tag, self.operation, place, reads or self.reads, self.writes)
 
 
+TouchedEntry: TypeAlias = tuple[HistoryEntry | None, HistoryEntry | None, bool]
+"""Entry of a tag before and after an edit; False if its operation was only run again."""
+
 CommitRecord: TypeAlias = dict[str, tuple[HistoryEntry | None, HistoryEntry | None]]
 """Entries before and after a commit, by tag, of the operations that the edit itself put, moved or removed."""
 
@@ -434,22 +437,17 @@ class History:
         self._given.clear()
         self._touched = {}
 
-    @property
-    def is_changed(self) -> bool:
-        """True if the transaction has put, removed or run an operation that is or was there."""
-        return any(before is not None or now is not None for before, now, _ in self.touched())
-
-    def touched(self) -> Iterator[tuple[HistoryEntry | None, HistoryEntry | None, bool]]:
-        """Yield the entries before and now of what the transaction has changed, the edit itself first.
-
-        The last item is True for these, and False for operations that were only run again.
-        """
+    def touched(self) -> Iterator[TouchedEntry]:
+        """Yield what the transaction has changed, first what the edit itself did, in its order."""
+        entries = self.entries
         for tag in self._given:
-            yield self._touched.get(tag), self.entries.get(tag), True
+            before, now = self._touched.get(tag), entries.get(tag)
+            if before is not None or now is not None:
+                yield before, now, True
         for tag, before in self._touched.items():
-            now = self.entries.get(tag)
-            if tag not in self._given and before is not None and now is not None:
-                if now.reads is not before.reads:
+            now = entries.get(tag)
+            if before is not None and now is not None and now.reads is not before.reads:
+                if tag not in self._given:
                     yield before, now, False
 
     def mark(self) -> tuple[Any, ...]:

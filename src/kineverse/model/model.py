@@ -16,7 +16,7 @@ from .commits.listeners import Commit, CommitFilter, Listener, Listeners
 from .commits.net_changes import NetChanges, adopt, find_touched_tags
 from .commits.undo import keep_commit
 from .edit import Edit
-from .history import History, HistoryEntry
+from .history import History, HistoryEntry, TouchedEntry
 from .model_view import ModelView
 from .read_recorder import ABSENT
 from .registry import LoopTreatment
@@ -72,6 +72,8 @@ class Model(ModelView):
                     f"{type(_entries).__name__}. To load one: kv.load(path)."
                 )
             _entries = History(_entries)
+            if _version == 1:  # all of it comes from one commit
+                _entries.commits[1] = {entry.tag: (None, entry) for entry in _entries.sequence}
         self._history = _entries
         self._edit: Edit | None = None
         self._listeners = Listeners()
@@ -107,13 +109,13 @@ class Model(ModelView):
                 yield edit
                 self._history.settle()
                 self.rates  # noqa: B018 - cyclic rates are an error of the edit, not of a later query
-                is_changed = self._history.is_changed
+                touched = list(self._history.touched())
             except BaseException:
                 self._history.roll_back()
                 raise
             else:
-                if is_changed:
-                    self._listeners.post(self._commit(self._history.runs - runs))
+                if touched:
+                    self._listeners.post(self._commit(touched, self._history.runs - runs))
             finally:
                 edit._open = False
                 self._edit = None
@@ -133,13 +135,13 @@ class Model(ModelView):
     def _ordered(self, kind: str) -> dict[str, Any]:
         return self._history.ordered(kind)
 
-    def _commit(self, reruns: int) -> Commit:
+    def _commit(self, touched: list[TouchedEntry], reruns: int) -> Commit:
         history, version = self._history, self._version + 1
         changes = [
             Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
             for (kind, name), before, after in history.changes()
         ]
-        tags = find_touched_tags(history)
+        tags = find_touched_tags(history, touched)
         diff = Diff(
             version,
             tuple(changes),
@@ -150,7 +152,7 @@ class Model(ModelView):
             tuple(tags.moved),
             tuple(tags.rerun),
         )
-        keep_commit(history, version)
+        keep_commit(history, version, touched)
         history.begin()
         self._version = version
         self._derived = {}

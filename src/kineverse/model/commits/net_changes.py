@@ -32,7 +32,7 @@ from kineverse.symbols import Symbol
 from .checks import check_parent, find_parents
 
 if TYPE_CHECKING:
-    from kineverse.model.history import History, HistoryEntry
+    from kineverse.model.history import History, HistoryEntry, TouchedEntry
 
 _PLACE = attrgetter("place")
 _TYPES = {FRAMES: Frame, BODIES: Body, ARTICULATIONS: Articulation, CONSTRAINTS: Constraint}
@@ -105,12 +105,13 @@ class TouchedTags:
     moved: list[str]  # of those replaced, in order of the sequence
 
 
-def find_touched_tags(history: History) -> TouchedTags:
+def find_touched_tags(history: History, touched: list[TouchedEntry]) -> TouchedTags:
     """Return the tags of what the transaction has changed so far."""
     added, replaced, removed, rerun = [], [], [], []
-    for before, now, is_given in history.touched():
+    for before, now, is_given in touched:
         if now is None:
-            removed += [] if before is None else [before.tag]
+            assert before is not None
+            removed.append(before.tag)
         elif before is None:
             added.append(now.tag)
         elif is_given:
@@ -118,12 +119,14 @@ def find_touched_tags(history: History) -> TouchedTags:
         else:
             rerun.append(now)
     rerun.sort(key=_PLACE)
-    return TouchedTags(added, replaced, removed, [entry.tag for entry in rerun], _find_moved(history))
+    return TouchedTags(
+        added, replaced, removed, [entry.tag for entry in rerun], _find_moved(history, touched)
+    )
 
 
 def find_net_changes(history: History) -> NetChanges:
     """Return the net changes of the transaction so far."""
-    tags = find_touched_tags(history)
+    tags = find_touched_tags(history, list(history.touched()))
     entries, sequence = history.entries, history.sequence
     new = {*tags.added, *tags.moved}
     end = len(sequence)
@@ -137,9 +140,9 @@ def find_net_changes(history: History) -> NetChanges:
     return NetChanges(tuple(put), *map(tuple, groups))
 
 
-def _find_moved(history: History) -> list[str]:
+def _find_moved(history: History, touched: list[TouchedEntry]) -> list[str]:
     """Return a smallest set of the tags put elsewhere whose removal makes both orders equal, in order."""
-    pairs = [(before, now) for before, now, _ in history.touched() if now is not None]
+    pairs = [(before, now) for before, now, _ in touched if now is not None]
     again = [(b, n) for b, n in pairs if b is not None and b.place != n.place]
     if not again:
         return []
@@ -153,8 +156,9 @@ def _find_moved(history: History) -> list[str]:
 
     def order(entries: Iterable[HistoryEntry]) -> list[str | int]:
         """Return tags in order, and a number for the entries that stand still between two of them."""
-        tags = [(rank(entry.place), entry.place, entry.tag) for entry in entries]
-        return [name for *_, name in sorted([*tags, *((r, -math.inf, r) for r in ranks)])]
+        names: list[tuple[int, float, str | int]] = [(r, -math.inf, r) for r in ranks]
+        names += [(rank(entry.place), entry.place, entry.tag) for entry in entries]
+        return [name for *_, name in sorted(names)]
 
     moved = find_moved_tags(order(b for b, _ in again), order(n for _, n in again), {n.tag for _, n in again})
     return [str(tag) for tag in moved]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from kineverse.errors import EditError
 
 if TYPE_CHECKING:
-    from kineverse.model.history import CommitRecord, History
+    from kineverse.model.history import CommitRecord, History, TouchedEntry
 
 UNDO_LIMIT = 1000
 """Number of commits of a model that can be taken back: those before the last ones are forgotten."""
@@ -16,13 +17,13 @@ UNDO_LIMIT = 1000
 _PLACE = attrgetter("place")
 
 
-def keep_commit(history: History, version: int) -> None:
+def keep_commit(history: History, version: int, touched: Iterable[TouchedEntry]) -> None:
     """Keep what it takes to undo the transaction: the entries before and after it of what it has put."""
     commits = history.commits
     commits[version] = {
         (before or now).tag: (before, now)  # type: ignore[union-attr]  # one of them is there
-        for before, now, is_given in history.touched()
-        if is_given and (before is not None or now is not None)
+        for before, now, is_given in touched
+        if is_given
     }
     while len(commits) > UNDO_LIMIT:
         del commits[next(iter(commits))]
