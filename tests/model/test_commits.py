@@ -8,8 +8,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
-from history_operations import Next, Place, Put, Row, Sequenced, Sum, Watch, check, state_of
+from history_operations import Fresh, Next, Place, Put, Row, Sequenced, Sum, Watch, check, state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_models import random_state, random_tree
@@ -316,6 +317,12 @@ def test_changes_adopted_in_an_edit_run_what_reads_them() -> None:
     with model.edit() as edit:
         edit.adopt(only)
     assert (dict(model.data), model.history.runs - runs) == ({"a": 5, "b": 6, "c": 6}, 2)
+    with model.edit() as edit:  # what waits to be run is not forgotten
+        edit.replace("0", Put("a", 1))
+        edit.adopt(put(entry("x", Place("x", "world"), frames__x=FRAME("world", np.eye(4)))))
+        edit.adopt(put(entry("y", Place("y", "x"), frames__y=FRAME("x", np.eye(4))), after="2"))
+    assert dict(model.data) == {"a": 1, "b": 2, "c": 2}
+    assert model.history.readers("frames/x") == ["y"]
 
 
 def test_an_operation_from_elsewhere_is_linked_and_run_if_it_read_something_else() -> None:
@@ -382,10 +389,19 @@ def test_a_commit_is_taken_back_below_later_ones_and_not_through_them() -> None:
         edit.undo(6)
         edit.undo(3)
     assert branch.history.tags == ["0", "x", "1", "2"]
-    model = build(Place("f", "world"))
+    model = build(Place("f", "world"), Put("a", 1), Next("b", "a"))
     with model.edit() as edit:
         edit.apply(Place("g", "f"), "g")
+        edit.replace("2", Put("b", 0))
+    with model.edit() as edit:
+        edit.replace("1", Put("a", 7))
+    with model.edit() as edit:
+        edit.undo(2)
+    assert model.data["b"] == 8
+    with model.edit() as edit:
+        edit.undo(4)
     with pytest.raises(kv.errors.EditError, match="parent of frame 'g' is missing"), model.edit() as edit:
+        edit.undo(3)
         edit.undo(1)
 
 
@@ -400,6 +416,37 @@ def test_only_the_last_commits_are_kept(monkeypatch: pytest.MonkeyPatch) -> None
     with model.edit() as edit:
         edit.undo(5)
     assert model.data["x"] == 3
+
+
+def test_what_was_moved_again_is_not_moved_back() -> None:
+    model = build(Put("a"), Put("b"), Put("c"))
+    for after in ("2", "1"):
+        with model.edit() as edit:
+            operation = model.history.operation("0")
+            edit.remove("0")
+            for number in range(70):  # places are given out anew
+                edit.insert(Put("x", number), f"x{after}{number}", after=after)
+            edit.insert(operation, "0", after=after)
+            assert edit.net().moved == ("0",)
+    with pytest.raises(kv.errors.EditError, match=r"'0'.*version 3"), model.edit() as edit:
+        edit.undo(2)
+
+
+def test_what_a_savepoint_settled_is_checked_again() -> None:
+    model = build(Fresh("f", "world"), Fresh("g", "world"), Place("h", "g"))
+    for wrong, corrected, message in (
+        (lambda edit: edit.replace("0", Fresh("g", "world")), "1", "There is a frame 'g' already"),
+        (lambda edit: edit.apply(Place("g", "h"), "3"), "3", "Cyclic frames"),
+    ):
+        with pytest.raises(kv.errors.EditError, match=message), model.edit() as edit:
+            wrong(edit)
+            point = edit.savepoint()
+            edit.remove(corrected)
+            if corrected == "1":
+                edit.apply(Place("g", "world"), "again")
+                edit.remove("2")
+            edit.net()
+            point.roll_back()
 
 
 def test_places_of_what_was_removed_survive_a_renumbering() -> None:

@@ -101,6 +101,17 @@ def test_what_carries_a_coordinate_is_heard_of_as_the_coordinate_is() -> None:
         edit.remove("hand")
         edit.apply(Follows("y", 1 * s), "y")
     assert heard[-1].poses == ("lamp", "hand")
+    model, about = arm(), []
+    model.listen(heard.append, frames=["hand"])
+    model.listen(about.append, symbols=[y])
+    with model.edit() as edit:  # x is driven by the speed of y, and that by a wheel
+        edit.set_rate(x, {y.derivative(): 2.0})
+    for number in range(2):
+        with model.edit() as edit:
+            edit.set_rate(y, {kv.velocity("wheel"): 1.0 + number}, override=True, tag=f"y{number}")
+            edit.constrain(f"x{number}", 0, x, 1)
+    assert [d.poses for d in heard[-3:]] == [("hand",)] * 3
+    assert [d.paths for d in about] == [("rates/x",), ("rates/y",), ("rates/y",)]
     for wrong in ([3], [("a",)]):
         with pytest.raises(kv.KineverseError, match="followed by its name"):
             model.listen(print, frames=wrong)
@@ -193,6 +204,28 @@ def test_a_builder_that_fails_keeps_the_old_value_until_one_succeeds(
     for wrong in (lambda: kv.follow(model.snapshot(), build), lambda: kv.follow(model, 3)):
         with pytest.raises(kv.errors.ExpressionError):
             wrong()
+
+
+def test_an_earlier_version_is_not_waited_for_longer_and_a_closed_follower_keeps_its_value() -> None:
+    model, go_on = arm(), threading.Event()
+
+    def build(snapshot: kv.model.Snapshot) -> float:
+        if snapshot.version > 2:
+            go_on.wait(60)
+        return height(snapshot)
+
+    follower = kv.follow(model, build)
+    shift(model, 1)
+    assert follower.wait(timeout=60)
+    shift(model, 2)
+    assert follower.wait(2, timeout=0)
+    assert not follower.wait(timeout=0.01)
+    follower.close()
+    workers = [one for one in threading.enumerate() if one.name == "kineverse-follow"]
+    go_on.set()
+    for worker in workers:
+        worker.join()
+    assert (len(workers), follower.current) == (1, (1, 2))
 
 
 AT_EXIT = """

@@ -452,18 +452,15 @@ class History:
 
     def mark(self) -> tuple[Any, ...]:
         """Return the state of the transaction, for :meth:`return_to`."""
-        return (
-            *(len(self._undo), self.runs, self._dirty.copy(), self._before.copy(), self._contested.copy()),
-            *(self._moved_frames.copy(), self._touched.copy()),
-        )
+        checks = self._contested.copy(), self._moved_frames.copy()
+        return len(self._undo), self.runs, self._dirty.copy(), *checks
 
     def return_to(self, mark: tuple[Any, ...]) -> None:
-        """Undo what the transaction did since a mark."""
+        """Undo what the transaction did since a mark, which may be used again."""
         self._undo_to(mark[0])
-        # Copies, since one may return to a mark several times.
-        self.runs, dirty, before, contested, moved, touched = mark[1:]
-        self._dirty, self._before, self._contested = dirty.copy(), before.copy(), contested.copy()
-        self._moved_frames, self._touched = moved.copy(), touched.copy()
+        self.runs, dirty, contested, moved = mark[1:]
+        # What was settled since then is to be checked again.
+        self._dirty, self._contested, self._moved_frames = dirty.copy(), contested.copy(), moved.copy()
 
     def roll_back(self) -> None:
         """Undo everything since :meth:`begin`."""
