@@ -39,18 +39,18 @@ def take_back(history: History, version: int) -> None:
             if now is None or after is None:
                 is_kept = now is after
             else:
-                is_kept = now.operation is after.operation and (now.place == after.place or not is_moved)
+                # What was adopted after it was run again elsewhere may be an equal operation.
+                is_same = now.operation is after.operation or now.operation == after.operation
+                is_kept = is_same and (now.place == after.place or not is_moved)
             if not is_kept:
                 raise _later_error(history, version, tag)
             if after is not None and (before is None or is_moved):
                 history.remove(tag)
-        restored = sorted((pair[0] for pair in commit.values() if pair[0] is not None), key=_PLACE)
-        for tag in [entry.tag for entry in restored]:
-            entry = history.commits[version][tag][
-                0
-            ]  # anew, since places are given out anew if there is no room
+        restored = [before for before, _ in commit.values() if before is not None]
+        for tag in [entry.tag for entry in sorted(restored, key=_PLACE)]:
+            # Looked up again, since places are given out anew when there is no room between two.
+            entry, now = history.commits[version][tag][0], history.entries.get(tag)
             assert entry is not None
-            now = history.entries.get(tag)
             history.note_given(tag)
             history.put(entry.at(history.free_place(entry.place) if now is None else now.place))
             history.mark_outdated(tag)
