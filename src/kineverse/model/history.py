@@ -452,15 +452,13 @@ class History:
 
     def mark(self) -> tuple[Any, ...]:
         """Return the state of the transaction, for :meth:`return_to`."""
-        checks = self._contested.copy(), self._moved_frames.copy()
-        return len(self._undo), self.runs, self._dirty.copy(), *checks
+        return len(self._undo), self.runs, self._dirty.copy(), self._moved_frames.copy()
 
     def return_to(self, mark: tuple[Any, ...]) -> None:
         """Undo what the transaction did since a mark, which may be used again."""
         self._undo_to(mark[0])
-        self.runs, dirty, contested, moved = mark[1:]
-        # What was settled since then is to be checked again.
-        self._dirty, self._contested, self._moved_frames = dirty.copy(), contested.copy(), moved.copy()
+        # Cycles are looked for again; names written twice are as entries are linked again.
+        self.runs, self._dirty, self._moved_frames = mark[1], mark[2].copy(), mark[3].copy()
 
     def roll_back(self) -> None:
         """Undo everything since :meth:`begin`."""
