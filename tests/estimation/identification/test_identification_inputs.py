@@ -7,8 +7,8 @@ import pytest
 from synthetic_recordings import recording
 
 import kineverse as kv
-from kineverse.estimation import Identifier, identify, pose_covariance
-from kineverse.estimation.identification import marginal_likelihood
+from kineverse.estimation import Identifier, identify, linear_algebra, pose_covariance
+from kineverse.estimation.identification import least_squares, marginal_likelihood
 from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
 from kineverse.estimation.identification.observations import check_observations
 
@@ -181,3 +181,20 @@ def test_marginal_likelihood_of_three_positions_is_finite(family):
         problem, [*initial_guesses(family, MotionStatistics(problem))]
     ).solution
     assert np.isfinite(marginal_likelihood.maximise_marginal_likelihood(problem, likeliest).log_evidence)
+
+
+def test_step_to_a_singular_covariance_is_shortened(monkeypatch):
+    data = recording("revolute", count=8, position=0.01, orientation=0.02, seed=3)
+    problem = check_observations(data.parent, data.child, data.covariance, data.covariance)
+    start = next(iter(initial_guesses("revolute", MotionStatistics(problem))))
+    usual = least_squares.levenberg_marquardt(problem, *start)
+    calls = []
+
+    def invert(matrices):
+        calls.append(matrices.shape)
+        if len(calls) == 3:  # at the start, in the step, and where it leads
+            raise kv.errors.InvalidValueError("singular")
+        return linear_algebra.invert_matrices(matrices)
+
+    monkeypatch.setattr(least_squares, "invert_matrices", invert)
+    assert least_squares.levenberg_marquardt(problem, *start).cost == pytest.approx(usual.cost, rel=1e-6)

@@ -18,6 +18,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from kineverse.errors import InvalidValueError
 from kineverse.estimation.linear_algebra import (
     invert_matrices,
     multiply_vectors,
@@ -229,7 +230,7 @@ def _step(
         return None
     try:
         trial = _linearise(observations, point.motion.retract(step), values, parent, joint_prior)
-    except np.linalg.LinAlgError:  # the lever is so long that S is singular in double precision
+    except (np.linalg.LinAlgError, InvalidValueError):  # the lever is too long for S in double precision
         return None
     return (trial, gain) if np.isfinite(trial.cost) else None
 
