@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
@@ -213,12 +213,15 @@ def _applied(
     """Apply the operations of a source, and yield their tags."""
     prefix = source.shipped if prefix is None else prefix
     file_format = _format(source, content)
-    operations: Iterable[tuple[str, Operation]]
-    if file_format is None:
-        operations = _build(source, prefix or None)
-    else:
+    if file_format is not None:
         file = FileContent(source.path, content, prefix or None, root, strict, source.shipped, arguments)
+        if file_format.exact:
+            for entry in file_format.entries(file):
+                yield edit.link(entry)
+            return
         operations = file_format.operations(file)
+    else:
+        operations = _build(source, prefix or None)
     if file_format is None or not file_format.loop_element:
         for tag, operation in operations:
             yield edit.apply(operation, tag)

@@ -76,6 +76,17 @@ class Edit:
         self._check_open().append(chosen, operation)
         return self._note_added(chosen)
 
+    def link(self, entry: HistoryEntry) -> str:
+        """Append an operation of a document and return its tag; it is not run where it finds what it read.
+
+        Raises
+        ------
+        DuplicateNameError, UnknownNameError, ModelError
+            As :meth:`apply`.
+        """
+        self._check_open().link(entry)
+        return self._note_added(entry.tag)
+
     def insert(
         self,
         operation: Operation,

@@ -36,18 +36,32 @@ _PLACE = attrgetter("place")
 
 
 class HistoryEntry:
-    """Operation at its place, with the reads and writes of its last run; immutable."""
+    """Operation at its place, with the reads and writes of its last run; immutable.
 
-    __slots__ = ("operation", "place", "reads", "tag", "writes")
+    ``blob`` is its form in documents, once it is known.
+    """
+
+    __slots__ = ("blob", "operation", "place", "reads", "tag", "writes")
 
     def __init__(
-        self, tag: str, operation: Operation, place: int, reads: Reads, writes: dict[Cell, Any]
+        self,
+        tag: str,
+        operation: Operation,
+        place: int,
+        reads: Reads,
+        writes: dict[Cell, Any],
+        blob: bytes | None = None,
     ) -> None:
         self.tag = tag
         self.operation = operation
         self.place = place
         self.reads = reads
         self.writes = writes
+        self.blob = blob
+
+    def at(self, place: int) -> HistoryEntry:
+        """Return the entry at another place."""
+        return HistoryEntry(self.tag, self.operation, place, self.reads, self.writes, self.blob)
 
 
 class History:
@@ -76,7 +90,7 @@ class History:
         cells, reading, head = self.cells, self.reading, self.head
         for i, given in enumerate(entries):
             # New places, because the entries may come from several models.
-            entry = HistoryEntry(given.tag, given.operation, i * _GAP, given.reads, given.writes)
+            entry = given.at(i * _GAP)
             self.entries[entry.tag] = entry
             self.sequence.append(entry)
             for cell, value in entry.writes.items():
@@ -138,8 +152,36 @@ class History:
 
     def append(self, tag: str, operation: Operation) -> None:
         """Append an operation."""
-        place = self.sequence[-1].place + _GAP if self.sequence else 0
-        self._add(tag, operation, place)
+        self._add(tag, operation, self._end)
+
+    def link(self, given: HistoryEntry) -> None:
+        """Append an operation with its writes elsewhere; it is run only if it finds other values here."""
+        entry = given.at(self._end)
+        if self._dirty or given.tag in self.entries or not self._finds_what_it_read(entry):
+            self._add(given.tag, given.operation, entry.place)
+            return
+        with self._step():
+            for (kind, name), value in entry.writes.items():
+                if kind == FRAMES:
+                    self._check_parent(name, value, entry.writes, entry.reads, entry.place)
+            self._check_overwrite(entry)
+            self._link(entry)
+            for cell, value in entry.writes.items():
+                self._mark_readers(cell, ABSENT, value, entry.place)
+
+    @property
+    def _end(self) -> int:
+        return self.sequence[-1].place + _GAP if self.sequence else 0
+
+    def _finds_what_it_read(self, entry: HistoryEntry) -> bool:
+        """Return whether all values that an operation read elsewhere are the same objects here."""
+        seen = entry.operation.seen
+        if seen is None:
+            return False
+        values, names = seen
+        return all(self.value_at(cell, entry.place) is value for cell, value in values.items()) and all(
+            tuple(self.names_at(kind, entry.place)) == listed for kind, listed in names.items()
+        )
 
     def insert(self, tag: str, operation: Operation, index: int) -> None:
         """Insert an operation before the one at ``index``."""
@@ -494,6 +536,13 @@ class History:
         self._events.append((cell, old, value))
 
     def _link(self, entry: HistoryEntry) -> None:
+        if entry.operation.recorded is entry.writes:  # linked without a run
+            place = entry.place
+            entry.operation.remember(
+                ReadRecorder(
+                    lambda cell: self.value_at(cell, place), lambda kind: self.names_at(kind, place), Reads()
+                )
+            )
         self.entries[entry.tag] = entry
         if not self.sequence or self.sequence[-1].place < entry.place:
             self.sequence.append(entry)
@@ -549,9 +598,7 @@ class History:
 
     def _renumber(self) -> None:
         # Copies and snapshots may share the entries, so they are replaced and not modified.
-        renumbered = [
-            HistoryEntry(e.tag, e.operation, i * _GAP, e.reads, e.writes) for i, e in enumerate(self.sequence)
-        ]
+        renumbered = [entry.at(i * _GAP) for i, entry in enumerate(self.sequence)]
         self._undo.append((self._put_entries, (self.sequence,)))
         self._put_entries(renumbered)
         self._dirty = [(self.entries[tag].place, tag) for _, tag in self._dirty if tag in self.entries]
