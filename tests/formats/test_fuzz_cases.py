@@ -167,7 +167,7 @@ def document(nodes: list, *writes: dict) -> bytes:
     operations = [
         {"tag": f"t{i}", "kind": "K", "reads": {}, "writes": write} for i, write in enumerate(writes)
     ]
-    text = json.dumps({"format": "kineverse", "version": 1, "nodes": nodes, "operations": operations})
+    text = json.dumps({"format": "kineverse", "version": 2, "nodes": nodes, "operations": operations})
     return text.encode()
 
 

@@ -169,7 +169,7 @@ def _refuse_form() -> NoReturn:
     )
 
 
-_QUOTED = re.compile("`([a-z |]+)`")
+_QUOTED = re.compile("`([^`]*)`")
 _TYPES = {
     "str": "a text",
     "int": "a whole number",
@@ -186,8 +186,14 @@ _TYPES = {
 
 def _explain(error: Exception) -> str:
     """Return the message of an error of msgspec with its place first, in words of JSON."""
+    if isinstance(error, OverflowError):
+        return 'an integer of more than 64 bits is {"integer": "digits"}'
     text, _, place = str(error).partition(" - at `")
-    text = _QUOTED.sub(lambda found: " or ".join(_TYPES.get(t, t) for t in found[1].split(" | ")), text)
-    text = text.replace("`", "'")
+    text = _QUOTED.sub(_name_type, text[:1].lower() + text[1:])
     place = place.removesuffix("`").removeprefix("$").removeprefix(".").replace("[...]", "")
     return f"{place}: {text}" if place else text
+
+
+def _name_type(quoted: re.Match[str]) -> str:
+    names = quoted[1].split(" | ")
+    return " or ".join(_TYPES[name] for name in names) if set(names) <= _TYPES.keys() else f"'{quoted[1]}'"

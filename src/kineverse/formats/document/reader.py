@@ -57,7 +57,6 @@ def read_operations(
     """
     try:
         content = content.encode() if isinstance(content, str) else content
-        content.decode()
     except UnicodeError as error:
         raise FormatError(f"{source}: a document is UTF-8 text, and this is not: {error}.") from None
     return _operations(_Document(source, prefix, root).read(content, True))
@@ -168,6 +167,13 @@ class _Document:
         """Return the operations of a document."""
         with _Refusing(self), no_collection():
             self._check_size(content)
+            if is_text:
+                try:
+                    content.decode()
+                except UnicodeError as error:
+                    raise InvalidDocumentError(
+                        f"a document is UTF-8 text, and this is not: {error}"
+                    ) from None
             return self._read(content, is_text)
 
     def read_alone(self, blob: bytes) -> HistoryEntry:
@@ -200,7 +206,7 @@ class _Document:
         self._place = "the document"
         if is_text:
             check_text(content, envelope, values)
-        if envelope.sha256 is not None and hash_blobs(blobs) != envelope.sha256:
+        if envelope.sha256 and hash_blobs(blobs) != envelope.sha256:
             raise InvalidDocumentError(
                 "its content is not what 'sha256' says; it was changed or damaged since it was written. Get "
                 "another copy, or, if the change is intended, delete the member 'sha256': it is written "
@@ -225,20 +231,23 @@ class _Document:
         self, value: OperationValue, blob: bytes, folders: dict[int, str], is_in_document: bool
     ) -> HistoryEntry:
         """Return an operation with its reads and writes, and what it has read if the document has that."""
-        names, graph = self._names, NodeGraph(self._names.before, self._budget)
+        names, graph, place = self._names, NodeGraph(self._names.before, self._budget), self._place
         read_nodes(graph, value.nodes)
         given = writes = self._writes(value, graph, folders)
         if graph.has_opaque_nodes:  # coordinates may be carried, which no model contains
             writes = Writes.from_cells(given).writes()
         is_as_given = not names.before and (writes is given or writes == given)
+        self._place = f"{place}, reads"
+        reads = self._reads(value.reads)
+        self._place = f"{place}, trace"
         trace = None if value.trace is None else decode_trace(value.trace, graph, names)
         if trace is not None and value.frozen:
             raise InvalidDocumentError("an operation with a trace is not frozen")
-        reads = self._reads(value.reads, writes)
         if trace is not None:
             asked = self._consistency.reads_of(trace, writes) if is_in_document else named_reads(trace)
             is_as_given &= _merge(reads, asked)
         is_as_given &= _merge(reads, _parents_of(writes))
+        self._place = f"{place}, parameters"
         parameters = {
             name: decode_parameter(given, graph, names, writes) for name, given in value.parameters.items()
         }
@@ -288,7 +297,7 @@ class _Document:
                 placed = map_meshes(body, place) if folders else body
                 writes[cell] = restrict_meshes(placed, self._root, f"{self._source}, body {cell[1]}")
 
-    def _reads(self, given: ReadsValue | None, writes: dict[Cell, Any]) -> Reads:
+    def _reads(self, given: ReadsValue | None) -> Reads:
         reads = Reads()
         if given is not None:
             for path in given.existence:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
-from msgspec import Meta, Struct, field
+from msgspec import UNSET, Meta, Struct, UnsetType, field
 
 from kineverse.model.body import Body, Finite, Pose, Vector3
 
@@ -307,7 +307,7 @@ class Envelope(_Part, kw_only=True):
     operations: Annotated[list[msgspec.Raw], Meta(max_length=MAX_NODES)]
     folders: dict[str, dict[str, tuple[Length, ...]]] = field(default_factory=dict)
     resources: tuple[Resource, ...] = ()
-    sha256: Digest | None = None
+    sha256: Digest | UnsetType = UNSET
 
 
 class Document(Envelope, kw_only=True):

@@ -63,7 +63,7 @@ def decode_trace(given: structs.TraceValue, graph: NodeGraph, names: Names) -> T
         for expression in (a for a in query.arguments if isinstance(a, Expression)):
             check_read_nodes(expression, len(steps))
         steps.append(TraceStep(query, Access(look)))
-    writes = tuple(decode_writes(given.writes, graph, names))
+    writes = tuple(decode_writes(given.writes, graph, names, is_trace=True))
     for expression in (e for (kind, _), value in writes for e in find_expressions(kind, value)):
         check_read_nodes(expression, len(steps))
     return Trace(tuple(steps), writes)

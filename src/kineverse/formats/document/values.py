@@ -10,19 +10,20 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from msgspec.structs import replace
 
-from kineverse.errors import FormatError
+from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.model.articulation import Articulation, check_home
 from kineverse.model.body import Body, Mesh, Pose, Shape
 from kineverse.model.constraint import Constraint, as_constraint
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, KINDS, RATES, Cell
-from kineverse.model.rates import as_entry
-from kineverse.symbols import symbol_name
+from kineverse.model.rates import RateEntry, as_entry
+from kineverse.symbols import Symbol, symbol_name
 
 from . import structs
 from .budget import MAX_DEPTH, InvalidDocumentError, check_depth
@@ -172,33 +173,29 @@ class Names:
         return self.cell(*path.partition("/")[::2])
 
 
-def decode_writes(given: structs.WritesValue, graph: NodeGraph, names: Names) -> Iterator[tuple[Cell, Any]]:
-    """Yield the writes of an operation, in the order of kinds."""
-    for name, frame in given.frames.items():
-        yield names.cell(FRAMES, check_name(name)), _decode_frame(frame, graph, names)
-    for name, body in given.bodies.items():
-        for mesh in meshes_of(body):
-            if mesh.folder or mesh.root is not None:
-                raise InvalidDocumentError(f"the mesh {mesh.uri[:60]!r} has an unknown key, folder or root")
-        yield names.cell(BODIES, check_name(name)), body
-    for name, record in given.articulations.items():
-        cell = names.cell(ARTICULATIONS, check_name(name))
-        yield cell, _decode_articulation(cell[1], record, graph, names)
-    for name, (lower, middle, upper) in given.constraints.items():
-        parts = graph.scalar(lower), graph.scalar(middle), graph.scalar(upper)
-        yield names.cell(CONSTRAINTS, check_name(name)), as_constraint(Constraint(*parts))
-    for name, (coordinate, entry) in given.rates.items():
-        cell = names.cell(RATES, check_name(name))
-        symbol = graph.symbol(coordinate)
-        if str(symbol) != cell[1]:
-            raise InvalidDocumentError(f"this is the rate of '{symbol}'")
-        row = graph.scalar(entry) if isinstance(entry, int) else dict(graph.pairs(entry, 1))
-        yield cell, (symbol, as_entry(symbol, row))
-    for name, datum in given.data.items():
-        yield names.cell(DATA, check_name(name)), decode_datum(datum, graph)
+def decode_writes(
+    given: structs.WritesValue, graph: NodeGraph, names: Names, is_trace: bool = False
+) -> Iterator[tuple[Cell, Any]]:
+    """Yield the writes of an operation or of its trace, in the order of kinds.
+
+    Raises
+    ------
+    InvalidDocumentError
+        With kind and name.
+    """
+    for kind, decode in _DECODERS.items():
+        for name, value in getattr(given, kind).items():
+            try:
+                cell = names.cell(kind, check_name(name))
+                decoded = decode(cell[1], value, graph, names)
+                if kind == CONSTRAINTS and not is_trace:  # a trace checks it once the values are known
+                    as_constraint(decoded)
+            except (InvalidDocumentError, KineverseError) as error:
+                raise InvalidDocumentError(f"writes {kind}/{name[:60]}: {error}") from None
+            yield cell, decoded
 
 
-def _decode_frame(given: structs.FrameValue, graph: NodeGraph, names: Names) -> Frame:
+def _decode_frame(name: str, given: structs.FrameValue, graph: NodeGraph, names: Names) -> Frame:
     factors: list[Pose | Expression] = []
     for factor in given.factors:
         if isinstance(factor, Pose):
@@ -209,6 +206,13 @@ def _decode_frame(given: structs.FrameValue, graph: NodeGraph, names: Names) -> 
             raise InvalidDocumentError(f"a factor should be 4×4, not of shape {transform.shape}")
         factors.append(transform)
     return Frame(names.frame(given.parent), tuple(factors))
+
+
+def _decode_body(name: str, given: Body, graph: NodeGraph, names: Names) -> Body:
+    for mesh in meshes_of(given):
+        if mesh.folder or mesh.root is not None:
+            raise InvalidDocumentError(f"the mesh {mesh.uri[:60]!r} has an unknown key, folder or root")
+    return given
 
 
 def _decode_articulation(
@@ -227,6 +231,31 @@ def _decode_articulation(
     if given.home:
         check_home(name, result)
     return result
+
+
+def _decode_constraint(name: str, given: tuple[int, int, int], graph: NodeGraph, names: Names) -> Constraint:
+    return Constraint(*map(graph.scalar, given))
+
+
+def _decode_rate(name: str, given: Any, graph: NodeGraph, names: Names) -> tuple[Symbol, RateEntry]:
+    coordinate, entry = given
+    symbol = graph.symbol(coordinate)
+    if str(symbol) != name:
+        raise InvalidDocumentError(f"this is the rate of '{symbol}'")
+    row = graph.scalar(entry) if isinstance(entry, int) else dict(graph.pairs(entry, 1))
+    return symbol, as_entry(symbol, row)
+
+
+_DECODERS: Mapping[str, Callable[[str, Any, NodeGraph, Names], Any]] = MappingProxyType(
+    {
+        FRAMES: _decode_frame,
+        BODIES: _decode_body,
+        ARTICULATIONS: _decode_articulation,
+        CONSTRAINTS: _decode_constraint,
+        RATES: _decode_rate,
+        DATA: lambda name, given, graph, names: decode_datum(given, graph),
+    }
+)
 
 
 def decode_datum(value: Any, graph: NodeGraph, depth: int = 0) -> Any:
