@@ -174,7 +174,7 @@ def test_grammar_documents_have_all_node_types_and_conditions():
     nodes, questions = set(), set()
     for seed in range(150):
         tree = json.loads(document.generate(Random(seed)))
-        nodes |= {node[0] for node in tree["nodes"]}
+        nodes |= {node[0] for one in tree["operations"] for node in one.get("nodes", [])}
         traces = [operation["trace"] for operation in tree["operations"] if "trace" in operation]
         questions |= {question[0] for trace in traces for question in trace["questions"]}
     assert nodes >= set(NODE_TYPES)

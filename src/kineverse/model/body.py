@@ -26,9 +26,7 @@ Finite: TypeAlias = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_i
 Vector3: TypeAlias = tuple[Finite, Finite, Finite]
 AxisLike: TypeAlias = "Sequence[float] | npt.NDArray[Any]"  # three numbers, not all zero
 Rgba: TypeAlias = tuple[Finite, Finite, Finite, Finite]
-_Rows: TypeAlias = tuple[
-    Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite
-]
+_Rows: TypeAlias = Annotated[tuple[Finite, ...], Meta(min_length=12, max_length=12)]
 
 
 class Pose(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -76,8 +74,7 @@ class Pose(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
         x, y, z, w = numbers[3].tolist()
         if not max(abs(x), abs(y), abs(z), abs(w - 1)) < _RIGID:
             raise InvalidValueError(f"The last row of a rigid transform is (0, 0, 0, 1), not {numbers[3]}.")
-        rows: Any = tuple(numbers[:3].ravel().tolist())
-        return Pose(rows)
+        return Pose(tuple(numbers[:3].ravel().tolist()))
 
     @property
     def matrix(self) -> npt.NDArray[Any]:
@@ -93,7 +90,7 @@ class _Geometry(Struct, frozen=True, tag_field="kind", omit_defaults=True, forbi
     kind: ClassVar[str]
 
 
-class Box(_Geometry, tag="box"):
+class Box(_Geometry, frozen=True, tag="box"):
     """A box centred at its origin; ``size`` are the full edge lengths along x, y, z [m]."""
 
     kind: ClassVar[str] = "box"
@@ -101,7 +98,7 @@ class Box(_Geometry, tag="box"):
     size: Vector3
 
 
-class Cylinder(_Geometry, tag="cylinder"):
+class Cylinder(_Geometry, frozen=True, tag="cylinder"):
     """A cylinder around z, centred at its origin; radius and length [m]."""
 
     kind: ClassVar[str] = "cylinder"
@@ -110,7 +107,7 @@ class Cylinder(_Geometry, tag="cylinder"):
     length: Finite
 
 
-class Capsule(_Geometry, tag="capsule"):
+class Capsule(_Geometry, frozen=True, tag="capsule"):
     """A capsule around z, centred; ``length`` is that of the cylindrical part [m]."""
 
     kind: ClassVar[str] = "capsule"
@@ -119,7 +116,7 @@ class Capsule(_Geometry, tag="capsule"):
     length: Finite
 
 
-class Sphere(_Geometry, tag="sphere"):
+class Sphere(_Geometry, frozen=True, tag="sphere"):
     """A sphere around its origin; radius [m]."""
 
     kind: ClassVar[str] = "sphere"
@@ -127,7 +124,7 @@ class Sphere(_Geometry, tag="sphere"):
     radius: Finite
 
 
-class Ellipsoid(_Geometry, tag="ellipsoid"):
+class Ellipsoid(_Geometry, frozen=True, tag="ellipsoid"):
     """An ellipsoid around its origin; ``radii`` are the half axes along x, y, z [m]."""
 
     kind: ClassVar[str] = "ellipsoid"
@@ -135,7 +132,7 @@ class Ellipsoid(_Geometry, tag="ellipsoid"):
     radii: Vector3
 
 
-class Cone(_Geometry, tag="cone"):
+class Cone(_Geometry, frozen=True, tag="cone"):
     """A cone around z, its base at -length/2 and its tip at +length/2; radius of the base and length [m]."""
 
     kind: ClassVar[str] = "cone"
@@ -144,7 +141,7 @@ class Cone(_Geometry, tag="cone"):
     length: Finite
 
 
-class Mesh(_Geometry, tag="mesh", eq=False):
+class Mesh(_Geometry, frozen=True, tag="mesh", eq=False):
     """Reference to a mesh file.
 
     ``uri`` is the reference in the description (``package://...``, ``file://...`` or a path). ``folder`` is
@@ -172,7 +169,7 @@ class Mesh(_Geometry, tag="mesh", eq=False):
         return self.uri, self.scale, self.folder
 
 
-_UNSCALED = (1.0, 1.0, 1.0)
+_UNSCALED: Vector3 = (1.0, 1.0, 1.0)
 _IDENTITY = Pose()
 
 Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone | Mesh

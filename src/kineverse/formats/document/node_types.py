@@ -318,7 +318,7 @@ def _read(graph: NodeGraph, node: structs.ReadNodeValue) -> None:
     graph.has_read_nodes = True
 
 
-_READERS: Mapping[type, Callable[[NodeGraph, Any], None]] = MappingProxyType(
+_READERS: Mapping[type[structs.NodeValue], Callable[[NodeGraph, Any], None]] = MappingProxyType(
     {
         structs.ConstantNode: _constant,
         structs.SymbolNode: _symbol,

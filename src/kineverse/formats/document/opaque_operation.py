@@ -55,11 +55,13 @@ class OpaqueOperation(Operation):
     given: Mapping[str, Any] = field(default_factory=dict, hash=False)
     reads: tuple[tuple[Cell, Read], ...] = ()
     listings: tuple[str, ...] = ()
-    recorded: Mapping[Cell, Any] = field(default_factory=dict, hash=False, repr=False)
+    recorded: Mapping[Cell, Any] = field(  # type: ignore[misc]
+        default_factory=dict, hash=False, repr=False
+    )
     trace: Trace | None = field(default=None, repr=False)
     frozen: str = ""
     scope: str = ""
-    seen: tuple[Mapping[Cell, Any], Mapping[str, tuple[str, ...]]] | None = field(
+    seen: tuple[Mapping[Cell, Any], Mapping[str, tuple[str, ...]]] | None = field(  # type: ignore[misc]
         default=None, repr=False, compare=False
     )
     overrides: bool = field(default=False, repr=False, compare=False)  # type: ignore[misc]

@@ -52,7 +52,7 @@ from kineverse.model.operation import Cell, Operation
 
 from .budget import MAX_DEPTH, InvalidDocumentError, check_depth
 from .node_graph import NodeGraph
-from .values import DATUM_TAGS, Names, Ref, decode_datum, describe_value, encode_datum, tagged
+from .values import DATUM_TAGS, Names, Ref, decode_datum, encode_datum, tagged
 
 TAGS = ("pose", "mapping", "record", "written", "unwritten", *DATUM_TAGS)
 
@@ -125,7 +125,7 @@ def document_kind(kind: type) -> str:
 
 
 @cache
-def _fields(kind: type) -> tuple[str, ...] | None:
+def _fields(kind: Any) -> tuple[str, ...] | None:
     """Return the names of the constructor arguments of a class; None for one without fields."""
     if issubclass(kind, msgspec.Struct):
         # The place of a mesh on this machine is no part of it.
@@ -169,10 +169,11 @@ def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: in
         return {"written": written[id(value)]}
     if isinstance(value, OpaqueRecord):
         return {"record": [value.kind, {key: inner(item) for key, item in value.fields}]}
-    names = _fields(type(value))
+    kind = type(value)
+    names = _fields(kind)
     if names is None:
-        return {"unwritten": document_kind(type(value))}
-    return {"record": [document_kind(type(value)), {name: inner(getattr(value, name)) for name in names}]}
+        return {"unwritten": document_kind(kind)}
+    return {"record": [document_kind(kind), {name: inner(getattr(value, name)) for name in names}]}
 
 
 def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
@@ -224,7 +225,7 @@ def decode_parameter(
             return OpaqueRecord(kind, tuple((key, inner(item)) for key, item in given.items()))
         text = msgspec.convert(content, str)
     except msgspec.ValidationError as error:
-        raise InvalidDocumentError(f"{describe_value(content)} is no {tag}: {error}") from None
+        raise InvalidDocumentError(str(error) if tag == "pose" else f"it is no {tag}: {error}") from None
     except TypeError:
         raise InvalidDocumentError("a mapping has keys that cannot be compared") from None
     if tag == "unwritten":

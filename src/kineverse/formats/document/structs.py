@@ -7,7 +7,7 @@ says what the parts mean.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType, field
@@ -16,8 +16,8 @@ from kineverse.model.body import Body, Finite, Pose, Vector3
 
 from .budget import MAX_LENGTH, MAX_NODES, MAX_ORDER, MAX_PATH, MAX_QUESTIONS, MAX_STEPS
 
-FORMAT = "kineverse"
-VERSION = 2
+FORMAT: Final = "kineverse"
+VERSION: Final = 2
 
 Number: TypeAlias = Finite | Literal["inf", "-inf"]
 Ref: TypeAlias = Annotated[int, Meta(ge=0, lt=MAX_NODES)]
@@ -35,13 +35,13 @@ class NodeValue(Struct, frozen=True, array_like=True, forbid_unknown_fields=True
     """Node of a table of expressions."""
 
 
-class ConstantNode(NodeValue, tag="constant"):
+class ConstantNode(NodeValue, frozen=True, tag="constant"):
     """A number."""
 
     value: Number
 
 
-class SymbolNode(NodeValue, tag="symbol"):
+class SymbolNode(NodeValue, frozen=True, tag="symbol"):
     """A symbol that is no parameter."""
 
     path: str
@@ -49,49 +49,49 @@ class SymbolNode(NodeValue, tag="symbol"):
     role: Literal["dof", "contact", "location"]
 
 
-class ParameterNode(NodeValue, tag="parameter"):
+class ParameterNode(NodeValue, frozen=True, tag="parameter"):
     """A parameter with its default value."""
 
     path: str
     value: Number
 
 
-class ElementaryNode(NodeValue, tag="elementary"):
+class ElementaryNode(NodeValue, frozen=True, tag="elementary"):
     """An elementary function of scalars."""
 
     function: str
     arguments: Refs
 
 
-class ElementNode(NodeValue, tag="element"):
+class ElementNode(NodeValue, frozen=True, tag="element"):
     """An element of an array, in C order."""
 
     array: Ref
     index: Length
 
 
-class MatrixNode(NodeValue, tag="matrix"):
+class MatrixNode(NodeValue, frozen=True, tag="matrix"):
     """An array in C order; null is a zero that is not stored."""
 
     shape: tuple[Length, ...]
     elements: tuple[Ref | None, ...]
 
 
-class RotationNode(NodeValue, tag="rotation"):
+class RotationNode(NodeValue, frozen=True, tag="rotation"):
     """A 4×4 rotation about a coordinate axis by an angle [rad]."""
 
     axis: Vector3
     angle: Ref
 
 
-class TranslationNode(NodeValue, tag="translation"):
+class TranslationNode(NodeValue, frozen=True, tag="translation"):
     """A 4×4 translation along a unit vector by a distance [m]."""
 
     direction: Vector3
     distance: Ref
 
 
-class AugmentNode(NodeValue, tag="augment"):
+class AugmentNode(NodeValue, frozen=True, tag="augment"):
     """A value with given entries of its gradient."""
 
     value: Ref
@@ -100,7 +100,7 @@ class AugmentNode(NodeValue, tag="augment"):
     entries: Pairs
 
 
-class LessNode(NodeValue, tag="less"):
+class LessNode(NodeValue, frozen=True, tag="less"):
     """A continuous comparison."""
 
     left: Ref
@@ -108,25 +108,25 @@ class LessNode(NodeValue, tag="less"):
     contrast: Finite
 
 
-class NotNode(NodeValue, tag="not"):
+class NotNode(NodeValue, frozen=True, tag="not"):
     """A negation."""
 
     argument: Ref
 
 
-class AndNode(NodeValue, tag="and"):
+class AndNode(NodeValue, frozen=True, tag="and"):
     """A conjunction."""
 
     arguments: Refs
 
 
-class OrNode(NodeValue, tag="or"):
+class OrNode(NodeValue, frozen=True, tag="or"):
     """A disjunction."""
 
     arguments: Refs
 
 
-class SelectNode(NodeValue, tag="select"):
+class SelectNode(NodeValue, frozen=True, tag="select"):
     """A choice, element by element."""
 
     condition: Ref
@@ -134,20 +134,20 @@ class SelectNode(NodeValue, tag="select"):
     otherwise: Ref
 
 
-class ExtremumNode(NodeValue, tag="extremum"):
+class ExtremumNode(NodeValue, frozen=True, tag="extremum"):
     """The smallest or largest of several values, element by element."""
 
     which: Literal["min", "max"]
     arguments: Annotated[Refs, Meta(min_length=2)]
 
 
-class NormNode(NodeValue, tag="norm"):
+class NormNode(NodeValue, frozen=True, tag="norm"):
     """The Euclidean norm of a vector."""
 
     argument: Ref
 
 
-class PiecewiseNode(NodeValue, tag="piecewise"):
+class PiecewiseNode(NodeValue, frozen=True, tag="piecewise"):
     """A polynomial for each piece between knots."""
 
     argument: Ref
@@ -156,28 +156,28 @@ class PiecewiseNode(NodeValue, tag="piecewise"):
     pieces: tuple[tuple[Finite, ...], ...]
 
 
-class CarriedNode(NodeValue, tag="carried"):
+class CarriedNode(NodeValue, frozen=True, tag="carried"):
     """A coordinate with the table of rates that moves it."""
 
     coordinate: Ref
     rates: tuple[tuple[Ref, Pairs], ...]
 
 
-class ComposedNode(NodeValue, tag="composed"):
+class ComposedNode(NodeValue, frozen=True, tag="composed"):
     """A carried coordinate after a substitution."""
 
     coordinate: Ref
     replacements: Pairs
 
 
-class DependentNode(NodeValue, tag="dependent"):
+class DependentNode(NodeValue, frozen=True, tag="dependent"):
     """A coordinate that is an expression of others."""
 
     value: Ref
     coordinate: Ref
 
 
-class ImplicitNode(NodeValue, tag="implicit"):
+class ImplicitNode(NodeValue, frozen=True, tag="implicit"):
     """An implicit function, solved by Newton steps, at arguments."""
 
     name: str
@@ -191,7 +191,7 @@ class ImplicitNode(NodeValue, tag="implicit"):
     domain: tuple[tuple[Number, Number], ...]
 
 
-class ReadNodeValue(NodeValue, tag="read"):
+class ReadNodeValue(NodeValue, frozen=True, tag="read"):
     """A part of the answer to a question, or an entry of its gradient."""
 
     question: Count
@@ -230,7 +230,7 @@ class _Part(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True)
     """Part of an operation: an object without members that have their default."""
 
 
-class ReadsValue(_Part):
+class ReadsValue(_Part, frozen=True):
     """Paths kind/name that an operation has read, and kinds whose names it has listed."""
 
     existence: tuple[str, ...] = ()
@@ -238,14 +238,14 @@ class ReadsValue(_Part):
     listing: tuple[str, ...] = ()
 
 
-class FrameValue(_Part):
+class FrameValue(_Part, frozen=True):
     """A frame: each factor of its transform is a pose or the place of an expression."""
 
     parent: str
     factors: tuple[Pose | Ref, ...]
 
 
-class ArticulationValue(_Part):
+class ArticulationValue(_Part, frozen=True):
     """Record of an articulation."""
 
     kind: str
@@ -258,7 +258,7 @@ class ArticulationValue(_Part):
     follows: Ref | None = None
 
 
-class WritesValue(_Part):
+class WritesValue(_Part, frozen=True):
     """What an operation writes, by kind and name."""
 
     frames: dict[str, FrameValue] = field(default_factory=dict)
@@ -269,14 +269,14 @@ class WritesValue(_Part):
     data: dict[str, Any] = field(default_factory=dict)
 
 
-class TraceValue(_Part):
+class TraceValue(_Part, frozen=True):
     """Questions of an operation to the model, and its writes as expressions of the answers."""
 
     questions: Annotated[tuple[tuple[Any, ...], ...], Meta(max_length=MAX_QUESTIONS)]
     writes: WritesValue
 
 
-class OperationValue(_Part, kw_only=True):
+class OperationValue(_Part, frozen=True, kw_only=True):
     """An operation: the content of a blob."""
 
     tag: Annotated[str, Meta(min_length=1)]
@@ -290,7 +290,7 @@ class OperationValue(_Part, kw_only=True):
     below: str = ""
 
 
-class Resource(_Part):
+class Resource(_Part, frozen=True):
     """File that bodies refer to, by its address in them and their folder: digest (SHA-256) and size."""
 
     uri: str
@@ -299,7 +299,7 @@ class Resource(_Part):
     folder: str = ""
 
 
-class Envelope(_Part, kw_only=True):
+class Envelope(_Part, frozen=True, kw_only=True):
     """A document, with operations that are not decoded yet."""
 
     format: Literal["kineverse"]
@@ -310,7 +310,7 @@ class Envelope(_Part, kw_only=True):
     sha256: Digest | UnsetType = UNSET
 
 
-class Document(Envelope, kw_only=True):
+class Document(Envelope, frozen=True, kw_only=True):
     """A document with its operations, for the schema."""
 
     operations: tuple[OperationValue, ...]  # type: ignore[assignment]

@@ -50,7 +50,11 @@ def decode_trace(given: structs.TraceValue, graph: NodeGraph, names: Names) -> T
     """Decode a trace."""
     steps: list[TraceStep] = []
     for item in given.questions:
-        kind, look, *arguments = (*item, None, None)[: max(len(item), 2)]
+        if len(item) < 2:
+            raise InvalidDocumentError(
+                "a question is its kind, how closely it was looked at, and what it is about"
+            )
+        kind, look, *arguments = item
         if type(kind) is not str or kind not in QUERY_KINDS:
             raise InvalidDocumentError(f"a question is one of {', '.join(QUERY_KINDS)}")
         if type(look) is not int or not 0 <= look <= 2:
