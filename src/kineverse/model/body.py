@@ -18,7 +18,6 @@ from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import Expression
 
 _RIGID = 2e-5
-_NO_TURN = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _FARTHEST = 1e100  # largest coordinate of a pose [m]. Products of a chain of such poses do not overflow
 
 # A number of a document; other values, such as infinity, are refused when it is written or read.
@@ -38,16 +37,21 @@ class Pose(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
         if len(self.rows) != 12:
             raise ShapeError(f"A pose has 12 numbers, not {len(self.rows)}.")
         a, b, c, x, d, e, f, y, g, h, i, z = self.rows
-        if (a, b, c, d, e, f, g, h, i) == _NO_TURN and all(-_FARTHEST <= v <= _FARTHEST for v in (x, y, z)):
+        # Each comparison is False for NaN. Most poses of shapes do not turn.
+        is_close = (
+            -_FARTHEST <= x <= _FARTHEST and -_FARTHEST <= y <= _FARTHEST and -_FARTHEST <= z <= _FARTHEST
+        )
+        if a == e == i == 1.0 and b == c == d == f == g == h == 0.0 and is_close:
             return
-        squares = a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1
-        products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
-        turns = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
-        # Each comparison is False for NaN.
         if not (
-            turns
-            and all(-_RIGID < v < _RIGID for v in (*squares, *products))
-            and all(-_FARTHEST <= v <= _FARTHEST for v in (x, y, z))
+            is_close
+            and abs(a * a + b * b + c * c - 1) < _RIGID
+            and abs(d * d + e * e + f * f - 1) < _RIGID
+            and abs(g * g + h * h + i * i - 1) < _RIGID
+            and abs(a * d + b * e + c * f) < _RIGID
+            and abs(a * g + b * h + c * i) < _RIGID
+            and abs(d * g + e * h + f * i) < _RIGID
+            and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
         ):
             raise InvalidValueError(
                 f"The pose is not rigid: the first three columns of {self.rows} must be a rotation "

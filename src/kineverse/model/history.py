@@ -160,14 +160,28 @@ class History:
         if self._dirty or given.tag in self.entries or not self._finds_what_it_read(entry):
             self._add(given.tag, given.operation, entry.place)
             return
-        with self._step():
-            for (kind, name), value in entry.writes.items():
-                if kind == FRAMES:
-                    self._check_parent(name, value, entry.writes, entry.reads, entry.place)
-            self._check_overwrite(entry)
+        for (kind, name), value in entry.writes.items():
+            if kind == FRAMES:
+                self._check_parent(name, value, entry.writes, entry.reads, entry.place)
+        self._check_overwrite(entry)
+        if any(c in self.cells or c in self.reading or self.listing[c[0]] for c in entry.writes):
             self._link(entry)
             for cell, value in entry.writes.items():
                 self._mark_readers(cell, ABSENT, value, entry.place)
+            return
+        # The usual case while a document is loaded, in one step.
+        self._undo.append((self._take_back, (entry,)))
+        self._index(entry)
+        for cell, value in entry.writes.items():
+            self.cells[cell] = [entry]
+            self.head[cell[0]][cell[1]] = value
+            self._before.setdefault(cell, ABSENT)
+            self._events.append((cell, ABSENT, value))
+
+    def _take_back(self, entry: HistoryEntry) -> None:
+        for cell, value in entry.writes.items():
+            self._put_head(cell, value, ABSENT)
+        self._forget(entry)
 
     @property
     def _end(self) -> int:
@@ -543,11 +557,7 @@ class History:
                     lambda cell: self.value_at(cell, place), lambda kind: self.names_at(kind, place), Reads()
                 )
             )
-        self.entries[entry.tag] = entry
-        if not self.sequence or self.sequence[-1].place < entry.place:
-            self.sequence.append(entry)
-        else:
-            insort(self.sequence, entry, key=_PLACE)
+        self._index(entry)
         for cell in entry.writes:
             writers = self.cells.get(cell)
             if writers is None:
@@ -557,11 +567,19 @@ class History:
                 self._disordered.add(cell[0])
                 if cell[0] != DATA:
                     self._contested[cell] = None
+        self._undo.append((self._forget, (entry,)))
+
+    def _index(self, entry: HistoryEntry) -> None:
+        """Note an entry by its tag, its place and its reads."""
+        self.entries[entry.tag] = entry
+        if not self.sequence or self.sequence[-1].place < entry.place:
+            self.sequence.append(entry)
+        else:
+            insort(self.sequence, entry, key=_PLACE)
         for cell, how in entry.reads.cells.items():
             self.reading.setdefault(cell, {})[entry.tag] = how
         for kind in entry.reads.listings:
             self.listing[kind].add(entry.tag)
-        self._undo.append((self._forget, (entry,)))
 
     def _unlink(self, entry: HistoryEntry) -> None:
         self._forget(entry)

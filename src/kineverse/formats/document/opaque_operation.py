@@ -53,8 +53,8 @@ class OpaqueOperation(Operation):
 
     kind: str
     given: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    reads: tuple[tuple[Cell, Read], ...] = ()
-    listings: tuple[str, ...] = ()
+    reads: Mapping[Cell, Read] = field(default_factory=dict, hash=False)
+    listings: frozenset[str] = frozenset()
     recorded: Mapping[Cell, Any] = field(  # type: ignore[misc]
         default_factory=dict, hash=False, repr=False
     )
@@ -112,7 +112,7 @@ class OpaqueOperation(Operation):
         """Take what a model contains now as what the original has read."""
         if self.seen is None:
             model = self._in_scope(model)
-            values = {cell: model.read(cell, how) for cell, how in self.reads}
+            values = {cell: model.read(cell, how) for cell, how in self.reads.items()}
             names = {kind: tuple(model.list_names(kind)) for kind in self.listings}
             silent = model.replaced({}, {})
             overrides = any(silent.read(cell, Read.EXISTENCE) is not ABSENT for cell in self.recorded)
@@ -160,10 +160,10 @@ class OpaqueOperation(Operation):
         values, names = self.seen
         changed = [
             f"the list of all {kind}"
-            for kind in self.listings
+            for kind in sorted(self.listings)
             if tuple(model.list_names(kind)) != names[kind]
         ]
-        for cell, how in self.reads:
+        for cell, how in sorted(self.reads.items()):
             now, then = model.read(cell, how), values.get(cell, ABSENT)
             if now is then:
                 continue

@@ -137,24 +137,29 @@ def _fields(kind: Any) -> tuple[str, ...] | None:
 
 def operation_parameters(operation: Operation) -> dict[str, Any]:
     """Return the constructor arguments of an operation by name; none for one that is no dataclass."""
-    if not dataclasses.is_dataclass(operation):
-        return {}
-    return {f.name: getattr(operation, f.name) for f in dataclasses.fields(operation) if f.init}
+    return {name: getattr(operation, name) for name in _arguments(type(operation))}
+
+
+@cache
+def _arguments(kind: type[Operation]) -> tuple[str, ...]:
+    return tuple(f.name for f in dataclasses.fields(kind) if f.init) if dataclasses.is_dataclass(kind) else ()
 
 
 def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: int = 0) -> Any:
     """Encode a parameter; ``written`` has the paths of the operation's writes by the id of the value."""
-
-    def inner(item: Any) -> Any:
-        return encode_parameter(item, written, ref, depth + 1)
-
-    if depth > MAX_DEPTH:
-        return {"unwritten": document_kind(type(value))}
     if value is None or isinstance(value, (bool, int, float, str, Expression)):
         try:
             return encode_datum(value, ref)
         except FormatError:
             return {"unwritten": document_kind(type(value))}
+    if id(value) in written:
+        return {"written": written[id(value)]}
+    if depth > MAX_DEPTH:
+        return {"unwritten": document_kind(type(value))}
+
+    def inner(item: Any) -> Any:
+        return encode_parameter(item, written, ref, depth + 1)
+
     if isinstance(value, (tuple, list)):
         return [inner(item) for item in value]
     if isinstance(value, Pose):
@@ -165,8 +170,6 @@ def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: in
         return {"unwritten": value.kind}
     if isinstance(value, Mapping):
         return {"mapping": [[inner(key), inner(item)] for key, item in value.items()]}
-    if id(value) in written:
-        return {"written": written[id(value)]}
     if isinstance(value, OpaqueRecord):
         return {"record": [value.kind, {key: inner(item) for key, item in value.fields}]}
     kind = type(value)
@@ -200,8 +203,8 @@ def decode_parameter(
     value: Any, graph: NodeGraph, names: Names, written: Mapping[Cell, Any], depth: int = 0
 ) -> Any:
     """Decode a parameter."""
-    if type(value) is str or value is None:
-        return value
+    if type(value) is not list and type(value) is not dict:
+        return decode_datum(value, graph)
 
     def inner(item: Any) -> Any:
         return decode_parameter(item, graph, names, written, depth + 1)
@@ -209,8 +212,6 @@ def decode_parameter(
     check_depth(depth)
     if type(value) is list:
         return tuple([inner(item) for item in value])
-    if type(value) is not dict:
-        return decode_datum(value, graph)
     tag, content = tagged(value, TAGS)
     if tag in DATUM_TAGS:
         return decode_datum(value, graph)

@@ -156,7 +156,7 @@ class _Document:
 
     def __init__(self, source: str, prefix: str | None, root: str) -> None:
         self._source, self._root = source, root
-        self._place = ""
+        self._place, self._part = "", ""
         self._names = Names(f"{prefix}/" if prefix else "")
         self._budget = Budget()
         self._cells: dict[Cell, Any] = {}
@@ -189,7 +189,7 @@ class _Document:
 
     def refuse(self, reason: str) -> NoReturn:
         """Raise the error of the document."""
-        place = f", {self._place}" if self._place else ""
+        place = f", {self._place}{self._part}" if self._place else ""
         if len(reason) > LONGEST_REASON:  # it quotes names, which may be of any length
             reason = f"{reason[:LONGEST_REASON]} ..."
         raise FormatError(f"{self._source}{place}: {reason.removesuffix('.')}.") from None
@@ -231,38 +231,39 @@ class _Document:
         self, value: OperationValue, blob: bytes, folders: dict[int, str], is_in_document: bool
     ) -> HistoryEntry:
         """Return an operation with its reads and writes, and what it has read if the document has that."""
-        names, graph, place = self._names, NodeGraph(self._names.before, self._budget), self._place
+        names, graph = self._names, NodeGraph(self._names.before, self._budget)
         read_nodes(graph, value.nodes)
         given = writes = self._writes(value, graph, folders)
         if graph.has_opaque_nodes:  # coordinates may be carried, which no model contains
             writes = Writes.from_cells(given).writes()
         is_as_given = not names.before and (writes is given or writes == given)
-        self._place = f"{place}, reads"
+        self._part = ", reads"
         reads = self._reads(value.reads)
-        self._place = f"{place}, trace"
+        self._part = ", trace"
         trace = None if value.trace is None else decode_trace(value.trace, graph, names)
-        if trace is not None and value.frozen:
-            raise InvalidDocumentError("an operation with a trace is not frozen")
         if trace is not None:
+            if value.frozen:
+                raise InvalidDocumentError("an operation with a trace is not frozen")
             asked = self._consistency.reads_of(trace, writes) if is_in_document else named_reads(trace)
             is_as_given &= _merge(reads, asked)
-        is_as_given &= _merge(reads, _parents_of(writes))
-        self._place = f"{place}, parameters"
-        parameters = {
-            name: decode_parameter(given, graph, names, writes) for name, given in value.parameters.items()
-        }
+        is_as_given &= _add_parents(reads, writes)
+        self._part = ", parameters"
+        parameters = value.parameters
+        for name, parameter in parameters.items():
+            parameters[name] = decode_parameter(parameter, graph, names, writes)
+        self._part = ""
         seen, overrides = None, False
         if is_in_document:
             seen = self._seen(reads)
-            overrides = any(cell in self._cells for cell in writes)
-            self._cells.update(writes)
-            for kind, written in writes:
-                self._listed[kind].add(written)
+            for cell, written in writes.items():
+                overrides = overrides or cell in self._cells
+                self._cells[cell] = written
+                self._listed[cell[0]].add(cell[1])
         operation = OpaqueOperation(
             value.kind,
             parameters,
-            tuple(sorted(reads.cells.items())),
-            tuple(sorted(reads.listings)),
+            reads.cells,
+            frozenset(reads.listings),
             writes,
             trace,
             value.frozen,
@@ -309,8 +310,10 @@ class _Document:
         return reads
 
     def _seen(self, reads: Reads) -> tuple[dict[Cell, Any], dict[str, tuple[str, ...]]]:
-        self._budget.spend(COST_OF_NAME * sum(len(self._listed[kind]) for kind in reads.listings))
-        names = {kind: tuple(sorted(self._listed[kind])) for kind in reads.listings}
+        names = {}
+        for kind in reads.listings:
+            self._budget.spend(COST_OF_NAME * len(self._listed[kind]))
+            names[kind] = tuple(sorted(self._listed[kind]))
         return {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}, names
 
 
@@ -352,10 +355,10 @@ def _merge(reads: Reads, others: Reads) -> bool:
     return known == reads.cells and listed == reads.listings
 
 
-def _parents_of(writes: dict[Cell, Any]) -> Reads:
-    """Return the reads of the parents that written frames need."""
-    reads = Reads()
+def _add_parents(reads: Reads, writes: dict[Cell, Any]) -> bool:
+    """Add the reads of the parents that written frames need, and return whether all of them were there."""
+    known = len(reads.cells)
     for (kind, _), value in writes.items():
         if kind == FRAMES and value.parent != WORLD and (FRAMES, value.parent) not in writes:
-            reads.add((FRAMES, value.parent), Read.EXISTENCE)
-    return reads
+            reads.cells.setdefault((FRAMES, value.parent), Read.EXISTENCE)
+    return len(reads.cells) == known

@@ -37,6 +37,7 @@ MAX_BITS = 10_000  # length of the longest integer: Python reads no more than 43
 PLAIN_BITS = 63
 """Length of the longest integer that is written as a number; other languages and msgpack end there."""
 DATUM_TAGS = ("expression", "float", "integer")
+_QUATERNION = 4  # coordinates that an orientation has at least
 _INTEGER = re.compile("-?[0-9]{1,3011}")
 
 
@@ -188,8 +189,8 @@ def decode_writes(
             try:
                 cell = names.cell(kind, check_name(name))
                 decoded = decode(cell[1], value, graph, names)
-                if kind == CONSTRAINTS and not is_trace:  # a trace checks it once the values are known
-                    as_constraint(decoded)
+                if kind == CONSTRAINTS and not is_trace:
+                    _check_bounds(decoded)
             except (InvalidDocumentError, KineverseError) as error:
                 raise InvalidDocumentError(f"writes {kind}/{name[:60]}: {error}") from None
             yield cell, decoded
@@ -228,13 +229,19 @@ def _decode_articulation(
         tuple((item, decode_datum(datum, graph)) for item, datum in given.dynamics),
         None if given.follows is None else graph.scalar(given.follows),
     )
-    if given.home:
+    if len(given.home) >= _QUATERNION:  # all numbers are finite
         check_home(name, result)
     return result
 
 
 def _decode_constraint(name: str, given: tuple[int, int, int], graph: NodeGraph, names: Names) -> Constraint:
     return Constraint(*map(graph.scalar, given))
+
+
+def _check_bounds(constraint: Constraint) -> None:
+    # A trace checks them once the values are known; most bounds are numbers.
+    if not (constraint.lower.sx.is_constant() and constraint.upper.sx.is_constant()):
+        as_constraint(constraint)
 
 
 def _decode_rate(name: str, given: Any, graph: NodeGraph, names: Names) -> tuple[Symbol, RateEntry]:

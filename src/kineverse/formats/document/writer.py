@@ -24,6 +24,10 @@ from .parameters import document_kind, encode_parameter, operation_parameters
 from .traces import encode_queries
 from .values import encode_writes, meshes_of
 
+# Flags are compared as wholes, because operations on them are slow.
+_WITH_EXISTENCE = (Read.EXISTENCE, Read.EXISTENCE | Read.VALUE)
+_WITH_VALUE = (Read.VALUE, Read.EXISTENCE | Read.VALUE)
+
 # Values before an operation, by cell.
 Before = Callable[[], dict[Cell, Any]]
 
@@ -183,7 +187,7 @@ def _encode_operation(entry: HistoryEntry, before: Before) -> dict[str, Any]:
         result["frozen"], result["below"] = operation.frozen, operation.scope
     else:
         kind, parameters = document_kind(type(operation)), operation_parameters(operation)
-        if entry.reads.listings or any(how & Read.VALUE for how in entry.reads.cells.values()):
+        if entry.reads.listings or any(how in _WITH_VALUE for how in entry.reads.cells.values()):
             if entry.reads.trace is None:
                 entry.reads.trace = _find_trace(entry, before())
             found = entry.reads.trace
@@ -213,8 +217,8 @@ def _encode_operation(entry: HistoryEntry, before: Before) -> dict[str, Any]:
 def _encode_reads(reads: Reads) -> dict[str, list[str]]:
     cells = sorted(reads.cells.items())
     return {
-        "existence": [f"{kind}/{name}" for (kind, name), how in cells if how & Read.EXISTENCE],
-        "value": [f"{kind}/{name}" for (kind, name), how in cells if how & Read.VALUE],
+        "existence": [f"{kind}/{name}" for (kind, name), how in cells if how in _WITH_EXISTENCE],
+        "value": [f"{kind}/{name}" for (kind, name), how in cells if how in _WITH_VALUE],
         "listing": sorted(reads.listings),
     }
 
