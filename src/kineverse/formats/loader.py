@@ -140,7 +140,7 @@ def load(
     known = _REMEMBERED.pop(key, None)
     if known is None:
         model = Model()
-        with collect_warnings() as remarks, _blaming(found.path), model.edit() as edit, no_collection():
+        with collect_warnings() as remarks, _blaming(found.path), no_collection(), model.edit() as edit:
             for _ in _applied(edit, found, content, prefix, below, strict, loops, given):
                 pass
         if len(content) > LARGEST_REMEMBERED or not remembered:

@@ -96,6 +96,8 @@ class NodeTable:
 
     def _scalar(self, root: SX) -> int:
         """Return the place of an element, after those of its operands."""
+        if root.op() == ca.OP_CONST:
+            return self._constant(float(root))
         places, stack, steps = self._elements, [root], 0
         while stack:
             sx = stack[-1]

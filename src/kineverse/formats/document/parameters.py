@@ -147,7 +147,9 @@ def _arguments(kind: type[Operation]) -> tuple[str, ...]:
 
 def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: int = 0) -> Any:
     """Encode a parameter; ``written`` has the paths of the operation's writes by the id of the value."""
-    if value is None or isinstance(value, (bool, int, float, str, Expression)):
+    if value is None or type(value) in (str, bool):
+        return value
+    if isinstance(value, (int, float, str, Expression)):
         try:
             return encode_datum(value, ref)
         except FormatError:

@@ -137,7 +137,7 @@ def from_bytes(
     entries = _Document("the document", prefix, find_text_root(NOWHERE, root)).read(content, False)
     model = Model()
     try:
-        with model.edit() as edit, no_collection():
+        with no_collection(), model.edit() as edit:
             for entry in entries:
                 edit.link(entry)
     except KineverseError as error:

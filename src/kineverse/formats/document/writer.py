@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -120,17 +121,21 @@ def operation_to_bytes(model: ModelView, tag: str) -> bytes:
     FormatError
         For content that a document cannot carry.
     """
-    if isinstance(model, Model) and tag in model.history.entries:
-        entry = model.history.entries[tag]  # the usual case, without a snapshot
-        if entry.blob is not None:
-            return entry.blob
-    entries = _entries(model)
-    index = next((i for i, entry in enumerate(entries) if entry.tag == tag), None)
-    if index is None:
-        tags = [entry.tag for entry in entries]
-        raise UnknownNameError(f"There is no operation {tag!r}. {suggest(str(tag), tags, 'tag')}")
-    before = entries[:index]
-    return _blob(entries[index], lambda: {c: value for entry in before for c, value in entry.writes.items()})
+    if isinstance(model, Model) and not model.is_edited:
+        entries: Sequence[HistoryEntry] = model.history.sequence  # without a snapshot, which lists all values
+        entry = model.history.entry(tag)
+    else:
+        entries = _entries(model)
+        by_tag = {entry.tag: entry for entry in entries}
+        if tag not in by_tag:
+            raise UnknownNameError(f"There is no operation {tag!r}. {suggest(str(tag), by_tag, 'tag')}")
+        entry = by_tag[tag]
+
+    def before() -> dict[Cell, Any]:
+        earlier = takewhile(lambda other: other is not entry, entries)
+        return {cell: value for other in earlier for cell, value in other.writes.items()}
+
+    return entry.blob or _blob(entry, before)
 
 
 def operation_digest(model: ModelView, tag: str) -> str:
