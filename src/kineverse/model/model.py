@@ -79,11 +79,6 @@ class Model(ModelView):
         """Operations: ``tags``, ``entry(tag)``, ``writers(path)``, ``readers(path)``, ``runs``."""
         return self._history
 
-    @property
-    def is_edited(self) -> bool:
-        """True while an edit of the model is open."""
-        return self._edit is not None
-
     # -- editing -------------------------------------------------------------------------------------------
 
     def edit(self) -> AbstractContextManager[Edit]:

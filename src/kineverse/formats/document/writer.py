@@ -121,7 +121,7 @@ def operation_to_bytes(model: ModelView, tag: str) -> bytes:
     FormatError
         For content that a document cannot carry.
     """
-    if isinstance(model, Model) and not model.is_edited:
+    if isinstance(model, Model) and model._edit is None:
         entries: Sequence[HistoryEntry] = model.history.sequence  # without a snapshot, which lists all values
         entry = model.history.entry(tag)
     else:
