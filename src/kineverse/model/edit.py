@@ -84,7 +84,7 @@ class Edit:
         DuplicateNameError, UnknownNameError, ModelError
             As :meth:`apply`.
         """
-        self._check_open().link(entry)
+        self._check_open().append_entry(entry)
         return self._note_added(entry.tag)
 
     def insert(

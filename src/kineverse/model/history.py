@@ -154,7 +154,7 @@ class History:
         """Append an operation."""
         self._add(tag, operation, self._end)
 
-    def link(self, given: HistoryEntry) -> None:
+    def append_entry(self, given: HistoryEntry) -> None:
         """Append an operation with its writes elsewhere; it is run only if it finds other values here."""
         entry = given.at(self._end)
         if self._dirty or given.tag in self.entries or not self._finds_what_it_read(entry):
