@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
+
 import numpy as np
 import pytest
 from document_models import Doubled, rich_model
@@ -14,6 +17,7 @@ from hypothesis_profiles import attempts
 from kineverse import gallery
 from kineverse.formats.document import OpaqueOperation
 from kineverse.formats.document.parameters import OPERATIONS
+from kineverse.geometry.mesh_files import read_mesh
 from kineverse.model.body import Body, Box, Mesh, Shape
 from kineverse.model.history import HistoryEntry
 
@@ -164,3 +168,40 @@ def test_operation_of_a_class_and_without_it_have_the_same_blob() -> None:
             edit.apply(sent(model, tag).operation, tag)
     assert read.history.entry("custom").blob is None
     assert kv.formats.operation_to_bytes(read, "custom") == kv.formats.operation_to_bytes(model, "custom")
+
+
+def test_mesh_is_fetched_by_its_content(tmp_path: Path) -> None:
+    """The document says digest and size; what a resolver has is checked by them, and files go before it."""
+    triangle = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    digest = hashlib.sha256(triangle).hexdigest()
+    here, store = tmp_path / "here", tmp_path / "store"
+    here.mkdir()
+    store.mkdir()
+    (here / "flag.obj").write_bytes(triangle)
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("flag", "world", np.eye(4), Body((Shape(Mesh("flag.obj", folder=str(here))),)))
+    data = kv.formats.to_bytes(model, resources=True)
+    assert kv.formats.document_hash(kv.formats.from_bytes(data)) == kv.formats.document_hash(model)
+    (here / "flag.obj").unlink()
+    mesh = (
+        kv.formats.from_bytes(kv.formats.to_bytes(kv.formats.from_bytes(data)))
+        .bodies["flag"]
+        .visuals[0]
+        .geometry
+    )
+    assert isinstance(mesh, Mesh)
+    assert mesh.content == (digest, len(triangle))
+    resolver = kv.formats.FolderResolver(store)
+    kv.formats.add_resolver(resolver)
+    try:
+        with pytest.raises(kv.errors.FormatError):
+            read_mesh(mesh)
+        for wrong in (triangle[:-1], triangle.replace(b"1 0 0", b"2 0 0"), triangle + b"#"):
+            (store / digest).write_bytes(wrong)
+            with pytest.raises(kv.errors.FormatError, match="what was fetched is not the file"):
+                read_mesh(mesh)
+        (store / digest).write_bytes(triangle)
+        assert read_mesh(mesh).vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    finally:
+        kv.formats.remove_resolver(resolver)

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
         operation_to_bytes as operation_to_bytes,
         to_bytes as to_bytes,
     )
+    from .resources import (
+        FolderResolver as FolderResolver,
+        Resolver as Resolver,
+        add_resolver as add_resolver,
+        remove_resolver as remove_resolver,
+    )
     from .loader import load as load
     from .locate import locate_model as locate_model, shipped_models as shipped_models
     from .srdf import read_srdf as read_srdf

@@ -151,8 +151,9 @@ class Mesh(_Geometry, frozen=True, tag="mesh", eq=False):
     ``uri`` is the reference in the description (``package://...``, ``file://...`` or a path). ``folder`` is
     the folder of the description, from which the reference is resolved when its triangles are needed.
     ``root`` is the folder that the resolved path must not leave, a real path: empty if no path is allowed,
-    None if a program made the reference, which may open any file. Operations in documents contain neither
-    ``folder`` nor ``root``, and comparisons ignore ``root``.
+    None if a program made the reference, which may open any file. ``content`` is the SHA-256 of the file and
+    its size [byte], where they are known. Operations in documents contain only ``uri`` and ``scale``;
+    comparisons ignore ``root`` and ``content``.
     """
 
     kind: ClassVar[str] = "mesh"
@@ -161,9 +162,13 @@ class Mesh(_Geometry, frozen=True, tag="mesh", eq=False):
     scale: Vector3 = field(default_factory=lambda: _UNSCALED)
     folder: str = ""
     root: str | None = None
+    content: tuple[str, int] | None = None
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Mesh) and self._key == other._key
+
+    def __ne__(self, other: object) -> bool:  # that of a struct compares identities
+        return not self == other
 
     def __hash__(self) -> int:
         return hash(self._key)

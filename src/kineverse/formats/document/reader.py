@@ -159,6 +159,7 @@ class _Document:
         self._place, self._part = "", ""
         self._names = Names(f"{prefix}/" if prefix else "")
         self._budget = Budget()
+        self._contents: dict[tuple[str, str], tuple[str, int]] = {}
         self._cells: dict[Cell, Any] = {}
         self._listed: dict[str, set[str]] = {kind: set() for kind in KINDS}
         self._consistency = TraceConsistency(self._budget, self._cells, self._listed)
@@ -215,6 +216,7 @@ class _Document:
         if sum(len(value.nodes) for value in values) > MAX_NODES:
             raise InvalidDocumentError(f"a document has up to {MAX_NODES:,} nodes")
         folders = _folders_by_tag(envelope)
+        self._contents = {(r.folder, r.uri): (r.sha256, r.size) for r in envelope.resources}
         entries: dict[str, HistoryEntry] = {}
         for i, (value, blob) in enumerate(zip(values, blobs, strict=True)):
             self._place = f"operations[{i}]"
@@ -291,11 +293,12 @@ class _Document:
         def place(mesh: Mesh) -> Mesh:
             nonlocal count
             count += 1
-            return Mesh(mesh.uri, mesh.scale, folders.get(count - 1) or folders.get(-1, ""))
+            folder = folders.get(count - 1) or folders.get(-1, "")
+            return Mesh(mesh.uri, mesh.scale, folder, content=self._contents.get((folder, mesh.uri)))
 
         for cell, body in writes.items():
             if cell[0] == BODIES and isinstance(body, Body) and meshes_of(body):
-                placed = map_meshes(body, place) if folders else body
+                placed = map_meshes(body, place) if folders or self._contents else body
                 writes[cell] = restrict_meshes(placed, self._root, f"{self._source}, body {cell[1]}")
 
     def _reads(self, given: ReadsValue | None) -> Reads:

@@ -330,7 +330,7 @@ def schema() -> dict[str, Any]:
     limits on size and work, and the hash.
     """
     content = msgspec.json.schema(Document)
-    for name in ("folder", "root"):  # parts of a mesh in memory
+    for name in ("folder", "root", "content"):  # parts of a mesh in memory
         del content["$defs"]["Mesh"]["properties"][name]
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

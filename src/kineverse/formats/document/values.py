@@ -138,7 +138,7 @@ def map_meshes(body: Body, change: Callable[[Mesh], Mesh]) -> Body:
 
 def without_folders(body: Body) -> Body:
     """Return a body whose meshes know nothing of the folders of this machine."""
-    if not any(mesh.folder or mesh.root is not None for mesh in meshes_of(body)):
+    if not any(mesh.folder or mesh.root is not None or mesh.content for mesh in meshes_of(body)):
         return body
     return map_meshes(body, lambda mesh: Mesh(mesh.uri, mesh.scale))
 
@@ -211,8 +211,8 @@ def _decode_frame(name: str, given: structs.FrameValue, graph: NodeGraph, names:
 
 def _decode_body(name: str, given: Body, graph: NodeGraph, names: Names) -> Body:
     for mesh in meshes_of(given):
-        if mesh.folder or mesh.root is not None:
-            raise InvalidDocumentError(f"the mesh {mesh.uri[:60]!r} has an unknown key, folder or root")
+        if mesh != Mesh(mesh.uri, mesh.scale) or mesh.root is not None or mesh.content is not None:
+            raise InvalidDocumentError(f"the mesh {mesh.uri[:60]!r} has more than a uri and a scale")
     return given
 
 

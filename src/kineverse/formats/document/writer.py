@@ -10,6 +10,7 @@ from typing import Any
 from kineverse._runtime import no_collection
 from kineverse.errors import FormatError, UnknownNameError, suggest
 from kineverse.formats.files import replace_file
+from kineverse.formats.resources import files_of, measure_content
 from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.model_view import ModelView
@@ -22,6 +23,7 @@ from .budget import InvalidDocumentError
 from .node_table import NodeTable
 from .opaque_operation import OpaqueOperation
 from .parameters import document_kind, encode_parameter, operation_parameters
+from .structs import Resource
 from .traces import encode_queries
 from .values import encode_writes, meshes_of
 
@@ -56,8 +58,15 @@ def write_document(model: ModelView, target: Path) -> None:
     replace_file(target, content)
 
 
-def to_json(model: ModelView) -> str:
+def to_json(model: ModelView, *, resources: bool = False) -> str:
     """Return a model as the text of a document; equal for models made by the same operations.
+
+    Parameters
+    ----------
+    model
+        Model or snapshot.
+    resources
+        True to add SHA-256 and size of each mesh and texture that is found, see :func:`.add_resolver`.
 
     Raises
     ------
@@ -65,16 +74,18 @@ def to_json(model: ModelView) -> str:
         For content that a document cannot carry.
     """
     entries = _entries(model)
-    return encoding.print_document(_blobs(entries), folders=_folders(entries))
+    return encoding.print_document(_blobs(entries), **_beside(entries, resources))
 
 
-def to_bytes(model: ModelView) -> bytes:
+def to_bytes(model: ModelView, *, resources: bool = False) -> bytes:
     """Return a model as a document in msgpack, as in ``.kv.msgpack`` files; equal for equal models.
 
     Parameters
     ----------
     model
         Model or snapshot.
+    resources
+        True to add SHA-256 and size of each mesh and texture that is found, see :func:`.add_resolver`.
 
     Raises
     ------
@@ -82,7 +93,7 @@ def to_bytes(model: ModelView) -> bytes:
         For content that a document cannot carry.
     """
     entries = _entries(model)
-    return encoding.pack_document(_blobs(entries), folders=_folders(entries))
+    return encoding.pack_document(_blobs(entries), **_beside(entries, resources))
 
 
 def document_hash(model: ModelView) -> str:
@@ -239,6 +250,24 @@ def _find_trace(entry: HistoryEntry, cells: dict[Cell, Any]) -> Trace | str:
         return record_trace(entry.operation, before, entry.writes)
     except UntraceableError as error:
         return str(error)
+
+
+def _beside(entries: Sequence[HistoryEntry], resources: bool) -> dict[str, Any]:
+    """Return the members of a document that are no part of its content."""
+    return {"folders": _folders(entries), "resources": _resources(entries, resources)}
+
+
+def _resources(entries: Sequence[HistoryEntry], measured: bool) -> tuple[Resource, ...]:
+    """Return the contents of files that are known, or measured, each address once."""
+    result: dict[tuple[str, str], Resource] = {}
+    for entry in entries:
+        for (kind, _), body in entry.writes.items():
+            for file in files_of(body) if kind == BODIES else ():
+                known = measure_content(file) if measured else file.content
+                if known is not None:
+                    resource = Resource(file.uri, known[0], known[1], file.folder)
+                    result.setdefault((file.folder, file.uri), resource)
+    return tuple(result.values())
 
 
 def _folders(entries: Sequence[HistoryEntry]) -> dict[str, dict[str, tuple[int, ...]]]:
