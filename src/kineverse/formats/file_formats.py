@@ -26,7 +26,7 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             FileFormat(
                 name=f"document ({suffix})",
                 suffixes=(suffix,),
-                read=f"{formats}.document.reader:read_file",
+                read=f"{formats}.document.reader:document_entries",
                 written=(suffix,),
                 write=f"{formats}.document.writer:write_document",
                 exact=True,

@@ -82,13 +82,7 @@ def _files_of(shape: Shape) -> Iterator[Mesh]:
 
 
 def fetch_mesh(mesh: Mesh) -> Path | None:
-    """Return a file with the content of a mesh, fetched by its digest; None if no resolver has it.
-
-    Raises
-    ------
-    FormatError
-        If what a resolver returns is other content.
-    """
+    """Return a file with the content of a mesh, fetched by its digest; None if no resolver has it."""
     if mesh.content is None:
         return None
     sha256, size = mesh.content

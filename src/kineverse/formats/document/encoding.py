@@ -39,13 +39,7 @@ _PARSE_ENVELOPE = msgspec.json.Decoder(Envelope).decode
 
 
 def make_blob(operation: dict[str, Any]) -> bytes:
-    """Return the blob of an encoded operation, in canonical form.
-
-    Raises
-    ------
-    InvalidDocumentError
-        For content that a reader would refuse.
-    """
+    """Return the blob of an encoded operation, in canonical form."""
     try:
         return _PACK(_UNPACK(_PACK(operation)))
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
@@ -126,13 +120,7 @@ def _refuse_envelope(content: bytes, is_text: bool, error: Exception) -> NoRetur
 
 
 def read_operation(raw: bytes, is_text: bool) -> tuple[OperationValue, bytes]:
-    """Return an operation and its blob, from its part of a document.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If it is none, or not in canonical form.
-    """
+    """Return an operation and its blob, from its part of a document."""
     try:
         operation: OperationValue = (_PARSE if is_text else _UNPACK)(raw)
         blob = _PACK(operation)

@@ -275,13 +275,7 @@ def _floats(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def encode_number(value: Any) -> float | str:
-    """Encode a number; infinities are texts.
-
-    Raises
-    ------
-    FormatError
-        For anything else, and for NaN.
-    """
+    """Encode a number; infinities are texts."""
     try:
         result = float(value) if isinstance(value, float | int) else float(value.item())
     except OverflowError:

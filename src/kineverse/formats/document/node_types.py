@@ -91,13 +91,7 @@ _STEPS_OF_MOTION = 6  # CasADi's steps for the matrix of a rotation or translati
 
 
 def read_nodes(graph: NodeGraph, nodes: tuple[structs.AnyNode, ...]) -> None:
-    """Add the nodes of a table to the graph.
-
-    Raises
-    ------
-    InvalidDocumentError
-        With the place of the node.
-    """
+    """Add the nodes of a table to the graph."""
     for node in nodes:
         try:
             _READERS[type(node)](graph, node)

@@ -79,7 +79,7 @@ def _operations(entries: list[HistoryEntry]) -> list[tuple[str, OpaqueOperation]
     return [(e.tag, e.operation) for e in entries if isinstance(e.operation, OpaqueOperation)]
 
 
-def read_file(file: FileContent) -> list[HistoryEntry]:
+def document_entries(file: FileContent) -> list[HistoryEntry]:
     """Return the operations of a ``.kv.json`` or ``.kv.msgpack`` file, with what they read and wrote."""
     is_text = not file.path.name.endswith(".kv.msgpack")
     return _Document(str(file.path), file.prefix, file.root).read(file.content, is_text)

@@ -259,7 +259,7 @@ class ArticulationValue(_Part, frozen=True):
 
 
 class WritesValue(_Part, frozen=True):
-    """What an operation writes, by kind and name."""
+    """Writes of an operation, by kind and name."""
 
     frames: dict[str, FrameValue] = field(default_factory=dict)
     bodies: dict[str, Body] = field(default_factory=dict)

@@ -45,13 +45,7 @@ _INTEGER = re.compile("-?[0-9]{1,3011}")
 
 
 def encode_writes(tag: str, writes: Mapping[Cell, Any], ref: Ref) -> dict[str, dict[str, Any]]:
-    """Encode the writes of an operation.
-
-    Raises
-    ------
-    FormatError
-        For what a document cannot carry, with its path and the tag of the operation.
-    """
+    """Encode the writes of an operation."""
     kinds: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
     for (kind, name), value in writes.items():
         try:
@@ -177,13 +171,7 @@ class Names:
 def decode_writes(
     given: structs.WritesValue, graph: NodeGraph, names: Names, is_trace: bool = False
 ) -> Iterator[tuple[Cell, Any]]:
-    """Yield the writes of an operation or of its trace, in the order of kinds.
-
-    Raises
-    ------
-    InvalidDocumentError
-        With kind and name.
-    """
+    """Yield the writes of an operation or of its trace, in the order of kinds."""
     for kind, decode in _DECODERS.items():
         for name, value in getattr(given, kind).items():
             try:
