@@ -10,7 +10,7 @@ from jsonschema import Draft202012Validator
 
 import kineverse as kv
 from kineverse.formats.document import read_operations, schema, to_json
-from kineverse.formats.document.node_types import NODE_TYPES
+from kineverse.formats.document.structs import NODES
 from kineverse.model.operation import KINDS
 
 SCHEMA = schema()
@@ -47,7 +47,7 @@ def test_schema_lists_the_names_of_the_reader() -> None:
     """Both ways: nothing is only here, nothing only there."""
     operation = DEFINITIONS["OperationValue"]["properties"]
     nodes = [DEFINITIONS[one["$ref"].rpartition("/")[2]] for one in operation["nodes"]["items"]["anyOf"]]
-    assert {node["prefixItems"][0]["enum"][0] for node in nodes} == set(NODE_TYPES)
+    assert {node["prefixItems"][0]["enum"][0] for node in nodes} == set(NODES)
     assert list(DEFINITIONS["WritesValue"]["properties"]) == list(KINDS)
     assert set(DEFINITIONS["Mesh"]["properties"]) == {"kind", "uri", "scale"}
 

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
+from msgspec import Struct
 
 from kineverse.errors import KineverseError
 from kineverse.expressions import layout
@@ -24,64 +25,24 @@ from kineverse.model.traces import ReadNode
 from kineverse.spatial import X, Y, Z, rotation_about, translation_along
 from kineverse.symbols import Symbol
 
-from . import structs
 from .budget import COST_OF_STEP, MAX_NORM, MAX_PIECES, InvalidDocumentError
 from .node_graph import NodeGraph
+from .structs import NODES, AnyNode
 
-UNARY: dict[str, int] = {
-    "neg": ca.OP_NEG,
-    "exp": ca.OP_EXP,
-    "log": ca.OP_LOG,
-    "expm1": ca.OP_EXPM1,
-    "log1p": ca.OP_LOG1P,
-    "sqrt": ca.OP_SQRT,
-    "square": ca.OP_SQ,
-    "twice": ca.OP_TWICE,
-    "inv": ca.OP_INV,
-    "sin": ca.OP_SIN,
-    "cos": ca.OP_COS,
-    "tan": ca.OP_TAN,
-    "arcsin": ca.OP_ASIN,
-    "arccos": ca.OP_ACOS,
-    "arctan": ca.OP_ATAN,
-    "sinh": ca.OP_SINH,
-    "cosh": ca.OP_COSH,
-    "tanh": ca.OP_TANH,
-    "arcsinh": ca.OP_ASINH,
-    "arccosh": ca.OP_ACOSH,
-    "arctanh": ca.OP_ATANH,
-    "erf": ca.OP_ERF,
-    "abs": ca.OP_FABS,
-    "sign": ca.OP_SIGN,
-    "floor": ca.OP_FLOOR,
-    "ceil": ca.OP_CEIL,
-    "not": ca.OP_NOT,
-}
+_UNARY = """neg exp log expm1 log1p sqrt square=SQ twice inv sin cos tan arcsin=ASIN arccos=ACOS arctan=ATAN
+    sinh cosh tanh arcsinh=ASINH arccosh=ACOSH arctanh=ATANH erf abs=FABS sign floor ceil not"""
+# if_else_zero is b where a holds, else 0, even if b is NaN.
+_BINARY = """add sub mul div pow constpow arctan2=ATAN2 hypot copysign fmod remainder min=FMIN max=FMAX
+    lt le eq ne and or if_else_zero"""
 
-BINARY: dict[str, int] = {
-    "add": ca.OP_ADD,
-    "sub": ca.OP_SUB,
-    "mul": ca.OP_MUL,
-    "div": ca.OP_DIV,
-    "pow": ca.OP_POW,
-    "constpow": ca.OP_CONSTPOW,
-    "arctan2": ca.OP_ATAN2,
-    "hypot": ca.OP_HYPOT,
-    "copysign": ca.OP_COPYSIGN,
-    "fmod": ca.OP_FMOD,
-    "remainder": ca.OP_REMAINDER,
-    "min": ca.OP_FMIN,
-    "max": ca.OP_FMAX,
-    "lt": ca.OP_LT,
-    "le": ca.OP_LE,
-    "eq": ca.OP_EQ,
-    "ne": ca.OP_NE,
-    "and": ca.OP_AND,
-    "or": ca.OP_OR,
-    # b where a holds, else 0, even if b is NaN.
-    "if_else_zero": ca.OP_IF_ELSE_ZERO,
-}
 
+def _codes(names: str) -> dict[str, int]:
+    """Return CasADi's codes by our names, of which some are those of numpy."""
+    pairs = (pair.partition("=") for pair in names.split())
+    return {name: getattr(ca, f"OP_{other or name.upper()}") for name, _, other in pairs}
+
+
+UNARY, BINARY = _codes(_UNARY), _codes(_BINARY)
 ELEMENTARY_NAMES: dict[int, str] = {code: name for name, code in (*UNARY.items(), *BINARY.items())}
 
 
@@ -90,7 +51,7 @@ _UNIT_TOLERANCE = 1e-9  # largest difference of the length of a direction from 1
 _STEPS_OF_MOTION = 6  # CasADi's steps for the matrix of a rotation or translation, at most
 
 
-def read_nodes(graph: NodeGraph, nodes: tuple[structs.AnyNode, ...]) -> None:
+def read_nodes(graph: NodeGraph, nodes: tuple[AnyNode, ...]) -> None:
     """Add the nodes of a table to the graph."""
     for node in nodes:
         try:
@@ -110,7 +71,7 @@ def _make_constant(value: float, sign: float) -> Expression:
     return from_casadi(ca.SX(value), (), NO_NODES)
 
 
-def _constant(graph: NodeGraph, node: structs.ConstantNode) -> None:
+def _constant(graph: NodeGraph, node: Any) -> None:
     value = decode_number(node.value)
     made = _make_constant(value, math.copysign(1.0, value))
     graph.add(made.sx, (), 0, made)
@@ -123,17 +84,17 @@ def check_name(name: str) -> str:
     return name
 
 
-def _symbol(graph: NodeGraph, node: structs.SymbolNode) -> None:
+def _symbol(graph: NodeGraph, node: Any) -> None:
     symbol = Symbol(graph.before + check_name(node.path), node.order, node.role)
     graph.add(symbol.sx, (), 0, symbol)
 
 
-def _parameter(graph: NodeGraph, node: structs.ParameterNode) -> None:
+def _parameter(graph: NodeGraph, node: Any) -> None:
     symbol = Symbol(graph.before + check_name(node.path), 0, "parameter", decode_number(node.value))
     graph.add(symbol.sx, (), 0, symbol)
 
 
-def _elementary(graph: NodeGraph, node: structs.ElementaryNode) -> None:
+def _elementary(graph: NodeGraph, node: Any) -> None:
     sx, depths, function = graph.sx, graph.depths, node.function
     refs = [graph.check_scalar_ref(ref) for ref in node.arguments]
     if len(refs) != (2 if function in BINARY else 1):
@@ -153,7 +114,7 @@ def _elementary(graph: NodeGraph, node: structs.ElementaryNode) -> None:
     graph.add(result, (), depth)
 
 
-def _element(graph: NodeGraph, node: structs.ElementNode) -> None:
+def _element(graph: NodeGraph, node: Any) -> None:
     place = graph.check_ref(node.array)
     shape = graph.shapes[place]
     size = math.prod(shape)
@@ -165,7 +126,7 @@ def _element(graph: NodeGraph, node: structs.ElementNode) -> None:
     graph.add(graph.graph_of(place)[row, column], (), graph.depths[place])
 
 
-def _matrix(graph: NodeGraph, node: structs.MatrixNode) -> None:
+def _matrix(graph: NodeGraph, node: Any) -> None:
     shape, refs = graph.shape(node.shape), node.elements
     if math.prod(shape) != len(refs):
         raise InvalidDocumentError(f"{len(refs)} elements do not fill the shape {shape}")
@@ -178,7 +139,7 @@ def _matrix(graph: NodeGraph, node: structs.MatrixNode) -> None:
     graph.add(sx, shape, max((graph.depths[p] for p in places), default=0))
 
 
-def _rotation(graph: NodeGraph, node: structs.RotationNode) -> None:
+def _rotation(graph: NodeGraph, node: Any) -> None:
     if node.axis not in _AXES:
         raise InvalidDocumentError("a rotation is about one of the axes x, y and z")
     place = graph.check_scalar_ref(node.angle)
@@ -186,7 +147,7 @@ def _rotation(graph: NodeGraph, node: structs.RotationNode) -> None:
     graph.steps += _STEPS_OF_MOTION
 
 
-def _translation(graph: NodeGraph, node: structs.TranslationNode) -> None:
+def _translation(graph: NodeGraph, node: Any) -> None:
     if not abs(math.hypot(*node.direction) - 1) <= _UNIT_TOLERANCE:
         raise InvalidDocumentError("the direction of a translation is of length 1")
     place = graph.check_scalar_ref(node.distance)
@@ -194,7 +155,7 @@ def _translation(graph: NodeGraph, node: structs.TranslationNode) -> None:
     graph.steps += _STEPS_OF_MOTION
 
 
-def _augment(graph: NodeGraph, node: structs.AugmentNode) -> None:
+def _augment(graph: NodeGraph, node: Any) -> None:
     keys = [key for key, _ in graph.pairs(node.entries, 1)]
     if keys != sorted(keys, key=lambda symbol: symbol.sort_key):
         raise InvalidDocumentError("the entries are not sorted by path and order")
@@ -202,13 +163,13 @@ def _augment(graph: NodeGraph, node: structs.AugmentNode) -> None:
     graph.add_alike(Augment, refs, (node.replace, node.heuristic, *keys))
 
 
-def _less(graph: NodeGraph, node: structs.LessNode) -> None:
+def _less(graph: NodeGraph, node: Any) -> None:
     if not node.contrast > 0:
         raise InvalidDocumentError("the contrast is a positive number")
     graph.add_alike(Less, (node.left, node.right), (node.contrast,))
 
 
-def _norm(graph: NodeGraph, node: structs.NormNode) -> None:
+def _norm(graph: NodeGraph, node: Any) -> None:
     shape = graph.shapes[graph.check_ref(node.argument)]
     if len(shape) != 1 or not shape[0]:
         raise InvalidDocumentError(f"the norm is that of a vector, not of shape {shape}")
@@ -217,7 +178,7 @@ def _norm(graph: NodeGraph, node: structs.NormNode) -> None:
     graph.add_opaque(Norm, (node.argument,), (), ())
 
 
-def _piecewise(graph: NodeGraph, node: structs.PiecewiseNode) -> None:
+def _piecewise(graph: NodeGraph, node: Any) -> None:
     options = check_pieces(node.periodic, node.knots, list(node.pieces))
     # Each element evaluates the whole table.
     work = sum(map(len, node.pieces)) * math.prod(graph.shapes[graph.check_ref(node.argument)])
@@ -227,7 +188,7 @@ def _piecewise(graph: NodeGraph, node: structs.PiecewiseNode) -> None:
     graph.add_alike(Piecewise, (node.argument,), options)
 
 
-def _carried(graph: NodeGraph, node: structs.CarriedNode) -> None:
+def _carried(graph: NodeGraph, node: Any) -> None:
     coordinate = graph.symbol(node.coordinate)
     rows = {}
     for key, row in node.rates:
@@ -242,7 +203,7 @@ def _carried(graph: NodeGraph, node: structs.CarriedNode) -> None:
     graph.add_opaque(Carried, (node.coordinate,), (), (Rates(rows).closure(coordinate),), inside)
 
 
-def _composed(graph: NodeGraph, node: structs.ComposedNode) -> None:
+def _composed(graph: NodeGraph, node: Any) -> None:
     if not isinstance(graph.owner(graph.expression(node.coordinate)), (Carried, Composed)):
         raise InvalidDocumentError(f"node {node.coordinate} should be a carried coordinate")
     pairs = graph.pairs(node.replacements, 0)
@@ -252,12 +213,12 @@ def _composed(graph: NodeGraph, node: structs.ComposedNode) -> None:
     graph.add_opaque(Composed, refs, (), tuple(key for key, _ in pairs))
 
 
-def _dependent(graph: NodeGraph, node: structs.DependentNode) -> None:
+def _dependent(graph: NodeGraph, node: Any) -> None:
     value = graph.check_scalar_ref(node.value)
     graph.add_opaque(Dependent, (value,), (), (graph.symbol(node.coordinate),))
 
 
-def _implicit(graph: NodeGraph, node: structs.ImplicitNode) -> None:
+def _implicit(graph: NodeGraph, node: Any) -> None:
     unknowns = tuple(map(graph.symbol, node.unknowns))
     inputs = tuple(map(graph.symbol, node.inputs))
     residual, seed = graph.expression(node.residual), graph.expression(node.seed)
@@ -304,7 +265,7 @@ def _arguments_of(node: Node) -> tuple[Expression, ...]:
     return node.arguments
 
 
-def _read(graph: NodeGraph, node: structs.ReadNodeValue) -> None:
+def _read(graph: NodeGraph, node: Any) -> None:
     path = tuple((graph.symbol(ref, 1), trends) for ref, trends in node.path)
     shape = graph.shape(node.shape)
     graph.check_elements(shape)
@@ -312,32 +273,34 @@ def _read(graph: NodeGraph, node: structs.ReadNodeValue) -> None:
     graph.has_read_nodes = True
 
 
-_READERS: Mapping[type[structs.NodeValue], Callable[[NodeGraph, Any], None]] = MappingProxyType(
+_READERS: Mapping[type[Struct], Callable[[NodeGraph, Any], None]] = MappingProxyType(
     {
-        structs.ConstantNode: _constant,
-        structs.SymbolNode: _symbol,
-        structs.ParameterNode: _parameter,
-        structs.ElementaryNode: _elementary,
-        structs.ElementNode: _element,
-        structs.MatrixNode: _matrix,
-        structs.RotationNode: _rotation,
-        structs.TranslationNode: _translation,
-        structs.AugmentNode: _augment,
-        structs.LessNode: _less,
-        structs.NotNode: lambda graph, node: graph.add_alike(Not, (node.argument,)),
-        structs.AndNode: lambda graph, node: graph.add_alike(And, node.arguments),
-        structs.OrNode: lambda graph, node: graph.add_alike(Or, node.arguments),
-        structs.SelectNode: lambda graph, node: graph.add_alike(
-            Select, (node.condition, node.chosen, node.otherwise)
-        ),
-        structs.ExtremumNode: lambda graph, node: graph.add_alike(Extremum, node.arguments, (node.which,)),
-        structs.NormNode: _norm,
-        structs.PiecewiseNode: _piecewise,
-        structs.CarriedNode: _carried,
-        structs.ComposedNode: _composed,
-        structs.DependentNode: _dependent,
-        structs.ImplicitNode: _implicit,
-        structs.ReadNodeValue: _read,
+        NODES[tag]: reader
+        for tag, reader in {
+            "constant": _constant,
+            "symbol": _symbol,
+            "parameter": _parameter,
+            "elementary": _elementary,
+            "element": _element,
+            "matrix": _matrix,
+            "rotation": _rotation,
+            "translation": _translation,
+            "augment": _augment,
+            "less": _less,
+            "not": lambda graph, node: graph.add_alike(Not, (node.argument,)),
+            "and": lambda graph, node: graph.add_alike(And, node.arguments),
+            "or": lambda graph, node: graph.add_alike(Or, node.arguments),
+            "select": lambda graph, node: graph.add_alike(
+                Select, (node.condition, node.chosen, node.otherwise)
+            ),
+            "extremum": lambda graph, node: graph.add_alike(Extremum, node.arguments, (node.which,)),
+            "norm": _norm,
+            "piecewise": _piecewise,
+            "carried": _carried,
+            "composed": _composed,
+            "dependent": _dependent,
+            "implicit": _implicit,
+            "read": _read,
+        }.items()
     }
 )
-NODE_TYPES = tuple(node.__struct_config__.tag for node in _READERS)

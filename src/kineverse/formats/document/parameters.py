@@ -21,31 +21,10 @@ from kineverse import articulations as a
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.loops import CloseLoop, LoopConstraint
+from kineverse.model import basic_operations as basic
+from kineverse.model import body
 from kineverse.model.articulation import Articulation
-from kineverse.model.basic_operations import (
-    AddFrame,
-    Attach,
-    Constrain,
-    Override,
-    SetBody,
-    SetData,
-    SetHome,
-    SetRate,
-    SoftLimits,
-)
-from kineverse.model.body import (
-    Body,
-    Box,
-    Capsule,
-    Cone,
-    Cylinder,
-    Ellipsoid,
-    Inertia,
-    Mesh,
-    Pose,
-    Shape,
-    Sphere,
-)
+from kineverse.model.body import Mesh, Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
 from kineverse.model.operation import Cell, Operation
@@ -80,8 +59,8 @@ class UnsupportedParameter:
 
 
 _OPERATIONS: tuple[type[Operation], ...] = (
-    *(AddFrame, Attach, Constrain, SetRate, SetData, SetBody, SetHome, SoftLimits, Override),
-    *(CloseLoop, LoopConstraint),
+    *(basic.AddFrame, basic.Attach, basic.Constrain, basic.SetRate, basic.SetData, basic.SetBody),
+    *(basic.SetHome, basic.SoftLimits, basic.Override, CloseLoop, LoopConstraint),
     *(a.Fixed, a.Revolute, a.Continuous, a.Prismatic, a.Screw, a.Cylindrical),
     *(a.Planar, a.Universal, a.Ball, a.Floating, a.Gearbox, a.RackAndPinion, a.Cam),
     *(a.OmniBase, a.DifferentialDrive, a.Ackermann, a.Mecanum),
@@ -98,16 +77,8 @@ RECORDS: Mapping[str, type] = MappingProxyType(
         "Frame": Frame,
         "Constraint": Constraint,
         "Articulation": Articulation,
-        "Body": Body,
-        "Shape": Shape,
-        "Inertia": Inertia,
-        "Box": Box,
-        "Capsule": Capsule,
-        "Cone": Cone,
-        "Cylinder": Cylinder,
-        "Ellipsoid": Ellipsoid,
-        "Mesh": Mesh,
-        "Sphere": Sphere,
+        **{kind.__name__: kind for kind in (body.Body, body.Shape, body.Inertia, body.Box, body.Capsule)},
+        **{kind.__name__: kind for kind in (body.Cone, body.Cylinder, body.Ellipsoid, Mesh, body.Sphere)},
         **OPERATIONS,
     }
 )

@@ -7,7 +7,8 @@ says what the parts mean.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, Union
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType, field
@@ -22,6 +23,7 @@ VERSION: Final = 2
 Number: TypeAlias = Finite | Literal["inf", "-inf"]
 Ref: TypeAlias = Annotated[int, Meta(ge=0, lt=MAX_NODES)]
 Refs: TypeAlias = tuple[Ref, ...]
+Numbers: TypeAlias = tuple[Finite, ...]
 Length: TypeAlias = Annotated[int, Meta(ge=0, le=MAX_LENGTH)]
 Count: TypeAlias = Annotated[int, Meta(ge=0, le=MAX_QUESTIONS)]
 Order: TypeAlias = Annotated[int, Meta(ge=0, le=MAX_ORDER)]
@@ -31,199 +33,46 @@ Pairs: TypeAlias = tuple[tuple[Ref, Ref], ...]  # of a symbol and an expression
 Digest: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 
-class NodeValue(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """Node of a table of expressions."""
-
-
-class ConstantNode(NodeValue, frozen=True, tag="constant"):
-    """A number."""
-
-    value: Number
-
-
-class SymbolNode(NodeValue, frozen=True, tag="symbol"):
-    """A symbol that is no parameter."""
-
-    path: str
-    order: Order
-    role: Literal["dof", "contact", "location"]
-
-
-class ParameterNode(NodeValue, frozen=True, tag="parameter"):
-    """A parameter with its default value."""
-
-    path: str
-    value: Number
-
-
-class ElementaryNode(NodeValue, frozen=True, tag="elementary"):
-    """An elementary function of scalars."""
-
-    function: str
-    arguments: Refs
-
-
-class ElementNode(NodeValue, frozen=True, tag="element"):
-    """An element of an array, in C order."""
-
-    array: Ref
-    index: Length
-
-
-class MatrixNode(NodeValue, frozen=True, tag="matrix"):
-    """An array in C order; null is a zero that is not stored."""
-
-    shape: tuple[Length, ...]
-    elements: tuple[Ref | None, ...]
-
-
-class RotationNode(NodeValue, frozen=True, tag="rotation"):
-    """A 4×4 rotation about a coordinate axis by an angle [rad]."""
-
-    axis: Vector3
-    angle: Ref
-
-
-class TranslationNode(NodeValue, frozen=True, tag="translation"):
-    """A 4×4 translation along a unit vector by a distance [m]."""
-
-    direction: Vector3
-    distance: Ref
-
-
-class AugmentNode(NodeValue, frozen=True, tag="augment"):
-    """A value with given entries of its gradient."""
-
-    value: Ref
-    replace: bool
-    heuristic: bool
-    entries: Pairs
-
-
-class LessNode(NodeValue, frozen=True, tag="less"):
-    """A continuous comparison."""
-
-    left: Ref
-    right: Ref
-    contrast: Finite
-
-
-class NotNode(NodeValue, frozen=True, tag="not"):
-    """A negation."""
-
-    argument: Ref
-
-
-class AndNode(NodeValue, frozen=True, tag="and"):
-    """A conjunction."""
-
-    arguments: Refs
-
-
-class OrNode(NodeValue, frozen=True, tag="or"):
-    """A disjunction."""
-
-    arguments: Refs
-
-
-class SelectNode(NodeValue, frozen=True, tag="select"):
-    """A choice, element by element."""
-
-    condition: Ref
-    chosen: Ref
-    otherwise: Ref
-
-
-class ExtremumNode(NodeValue, frozen=True, tag="extremum"):
-    """The smallest or largest of several values, element by element."""
-
-    which: Literal["min", "max"]
-    arguments: Annotated[Refs, Meta(min_length=2)]
-
-
-class NormNode(NodeValue, frozen=True, tag="norm"):
-    """The Euclidean norm of a vector."""
-
-    argument: Ref
-
-
-class PiecewiseNode(NodeValue, frozen=True, tag="piecewise"):
-    """A polynomial for each piece between knots."""
-
-    argument: Ref
-    periodic: bool
-    knots: tuple[Finite, ...]
-    pieces: tuple[tuple[Finite, ...], ...]
-
-
-class CarriedNode(NodeValue, frozen=True, tag="carried"):
-    """A coordinate with the table of rates that moves it."""
-
-    coordinate: Ref
-    rates: tuple[tuple[Ref, Pairs], ...]
-
-
-class ComposedNode(NodeValue, frozen=True, tag="composed"):
-    """A carried coordinate after a substitution."""
-
-    coordinate: Ref
-    replacements: Pairs
-
-
-class DependentNode(NodeValue, frozen=True, tag="dependent"):
-    """A coordinate that is an expression of others."""
-
-    value: Ref
-    coordinate: Ref
-
-
-class ImplicitNode(NodeValue, frozen=True, tag="implicit"):
-    """An implicit function, solved by Newton steps, at arguments."""
-
-    name: str
-    unknowns: Refs
-    inputs: Refs
-    residual: Ref
-    rows: tuple[Length, ...]
-    seed: Ref
-    steps: Steps
-    arguments: Refs
-    domain: tuple[tuple[Number, Number], ...]
-
-
-class ReadNodeValue(NodeValue, frozen=True, tag="read"):
-    """A part of the answer to a question, or an entry of its gradient."""
-
-    question: Count
-    part: Count
-    shape: tuple[Length, ...]
-    path: GradientSteps
-
-
-AnyNode: TypeAlias = (
-    ConstantNode
-    | SymbolNode
-    | ParameterNode
-    | ElementaryNode
-    | ElementNode
-    | MatrixNode
-    | RotationNode
-    | TranslationNode
-    | AugmentNode
-    | LessNode
-    | NotNode
-    | AndNode
-    | OrNode
-    | SelectNode
-    | ExtremumNode
-    | NormNode
-    | PiecewiseNode
-    | CarriedNode
-    | ComposedNode
-    | DependentNode
-    | ImplicitNode
-    | ReadNodeValue
-)
+_NODE_FIELDS: Mapping[str, Mapping[str, Any]] = {
+    "constant": {"value": Number},
+    "symbol": {"path": str, "order": Order, "role": Literal["dof", "contact", "location"]},
+    "parameter": {"path": str, "value": Number},
+    "elementary": {"function": str, "arguments": Refs},
+    "element": {"array": Ref, "index": Length},
+    "matrix": {"shape": tuple[Length, ...], "elements": tuple[Ref | None, ...]},
+    "rotation": {"axis": Vector3, "angle": Ref},
+    "translation": {"direction": Vector3, "distance": Ref},
+    "augment": {"value": Ref, "replace": bool, "heuristic": bool, "entries": Pairs},
+    "less": {"left": Ref, "right": Ref, "contrast": Finite},
+    "not": {"argument": Ref},
+    "and": {"arguments": Refs},
+    "or": {"arguments": Refs},
+    "select": {"condition": Ref, "chosen": Ref, "otherwise": Ref},
+    "extremum": {"which": Literal["min", "max"], "arguments": Annotated[Refs, Meta(min_length=2)]},
+    "norm": {"argument": Ref},
+    "piecewise": {"argument": Ref, "periodic": bool, "knots": Numbers, "pieces": tuple[Numbers, ...]},
+    "carried": {"coordinate": Ref, "rates": tuple[tuple[Ref, Pairs], ...]},
+    "composed": {"coordinate": Ref, "replacements": Pairs},
+    "dependent": {"value": Ref, "coordinate": Ref},
+    "implicit": {
+        **{"name": str, "unknowns": Refs, "inputs": Refs, "residual": Ref, "rows": tuple[Length, ...]},
+        **{"seed": Ref, "steps": Steps, "arguments": Refs, "domain": tuple[tuple[Number, Number], ...]},
+    },
+    "read": {"question": Count, "part": Count, "shape": tuple[Length, ...], "path": GradientSteps},
+}
+
+NODES: Mapping[str, type[Struct]] = {
+    tag: msgspec.defstruct(
+        tag, list(fields.items()), frozen=True, array_like=True, forbid_unknown_fields=True, tag=tag
+    )
+    for tag, fields in _NODE_FIELDS.items()
+}
+"""Types of nodes by name: lists of the name and the fields."""
+
+if TYPE_CHECKING:
+    AnyNode: TypeAlias = Struct
+else:
+    AnyNode = Union[tuple(NODES.values())]  # noqa: UP007
 
 
 class _Part(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
