@@ -78,7 +78,8 @@ def _files_of(shape: Shape) -> Iterator[Mesh]:
     if mesh is not None:
         yield mesh
     if shape.texture:
-        yield Mesh(shape.texture, folder="" if mesh is None else mesh.folder, root=mesh and mesh.root)
+        folder, root = ("", None) if mesh is None else (mesh.folder, mesh.root)
+        yield Mesh(shape.texture, folder=folder, root=root)
 
 
 def fetch_mesh(mesh: Mesh) -> Path | None:

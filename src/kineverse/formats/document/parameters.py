@@ -145,7 +145,7 @@ def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: in
         return {"mapping": [[inner(key), inner(item)] for key, item in value.items()]}
     if isinstance(value, OpaqueRecord):
         return {"record": [value.kind, {key: inner(item) for key, item in value.fields}]}
-    kind = type(value)
+    kind: Any = type(value)
     names = _fields(kind)
     if names is None:
         return {"unwritten": document_kind(kind)}
