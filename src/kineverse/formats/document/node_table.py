@@ -98,28 +98,32 @@ class NodeTable:
         """Return the place of an element, after those of its operands."""
         if root.op() == ca.OP_CONST:
             return self._constant(float(root))
-        places, stack, steps = self._elements, [root], 0
+        places, steps = self._elements, 0
+        goal = root.element_hash()
+        stack: list[tuple[SX, int, list[tuple[SX, int]] | None]] = [(root, goal, None)]
         while stack:
-            sx = stack[-1]
-            key = sx.element_hash()
-            if key not in places:
-                code = sx.op()
-                if code == ca.OP_CONST:
-                    places[key] = self._constant(float(sx))
-                elif code == ca.OP_PARAMETER:
-                    places[key] = self._leaf(key)
-                else:
-                    operands = [sx.dep(k) for k in range(sx.n_dep())]
-                    missing = [x for x in operands if x.element_hash() not in places]
-                    if missing:
-                        steps += 1
-                        if steps > _FEW:
-                            return self._run(root)
-                        stack.extend(reversed(missing))
-                        continue
-                    places[key] = self._elementary(code, [places[x.element_hash()] for x in operands])
-            stack.pop()
-        return places[root.element_hash()]
+            sx, key, operands = stack.pop()
+            if key in places:
+                continue
+            code = sx.op()
+            if code == ca.OP_CONST:
+                places[key] = self._constant(float(sx))
+                continue
+            if code == ca.OP_PARAMETER:
+                places[key] = self._leaf(key)
+                continue
+            if operands is None:
+                found = [sx.dep(k) for k in range(sx.n_dep())]
+                operands = [(operand, operand.element_hash()) for operand in found]
+                missing = [(operand, its, None) for operand, its in operands if its not in places]
+                if missing:
+                    steps += 1
+                    if steps > _FEW:
+                        return self._run(root)
+                    stack += [(sx, key, operands), *reversed(missing)]
+                    continue
+            places[key] = self._elementary(code, [places[its] for _, its in operands])
+        return places[goal]
 
     def _run(self, root: SX) -> int:
         """Return the place of an element by CasADi's program for it, in which memory is used again."""
