@@ -125,8 +125,6 @@ def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: in
             return encode_datum(value, ref)
         except FormatError:
             return {"unwritten": document_kind(type(value))}
-    if id(value) in written:
-        return {"written": written[id(value)]}
     if depth > MAX_DEPTH:
         return {"unwritten": document_kind(type(value))}
 
@@ -143,6 +141,9 @@ def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: in
         return {"unwritten": value.kind}
     if isinstance(value, Mapping):
         return {"mapping": [[inner(key), inner(item)] for key, item in value.items()]}
+    # Not so tuples: equal ones are one object in some programs, and several in others.
+    if id(value) in written:
+        return {"written": written[id(value)]}
     if isinstance(value, OpaqueRecord):
         return {"record": [value.kind, {key: inner(item) for key, item in value.fields}]}
     kind: Any = type(value)
