@@ -24,7 +24,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 import hypothesis_profiles
 import published_data
@@ -34,7 +34,14 @@ ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "examples"))  # living_kitchen
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
-settings.register_profile("kineverse", deadline=None, max_examples=45, derandomize=bool(os.environ.get("CI")))
+# No test depends on the load of the machine.
+settings.register_profile(
+    "kineverse",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    max_examples=45,
+    derandomize=bool(os.environ.get("CI")),
+)
 settings.register_profile(
     "thorough", settings.get_profile("kineverse"), max_examples=10 * hypothesis_profiles.USUAL
 )

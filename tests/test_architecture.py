@@ -7,7 +7,7 @@ import re
 import runpy
 import sys
 import tomllib
-from collections import Counter, defaultdict
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -17,7 +17,7 @@ import kineverse as kv
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
-from inventory.size import imports  # noqa: E402  - it is no part of the package
+from inventory.size import count_lines, find_importers, find_modules  # noqa: E402  - it is no part of the package
 
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 LARGEST, SMALLEST, MOST_FILES = 650, 100, 26
@@ -57,11 +57,8 @@ def test_the_modules_of_the_data_flow_exist() -> None:
 
 def test_modules_and_folders_have_a_good_size() -> None:
     """Large modules are divided, and small ones belong into the module that imports them."""
-    modules, importers = _modules(), defaultdict(set)
-    for name, path in modules.items():
-        for imported in {*imports(name, path, modules)} - {name}:
-            importers[imported].add(name)
-    lines = {name: len(path.read_text("utf-8").splitlines()) for name, path in modules.items()}
+    modules = _modules()
+    lines, importers = count_lines(modules), find_importers(modules)
     assert {name for name, n in lines.items() if n > LARGEST} == LARGE
     small = {
         name: importers[name]
@@ -76,11 +73,7 @@ def test_modules_and_folders_have_a_good_size() -> None:
 
 
 def _modules() -> dict[str, Path]:
-    return {
-        ".".join(path.relative_to(top).with_suffix("").parts).removesuffix(".__init__"): path
-        for top in (ROOT / "src", ROOT / "studies")
-        for path in sorted(top.rglob("*.py"))
-    }
+    return find_modules(ROOT / "src", ROOT / "studies")
 
 
 def test_the_package_does_not_import_its_studies() -> None:

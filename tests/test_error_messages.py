@@ -194,7 +194,7 @@ COMMANDS = [
     Mistake("a page of text", f"info {shlex.quote(str(ROOT / 'README.md'))}", r"reads URDF"),
     Mistake("a folder", f"info {shlex.quote(str(ROOT / 'examples'))}", r"door\.urdf"),
     Mistake("unexpanded xacro", "info robot.urdf.xacro", r"xacro"),
-    Mistake("an ending that nobody knows", "convert kitchen kitchen.stl", r"Written are .*\.urdf"),
+    Mistake("an ending that nobody knows", "convert kitchen kitchen.stl", r"Use one of .*\.urdf"),
     Mistake("a table that is not there", "fit poses.csv", r"no such file"),
     Mistake("a part that nobody saw", f"fit {shlex.quote(str(ROOT / 'examples' / 'poses.csv'))} --child dor", r"Did you mean 'door'"),
     Mistake("an experiment that nobody made", "reproduce fig33", r"Did you mean 'fig3'"),

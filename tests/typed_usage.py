@@ -89,6 +89,8 @@ try:
     model.fk("dor")
 except kv.errors.UnknownNameError as error:
     base: kv.KineverseError = error
+with kv.follow(model, lambda snapshot: kv.compile(snapshot.fk("door")), frames=["door"]) as follower:
+    assert_type(follower.value, kv.compilation.CompiledFunction[Numbers])
 scene: kv.geometry.Scene
 tracker: kv.estimation.Tracker
 goal = kv.control.Goal(a, 0.5, weight=2.0)

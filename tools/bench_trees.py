@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 LEAST_SECONDS = 0.25
 """Time for which a workload is repeated in one process."""
@@ -101,11 +102,11 @@ def workloads() -> Iterator[tuple[str, Callable[[], object]]]:
     yield "violations", lambda: [kitchen.violations(state) for _ in range(10)]
 
 
-def _fresh_load(kv: object, name: str) -> object:
+def _fresh_load(kv: Any, name: str) -> object:
     from kineverse.formats import loader
 
     loader._REMEMBERED.clear()
-    return kv.load(name)  # type: ignore[attr-defined]
+    return kv.load(name)
 
 
 def _until_compiled(work: Callable[[], object], seconds: float = 60.0) -> None:
@@ -117,11 +118,11 @@ def _until_compiled(work: Callable[[], object], seconds: float = 60.0) -> None:
         work()
 
 
-def _edit(kv: object, model: object) -> None:
-    with model.edit() as edit:  # type: ignore[attr-defined]
-        edit.add_frame("bench/frame", parent="world", transform=kv.translation(0, 0, 1))  # type: ignore[attr-defined]
-    with model.edit() as edit:  # type: ignore[attr-defined]
-        edit.remove(list(model.history.tags)[-1])  # type: ignore[attr-defined]
+def _edit(kv: Any, model: Any) -> None:
+    with model.edit() as edit:
+        edit.add_frame("bench/frame", parent="world", transform=kv.translation(0, 0, 1))
+    with model.edit() as edit:
+        edit.remove(list(model.history.tags)[-1])
 
 
 def commands() -> Iterator[tuple[str, list[str]]]:

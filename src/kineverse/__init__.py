@@ -54,7 +54,12 @@ if TYPE_CHECKING:
     from kineverse.expressions.piecewise import spline as spline
     from kineverse.formats import load as load, shipped_models as shipped_models
     from kineverse.loops import CloseLoop as CloseLoop
-    from kineverse.model import Constraint as Constraint, Model as Model, Operation as Operation
+    from kineverse.model import (
+        Constraint as Constraint,
+        Model as Model,
+        Operation as Operation,
+        follow as follow,
+    )
     from kineverse.spatial import (
         axis_angle as axis_angle,
         inverse as inverse,

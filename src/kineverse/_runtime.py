@@ -1,10 +1,11 @@
-"""Threads and garbage: locks of objects that several threads use, pauses of the garbage collector."""
+"""Threads, garbage and limits: locks of objects, pauses of the garbage collector, bounds of a process."""
 
 from __future__ import annotations
 
 import _thread
 import gc
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
@@ -58,3 +59,15 @@ def one_at_a_time(
             return method(self, *args, **options)
 
     return alone
+
+
+def limit_resources(memory: int, cpu_seconds: int | None = None) -> None:
+    """Limit the address space [bytes] and the CPU time [s] of this process, where the system can."""
+    try:
+        import resource  # missing on Windows
+    except ImportError:
+        return
+    for kind, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, cpu_seconds)):
+        if most is not None:
+            with suppress(ValueError, OSError):
+                resource.setrlimit(kind, (most, most))

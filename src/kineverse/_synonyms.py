@@ -69,9 +69,12 @@ EDIT_METHODS = (
     "close_loop",
     "constrain",
     "insert",
+    "net",
     "remove",
     "replace",
+    "savepoint",
     "set_rate",
+    "undo",
     "write",
 )
 

@@ -51,6 +51,21 @@ def test_command_of_another_distribution_runs(run, add_command):
     assert "'greet'" in err
 
 
+def test_command_of_others_may_have_an_option_v(run, add_command):
+    add_command("greet", GREETING.replace('"name"', '"-v", dest="name"'))
+    assert run("greet", "-v", "Ada", "--verbose") == (3, "Hello Ada\n", "")
+
+
+def test_damaged_entry_points_of_others_leave_the_help(run, add_command, tmp_path):
+    add_command("greet", GREETING)
+    next(tmp_path.glob("*/entry_points.txt")).write_text("[kineverse.commands]\nno sign here\n", "utf-8")
+    status, out, err = run("--help")
+    assert status == 0
+    assert "info" in out
+    assert len(err.splitlines()) == 1
+    assert "entry points" in err
+
+
 def test_help_lists_commands_of_others_without_importing_them(run, add_command):
     add_command("greet", "raise SystemExit('imported')")
     for words in (["--help"], []):
@@ -61,7 +76,11 @@ def test_help_lists_commands_of_others_without_importing_them(run, add_command):
 
 
 @pytest.mark.parametrize(
-    "text", ["raise OSError('broken\\ntwice')", "import nowhere_at_all", "=", None, "HELP = 'x'"]
+    "text",
+    [
+        *("raise OSError('broken\\ntwice')", "import nowhere_at_all", "=", None, "HELP = 'x'"),
+        *("raise SystemExit('imported')", GREETING.replace('"greet somebody"', "None")),
+    ],
 )
 def test_broken_command_of_others_is_one_line_and_breaks_no_other(run, add_command, text):
     add_command("greet", text)

@@ -175,7 +175,7 @@ def test_a_file_is_not_converted_into_itself(run, robot, tmp_path):
     for target in (robot, "./robot.urdf", "link.urdf", "twin.urdf"):
         status, out, err = run("robot.urdf", target, "--force")
         assert (status, out) == (2, "")
-        assert "is what is read" in err
+        assert "is the input" in err
     assert robot.read_bytes() == before
 
 

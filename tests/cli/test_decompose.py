@@ -120,7 +120,7 @@ def test_a_model_that_cannot_be_read_does_not_stop_the_others(run):
         (("cube.stl", "--timeout", "nan"), "--timeout"),
         (("cube.stl", "--memory", "-1"), "--memory"),
         (("cube.stl", "--list"), "whole cache"),
-        (("--list", "--clear"), "one at a time"),
+        (("--list", "--clear"), "give one of them"),
     ],
 )
 def test_decompose_refuses_invalid_arguments_in_one_line(run, words, message):

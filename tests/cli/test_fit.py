@@ -234,7 +234,7 @@ def test_thin_reduces_the_number_of_poses(door, capsys):
         ("0 0 0\n0 0 1\n", ["--noise", "3deg"], "write two positive numbers"),
         ("0 0 0\n0 0 1\n", ["--noise", "3mm,2cm"], "write two positive numbers"),
         ("0 0 0\n0 0 1\n", ["--noise", "0"], "write two positive numbers"),
-        ("0 0 0 0 0 0 1\n0 0 1 0 0 0 1\n", ["--noise", "3mm"], "poses have two"),
+        ("0 0 0 0 0 0 1\n0 0 1 0 0 0 1\n", ["--noise", "3mm"], "poses has two values"),
         ("0 0 0\n0 0 1\n", ["--families", "hinge"], "There is no family 'hinge'"),
         ("0 0 0\n0 0 1\n", ["--parent", "cupboard"], "names no parts"),
         ("0 0 0\n0 0 1\n", ["--thin", "1"], "takes at least two"),

@@ -224,7 +224,7 @@ def test_other_coordinates_are_set_at_the_start(run, asked):
             ["shelf_drawers", *HSR[:2], "--what", "shelf_drawers/uper_drawer"],
             "Did you mean 'shelf_drawers/upper",
         ),
-        (["shelf_drawers", *HSR[:2], "--what", "hsr/arm_lift_joint"], "of the robot itself"),
+        (["shelf_drawers", *HSR[:2], "--what", "hsr/arm_lift_joint"], "is a coordinate of the robot"),
         (["shelf_drawers", "--robot", "hsr@0,0,0", *HSR[2:]], "begins in contact: shelf_drawers/"),
         (["shelf_drawers", *HSR, "--from", "2m"], "--from 2: 'shelf_drawers/upper_drawer' is between 0 and"),
         (["shelf_drawers", *HSR, "--to", "far"], "'far' is not a value"),
@@ -252,7 +252,7 @@ def test_other_coordinates_are_set_at_the_start(run, asked):
         (["box.urdf", "--robot", "arm.urdf@1,0", "--what", "drawer"], "a place is X,Y,ANGLE"),
         (["box.urdf", "--robot", "hsr@1,0,0.5,0", "--what", "drawer"], "stands on the floor"),
         (["box.urdf", "--robot", "hsr", "--base", "omni", "--what", "drawer"], "moves already"),
-        (["arm.urdf", "--robot", "box.urdf", "--what", "box/drawer"], "of the robot itself"),
+        (["arm.urdf", "--robot", "box.urdf", "--what", "box/drawer"], "is a coordinate of the robot"),
     ],
 )
 def test_mistakes_are_reported_in_one_line(run, asked, files, words, message):

@@ -132,7 +132,7 @@ def test_requests_and_robots_are_parsed():
         (["--to", "j0=x"], "'x' is not a value"),
         (["--to", "j0=1", "--seconds", "0"], "--seconds is a positive number"),
         (["--to", "j0=1", "--margin", "-1cm"], "The margin"),
-        (["--to", "j0=1", "--move", "j1"], "--move does not say that it moves"),
+        (["--to", "j0=1", "--move", "j1"], "which --move does not list"),
         (["--to", "j0=1", "--picture", "a.jpg"], "written as .png"),
         (["--to", "j0=1", "--leave-out", "bax"], "Did you mean 'box'"),
         (["--to", "j0=1", "--save", "a.csv"], "written as .json"),

@@ -89,7 +89,7 @@ def test_the_cache_is_listed_and_emptied(run):
         (["robot.urdf", "--protrusion", "5deg"], "length"),
         (["robot.urdf", "--most", "0"], "1 to 1024"),
         ([], "Name a model"),
-        (["--list", "--clear"], "one at a time"),
+        (["--list", "--clear"], "give one of them"),
     ],
 )
 def test_wrong_requests_are_told(run, words, part):

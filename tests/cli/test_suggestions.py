@@ -41,7 +41,7 @@ def test_python_m_kineverse_is_the_command():
         ),
         (
             ("info", "kitchen", "pr2"),
-            "kineverse info has no use for 'pr2'. 'kineverse info --help' says what it takes.",
+            "kineverse info takes no argument 'pr2'. 'kineverse info --help' lists those that it takes.",
         ),
         (
             ("info", "r.urdf.xacro", "side:=left"),

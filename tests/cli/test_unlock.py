@@ -96,7 +96,7 @@ def test_unlock_execute_with_a_jammed_part(capsys):
         (["--goal", "lockbox/a=1", "--from", "lockbox/x=1"], "lockbox/x"),
         (["--goal", "lockbox/a=1", "--still", "lockbox/x"], "'lockbox/x' is no degree of freedom"),
         (["--goal", "lockbox/a=1", "--budget", "0"], "positive time in seconds"),
-        (["--goal", "lockbox/a=1", "--jam", "lockbox/d"], "about the world of --execute"),
+        (["--goal", "lockbox/a=1", "--jam", "lockbox/d"], "need --execute"),
         (["--goal", "lockbox/a=1", "--execute", "--jam", "lockbox/x"], "'lockbox/x' is no degree of freedom"),
         (["--goal", "lockbox/a=1", "--execute", "--record", "run.txt"], ".mcap"),
         ([], "--goal"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -205,3 +206,22 @@ def test_mesh_is_fetched_by_its_content(tmp_path: Path) -> None:
         assert read_mesh(mesh).vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     finally:
         kv.formats.remove_resolver(resolver)
+
+
+def test_net_changes_with_operations_from_elsewhere_are_adopted() -> None:
+    """A replica that has no code holds the same blobs, and follows what changes later."""
+    home = build(lambda m: kv.model.Writes(data={"twice": 2 * m.data["number"]}))
+    replica = kv.formats.from_bytes(kv.formats.to_bytes(home))
+    with home.edit() as edit:
+        edit.replace("data number", kv.model.SetData("number", 5.0))
+        edit.apply(Doubled("number", "again"), "mine")
+        net = edit.net()
+    put = tuple(replace(placed, entry=sent(home, placed.entry.tag)) for placed in net.put)
+    runs = replica.history.runs
+    replica.adopt(replace(net, put=put))
+    assert replica.history.runs == runs
+    assert kv.formats.document_hash(replica) == kv.formats.document_hash(home)
+    assert replica.data["again"] == 10.0
+    with replica.edit() as edit:
+        edit.replace("data number", kv.model.SetData("number", 7.0))
+    assert (replica.data["again"], replica.data["twice"]) == (14.0, 14.0)

@@ -97,6 +97,12 @@ def test_a_loop_is_closed_again_when_what_it_reads_changes() -> None:
         np.testing.assert_allclose(pose, wanted, rtol=1e-12, atol=1e-12)
 
 
+def test_loop_without_a_solution_is_named_with_its_prefix() -> None:
+    model = kv.load("articulations/parallel_gripper", prefix="left")
+    with pytest.raises(kv.errors.NoSolutionError, match="'left/left_parallelogram' has no solution at left/"):
+        model.fk("left/left_finger")({"left/left_inner": -9.0})
+
+
 def test_below_a_prefix_the_error_names_the_missing_prefix() -> None:
     read = kv.Model()
     _include(read, to_json(build(branching)), "shelf")

@@ -78,7 +78,7 @@ def test_mimic_cycles_are_refused_and_shown():
     assert read.remarks[0].endswith("; it moves by itself.")
 
 
-def test_broken_mimic_chain_error_names_the_joint():
+def test_broken_mimic_chain_error_names_the_joint(caplog):
     text = robot(
         joint("a", "l0", "l1", "continuous", '<mimic joint="finger_jiont"/>'),
         joint("b", "l0", "l2", "continuous", '<mimic joint="a"/>'),
@@ -87,8 +87,13 @@ def test_broken_mimic_chain_error_names_the_joint():
     )
     with pytest.raises(FormatError, match=r"<mimic> of <joint name=\"a\">: .*Did you mean 'finger_joint'\?"):
         parse_urdf(text, strict=True)
-    mimics = {joint.name: joint.mimic for joint in parse_urdf(text).joints}
+    with caplog.at_level("WARNING", "kineverse.formats"):
+        mimics = {joint.name: joint.mimic for joint in parse_urdf(text).joints}
+        parse_urdf(text.replace("finger_jiont", "a"))  # a cycle is a remark
     assert mimics == {"a": None, "b": UrdfMimic("a"), "finger_joint": None}
+    (heard,) = caplog.messages
+    assert '<joint name="a">: it mimics "finger_jiont"' in heard
+    assert heard.endswith("; it moves by itself. Did you mean 'finger_joint'?")
 
 
 def test_factors_that_overflow_are_refused():

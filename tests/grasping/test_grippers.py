@@ -142,6 +142,20 @@ def test_robots_without_two_opposed_fingers_are_told_why() -> None:
         UnknownNameError, match=r"'shelf_drawers' has no gripper .*\n.* is .* m large, more than"
     ):
         find_gripper(kv.load("shelf_drawers"), "shelf_drawers")
+    many = kv.Model()
+    with many.edit() as edit:
+        for i, parent in enumerate(["world", *(f"hand{k}" for k in range(4))]):
+            edit.add_frame(f"hand{i}", parent, transform=kv.rotation_z(kv.position(f"j{i}")))
+            for k in range(5):
+                edit.apply(kv.Continuous(name=f"w{i}-{k}", parent=f"hand{i}", child=f"wheel{i}-{k}"))
+    with pytest.raises(
+        UnknownNameError, match=r"^The model has no gripper .*\n  At hand4: .*3 more"
+    ) as caught:
+        find_gripper(many, "")
+    assert "\n  Further links without fingers: 3." in str(caught.value), (
+        "a robot of many links gives a short reason"
+    )
+    assert len(str(caught.value).splitlines()) == 4
 
 
 def test_fingers_without_readable_shapes_are_where_their_frames_are() -> None:

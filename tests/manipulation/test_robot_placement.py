@@ -70,7 +70,7 @@ def test_omnidirectional_base_carries_the_robot(arm):
 @pytest.mark.parametrize(
     ("robot", "options", "message"),
     [
-        ("shelf_door", {}, "which would be of the robot 'shelf_door'"),
+        ("shelf_door", {}, "begin with 'shelf_door/', too"),
         ("hsr", {"base": "omni"}, "'hsr' has a base that moves already"),
         ("hsr", {"at": (1.0, 0.0, 0.5, 0.0)}, "no height 0.5"),
         ("hsr", {"at": (1.0, 0.0)}, "A place is x, y and an angle"),

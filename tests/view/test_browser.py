@@ -229,12 +229,20 @@ def test_the_camera_frames_the_model_in_any_window_until_it_is_moved(browser):
         until(page, lambda: len(viewer._server.get_clients()) == 1)
         (client,) = viewer._server.get_clients().values()
         camera = client.camera
-        for size in ((900, 420), (640, 700)):
+        for size in ((900, 420), (390, 844)):
             page.set_viewport_size({"width": size[0], "height": size[1]})
             # What the client reported last may still be of the window before.
             wide = size[0] > size[1]
             until(page, lambda wide=wide: (camera.image_width > camera.image_height) is wide)
             # As large as it can be, with some room at the edges.
+            until(page, lambda: 0.75 < np.abs(corners(viewer, camera)).max() < 0.95)
+        canvas, panel = page.locator("canvas[data-engine]"), page.locator(".mantine-Paper-root").first
+        # On a phone the panel is a sheet, below the whole model when it is open and when it is folded.
+        for folded in (False, True):
+            if folded:
+                page.get_by_text("cabinet", exact=True).first.click()
+            until(page, lambda folded=folded: (canvas.bounding_box()["height"] > 750) is folded)
+            until(page, lambda: canvas.bounding_box()["height"] <= panel.bounding_box()["y"] + 1)
             until(page, lambda: 0.75 < np.abs(corners(viewer, camera)).max() < 0.95)
         moved, reports = camera.position + 0.3, []
         client.camera.on_update(lambda camera: reports.append(camera.position.copy()))

@@ -186,6 +186,7 @@ def judged(*states, dt=0.5):
     with model.edit() as edit:
         edit.constrain("range", 0, A, 1)
         edit.constrain("lock", -1, A.derivative(), 2 * (B > 0.5))
+        edit.constrain("root", 0, np.sqrt(2 + A), 9)
     judge = LimitJudge(model)
     assert judge.symbols == (A, B)
     for n, state in enumerate(states):
@@ -213,5 +214,7 @@ def test_position_beyond_its_limit_is_the_largest_violation():
     judge = judged((0.0, 1.0), (1.0, 1.0), (1.3, 1.0), (1.0, 1.0))
     assert judge.violation == pytest.approx(0.3)
     assert judge.limit == "range"
+    judge.update(np.array([-3.0, 1.0]), 9.0)
+    assert (judge.violation, judge.limit) == (math.inf, "root")  # which has no value there
     judge.reset()
     assert (judge.violation, judge.limit) == (0.0, "")

@@ -50,14 +50,12 @@ def size(data: Path | None) -> dict[str, Any]:
 
 def _rooms(folder: Path) -> dict[str, Any]:
     """Return modules that are small and imported by one other alone, large ones, and crowded folders."""
-    files = {_module(f): f for f in sorted(folder.rglob("*.py"))}
-    importers: dict[str, set[str]] = {name: set() for name in files}
-    for name, file in files.items():
-        for imported in imports(name, file, files):
-            if imported != name:
-                importers[imported].add(name)
+    files = find_modules(folder)
+    counted, importers = count_lines(files), find_importers(files)
     inner = {
-        name: _lines(file) for name, file in files.items() if file.name not in ("__init__.py", "__main__.py")
+        name: lines
+        for name, lines in counted.items()
+        if files[name].name not in ("__init__.py", "__main__.py")
     }
     below = [folder, *(p for p in sorted(folder.rglob("*")) if p.is_dir())]
     counts = {
@@ -73,7 +71,26 @@ def _rooms(folder: Path) -> dict[str, Any]:
     }
 
 
-def imports(name: str, file: Path, files: dict[str, Path]) -> Iterator[str]:
+def find_modules(*folders: Path) -> dict[str, Path]:
+    """Return the files of the modules below some folders by name."""
+    return {_module(f): f for folder in folders for f in sorted(folder.rglob("*.py"))}
+
+
+def count_lines(files: dict[str, Path]) -> dict[str, int]:
+    """Return the number of lines of some modules."""
+    return {name: _lines(file) for name, file in files.items()}
+
+
+def find_importers(files: dict[str, Path]) -> dict[str, set[str]]:
+    """Return the modules, among some, that import each of them."""
+    importers: dict[str, set[str]] = {name: set() for name in files}
+    for name, file in files.items():
+        for imported in {*_imports(name, file, files)} - {name}:
+            importers[imported].add(name)
+    return importers
+
+
+def _imports(name: str, file: Path, files: dict[str, Path]) -> Iterator[str]:
     """Yield the modules, among some, that a module imports or names in a text such as ``module:function``."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
     for node in ast.walk(ast.parse(file.read_text("utf-8"))):

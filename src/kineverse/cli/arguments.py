@@ -142,7 +142,7 @@ def manage_cache(
     folder. Each entry has its facts and its row below ``head``.
     """
     if named or (arguments.list and arguments.clear):
-        raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
+        raise InvalidValueError("--list and --clear act on the whole cache: give one of them, and no names.")
     if arguments.clear:
         count = clear()
         print(json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder}")

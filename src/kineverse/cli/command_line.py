@@ -80,7 +80,7 @@ _NEGATIVE_VALUE = re.compile(r"-\s*(\d|\.\d|(pi|π|inf|nan)\b)")
 VERBOSE = "print more messages on standard error"
 
 # The commands report missing meshes themselves; a missing compiler does not change their results.
-QUIET = ("kineverse.view.meshes", "kineverse.compilation.toolchain")
+QUIET = ("kineverse.view.meshes", "kineverse.compile.toolchain")
 
 EXAMPLES = """\
 A MODEL is the name of a shipped model (kitchen, pr2, articulations/screw ...) or the path of a file.
@@ -206,7 +206,12 @@ def find_added_commands() -> Mapping[str, EntryPoint]:
     """Return the entry points of commands that other distributions add, by name, without importing them."""
     from importlib.metadata import entry_points  # for start-up time
 
-    found = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    try:
+        found = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    except Exception as error:  # of a damaged file of any installed distribution
+        reason = f"the entry points of one cannot be read ({join_lines(error)})"
+        print(f"kineverse: commands of other distributions are left out, as {reason}", file=sys.stderr)
+        return {}
     return {name: found[name] for name in sorted(found) if name not in COMMANDS}
 
 
@@ -227,13 +232,14 @@ def load_command(name: str) -> CommandModule:
     distribution = point.dist.name if point.dist else point.value
     try:
         command = point.load()
-    except Exception as error:  # somebody else's code
+    except (Exception, SystemExit) as error:  # somebody else's code
         reason = join_lines(error) or "no reason given"
         raise MissingDependencyError(
             f"'kineverse {name}' is a command of {distribution}, and {point.value} cannot be imported "
             f"({type(error).__name__}: {reason}). Install {distribution} again."
         ) from error
-    lacking = [part for part in ("HELP", "add_arguments", "run") if not hasattr(command, part)]
+    parts = ("HELP", "add_arguments", "run")
+    lacking = [part for part in parts if getattr(command, part, None) is None]
     if lacking:
         raise MissingDependencyError(
             f"'kineverse {name}' is a command of {distribution}, and {point.value} has no "
@@ -269,7 +275,8 @@ def make_parser(name: str | None = None) -> argparse.ArgumentParser:
     )
     command.add_arguments(sub)
     if "--verbose" not in sub._option_string_actions:
-        sub.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS, help=VERBOSE)
+        words = [word for word in ("-v", "--verbose") if word not in sub._option_string_actions]
+        sub.add_argument(*words, action="store_true", default=argparse.SUPPRESS, help=VERBOSE)
     sub.set_defaults(run=command.run, command=sub)
     return top
 
@@ -289,7 +296,7 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
             )
         if not word.startswith("-"):
             raise UnknownNameError(
-                f"{sub.prog} has no use for {word!r}. '{sub.prog} --help' says what it takes."
+                f"{sub.prog} takes no argument {word!r}. '{sub.prog} --help' lists those that it takes."
             )
         options = [option for option in sub._option_string_actions if option.startswith("--")]
         raise UnknownNameError(f"{sub.prog} has no option {word!r}. {suggest(word, options, 'option')}")

@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         option = next((name for name, is_given in given.items() if is_given), None)
         if option is not None:
             raise InvalidValueError(
-                f"{option} and - exclude each other: the output is a document, which says all."
+                f"{option} and - exclude each other: standard output is a document, which omits nothing."
             )
 
     with collect_warnings() as left_out, show_activity(f"reading {arguments.source}"):
@@ -136,9 +136,7 @@ def check_writable(target: str, source: str, force: bool = False) -> None:
         inside = path / f"{_source_stem(source)}{endings[0]}"
         raise FormatError(f"{target} is a folder; name a file in it, such as {inside}.")
     if not path.name.endswith(endings):
-        raise FormatError(
-            f"{target}: nothing is known that ends like this. Written are {', '.join(endings)}."
-        )
+        raise FormatError(f"{target}: no format has this suffix. Use one of {', '.join(endings)}.")
     if not path.parent.is_dir():
         raise FormatError(f"{target}: the folder {path.parent} does not exist.")
     if not os.path.lexists(path):
@@ -147,9 +145,9 @@ def check_writable(target: str, source: str, force: bool = False) -> None:
         raise FormatError(f"{target} is no regular file.")
     found = locate_model(source)
     if not found.collection and path.samefile(found.path):
-        raise DuplicateNameError(f"{target} is what is read; give the result another name.")
+        raise DuplicateNameError(f"{target} is the input; give the output another name.")
     if not force:
-        raise DuplicateNameError(f"{target} is there already; --force replaces it.")
+        raise DuplicateNameError(f"{target} exists already; --force replaces it.")
 
 
 def _source_stem(source: str) -> str:

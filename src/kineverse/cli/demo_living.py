@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _show_sliders(arguments)
     if not _find_example():
         raise InvalidValueError(
-            "--living is an example of the source checkout (examples/living_kitchen), which is not here. "
+            "--living runs examples/living_kitchen of the source checkout, which is not installed here. "
             "Leave it out, or take --sliders."
         )
     from living_kitchen.simulation import Simulation  # an example of the checkout

@@ -139,7 +139,7 @@ def check_noise(stated: tuple[float, float | None], pair: RecordedPair) -> Obser
     """Return the stated noise of the observations of a pair."""
     position, orientation = stated
     if orientation is None and pair.has_orientation:
-        raise InvalidValueError("--noise: poses have two, of positions and orientations: 3mm,1deg")
+        raise InvalidValueError("--noise of poses has two values, of positions and of orientations: 3mm,1deg")
     return ObservationNoise(position, orientation if pair.has_orientation else None, True)
 
 

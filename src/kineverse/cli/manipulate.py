@@ -144,10 +144,10 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
     parser.add_argument("--to", metavar="VALUE", help="wanted value")
     add_set_option(parser, "another coordinate at the start")
     parser.add_argument(
-        "--hand", metavar="FRAME", help="hand of the robot, or one of its fingers; the likeliest gripper"
+        "--hand", metavar="FRAME", help="hand of the robot, or one of its fingers (the likeliest gripper)"
     )
     if skill != "push":
-        parser.add_argument("--handle", metavar="FRAME", help="handle of the object; the best one")
+        parser.add_argument("--handle", metavar="FRAME", help="handle of the object (the best one)")
     if skill == "open":
         parser.add_argument(
             "--unknown",
@@ -159,7 +159,7 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
     parser.add_argument(
         "--grasp",
         choices=("friction", "tie"),
-        help="what holds in MuJoCo: friction (the default), or a weld as soon as both fingers touch",
+        help="grasps in MuJoCo: held by friction (the default), or by a weld as soon as both fingers touch",
     )
     parser.add_argument(
         "--noise",

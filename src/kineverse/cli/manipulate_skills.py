@@ -169,7 +169,7 @@ def _find_coordinate(model: Model, name: str, robot: str) -> Symbol:
     objects = [str(s) for s in model.degrees_of_freedom if not str(s).startswith(f"{robot}/")]
     if name.startswith(f"{robot}/"):
         raise InvalidValueError(
-            f"--what {name} is of the robot itself; it names what the robot moves. "
+            f"--what {name} is a coordinate of the robot; name one of an object. "
             f"{suggest(name, objects, 'coordinate')}"
         )
     if name not in objects:
@@ -267,7 +267,7 @@ def open_as_unknown(
     model, coordinate, start = scene.model, scene.coordinate, scene.start
     part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
     if part is None:
-        raise InvalidValueError(f"--unknown: '{coordinate}' is of no joint, so no part belongs to it.")
+        raise InvalidValueError(f"--unknown: no joint moves '{coordinate}', so no part belongs to it.")
     far = None if arguments.to is None else abs(scene.target - start[coordinate])
     outcome: Outcome = open_unknown(
         Session(world, on_step=look),

@@ -93,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="START",
         dest="start",
-        help="the same, or a JSON file of values; the default state",
+        help="the same, or a JSON file of values (the default state)",
     )
     add_robot_option(parser)
     parser.add_argument(
@@ -126,7 +126,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--decomposed", action="store_true", help="use the hulls of kineverse decompose for hollow meshes"
     )
-    parser.add_argument("--margin", metavar="M", default="0", help="least distance from everything (1cm); 0")
+    parser.add_argument(
+        "--margin", metavar="M", default="0", help="least distance from everything, such as 1cm (0)"
+    )
     parser.add_argument(
         "--seconds", type=float, default=5.0, metavar="S", help="largest time of the search (5)"
     )
@@ -151,8 +153,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Planning problem."""
-
     model: kv.Model
     planner: Planner  # planner, placed at the start
     state: kv.State  # state at the start, but for what --from says of frames
@@ -245,7 +245,7 @@ def _prepare(
         print(f"kineverse: note: without shapes, and not checked: {', '.join(bare[:6])}", file=sys.stderr)
     still = [name for name in goal.values if model.symbol(name) not in planner.symbols]
     if still:
-        raise InvalidValueError(f"--to says where '{still[0]}' goes, and --move does not say that it moves.")
+        raise InvalidValueError(f"--to has a value of '{still[0]}', which --move does not list.")
     state = model.default_state().updated(standing).updated(start.values)
     planner.place(state)
     return _Problem(model, planner, state, start, goal, holds, start_tasks, goal_tasks, grips)

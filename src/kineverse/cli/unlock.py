@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     goal = parse_assignments(arguments.goal, "--goal")
     start = parse_assignments(arguments.assignments, "--from")
     if (arguments.jam or arguments.record) and not arguments.execute:
-        raise InvalidValueError("--jam and --record are about the world of --execute.")
+        raise InvalidValueError("--jam and --record need --execute.")
 
     model = load_model(arguments, arguments.model)
     still = match_coordinates(model, arguments.still, "--still")

@@ -183,7 +183,7 @@ def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:
         raise InvalidValueError(f"--time is a time from 0 s, not {arguments.time}")
     if name.endswith(".json") and not name.endswith(".kv.json") and Path(arguments.model).is_file():
         raise InvalidValueError(
-            f"{arguments.model} is no model; for a trajectory: kineverse view MODEL --play {arguments.model}"
+            f"{arguments.model} is no model. Try: kineverse view MODEL --play {arguments.model}"
         )
     if not name.endswith(".mcap"):
         return None

@@ -20,7 +20,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-logger = logging.getLogger(__name__)
+logger = logging.getLogger("kineverse.compile.toolchain")
 
 # Flags with which C and interpreter agree to the last bit. No -ffast-math, which also deletes checks for NaN;
 # no contraction to fused operations; no constant folding of functions by the compiler (-frounding-math),

@@ -141,8 +141,6 @@ def run_control_loop(
 
 
 class _Loop:
-    """State of a loop, and its commands."""
-
     def __init__(
         self,
         controller: SpeedController,

@@ -10,10 +10,10 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import suppress
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from kineverse._runtime import limit_resources
 from kineverse.errors import KineverseError
 
 CPU_SECONDS = 20  # largest CPU time of a call [s]. A large robot takes xacro about 2 s
@@ -61,19 +61,8 @@ def call_isolated(module: str, function: str, *arguments: Any) -> Any:
 
 def answer(job: dict[str, Any]) -> None:
     """Call the function of a job within the limits, and print the result."""
-    _limit_resources()
+    limit_resources(MEMORY, CPU_SECONDS)
     output, sys.stdout = sys.stdout, sys.stderr  # what the function itself prints is no result
     function = getattr(importlib.import_module(job["module"]), job["function"])
     json.dump(function(*job["arguments"]), output)
     output.flush()
-
-
-def _limit_resources() -> None:
-    """Limit time and memory of this process, where the system can."""
-    try:
-        import resource  # missing on Windows
-    except ImportError:
-        return
-    for kind, most in ((resource.RLIMIT_CPU, CPU_SECONDS), (resource.RLIMIT_AS, MEMORY)):
-        with suppress(ValueError, OSError):
-            resource.setrlimit(kind, (most, most))

@@ -21,6 +21,12 @@ class Fault(str):
     __slots__ = ()
 
 
+class ChangedMotion(Fault):
+    """Fault without which the model would move otherwise: logged as a warning, others as information."""
+
+    __slots__ = ()
+
+
 @dataclass(slots=True)
 class ReaderWarnings:
     """Warnings about one document; with ``strict``, mistakes raise instead."""
@@ -45,17 +51,16 @@ class ReaderWarnings:
         of = "" if owner is element else f"{label(element)} "
         self.fault(element[3], f"{label(owner)}: {of}{mistake.message.rstrip('. ')}; {taken}.")
 
-    def fault(self, line: int, text: str) -> None:
+    def fault(self, line: int, text: str, kind: type[Fault] = Fault) -> None:
         """Add a warning about a mistake in a line."""
-        fault = Fault(f"line {line}, {text}")
-        self.texts.append(fault)
-        warn([Fault(f"{self.source}, {fault}")])
+        self.texts.append(kind(f"line {line}, {text}"))
+        warn([kind(f"{self.source}, {self.texts[-1]}")])
 
 
 def warn(remarks: Iterable[str]) -> None:
     """Log warnings, each with its source in front, and add them to the lists of :func:`collect_warnings`."""
     for remark in remarks:
-        _log.info("%s", remark)
+        _log.log(logging.WARNING if isinstance(remark, ChangedMotion) else logging.INFO, "%s", remark)
         for heard in _listeners.get():
             heard.append(remark)
 

@@ -268,7 +268,6 @@ class _Expansion:
             raise self._xacro.XacroException(f"there is no file {quote(path)}.", exc=FileNotFoundError())
 
     def _find_package(self, name: str) -> str:
-        """Return the folder of a package, as ``package://`` finds it."""
         if name not in self._packages:
             match = re.match(rf"\s*\$\(find\s+{re.escape(name)}\s*\)/*([^$]*)$", self._wanted)
             folder, is_substitute = find_package(name, self._folder, self._root, match[1] if match else "")

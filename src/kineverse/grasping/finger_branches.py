@@ -91,9 +91,9 @@ def _branch(model: ModelView, root: str, parents: Mapping[str, str]) -> Branch:
 
 def _why_no_finger(model: ModelView, branch: Branch) -> str:
     """Return the reason why a branch is no finger; empty if it may be one."""
-    names = ", ".join(map(str, branch.joints[: MOST_JOINTS + 1]))
     if len(branch.joints) > MOST_JOINTS:
-        return f"{branch.root} has more joints than a finger's {MOST_JOINTS} ({names} ...)"
+        return f"{branch.root} has {len(branch.joints)} joints, more than a finger's {MOST_JOINTS}"
+    names = ", ".join(map(str, branch.joints))
     if not all(high - low <= 2 * math.pi for low, high in map(model.limits, branch.joints)):
         return f"{branch.root} has no limits ({names})"
     if not bodies_with_shapes(model, branch.frames):

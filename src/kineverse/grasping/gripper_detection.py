@@ -120,7 +120,10 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
     if not result:
         if hand is not None:
             model.fk(hand)  # raises for an unknown frame
-        reasons = "".join(f"\n  {line}" for line in why) or " None of its links carries two moving branches."
+        # Hands come last in a tree, and first in the message.
+        lines = [f"\n  {line}" for line in why[: -_MOST_LINKS - 1 : -1]]
+        lines += [f"\n  Further links without fingers: {len(why) - _MOST_LINKS}."] * (len(why) > _MOST_LINKS)
+        reasons = "".join(lines) or " None of its links carries two moving branches."
         raise UnknownNameError(f"{name} has no gripper with two opposed fingers.{reasons}")
     if hand is None:
         return result[0]
@@ -214,7 +217,7 @@ def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> 
     )
 
 
-_MOST_LISTED = 6
+_MOST_LINKS, _MOST_LISTED = 2, 2  # links that a message names, and reasons for each
 _LARGEST = 0.5  # diagonal of the box around a finger that is too large for one [m]
 _STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))  # for shapes that cannot be read
 

@@ -27,7 +27,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .base_sampling import find_free_state
-from .robot_sources import SHIPPED
+from .robot_sources import SHIPPED, mount
 
 _BASE = ("x", "y", "angle")
 _DEEPEST = 2e-4  # depth below which bodies only touch at the start [m]
@@ -172,7 +172,7 @@ def _choose_prefix(
     taken = next((name for name in known if name.startswith(f"{own}/")), None)
     if taken is not None:
         raise InvalidValueError(
-            f"The model has '{taken}', which would be of the robot '{own}' of {source}. "
+            f"The model has '{taken}', and the names of {source} begin with '{own}/', too. "
             "Give the furniture alone as the model, or a robot with another name."
         )
     return prefix, own
@@ -185,11 +185,7 @@ def _add_base(edit: Edit, robot: str) -> None:
     if any(model.speeds_of(name) for name in roots):
         raise InvalidValueError(f"The robot '{robot}' has a base that moves already.")
     name = f"{robot}/base" if f"{robot}/base" not in inside else f"{robot}/omni_base"
-    carrier = f"{name}_carrier"
-    poses = {root: np.asarray(model.fk(root)({})) for root in roots}
-    edit.apply(OmniBase(name=name, parent=WORLD, child=carrier))
-    for root, pose in poses.items():
-        edit.attach(root, carrier, pose)
+    mount(edit, OmniBase(name=name, parent=WORLD, child=f"{name}_carrier"), roots)
 
 
 def _put(

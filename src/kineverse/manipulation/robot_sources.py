@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+
+import numpy as np
 
 from kineverse.articulations import DifferentialDrive, OmniBase
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.formats import load
 from kineverse.geometry.exclusions import remove_unusable_shapes
 from kineverse.grasping.gripper_detection import Gripper, find_gripper
+from kineverse.model.edit import Edit
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
-from kineverse.spatial import translation
 from kineverse.state import State
 
 BASE_SPEED, BASE_TURN = 1.0, 0.6
@@ -41,24 +43,22 @@ class RobotSource:
             return model
         roots = [frame for frame, placed in model.frames.items() if placed.parent == WORLD]
         carrier = f"{name}_carrier"
+        base: OmniBase | DifferentialDrive
+        if self.omni:
+            base = OmniBase(name=name, parent=WORLD, child=carrier, speed=BASE_SPEED, turn=BASE_TURN)
+        else:
+            base = DifferentialDrive(
+                name=name,
+                parent=WORLD,
+                child=carrier,
+                radius=WHEEL_RADIUS,
+                track=TRACK,
+                left=f"{self.prefix}/l_wheel_joint",
+                right=f"{self.prefix}/r_wheel_joint",
+                wheel_speed=WHEEL_SPEED,
+            )
         with model.edit() as edit:
-            if self.omni:
-                edit.apply(OmniBase(name=name, parent=WORLD, child=carrier, speed=BASE_SPEED, turn=BASE_TURN))
-            else:
-                edit.apply(
-                    DifferentialDrive(
-                        name=name,
-                        parent=WORLD,
-                        child=carrier,
-                        radius=WHEEL_RADIUS,
-                        track=TRACK,
-                        left=f"{self.prefix}/l_wheel_joint",
-                        right=f"{self.prefix}/r_wheel_joint",
-                        wheel_speed=WHEEL_SPEED,
-                    )
-                )
-            for root in roots:
-                edit.attach(root, carrier, translation(0.0, 0.0, 0.0))
+            mount(edit, base, roots)
         remove_unusable_shapes(model)
         return model
 
@@ -75,6 +75,14 @@ class RobotSource:
     def gripper(self, model: Model) -> Gripper:
         """Return the gripper at the robot's hand in a model."""
         return find_gripper(model, self.prefix, f"{self.prefix}/{self.hand}")
+
+
+def mount(edit: Edit, base: OmniBase | DifferentialDrive, roots: Iterable[str]) -> None:
+    """Apply a mobile base, and attach the roots of a robot to it where they stand."""
+    poses = {root: np.asarray(edit.model.fk(root)({})) for root in roots}
+    edit.apply(base)
+    for root, pose in poses.items():
+        edit.attach(root, base.child, pose)
 
 
 _PR2_START = {

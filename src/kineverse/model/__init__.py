@@ -28,11 +28,16 @@ if TYPE_CHECKING:
         Sphere as Sphere,
     )
     from .changes import Change as Change, Diff as Diff
+    from .commits.follower import BuiltValue as BuiltValue, Follower as Follower, follow as follow
+    from .commits.listeners import Listener as Listener
+    from .commits.net_changes import NetChanges as NetChanges, PlacedEntry as PlacedEntry
+    from .commits.undo import UNDO_LIMIT as UNDO_LIMIT
     from .comparison import BehaviourComparison as BehaviourComparison, compare_models as compare_models
     from .constraint import Constraint as Constraint
-    from .edit import Edit as Edit
+    from .edit import Edit as Edit, Savepoint as Savepoint
     from .frame import WORLD as WORLD, Frame as Frame
     from .frame_dependence import count_moved_bodies as count_moved_bodies, moved_frames as moved_frames
+    from .history import HistoryEntry as HistoryEntry
     from .integration import Integrator as Integrator
     from .model import Model as Model, Snapshot as Snapshot
     from .operation import Operation as Operation, Writes as Writes

@@ -1,22 +1,18 @@
-"""Changes of a model by a commit, and listeners that get them."""
+"""Changes of a model between two versions."""
 
 from __future__ import annotations
 
-import logging
 import math
-import threading
 from bisect import bisect_left
-from collections import deque
-from collections.abc import Callable, Container, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Container, Hashable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any, TypeVar
 
-from kineverse.errors import ExpressionError
-from kineverse.symbols import Symbol, check_symbols
+from kineverse.expressions.expression import Expression
 
 from .constraint import Constraint, coordinates
-from .operation import CONSTRAINTS, KINDS
-from .read_recorder import unknown_path_error
+from .operation import RATES
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +31,16 @@ class Change:
 
     @property
     def coordinates(self) -> frozenset[str]:
-        """Coordinates of a constraint before and after the change; empty for other kinds of data."""
-        sides = [v for v in (self.before, self.after) if isinstance(v, Constraint)]
-        return frozenset().union(*(coordinates(c.lower, c.expression, c.upper) for c in sides))
+        """Coordinates of a constraint or a rate before and after the change; empty for other kinds."""
+        found: set[str] = set()
+        for side in (self.before, self.after):
+            if isinstance(side, Constraint):
+                found |= coordinates(side.lower, side.expression, side.upper)
+            elif self.kind == RATES and side is not None:
+                coordinate, entry = side
+                parts = (entry,) if isinstance(entry, Expression) else chain.from_iterable(entry)
+                found |= coordinates(coordinate, *parts)
+        return frozenset(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,8 @@ class Diff:
     rerun
         Tags of operations that were applied again because a value that they read had changed, in order.
         ``changes`` shows if their writes changed. Empty in comparisons of models.
+    poses
+        Frames with other forward kinematics, among those that a listener follows by ``frames=``.
     """
 
     version: int
@@ -70,6 +75,7 @@ class Diff:
     reruns: int = 0
     moved: tuple[str, ...] = ()
     rerun: tuple[str, ...] = ()
+    poses: tuple[str, ...] = ()
 
     @property
     def is_empty(self) -> bool:
@@ -87,7 +93,10 @@ class Diff:
         return frozenset((*self.added, *self.removed, *self.replaced, *self.moved, *self.rerun))
 
 
-def find_moved_tags(before: Sequence[str], after: Sequence[str], among: Container[str]) -> tuple[str, ...]:
+Tag = TypeVar("Tag", bound=Hashable)
+
+
+def find_moved_tags(before: Sequence[Tag], after: Sequence[Tag], among: Container[Tag]) -> tuple[Tag, ...]:
     """Return a smallest set of tags whose removal makes both orders equal, in the new order."""
     present = set(after)
     place = {tag: i for i, tag in enumerate(tag for tag in before if tag in present)}
@@ -124,126 +133,3 @@ def _longest(places: Sequence[int]) -> set[int]:
             kept.add(i)
             length, last = length - 1, places[i]
     return kept
-
-
-_LOG = logging.getLogger(__name__)
-
-Callback = Callable[[Diff], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Listener:
-    """Callback with its filter; :meth:`close` unregisters it."""
-
-    callback: Callback
-    paths: tuple[str, ...] | None
-    coordinates: frozenset[str] | None
-    tags: frozenset[str] | None
-    registry: Listeners
-
-    def close(self) -> None:
-        """Unregister the callback; a second call has no effect."""
-        self.registry.remove(self)
-
-    def __enter__(self) -> Listener:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def relevant(self, diff: Diff) -> Diff | None:
-        """Return the part of a diff that passes the filter; None if it is empty."""
-        if self.paths is None and self.coordinates is None and self.tags is None:
-            return diff
-        changes = tuple(c for c in diff.changes if self._wants(c))
-        tags = self.tags or frozenset()
-        groups = ("added", "removed", "replaced", "moved", "rerun")
-        heard = {name: tuple(t for t in getattr(diff, name) if t in tags) for name in groups}
-        if not (changes or any(heard.values())):
-            return None
-        return replace(diff, changes=changes, **heard)  # type: ignore[arg-type]
-
-    def _wants(self, change: Change) -> bool:
-        if self.paths is not None and any(_below(change.path, p) for p in self.paths):
-            return True
-        wanted = self.coordinates
-        return wanted is not None and change.kind == CONSTRAINTS and not wanted.isdisjoint(change.coordinates)
-
-
-class Listeners:
-    """Listeners of one model, called in the order of registration and of versions."""
-
-    def __init__(self) -> None:
-        self._listeners: list[Listener] = []
-        self._waiting: deque[tuple[Diff, tuple[Listener, ...]]] = deque()
-        self._delivering = False
-        self._lock = threading.Lock()
-
-    def add(
-        self,
-        callback: Callback,
-        paths: Iterable[str] | None,
-        symbols: Iterable[Symbol] | None,
-        tags: Iterable[str] | None,
-    ) -> Listener:
-        """Register a callback; without a filter it gets every diff."""
-        if not callable(callback):
-            raise ExpressionError(f"A listener is called with a diff, and {callback!r} cannot be called.")
-        for path in () if paths is None else _names(paths):
-            if path and str(path).partition("/")[0] not in KINDS:  # everything is below the empty path
-                raise unknown_path_error(path)
-        listener = Listener(
-            callback,
-            None if paths is None else _names(paths),
-            None if symbols is None else frozenset(s.path for s in check_symbols(symbols)),
-            None if tags is None else frozenset(_names(tags)),
-            self,
-        )
-        self._listeners.append(listener)
-        return listener
-
-    def remove(self, listener: Listener) -> None:
-        """Unregister a listener."""
-        self._listeners = [known for known in self._listeners if known is not listener]
-
-    def post(self, diff: Diff) -> None:
-        """Queue a diff for the present listeners; called in the order of versions."""
-        if self._listeners:
-            with self._lock:
-                self._waiting.append((diff, tuple(self._listeners)))
-
-    def deliver(self) -> None:
-        """Call the listeners with the queued diffs. An exception of a listener is logged; the others go on.
-
-        One thread delivers at a time, so diffs arrive in order. If another thread, or a callback that edits
-        the model, posts a diff meanwhile, the delivering thread takes it over.
-        """
-        while True:
-            with self._lock:
-                if self._delivering or not self._waiting:
-                    return
-                self._delivering = True
-                diff, listeners = self._waiting.popleft()
-            try:
-                for listener in listeners:
-                    self._tell(listener, diff)
-            finally:
-                with self._lock:
-                    self._delivering = False
-
-    def _tell(self, listener: Listener, diff: Diff) -> None:
-        part = listener.relevant(diff) if listener in self._listeners else None
-        if part is None:
-            return
-        try:
-            listener.callback(part)
-        except Exception:
-            _LOG.exception("A listener of the model raised at version %d.", diff.version)
-
-
-def _names(names: Iterable[str]) -> tuple[str, ...]:
-    return (names,) if isinstance(names, str) else tuple(names)
-
-
-def _below(path: str, root: str) -> bool:
-    return not root or path == root or path.startswith(root if root.endswith("/") else f"{root}/")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kineverse._checks import check_flag
@@ -15,7 +15,8 @@ from kineverse.symbols import Symbol
 from . import registry
 from .basic_operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .body import Body, Pose
-from .changes import Change, Diff, find_moved_tags
+from .commits.net_changes import NetChanges, adopt, find_net_changes
+from .commits.undo import take_back
 from .constraint import Constraint
 from .frame import WORLD, Frame, TransformLike
 from .history import History, HistoryEntry
@@ -38,11 +39,7 @@ class Edit:
         self._history = history
         self._model = model
         self._open = True
-        self._added: dict[str, None] = {}
-        self._removed: dict[str, None] = {}
-        self._replaced: dict[str, None] = {}
-        self._again: dict[str, None] = {}
-        self._order: list[HistoryEntry] = []
+        self._savepoints: list[Savepoint] = []
 
     if not TYPE_CHECKING:  # type checkers report unknown names themselves
 
@@ -74,7 +71,7 @@ class Edit:
             operation = Override(operation)
         chosen = self._tag(operation, tag)
         self._check_open().append(chosen, operation)
-        return self._note_added(chosen)
+        return chosen
 
     def link(self, entry: HistoryEntry) -> str:
         """Append an operation of a document and return its tag; it is not run where it finds what it read.
@@ -84,8 +81,8 @@ class Edit:
         DuplicateNameError, UnknownNameError, ModelError
             As :meth:`apply`.
         """
-        self._check_open().append_entry(entry)
-        return self._note_added(entry.tag)
+        self._check_open().link(entry)
+        return entry.tag
 
     def insert(
         self,
@@ -119,26 +116,71 @@ class Edit:
         index = history.index(before) if before is not None else history.index(str(after)) + 1
         chosen = self._tag(operation, tag)
         history.insert(chosen, operation, index)
-        return self._note_added(chosen)
+        return chosen
 
     def replace(self, tag: str, operation: Operation) -> None:
         """Replace an operation under its tag; operations that depend on it are applied again."""
         self._check_open().replace(tag, operation)
-        if tag not in self._added:
-            self._replaced[tag] = None
 
     def remove(self, tag: str) -> None:
         """Remove an operation, with its constraints and all its other writes."""
+        self._check_open().remove(tag)
+
+    # -- the edit as a value -------------------------------------------------------------------------------
+
+    def net(self) -> NetChanges:
+        """Return the net changes of the edit so far: what :meth:`.Model.adopt` makes in an equal model.
+
+        Raises
+        ------
+        EditError, ModelError
+            If the edit would be refused at its end.
+        """
         history = self._check_open()
-        before = [] if self._order else list(history.sequence)
-        history.remove(tag)
-        self._order = self._order or before
-        self._replaced.pop(tag, None)
-        self._again.pop(tag, None)
-        if tag in self._added:
-            del self._added[tag]
-        else:
-            self._removed[tag] = None
+        self._model.rates  # noqa: B018 - settles, and raises for cyclic rates
+        return find_net_changes(history)
+
+    def adopt(self, changes: NetChanges) -> None:
+        """Link the entries of another edit's net changes as they are, without running their operations.
+
+        Other operations that read what they change are run again, as after any edit. An entry that was at the
+        end goes to the end.
+
+        Raises
+        ------
+        EditError
+            If a tag is taken or missing, or something is not of the right type. Names, parents and cycles are
+            checked as in any edit.
+        """
+        adopt(self._check_open(), changes, complete=False)
+
+    def undo(self, version: int) -> None:
+        """Take back the commit that led to a version: what it has put, moved and removed.
+
+        What came after it stands, and is run again where it reads what changes. An undo can be taken back as
+        well. A model keeps its last ``kv.model.UNDO_LIMIT`` commits, and a copy of it keeps them too.
+
+        Raises
+        ------
+        EditError
+            If a later edit has changed an operation that this one would change, or the commit is not kept.
+        """
+        take_back(self._check_open(), version)
+
+    def savepoint(self) -> Savepoint:
+        """Return a point of the edit that it can be rolled back to, several times.
+
+        An edit that was rolled back to its beginning has done nothing, and is no commit::
+
+            with model.edit() as edit:
+                start = edit.savepoint()
+                edit.remove("joint door")
+                changes = edit.net()
+                start.roll_back()
+        """
+        point = Savepoint(self, self._check_open().mark())
+        self._savepoints.append(point)
+        return point
 
     # -- shorthands ----------------------------------------------------------------------------------------
 
@@ -248,34 +290,32 @@ class Edit:
             )
         return operation.default_tag()
 
-    def _diff(self, version: int, changes: Iterable[Change], reruns: int) -> Diff:
-        moved: tuple[str, ...] = ()
-        if self._again:
-            old = [entry.tag for entry in self._order if entry.tag not in self._added]
-            moved = find_moved_tags(old, [entry.tag for entry in self._history.sequence], self._again)
-        exchanged = self._added.keys() | self._replaced.keys()
-        entries = self._history.entries
-        rerun = [entries[tag] for tag in self._history.run_again - exchanged if tag in entries]
-        return Diff(
-            version,
-            tuple(changes),
-            tuple(self._added),
-            tuple(self._removed),
-            tuple(self._replaced),
-            reruns,
-            moved,
-            tuple(entry.tag for entry in sorted(rerun, key=lambda entry: entry.place)),
-        )
+    def _roll_back(self, point: Savepoint) -> None:
+        history = self._check_open()
+        if point not in self._savepoints:
+            raise EditError("This savepoint is gone, because the edit was rolled back to an earlier one.")
+        del self._savepoints[self._savepoints.index(point) + 1 :]
+        history.return_to(point.mark)
 
     def _check_open(self) -> History:
         if not self._open:
             raise EditError("This edit is over; start another one with model.edit().")
         return self._history
 
-    def _note_added(self, tag: str) -> str:
-        if tag in self._removed:
-            del self._removed[tag]
-            self._replaced[tag] = self._again[tag] = None
-        else:
-            self._added[tag] = None
-        return tag
+
+class Savepoint:
+    """Point of an edit, from :meth:`Edit.savepoint`."""
+
+    def __init__(self, edit: Edit, mark: tuple[Any, ...]) -> None:
+        self._edit = edit
+        self.mark = mark
+
+    def roll_back(self) -> None:
+        """Undo what the edit has done since this point; the edit goes on.
+
+        Raises
+        ------
+        EditError
+            If the edit is over, or was rolled back to an earlier point.
+        """
+        self._edit._roll_back(self)

@@ -9,29 +9,32 @@ from __future__ import annotations
 
 import heapq
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
 from operator import attrgetter
-from typing import Any
+from typing import Any, TypeAlias
 
 from kineverse._runtime import no_collection
 from kineverse.errors import (
     DuplicateNameError,
     EditError,
     KineverseError,
-    ModelError,
     UnknownNameError,
     suggest,
 )
 
-from .frame import WORLD, Frame
-from .operation import DATA, FRAMES, KINDS, Cell, Operation, Writes, may_override, overwrite_error
-from .read_recorder import ABSENT, Read, ReadRecorder, Reads, unknown_name_error, unknown_path_error
+from .commits.checks import (
+    BEFORE_ALL,
+    check_frames,
+    check_names,
+    check_overwrite,
+    check_writes,
+    refused_error,
+)
+from .operation import DATA, FRAMES, KINDS, Cell, Operation, Writes
+from .read_recorder import ABSENT, Read, ReadRecorder, Reads, unknown_path_error
 
 _GAP = 1 << 32
-_BEFORE_ALL = -1 << 200
-_LISTED = 10
-_FEW = 4
 _PLACE = attrgetter("place")
 
 
@@ -59,9 +62,17 @@ class HistoryEntry:
         self.writes = writes
         self.blob = blob
 
-    def at(self, place: int) -> HistoryEntry:
-        """Return the entry at another place."""
-        return HistoryEntry(self.tag, self.operation, place, self.reads, self.writes, self.blob)
+    def at(self, place: int, reads: Reads | None = None) -> HistoryEntry:
+        """Return the entry at another place, and with other reads if some are given."""
+        blob = self.blob if reads is None or reads is self.reads else None
+        return HistoryEntry(self.tag, self.operation, place, reads or self.reads, self.writes, blob)
+
+
+TouchedEntry: TypeAlias = tuple[HistoryEntry | None, HistoryEntry | None, bool]
+"""Entry of a tag before and after an edit; False if its operation was only run again."""
+
+CommitRecord: TypeAlias = dict[str, tuple[HistoryEntry | None, HistoryEntry | None]]
+"""Entries before and after a commit, by tag, of the operations that the edit itself put, moved or removed."""
 
 
 class History:
@@ -81,7 +92,10 @@ class History:
         self._dirty: list[tuple[int, str]] = []
         self._moved_frames: dict[tuple[str, int], None] = {}
         self._contested: dict[Cell, None] = {}
-        self.run_again: set[str] = set()
+        self._given: dict[str, None] = {}
+        self._touched: dict[str, HistoryEntry | None] = {}
+        self.commits: dict[int, CommitRecord] = {}
+        self._seen: dict[tuple[str, Cell], Any] | None = None
         self._disordered: set[str] = set()
         with no_collection():
             self._fill(entries)
@@ -116,6 +130,7 @@ class History:
         other.reading = {cell: tags.copy() for cell, tags in self.reading.items()}
         other.listing = {kind: tags.copy() for kind, tags in self.listing.items()}
         other.head = {kind: self.ordered(kind).copy() for kind in self.head}
+        other.commits = self.commits.copy()
         return other
 
     # -- queries -------------------------------------------------------------------------------------------
@@ -152,22 +167,19 @@ class History:
 
     def append(self, tag: str, operation: Operation) -> None:
         """Append an operation."""
-        self._add(tag, operation, self._end)
+        self._add(tag, operation, self.place_at(len(self.sequence)))
 
-    def append_entry(self, given: HistoryEntry) -> None:
+    def link(self, given: HistoryEntry) -> None:
         """Append an operation with its writes elsewhere; it is run only if it finds other values here."""
-        entry = given.at(self._end)
+        entry = given.at(self.place_at(len(self.sequence)))
         if self._dirty or given.tag in self.entries or not self._finds_what_it_read(entry):
             self._add(given.tag, given.operation, entry.place)
             return
-        for (kind, name), value in entry.writes.items():
-            if kind == FRAMES:
-                self._check_parent(name, value, entry.writes, entry.reads, entry.place)
-        self._check_overwrite(entry)
+        check_writes(self, entry)
+        check_overwrite(self, entry)
+        self.note_given(entry.tag)
         if any(c in self.cells or c in self.reading or self.listing[c[0]] for c in entry.writes):
-            self._link(entry)
-            for cell, value in entry.writes.items():
-                self._mark_readers(cell, ABSENT, value, entry.place)
+            self.put(entry)
             return
         # The usual case while a document is loaded, in one step.
         self._undo.append((self._take_back, (entry,)))
@@ -183,10 +195,6 @@ class History:
             self._put_head(cell, value, ABSENT)
         self._forget(entry)
 
-    @property
-    def _end(self) -> int:
-        return self.sequence[-1].place + _GAP if self.sequence else 0
-
     def _finds_what_it_read(self, entry: HistoryEntry) -> bool:
         """Return whether all values that an operation read elsewhere are the same objects here."""
         seen = entry.operation.seen
@@ -199,16 +207,7 @@ class History:
 
     def insert(self, tag: str, operation: Operation, index: int) -> None:
         """Insert an operation before the one at ``index``."""
-        if index >= len(self.sequence):
-            self.append(tag, operation)
-            return
-        after = self.sequence[index].place
-        before = self.sequence[index - 1].place if index else after - 2 * _GAP
-        if after - before < 2:
-            self._renumber()
-            self.insert(tag, operation, index)
-            return
-        self._add(tag, operation, (before + after) // 2)
+        self._add(tag, operation, self.place_at(index))
 
     def index(self, tag: str) -> int:
         """Return the position of a tag in the sequence."""
@@ -218,22 +217,55 @@ class History:
         """Replace an operation, at its place and under its tag."""
         old = self.entry(tag)
         _check_operation(operation)
-        with self._step():
+        with self.step():
+            self.note_given(tag)
             self._exchange(HistoryEntry(tag, operation, old.place, old.reads, old.writes))
             if self._dirty:
-                self._mark_outdated(tag)
+                self.mark_outdated(tag)
             else:
                 self._run(tag)
-                self._check_overwrite(self.entries[tag])
+                check_overwrite(self, self.entries[tag])
 
     def remove(self, tag: str) -> None:
         """Remove an operation and its writes."""
         entry = self.entry(tag)
+        self.note_given(tag)
         self._unlink(entry)
         for cell, value in entry.writes.items():
             self._mark_readers(cell, value, ABSENT, entry.place)
 
-    def _add(self, tag: str, operation: Operation, place: int) -> None:
+    def put(self, entry: HistoryEntry) -> None:
+        """Link an entry at its place, or exchange the one there, and mark the readers of what it changes."""
+        old = self.entries.get(entry.tag)
+        if old is None:
+            self._link(entry)
+            for cell, value in entry.writes.items():
+                self._mark_readers(cell, ABSENT, value, entry.place)
+            return
+        self._exchange(entry)
+        for cell in {**old.writes, **entry.writes}:
+            self._mark_readers(
+                cell, old.writes.get(cell, ABSENT), entry.writes.get(cell, ABSENT), entry.place
+            )
+
+    def place_at(self, index: int) -> int:
+        """Return a free place before the entry at an index."""
+        if index >= len(self.sequence):
+            return self.sequence[-1].place + _GAP if self.sequence else 0
+        after = self.sequence[index].place
+        before = self.sequence[index - 1].place if index else after - 2 * _GAP
+        if after - before < 2:
+            self._renumber()
+            return self.place_at(index)
+        return (before + after) // 2
+
+    def free_place(self, place: int) -> int:
+        """Return a place, or a free one directly before it if it is taken."""
+        index = bisect_left(self.sequence, place, key=_PLACE)
+        is_free = index == len(self.sequence) or self.sequence[index].place != place
+        return place if is_free else self.place_at(index)
+
+    def _check_new(self, tag: str, operation: object) -> None:
         if not isinstance(tag, str) or not tag:
             raise EditError(f"A tag is a non-empty text, not {tag!r}.")
         _check_operation(operation)
@@ -241,27 +273,35 @@ class History:
             raise DuplicateNameError(
                 f"The tag {tag!r} is taken; give another one with tag=, or replace the operation."
             )
-        with self._step():
+
+    def _add(self, tag: str, operation: Operation, place: int) -> None:
+        self._check_new(tag, operation)
+        with self.step():
+            self.note_given(tag)
             entry = HistoryEntry(tag, operation, place, Reads(), {})
             if self._dirty:
                 self._link(entry)
-                self._mark_outdated(tag)
+                self.mark_outdated(tag)
             else:
                 entry = self._apply(entry)
-                self._check_overwrite(entry)
-                self._link(entry)
-                for cell, value in entry.writes.items():
-                    self._mark_readers(cell, ABSENT, value, place)
+                check_overwrite(self, entry)
+                self.put(entry)
+
+    def note_given(self, tag: str) -> None:
+        """Note a tag as one that the edit itself puts, moves or removes."""
+        if tag not in self._given:
+            self._given[tag] = None
+            self._undo.append((self._given.pop, (tag,)))
 
     @contextmanager
-    def _step(self) -> Iterator[None]:
+    def step(self) -> Iterator[None]:
         """Undo a single step if it raises, so that the edit can continue after the error."""
         mark, dirty = len(self._undo), list(self._dirty)
         try:
             yield
         except BaseException:
             self._undo_to(mark)
-            self._dirty = dirty
+            self._dirty, self._seen = dirty, None
             raise
 
     # -- running -------------------------------------------------------------------------------------------
@@ -280,65 +320,29 @@ class History:
             done.add(item)
             try:
                 self._run(tag)
-                self.run_again.add(tag)
             except KineverseError as error:
                 failures[tag] = error
                 failed.append(item)
         if self._contested:
-            self._check_names(failures)
+            check_names(self, self._contested, failures)
         if self._moved_frames:
-            self._check_frames(failures)
+            check_frames(self, self._moved_frames, failures)
         if failures:
             # The edit may still correct this; if not, it fails again at the end.
             self._dirty = failed
-            raise EditError(self._edit_error(failures), failures)
+            raise refused_error(self, failures)
         self._contested.clear()
         self._moved_frames.clear()
 
-    def _edit_error(self, failures: Mapping[str, KineverseError]) -> str:
-        lines = [f"  {tag!r}: {error}" for tag, error in list(failures.items())[:_LISTED]]
-        if len(failures) > _LISTED:
-            lines.append(f"  and {len(failures) - _LISTED} more operations.")
-        needing = self._dependents(failures)
-        if needing:
-            some = ", ".join(map(repr, needing[:_FEW]))
-            more = f" and {len(needing) - _FEW} more" if len(needing) > _FEW else ""
-            lines.append(f"What these write is needed by {some}{more}.")
-        listed = "\n".join(lines)
-        return f"The edit is refused, because these operations cannot be applied:\n{listed}"
-
-    def _dependents(self, tags: Iterable[str]) -> list[str]:
-        """Return the tags of all operations that depend on others, directly or indirectly, in order."""
-        waiting = list(tags)
-        found = set(waiting)
-        first = len(found)
-        while waiting:
-            entry = self.entries[waiting.pop()]
-            for cell in entry.writes:
-                for tag in self.reading.get(cell, ()):
-                    if tag not in found and self.entries[tag].place > entry.place:
-                        found.add(tag)
-                        waiting.append(tag)
-        if len(found) == first:
-            return []
-        return sorted(found.difference(tags), key=lambda tag: self.entries[tag].place)
-
     def _run(self, tag: str) -> None:
-        old = self.entries[tag]
-        new = self._apply(old)
-        self._exchange(new)
-        for cell in {**old.writes, **new.writes}:
-            self._mark_readers(cell, old.writes.get(cell, ABSENT), new.writes.get(cell, ABSENT), new.place)
+        self.put(self._apply(self.entries[tag]))
 
     def _apply(self, entry: HistoryEntry) -> HistoryEntry:
         self.runs += 1
         tag = entry.tag
         reads = Reads()
-        reader = ReadRecorder(
-            lambda cell: self.value_at(cell, entry.place), lambda k: self.names_at(k, entry.place), reads
-        )
         try:
-            effects = entry.operation.apply(reader)
+            effects = entry.operation.apply(self._reader(entry.place, reads))
             if not isinstance(effects, Writes):
                 raise EditError(f"apply() returns kv.model.Writes, not {type(effects).__name__}.")
             writes = effects.writes()
@@ -346,88 +350,15 @@ class History:
             raise
         except Exception as error:
             raise EditError(f"Operation {tag!r} raised {type(error).__name__}: {error}") from error
-        for (kind, name), value in writes.items():
-            if not isinstance(name, str) or not name or "//" in f"/{name}/":
-                raise EditError(f"Operation {tag!r} writes {kind} under {name!r}, which is not a name.")
-            if kind == FRAMES:
-                self._check_parent(name, value, writes, reads, entry.place)
-        return HistoryEntry(tag, entry.operation, entry.place, reads, writes)
+        new = HistoryEntry(tag, entry.operation, entry.place, reads, writes)
+        check_writes(self, new)
+        return new
 
-    def _check_parent(
-        self, name: str, frame: Frame, writes: Mapping[Cell, Any], reads: Reads, place: int
-    ) -> None:
-        if name == WORLD:
-            raise EditError(f"The frame '{WORLD}' is the root of everything and cannot be written.")
-        parent = frame.parent
-        if parent == WORLD:
-            return
-        # An operation may write several frames, one below the other.
-        above, chain = parent, {name}
-        while (FRAMES, above) in writes and above not in chain:
-            chain.add(above)
-            above = writes[FRAMES, above].parent
-        if above == name:
-            raise ModelError(f"Cyclic frames: '{name}' would be its own parent.")
-        if parent in chain:
-            return
-        reads.add((FRAMES, parent), Read.EXISTENCE)
-        if self.value_at((FRAMES, parent), place) is ABSENT:
-            error = unknown_name_error(FRAMES, parent, self.names_at(FRAMES, place))
-            raise UnknownNameError(f"The parent of frame '{name}' is missing. {error}")
-
-    def _check_overwrite(self, entry: HistoryEntry) -> None:
-        """Refuse an operation that overwrites a value of an earlier one without having read it."""
-        for cell in entry.writes:
-            writers = self.cells.get(cell)
-            # A later operation may write another name when it is applied again.
-            if writers and writers[0].place < entry.place and not may_override(entry, cell):
-                raise overwrite_error(cell, entry, writers[0].tag)
-
-    def _check_names(self, failures: dict[str, KineverseError]) -> None:
-        """Report cells with a second writer that has not read the value of the first."""
-        for cell in self._contested:
-            first, *others = self.cells.get(cell, (None,))
-            for entry in others:
-                if first is not None and entry is not None and not may_override(entry, cell):
-                    failures.setdefault(entry.tag, overwrite_error(cell, entry, first.tag))
-
-    def _check_frames(self, failures: dict[str, KineverseError]) -> None:
-        """Report cycles of frames at any place of the sequence; only frames with new writes can close one."""
-        for name, place in self._moved_frames:
-            circle = self._find_cycle(name, place)
-            if circle is not None:
-                tag, names = circle
-                failures.setdefault(tag, ModelError(f"Cyclic frames: {' -> '.join([*names, names[0]])}."))
-
-    def _find_cycle(self, name: str, place: int) -> tuple[str, list[str]] | None:
-        """Return the first cycle through a frame, between a place and the frame's next write.
-
-        The result is the tag of the operation that closes the cycle, and the names of its frames.
-        """
-        end = None if place == _BEFORE_ALL else self._next_writer(name, place)
-        while True:
-            chain: dict[str, HistoryEntry] = {}
-            until = end
-            link = name
-            while link != WORLD and link not in chain:
-                writers = self.cells.get((FRAMES, link), [])
-                index = bisect_right(writers, place, key=_PLACE)
-                if index < len(writers) and (until is None or writers[index].place < until):
-                    until = writers[index].place
-                if not index:
-                    break  # the frame does not exist yet
-                chain[link] = writers[index - 1]
-                link = writers[index - 1].writes[FRAMES, link].parent
-            if link == name and chain:
-                return max(chain.values(), key=_PLACE).tag, list(chain)
-            if until is None or until == end:
-                return None
-            place = until
-
-    def _next_writer(self, name: str, place: int) -> int | None:
-        writers = self.cells.get((FRAMES, name), [])
-        index = bisect_right(writers, place, key=_PLACE)
-        return writers[index].place if index < len(writers) else None
+    def _reader(self, place: int, reads: Reads) -> ReadRecorder:
+        """Return the model before a place, which records what is read."""
+        return ReadRecorder(
+            lambda cell: self.value_at(cell, place), lambda kind: self.names_at(kind, place), reads
+        )
 
     def _mark_readers(self, cell: Cell, old: Any, new: Any, place: int) -> None:
         """Mark the readers of a write at ``place`` as outdated."""
@@ -458,14 +389,37 @@ class History:
                 and (following is None or reader <= following)
                 and (how & Read.VALUE or existence)
             ):
-                self._mark_outdated(tag)
+                self._note_change(tag, cell, old)
         if existence:
             for tag in self.listing[kind]:
                 reader = self.entries[tag].place
                 if reader > place and (following is None or reader <= following):
-                    self._mark_outdated(tag)
+                    self._note_change(tag, cell, old)
 
-    def _mark_outdated(self, tag: str) -> None:
+    def _note_change(self, tag: str, cell: Cell, old: Any) -> None:
+        self.mark_outdated(tag)
+        if self._seen is not None:
+            self._seen.setdefault((tag, cell), old)
+
+    def take_notes(self) -> None:
+        """Note from now on what readers see before each change, for :meth:`find_outdated`."""
+        self._seen = {}
+
+    def find_outdated(self, without: Container[str]) -> list[tuple[str, Cell]]:
+        """Return who reads other values than when notes were begun, and what; only these remain marked."""
+        seen, self._seen, self._dirty = self._seen or {}, None, []
+        found = []
+        for (tag, cell), before in seen.items():
+            entry = self.entries.get(tag)
+            if entry is not None and tag not in without:
+                how = entry.reads.cells.get(cell, Read.EXISTENCE)
+                if _differs(how, before, self.value_at(cell, entry.place)):
+                    self.mark_outdated(tag)
+                    found.append((tag, cell))
+        return found
+
+    def mark_outdated(self, tag: str) -> None:
+        """Mark an operation to be run when the edit settles."""
         heapq.heappush(self._dirty, (self.entries[tag].place, tag))
 
     def value_at(self, cell: Cell, place: int) -> Any:
@@ -504,7 +458,31 @@ class History:
         self._dirty.clear()
         self._moved_frames.clear()
         self._contested.clear()
-        self.run_again.clear()
+        self._given.clear()
+        self._touched = {}
+
+    def touched(self) -> Iterator[TouchedEntry]:
+        """Yield what the transaction has changed, first what the edit itself did, in its order."""
+        entries = self.entries
+        for tag in self._given:
+            before, now = self._touched.get(tag), entries.get(tag)
+            if before is not None or now is not None:
+                yield before, now, True
+        for tag, before in self._touched.items():
+            now = entries.get(tag)
+            if before is not None and now is not None and now.reads is not before.reads:
+                if tag not in self._given:
+                    yield before, now, False
+
+    def mark(self) -> tuple[Any, ...]:
+        """Return the state of the transaction, for :meth:`return_to`."""
+        return len(self._undo), self.runs, self._dirty.copy(), self._moved_frames.copy()
+
+    def return_to(self, mark: tuple[Any, ...]) -> None:
+        """Undo what the transaction did since a mark, which may be used again."""
+        self._undo_to(mark[0])
+        # Cycles are looked for again; names written twice are as entries are linked again.
+        self.runs, self._dirty, self._moved_frames = mark[1], mark[2].copy(), mark[3].copy()
 
     def roll_back(self) -> None:
         """Undo everything since :meth:`begin`."""
@@ -551,12 +529,7 @@ class History:
 
     def _link(self, entry: HistoryEntry) -> None:
         if entry.operation.recorded is entry.writes:  # linked without a run
-            place = entry.place
-            entry.operation.remember(
-                ReadRecorder(
-                    lambda cell: self.value_at(cell, place), lambda kind: self.names_at(kind, place), Reads()
-                )
-            )
+            entry.operation.remember(self._reader(entry.place, Reads()))
         self._index(entry)
         for cell in entry.writes:
             writers = self.cells.get(cell)
@@ -571,6 +544,7 @@ class History:
 
     def _index(self, entry: HistoryEntry) -> None:
         """Note an entry by its tag, its place and its reads."""
+        self._touched.setdefault(entry.tag, None)
         self.entries[entry.tag] = entry
         if not self.sequence or self.sequence[-1].place < entry.place:
             self.sequence.append(entry)
@@ -582,6 +556,7 @@ class History:
             self.listing[kind].add(entry.tag)
 
     def _unlink(self, entry: HistoryEntry) -> None:
+        self._touched.setdefault(entry.tag, entry)
         self._forget(entry)
         self._undo.append((self._relink, (entry,)))
 
@@ -615,21 +590,45 @@ class History:
             self._disordered.update(kind for kind, _ in (*old.writes, *new.writes))
 
     def _renumber(self) -> None:
-        # Copies and snapshots may share the entries, so they are replaced and not modified.
-        renumbered = [entry.at(i * _GAP) for i, entry in enumerate(self.sequence)]
-        self._undo.append((self._put_entries, (self.sequence,)))
-        self._put_entries(renumbered)
+        # Copies and snapshots may share the entries, so they are replaced and not modified. Entries that are
+        # not there any more keep their places among the others, to be put back there.
+        pairs = [pair for commit in self.commits.values() for pair in commit.values() if pair[0] is not None]
+        gone = [*self._touched.values(), *(entry for pair in pairs for entry in pair)]
+        places = sorted({entry.place for entry in (*self.sequence, *gone) if entry is not None})
+        new = {place: i * _GAP for i, place in enumerate(places)}
+
+        def moved(entry: HistoryEntry | None) -> HistoryEntry | None:
+            return None if entry is None else entry.at(new[entry.place])
+
+        old = self.sequence, self._touched, self.commits
+        self._undo.append((self._put_entries, old))
+        self._put_entries(
+            [entry.at(new[entry.place]) for entry in self.sequence],
+            {tag: moved(entry) for tag, entry in self._touched.items()},
+            {
+                version: {
+                    tag: pair if pair[0] is None else (moved(pair[0]), moved(pair[1]))
+                    for tag, pair in commit.items()
+                }
+                for version, commit in self.commits.items()
+            },
+        )
         self._dirty = [(self.entries[tag].place, tag) for _, tag in self._dirty if tag in self.entries]
         heapq.heapify(self._dirty)
 
-    def _put_entries(self, sequence: list[HistoryEntry]) -> None:
+    def _put_entries(
+        self,
+        sequence: list[HistoryEntry],
+        touched: dict[str, HistoryEntry | None],
+        commits: dict[int, CommitRecord],
+    ) -> None:
         # The order stays the same, so every sorted list of entries stays sorted.
-        self.sequence = sequence
+        self.sequence, self._touched, self.commits = sequence, touched, commits
         self.entries = {entry.tag: entry for entry in sequence}
         for writers in self.cells.values():
             writers[:] = [self.entries[entry.tag] for entry in writers]
         # The places of moved frames are no longer known, so cycles are searched from the beginning.
-        self._moved_frames = {(name, _BEFORE_ALL): None for name, _ in self._moved_frames}
+        self._moved_frames = {(name, BEFORE_ALL): None for name, _ in self._moved_frames}
 
 
 def as_cell(path: str) -> Cell:
@@ -643,3 +642,10 @@ def as_cell(path: str) -> Cell:
 def _check_operation(operation: object) -> None:
     if not isinstance(operation, Operation):
         raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
+
+
+def _differs(how: Read, before: Any, now: Any) -> bool:
+    """Return whether a read finds something else than before."""
+    if before is now:
+        return False
+    return before is ABSENT or now is ABSENT or bool(how & Read.VALUE and before != now)

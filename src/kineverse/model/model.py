@@ -8,12 +8,15 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from kineverse._runtime import no_collection
-from kineverse.errors import EditError, ExpressionError, UnknownAttributeError
+from kineverse.errors import EditError, ExpressionError, KineverseError, UnknownAttributeError
 from kineverse.symbols import Symbol
 
-from .changes import Change, Diff, Listener, Listeners
+from .changes import Change, Diff
+from .commits.listeners import Commit, CommitFilter, Listener, Listeners
+from .commits.net_changes import NetChanges, adopt, find_touched_tags
+from .commits.undo import keep_commit
 from .edit import Edit
-from .history import History, HistoryEntry
+from .history import History, HistoryEntry, TouchedEntry
 from .model_view import ModelView
 from .read_recorder import ABSENT
 from .registry import LoopTreatment
@@ -69,6 +72,8 @@ class Model(ModelView):
                     f"{type(_entries).__name__}. To load one: kv.load(path)."
                 )
             _entries = History(_entries)
+            if _version == 1:  # all of it comes from one commit
+                _entries.commits[1] = {entry.tag: (None, entry) for entry in _entries.sequence}
         self._history = _entries
         self._edit: Edit | None = None
         self._listeners = Listeners()
@@ -104,11 +109,13 @@ class Model(ModelView):
                 yield edit
                 self._history.settle()
                 self.rates  # noqa: B018 - cyclic rates are an error of the edit, not of a later query
+                touched = list(self._history.touched())
             except BaseException:
                 self._history.roll_back()
                 raise
             else:
-                self._listeners.post(self._commit(edit, self._history.runs - runs))
+                if touched:
+                    self._listeners.post(self._commit(touched, self._history.runs - runs))
             finally:
                 edit._open = False
                 self._edit = None
@@ -128,16 +135,53 @@ class Model(ModelView):
     def _ordered(self, kind: str) -> dict[str, Any]:
         return self._history.ordered(kind)
 
-    def _commit(self, edit: Edit, reruns: int) -> Diff:
+    def _commit(self, touched: list[TouchedEntry], reruns: int) -> Commit:
+        history, version = self._history, self._version + 1
         changes = [
             Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
-            for (kind, name), before, after in self._history.changes()
+            for (kind, name), before, after in history.changes()
         ]
-        diff = edit._diff(self._version + 1, changes, reruns)
-        self._history.begin()
-        self._version += 1
+        tags = find_touched_tags(history, touched)
+        diff = Diff(
+            version,
+            tuple(changes),
+            tuple(tags.added),
+            tuple(tags.removed),
+            tuple(tags.replaced),
+            reruns,
+            tuple(tags.moved),
+            tuple(tags.rerun),
+        )
+        keep_commit(history, version, touched)
+        history.begin()
+        self._version = version
         self._derived = {}
-        return diff
+        return Commit(diff, history.head)
+
+    def adopt(self, changes: NetChanges) -> None:
+        """Make the net changes of an edit of an equal model, in one commit, without running an operation.
+
+        A copy that adopts the changes of each edit in order keeps equal values, order and history. Listeners
+        get one diff, as after the edit itself.
+
+        Parameters
+        ----------
+        changes
+            Result of :meth:`.Edit.net`.
+
+        Raises
+        ------
+        EditError
+            If the changes do not belong to this model: a tag is taken, an anchor or a parent is missing,
+            frames or rates are cyclic, or another operation reads what they change. The model is unchanged.
+        """
+        try:
+            with self.edit() as edit:
+                adopt(edit._check_open(), changes, complete=True)
+        except EditError:
+            raise
+        except KineverseError as error:
+            raise EditError(f"The changes cannot be adopted: {error}") from error
 
     def include(
         self,
@@ -159,6 +203,7 @@ class Model(ModelView):
         paths: Iterable[str] | None = None,
         symbols: Iterable[Symbol] | None = None,
         tags: Iterable[str] | None = None,
+        frames: Iterable[str] | None = None,
     ) -> Listener:
         """Register a callback for commits; it gets the part of each diff that passes the filter.
 
@@ -170,11 +215,15 @@ class Model(ModelView):
         paths
             Paths such as ``frames/kitchen``, for all values at or below them.
         symbols
-            Symbols, for constraints with their coordinates in expression, bounds or gradient.
+            Symbols, for constraints with their coordinates in expression, bounds or gradient, and for rates
+            of them or with them. What is about a dependent coordinate is about those that determine it.
         tags
             Tags of operations that are added, removed, replaced, moved or run again.
+        frames
+            Frames whose forward kinematics are followed: their own frames and rates, and those of all frames
+            above them. The diff names those that moved in ``poses``.
         """
-        return self._listeners.add(callback, paths, symbols, tags)
+        return self._listeners.add(callback, CommitFilter.of(paths, symbols, tags, frames))
 
     # -- copies --------------------------------------------------------------------------------------------
 

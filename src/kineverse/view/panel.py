@@ -29,8 +29,15 @@ STYLE = """
   display: block; white-space: pre; overflow: hidden; text-overflow: ellipsis }
 .mantine-Flex-root:has(> div > p > label):has(.mantine-Checkbox-root) > div:first-child {
   width: auto !important; min-width: 6.5em; white-space: nowrap }
+@media (max-width: 36em) {
+  .mantine-Paper-root[style*="position: fixed"] { width: 100% !important; max-height: 45% !important }
+  .mantine-Paper-root[style*="position: fixed"] .mantine-ScrollArea-content > div { width: 100% !important }
+  [data-dock-root] > div:first-child { bottom: 45% !important }
+  body:has(.mantine-ScrollArea-content > div > div:first-child + [aria-hidden="true"])
+    [data-dock-root] > div:first-child { bottom: 3.5em !important }
+}
 """
-"""Sliders below their names, which do not fit beside them; the names include the range."""
+"""Sliders below their names, which include the range; on a phone the panel is a sheet below the scene."""
 
 
 class Panel:

@@ -85,7 +85,7 @@ def complete(model: ModelView, state: StateLike | None = None) -> dict[str, floa
             values[name] = float(value)
         elif not isinstance(state, State):
             if parse_symbol_name(name)[1] and name.partition(":")[0] in known:
-                raise UnknownNameError(f"'{name}' is a speed; where things are depends on positions only.")
+                raise UnknownNameError(f"'{name}' is a speed; poses depend on positions only.")
             raise UnknownNameError(f"The model has no symbol '{name}'. {suggest(name, known, 'symbol')}")
     return values
 

@@ -417,6 +417,6 @@ def play_recording(
     """Play a recorded run on a page of its model, with a slider for the time."""
     scene = RecordedScene(recording)
     if scene.trajectory is None:
-        raise InvalidValueError(f"There is no state in {recording.path.name} to be played.")
+        raise InvalidValueError(f"{recording.path.name} has no state to play.")
     layer = RunLayer(page.server, scene.drawing, "recording", scene.at)
     page.play(scene.trajectory, speed=speed, loop=loop, layer=layer, at=time)

@@ -182,4 +182,4 @@ def _free_port(host: str, port: int | None) -> int:
                     raise InvalidValueError(f"{host!r} is no address of this computer") from None
                 continue
             return int(probe.getsockname()[1])
-    raise InvalidValueError(f"port {port} is taken; leave --port away to get a free one")
+    raise InvalidValueError(f"port {port} is taken; without --port a free one is chosen")

@@ -71,7 +71,7 @@ class SpeedMap:
         if missing:
             raise InvalidValueError(
                 f"The speeds of {', '.join(map(str, coordinates))} depend on {', '.join(missing)}, which "
-                "MuJoCo has not as the position of one joint. Replace that part of the robot."
+                "is the position of no joint in MuJoCo. Replace that part of the robot."
             )
         self._at = np.array([address[s] for s in inputs], dtype=int)
 

@@ -230,7 +230,6 @@ def _opens(loop: ControllerLoop) -> bool:
 
 @cache
 def make_opening(robot: str) -> Opening:
-    """Return the workload of a robot, one of :data:`GRIPPERS`."""
     grasp = translation(0.04, 0.0, 0.0) @ rpy(np.pi / 2, 0.0, np.pi)
     if robot == "hsr":  # its palm points along z
         grasp = translation(0.08, 0.0, 0.0) @ rpy(np.pi / 2, 0.0, np.pi) @ rotation_y(np.pi / 2)

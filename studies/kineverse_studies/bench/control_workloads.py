@@ -80,6 +80,16 @@ class PeerLoop:
         self._q = self.robot.configuration.q
 
 
+def measure_error(robot: Any, task: Any) -> Callable[[], float]:
+    """Return a function that gives the error of position of a task of pink or mink [m]."""
+    return lambda: float(np.linalg.norm(task.compute_error(robot.configuration)[:3]))
+
+
+def hold_start(robot: Any, tasks: Iterable[Any]) -> None:
+    for task in tasks:
+        task.set_target_from_configuration(robot.configuration)
+
+
 def split_coordinate(name: str) -> tuple[str, int]:
     """Return the joint of a coordinate, and its number in the joint: 0 to 2 for x, y and z of the root."""
     joint, _, axis = name.rpartition("/") if name.startswith(f"{ROOT}/") else (name, "", "x")

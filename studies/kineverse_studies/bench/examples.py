@@ -66,7 +66,6 @@ def measure_examples(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def find_examples(folder: Path | None = None) -> Path:
-    """Return the folder of our examples, by default that of the checkout."""
     here = checkout(Path(kineverse.__file__))
     found = folder or (here and here / "examples")
     if found is None or not (found / "from_pink").is_dir():

@@ -16,7 +16,6 @@ from typing import Any
 
 
 def import_time(module: str) -> dict[str, Any]:
-    """Return the time of an import [s]."""
     start = perf_counter()
     importlib.import_module(module)
     return {"seconds": perf_counter() - start}
@@ -120,7 +119,6 @@ def memory_of_robot(library: str, file: str, frame: str) -> dict[str, Any]:
 
 
 def _resident_memory() -> float:
-    """Return the resident memory of this process [MB]."""
     with open("/proc/self/statm", encoding="ascii") as file:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 

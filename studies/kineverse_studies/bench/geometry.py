@@ -262,7 +262,6 @@ class RobotSurroundings:
 
 
 def solid_corners(solid: Solid) -> Array:
-    """Return the corners of a box or hull, (N, 3)."""
     if isinstance(solid.surface, Box):
         return UNIT_BOX_CORNERS * solid.surface.size
     assert solid.core is not None

@@ -26,7 +26,7 @@ from .lockbox.unlocking_runs import (
     make_thesis_table,
     run_unlocking,
 )
-from .manipulation.skills import SettingOptions, check_data, find_robots, make_settings
+from .manipulation.skills import SettingOptions, find_robots, make_settings
 from .manipulation.trials import (
     QUALITY,
     ROW,
@@ -54,7 +54,7 @@ _PUSH_LOGIC: dict[Rule, str | None] = {"and": "and", "product": "product", "none
 def run(progress: Progress, options: Options) -> Report:
     """Open boxes and push objects with each rule; ``quick`` takes few boxes, one robot and one object."""
     settings = make_settings(options)
-    robots = find_robots(options.robot, check_data(options.data))
+    robots = find_robots(options.robot, options.data)
     boxes = options.count or (QUICK_BOXES if options.quick else BOXES)
     thesis = {rule: run_unlocking(THESIS, rule) for rule in RULES}
     runs = run_boxes(boxes, options.seed, progress)

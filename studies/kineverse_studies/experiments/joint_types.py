@@ -63,7 +63,6 @@ class JointCase:
 
 
 def draw_case(number: int) -> JointCase:
-    """Draw the case of a number. Each has a random generator of its own."""
     rng = np.random.default_rng([SEED, number])
     joint: Joint = "revolute" if rng.random() < 0.5 else "prismatic"
     count = round(_log_uniform(rng, *COUNTS))
@@ -232,12 +231,10 @@ def noise_ratio(answer: TypeAnswer) -> float:
 
 
 def share_right(answers: Sequence[TypeAnswer]) -> float:
-    """Return the share of right answers; NaN without answers."""
     return sum(answer.is_right for answer in answers) / len(answers) if answers else math.nan
 
 
 def share_of_sure_errors(answers: Sequence[TypeAnswer]) -> float:
-    """Return the share of wrong sure answers; NaN without answers."""
     errors = sum(answer.is_sure and not answer.is_right for answer in answers)
     return errors / len(answers) if answers else math.nan
 

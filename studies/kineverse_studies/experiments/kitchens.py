@@ -26,7 +26,6 @@ from .manipulation.skills import (
     SettingOptions,
     TrialCase,
     TrialSetting,
-    check_data,
     find_robots,
     make_settings,
     open_then_close,
@@ -58,7 +57,7 @@ class KitchenJob:
 def run(progress: Progress, options: Options) -> Report:
     """Open and close everything; the option ``quick`` takes two objects of one kitchen, and one robot."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
-    robots = find_robots(options.robot, check_data(options.data))
+    robots = find_robots(options.robot, options.data)
     if options.quick and not options.robot:
         robots = robots[-1:]
     names = [options.model] if options.model else name_kitchens(options.seed, count)
@@ -124,7 +123,6 @@ def make_kitchen_with(robot: RobotSource, name: str) -> Model:
 
 
 def start_in_aisle(robot: RobotSource, model: Model) -> State:
-    """Return a state with the robot in the aisle, which looks along it, near to its middle."""
     floor, begin = f"{KITCHEN}/floor", robot.start_state(model)
     states = (
         begin.updated({f"{robot.prefix}/base/y": offset, f"{robot.prefix}/base/angle": angle})

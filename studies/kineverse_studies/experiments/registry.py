@@ -18,8 +18,6 @@ WORLDS, BOTH = ("kinematic", "mujoco"), "both"  # worlds of trials, and the opti
 
 @dataclass(frozen=True)
 class Options:
-    """Options of experiments; each takes some of these."""
-
     quick: bool = False  # true for a reduced experiment, in seconds
     data: Path | None = None  # folder of recordings or robots
     model: str | None = None  # name or path of the model; None for the default

@@ -195,7 +195,6 @@ class TrackingSummary:
 def make_streams(
     model: Model, seeds: Iterable[int], progress: Progress, duration: float = DURATION
 ) -> list[Stream]:
-    """Return a stream of the door for each seed, of a duration [s]."""
     angles = hand_motion(np.arange(round(duration * RATE)) / RATE)
     seeds = progress(list(seeds), "stream: observations", "seed")
     return [simulate_stream(model, angles, np.random.default_rng(seed)) for seed in seeds]

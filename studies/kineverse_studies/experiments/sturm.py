@@ -204,7 +204,6 @@ RIGHT, WRONG = "0.25", "tab:red"
 
 
 def figure_size(classified: Sequence[Classification]) -> tuple[float, float]:
-    """Return width and height of the figure [inch]."""
     misclassified = sum(not j.is_correct for j in classified)
     rows = math.ceil(len(classified) / FIGURE_COLUMNS)
     return FIGURE_COLUMNS * SMALL, SMALL * rows + LARGE * misclassified + 0.5

@@ -1,7 +1,8 @@
 """``table1-push``: twelve objects of a kitchen and a folding door are pushed shut (both papers, Table I).
 
 The objects are open by .4 m or rad. A robot begins at the papers' start. Where that fails, base placement
-searches for another one, and the table says so. The authors' kitchen and robots come from ``--data``.
+searches for another one, and the table says so. The papers' own controller pushes from their start alone. The
+authors' kitchen and robots come from ``--data``.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ from .manipulation.skills import (
     run_push_trial,
 )
 from .manipulation.trials import (
+    PAPER_DOF,
+    QUALITY,
     ROW,
     TIMES,
     Column,
@@ -157,16 +160,17 @@ PENETRATION, LIMITS, LOSSES = 5e-4, 1e-6, 1
 
 
 def make_push_report(trials: Sequence[Trial], seed: int) -> Report:
-    by = ("case", "skill")
-    groups = group_trials(trials, *by, *(c.key for c in ROW)).values()
+    by, every = ("case", "skill"), trials
+    trials = [t for t in every if PAPERS not in t.skill]
+    groups = group_trials(every, *by, *(c.key for c in ROW)).values()
     columns = (*ROW[:3], *OBJECT_COLUMNS, *PAPER_COLUMNS)
     pushes = [
         {"case": own[0].case, "skill": own[0].skill, **{c.key: c.of(own) for c in columns}} for own in groups
     ]
     numbers = {"seed": seed, "pushes": pushes, **make_trial_numbers(trials)}
     more = (
-        make_group_table("Starts and bars", trials, (*ROW[:3], *OBJECT_COLUMNS), by),
-        make_group_table("Control steps beside the papers [ms]", trials, (*ROW[:3], *PAPER_COLUMNS), by),
+        make_group_table("Starts and bars", every, (*ROW[:3], *OBJECT_COLUMNS, *_COMPARED), by),
+        make_group_table("Control steps beside the papers [ms]", trials, (*ROW, *PAPER_COLUMNS), by),
     )
     return Report(
         "table1-push",
@@ -183,7 +187,6 @@ _NAMED = 6  # number of the fastest joints that have their names in the figure
 
 
 def meets_bars(trial: Trial) -> bool:
-    """Return whether a push was done within the bars."""
     m = trial.measures
     return bool(
         trial.done
@@ -217,7 +220,10 @@ def _published(trials: Sequence[Trial], entry: int) -> float:
     return paper.get(trials[0].robot.partition(" ")[0], (math.nan, math.nan))[entry]
 
 
+PAPERS = "papers' push"  # skill of the papers' controller
+_COMPARED = (*(c for c in QUALITY if c.key not in ("grasp_error_mm", "penetrating", "peak_force")), TIMES[1])
 PAPER_COLUMNS = (
+    PAPER_DOF,
     TIMES[1],
     Column("sd_over_objects_ms", "sd over objects", _spread),
     Column("published_mean_ms", "paper mean", lambda trials: _published(trials, 0)),
@@ -264,17 +270,19 @@ class PushJob:
     setting: TrialSetting = field(default_factory=TrialSetting)  # world, noise and recordings
     seed: int = 0  # seed of the base placement
     logic: str | None = "and"  # rule of trends: ``"and"``, ``"product"``, or None for exact gradients alone
+    baseline: bool = False  # whether the papers' controller pushes
 
 
 def run(progress: Progress, options: Options) -> Report:
     """Push all objects shut; the option ``quick`` takes two of them, and the period of the 2022 paper."""
     data = check_data(options.data)
     jobs = [
-        PushJob(robot, kitchen, data, thing, paper, setting, options.seed)
+        PushJob(robot, kitchen, data, thing, paper, setting, options.seed, baseline=baseline)
         for setting in make_settings(options)
         for kitchen, things in find_kitchens(data).items()
         for robot in find_robots(options.robot, data)
         for thing in things
+        for baseline in (False, True)
         for paper in PERIODS
         if not options.quick or (thing in QUICK_OBJECTS and paper == "2022")
     ]
@@ -291,9 +299,10 @@ def run_push(job: PushJob) -> list[Trial]:
         setup.what,
         job.setting,
         job.seed,
-        film=job.thing in FILMED and job.paper == "2022",
+        film=job.thing in FILMED and job.paper == "2022" and not job.baseline,
         measures=(("thing", job.thing),),
     )
     world = job.setting.make_world(setup.model, job.robot.prefix, setup.start, dt=dt)
-    skill = f"push ({job.paper})"
-    return [run_push_trial(case, setup.model, world, setup.start, skill, dt=dt, steps=steps, logic=job.logic)]
+    skill = f"{PAPERS if job.baseline else 'push'} ({job.paper})"
+    push = partial(run_push_trial, dt=dt, steps=steps, logic=job.logic, baseline=job.baseline)
+    return [push(case, setup.model, world, setup.start, skill)]

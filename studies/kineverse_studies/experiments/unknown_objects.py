@@ -24,7 +24,6 @@ from .manipulation.skills import (
     TrialCase,
     TrialSetting,
     TrialWatch,
-    check_data,
     find_robots,
     make_settings,
 )
@@ -78,7 +77,7 @@ def run(progress: Progress, options: Options) -> Report:
     """Open the objects; the option ``quick`` takes one seed and the last robot, ``count`` so many seeds."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
     settings = make_settings(replace(options, noise=options.noise or NOISE))
-    robots = find_robots(options.robot, check_data(options.data))
+    robots = find_robots(options.robot, options.data)
     if options.quick and not options.robot:
         robots = robots[-1:]
     jobs = [
@@ -145,7 +144,6 @@ def is_known_early(trial: Trial) -> bool:
 
 
 def is_open_early(trial: Trial) -> bool:
-    """Return whether the part was open in time."""
     return trial.done and trial.measures["opened_seconds"] <= MOST_SECONDS
 
 

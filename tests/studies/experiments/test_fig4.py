@@ -188,7 +188,7 @@ def cupboard(tmp_path_factory):
 @pytest.fixture(scope="module")
 def few():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fig4, "CONFIGURATIONS", 30)
+        patch.setattr(fig4.protocol, "CONFIGURATIONS", 30)
         patch.setattr(fig4, "TIMED", 1)
         yield
 

@@ -11,7 +11,7 @@ import pytest
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
 from kineverse.gallery.lockboxes import THESIS, draw_lockbox
 from kineverse.geometry import Rule, Scene
-from kineverse.manipulation import Outcome, TrackedBelief, TrueBelief
+from kineverse.manipulation import Outcome, Session, TrackedBelief, TrueBelief
 from kineverse.manipulation.base_sampling import find_free_state
 from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.worlds import read_run_recording
@@ -21,6 +21,7 @@ from kineverse_studies.experiments.execution import run_jobs
 from kineverse_studies.experiments.lockbox.unlocking_runs import RULES, run_unlocking
 from kineverse_studies.experiments.manipulation import skills
 from kineverse_studies.experiments.manipulation.film import draw_vectors, find_telling_moment
+from kineverse_studies.experiments.manipulation.paper_push import push_as_published
 from kineverse_studies.experiments.manipulation.skills import (
     TrialSetting,
     TrialWatch,
@@ -44,7 +45,7 @@ from kineverse_studies.experiments.table1_open.programs import (
     make_opening_setup,
     open_by_program,
 )
-from kineverse_studies.experiments.table1_push import find_kitchens, make_push_setup
+from kineverse_studies.experiments.table1_push import find_kitchens, make_push_report, make_push_setup
 
 
 def _trial(what, failure="", *, skill="open", placements=0, case="7", cpu=()):
@@ -236,6 +237,9 @@ def test_find_robots_and_options_name_what_there_is(tmp_path):
     assert [r.name for r in find_robots()] == ["pr2", "fetch", "hsr"]
     with pytest.raises(UnknownNameError, match="Did you mean 'fetch'"):
         find_robots(["fetsch"])
+    (tmp_path / "data/pr2/pr2_description/robots").mkdir(parents=True)
+    (tmp_path / "data/pr2/pr2_description/robots/pr2.urdf").touch()
+    assert [r.name for r in find_robots(["pr2", "hsr"], tmp_path / "data")] == ["pr2 (authors)", "hsr"]
     with pytest.raises(InvalidValueError, match="There is no folder"):
         check_data(tmp_path / "none")
     with pytest.raises(InvalidValueError, match="has none of pr2, fetch"):
@@ -340,6 +344,33 @@ def test_setting_believes_the_truth_only_without_noise():
     assert isinstance(TrialSetting("kinematic", "3mm").make_belief(world), TrackedBelief)
     assert isinstance(TrialSetting().make_belief(world), TrueBelief)
     assert [one.world for one in make_settings(Options(world="both"))] == ["kinematic", "mujoco"]
+
+
+def test_papers_controller_moves_an_object_only_where_it_touches():
+    robot = SHIPPED["hsr"]
+    setup = make_push_setup(robot, table1_push.SHIPPED_KITCHEN, "folding door")
+    what, touches, commanded = setup.model.symbol(setup.what), [], []
+    world = TrialSetting().make_world(setup.model, "hsr", setup.start, dt=0.1)
+    session = Session(world, dt=0.1, on_step=lambda own: commanded.append(own.command.speeds))
+    outcome = push_as_published(session, robot, what, 500, lambda push: touches.append(push.touching))
+    assert outcome, outcome.reason
+    speeds = [speeds[what.derivative()] for speeds in commanded]
+    assert max(map(abs, speeds)) > 0.05
+    assert not touches[0]
+    assert [v for v, touched in zip(speeds, touches, strict=True) if not touched] == pytest.approx(
+        [0.0] * touches.count(False), abs=1e-9
+    )
+
+
+def test_push_report_has_the_papers_controller_apart():
+    ours = Trial("shipped kitchen", "hsr", "door", "push (2020)", False, 0.4, "time", "", 1.0, 10)
+    papers = replace(ours, skill="papers' push (2020)", done=True, failure="")
+    report = make_push_report([ours, papers], 0)
+    tables = {table.title: table for table in report.tables}
+    assert len(tables["Starts and bars"].rows) == 2
+    assert tables["Objects pushed shut"].rows[0][:4] == ("hsr", "kinematic", "0", "1")
+    assert len(tables["Failures"].rows) == 1
+    assert [row["published_dof"] for row in report.numbers["pushes"]] == [23, 23]
 
 
 def test_push_vectors_are_drawn_at_nearest_points_with_the_longest_tangent():

@@ -227,7 +227,7 @@ def _implicit(graph: NodeGraph, node: Any) -> None:
     graph.budget.spend(work)
     graph.check_elements(residual.shape)
     function = ImplicitFunction(
-        name=check_name(node.name),
+        name=graph.before + check_name(node.name),
         unknowns=unknowns,
         inputs=inputs,
         residual=residual,

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from kineverse.errors import FormatError, suggest
 from kineverse.formats.mimic import MimicRelation, resolve_mimic_chains
-from kineverse.formats.reader_warnings import ReaderWarnings
+from kineverse.formats.reader_warnings import ChangedMotion, Fault, ReaderWarnings
 from kineverse.formats.xml_reader import Element, ElementError, abbreviate, quote, read_name
 from kineverse.formats.xml_values import (
     LARGEST,
@@ -330,11 +330,11 @@ def resolve_mimic_joints(joints: Iterable[UrdfJoint], remarks: ReaderWarnings) -
         return joints
     by_name = {joint.name: joint for joint in joints}
 
-    def refuse(follower: str, reason: str) -> None:
+    def refuse(follower: str, reason: str, advice: str = "", kind: type[Fault] = Fault) -> None:
         line, text = by_name[follower].line, f"<mimic> of <joint name={quote(follower)}>: {reason}"
         if remarks.strict:
-            raise FormatError(f"{remarks.source}, line {line}, {text}")
-        remarks.fault(line, f"{text.rstrip('. ')}; it moves by itself.")
+            raise FormatError(f"{remarks.source}, line {line}, {text} {advice}".rstrip())
+        remarks.fault(line, f"{text.rstrip('. ')}; it moves by itself. {advice}".rstrip(), kind)
 
     def check(follower: str, name: str) -> bool:
         leader = by_name.get(name)
@@ -342,8 +342,9 @@ def resolve_mimic_joints(joints: Iterable[UrdfJoint], remarks: ReaderWarnings) -
             movable = [joint.name for joint in joints if DOF_BY_TYPE[joint.kind] == 1]
             refuse(
                 follower,
-                f"it mimics {quote(name)}, and there is no joint of that name. "
-                f"{suggest(name, movable, 'joint to mimic')}",
+                f"it mimics {quote(name)}, and there is no joint of that name.",
+                suggest(name, movable, "joint to mimic"),
+                ChangedMotion,
             )
             return False
         if DOF_BY_TYPE[leader.kind] != 1:

@@ -6,10 +6,10 @@ IN and OUT are archives of numpy; ERROR is in metres, MEMORY in bytes. The proce
 input ends, so it does not outlive its parent.
 """
 
-import contextlib
 import os
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 
@@ -29,7 +29,11 @@ COACD_OPTIONS = {
 def main(source: str, target: str, error: str, memory: str) -> None:
     """Read a mesh and write the hulls of its decomposition."""
     threading.Thread(target=_end_with_standard_input, daemon=True).start()
-    _bound_memory(int(memory))
+    sys.path.insert(0, str(Path(__file__).parents[3]))  # the package of this file, installed or not
+    from kineverse._runtime import limit_resources
+
+    del sys.path[0]
+    limit_resources(int(memory))
 
     import coacd
 
@@ -48,15 +52,6 @@ def main(source: str, target: str, error: str, memory: str) -> None:
 def _end_with_standard_input() -> None:
     os.read(0, 1)
     os._exit(1)
-
-
-def _bound_memory(limit: int) -> None:
-    try:
-        import resource
-    except ImportError:  # Windows has no such limits.
-        return
-    with contextlib.suppress(ValueError, OSError):
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
 if __name__ == "__main__":

@@ -285,7 +285,7 @@ class PlacementSearch:
         """
         grasp = earlier.grasp
         if grasp is None or grasp.gripper.hand != self.gripper.hand:
-            raise InvalidValueError(f"The placement that leads back has to be one of '{self.gripper.hand}'.")
+            raise InvalidValueError(f"The earlier placement must be one of '{self.gripper.hand}'.")
         self.paths.ease = self.samples.eases[0]
         return _Search(self, state, [grasp], target, accept, np.random.default_rng(0)).retrace(earlier)
 

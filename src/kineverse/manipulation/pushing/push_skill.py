@@ -13,7 +13,6 @@ from kineverse.errors import KineverseError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
-from kineverse.lie import Array
 from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
@@ -146,10 +145,9 @@ def push(
     -------
     Outcome
         With ``measures``: those of :class:`.Judge`, ``losses``, ``blocked``, ``contacts``, ``jammed``,
-        ``planned``, ``jitter`` (largest mean change of a speed from step to step while touching, [m/s],
-        [rad/s]), ``tolerance``, ``peak_force`` [N] in a world with forces, and ``failure``: ``"collision"``,
-        ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the path is free, if
-        something is in the way.
+        ``planned``, ``tolerance``, ``peak_force`` [N] in a world with forces, and ``failure``:
+        ``"collision"``, ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the
+        path is free, if something is in the way.
 
     Raises
     ------
@@ -291,8 +289,6 @@ class _Run:
         self._seconds, self._tolerance, self._plan = seconds, tolerance, plan
         self._first, self._begin = session.steps, session.world.time
         self._approaches = 0
-        self._changes: list[Array] = []
-        self._last: Array | None = None
 
     @property
     def steps(self) -> int:
@@ -342,10 +338,6 @@ class _Run:
             if observation is not None:
                 deviation = pushing.find_deviation(state, session.belief.deviation)
             command = pushing.step(state, observation if deviation else None, deviation)
-        speeds = command.vector
-        if pushing.touching and self._last is not None:
-            self._changes.append(np.abs(speeds - self._last))
-        self._last = speeds if pushing.touching else None
         session.vectors = {} if pushing.view is None else pushing.view.vectors
         self.act(command.speeds)
         session.vectors = {}
@@ -407,5 +399,4 @@ class _Run:
             "contacts": pushing.choice.contacts,
             "jammed": pushing.choice.jammed,
             "planned": self._approaches,
-            "jitter": float(np.mean(self._changes, axis=0).max()) if self._changes else 0.0,
         }

@@ -162,8 +162,6 @@ def explore_locks(
 
 
 class _Explorer:
-    """State of an exploration."""
-
     def __init__(self, model: Model, state: StateLike | None, move: MoveFunction, seed: int) -> None:
         given = dict(model.default_state())
         if state is not None:

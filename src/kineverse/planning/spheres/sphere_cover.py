@@ -45,7 +45,6 @@ class SphereCover:
     protrusion: float
 
     def __len__(self) -> int:
-        """Return the number of spheres."""
         return len(self.radii)
 
     def move(self, pose: Floats) -> SphereCover:

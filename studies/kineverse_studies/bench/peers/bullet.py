@@ -8,31 +8,20 @@ from typing import Any
 from kineverse.geometry.shapes import Solid
 from kineverse.lie import Array, to_quaternion
 from kineverse.model.body import Box, Capsule, Cylinder, Sphere
-from kineverse_studies.bench.geometry import (
-    BOX_SIZE,
-    CAPSULE_SIZE,
-    CENTRE,
-    LINK_LENGTH,
-    LINKS,
-    RADIUS,
-    Clutter,
-    PairDistances,
-    RobotSurroundings,
-    solid_corners,
-)
+from kineverse_studies.bench import geometry
 
 _LINKS_PER_BODY = 100  # number of boxes in one body, as Bullet limits the number of links
 
 
 class BulletSearch:
-    def __init__(self, clutter: Clutter) -> None:
+    def __init__(self, clutter: geometry.Clutter) -> None:
         import pybullet
 
         self._bullet: Any = pybullet
         self._client = pybullet.connect(pybullet.DIRECT)
-        shapes = [_create_link_shape(pybullet, clutter, link, self._client) for link in range(LINKS)]
-        links = [[0.0, 0.0, LINK_LENGTH if link else 0.0] for link in range(LINKS)]
-        axes = [list(clutter.axis(link)) for link in range(LINKS)]
+        shapes = [_create_link_shape(pybullet, clutter, link, self._client) for link in range(geometry.LINKS)]
+        links = [[0.0, 0.0, geometry.LINK_LENGTH if link else 0.0] for link in range(geometry.LINKS)]
+        axes = [list(clutter.axis(link)) for link in range(geometry.LINKS)]
         self._arm = _create_body(pybullet, shapes, links, None, axes, self._client)
         boxes = [
             pybullet.createCollisionShape(
@@ -41,7 +30,7 @@ class BulletSearch:
             for size in clutter.sizes
         ]
         self._bodies = _create_static_bodies(pybullet, boxes, clutter.poses, self._client)
-        self._joints = list(range(LINKS))
+        self._joints = list(range(geometry.LINKS))
         self.results: list[Any] = []
 
     def update(self, angles: Array) -> None:
@@ -52,10 +41,12 @@ class BulletSearch:
 
     def query(self) -> object:
         closest_points, arm, client = self._bullet.getClosestPoints, self._arm, self._client
-        self.results = [closest_points(arm, body, RADIUS, physicsClientId=client) for body in self._bodies]
+        self.results = [
+            closest_points(arm, body, geometry.RADIUS, physicsClientId=client) for body in self._bodies
+        ]
         return self.results
 
-    def distances(self) -> PairDistances:
+    def distances(self) -> geometry.PairDistances:
         for contact in itertools.chain(*self.results):
             yield f"link{contact[3]}", f"box{self._bodies[contact[2]] + contact[4]}", contact[8]
 
@@ -73,14 +64,14 @@ def _create_static_bodies(pybullet: Any, shapes: list[int], poses: Array, client
     return bodies
 
 
-def _create_link_shape(pybullet: Any, clutter: Clutter, link: int, client: int) -> int:
+def _create_link_shape(pybullet: Any, clutter: geometry.Clutter, link: int, client: int) -> int:
     kind = clutter.kind(link)
-    at = {"collisionFramePosition": list(CENTRE), "physicsClientId": client}
+    at = {"collisionFramePosition": list(geometry.CENTRE), "physicsClientId": client}
     if kind == "box":
-        half = [edge / 2 for edge in BOX_SIZE]
+        half = [edge / 2 for edge in geometry.BOX_SIZE]
         return int(pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **at))
     if kind == "capsule":
-        radius, length = CAPSULE_SIZE
+        radius, length = geometry.CAPSULE_SIZE
         return int(pybullet.createCollisionShape(pybullet.GEOM_CAPSULE, radius=radius, height=length, **at))
     return int(
         pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=clutter.corners[link].tolist(), **at)
@@ -122,7 +113,7 @@ def _xyzw_quaternions(poses: Array) -> list[list[float]]:
 
 
 class BulletRobotSearch:
-    def __init__(self, room: RobotSurroundings) -> None:
+    def __init__(self, room: geometry.RobotSurroundings) -> None:
         import pybullet
 
         self._bullet: Any = pybullet
@@ -146,13 +137,13 @@ class BulletRobotSearch:
     def query(self) -> object:
         closest_points, client = self._bullet.getClosestPoints, self._client
         self.results = [
-            (index, first, closest_points(body, other, RADIUS, physicsClientId=client))
+            (index, first, closest_points(body, other, geometry.RADIUS, physicsClientId=client))
             for body, index in self._robot.items()
             for other, first in self._bodies.items()
         ]
         return self.results
 
-    def distances(self) -> PairDistances:
+    def distances(self) -> geometry.PairDistances:
         names, others = self._room.names, self._room.others
         for index, first, contacts in self.results:
             for contact in contacts:
@@ -169,7 +160,7 @@ class BulletRobotSearch:
             kind = bullet.GEOM_CAPSULE if isinstance(shape, Capsule) else bullet.GEOM_CYLINDER
             sizes = {"radius": shape.radius, "height": shape.length}
         else:
-            kind, sizes = bullet.GEOM_MESH, {"vertices": solid_corners(solid).tolist()}
+            kind, sizes = bullet.GEOM_MESH, {"vertices": geometry.solid_corners(solid).tolist()}
         return int(bullet.createCollisionShape(kind, physicsClientId=self._client, **sizes))
 
     def __del__(self) -> None:

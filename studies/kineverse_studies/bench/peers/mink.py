@@ -14,28 +14,8 @@ import mujoco
 import numpy as np
 
 from kineverse.lie import Array
+from kineverse_studies.bench import control_workloads as workloads
 from kineverse_studies.bench.control import DOOR, DOOR_GAIN, GRASP, GRIPPERS, OPENING
-from kineverse_studies.bench.control_workloads import (
-    FEET,
-    FINGERS,
-    HAND_SPHERES,
-    HANDS,
-    TABLE_CENTRE,
-    TABLE_SIZE,
-    THIGH_SPHERES,
-    CollisionSphere,
-    ControlWorkload,
-    PeerLoop,
-    drive,
-    figure_eight,
-    grasp,
-    joint_speeds,
-    lean,
-    loop,
-    nod,
-    orbit,
-    split_coordinate,
-)
 from kineverse_studies.bench.inverse_kinematics import ReachingProblem, TaskReaching
 
 from .mujoco import add_mujoco_options
@@ -48,7 +28,7 @@ class MinkRobot:
         self.model, self.speeds = model, speeds
         self.start: Array = model.qpos0.copy()
         for name, value in start.items():
-            joint, number = split_coordinate(name)
+            joint, number = workloads.split_coordinate(name)
             self.start[model.joint(joint).qposadr[0] + number] = value
         self.configuration: Any = mink.Configuration(model, self.start)
 
@@ -57,7 +37,7 @@ class MinkRobot:
 
 
 @dataclass
-class MinkLoop(PeerLoop):
+class MinkLoop(workloads.PeerLoop):
     damping: float = 1e-3  # weight of squared displacements
     limits: list[Any] = field(default_factory=list)
     # returns the tasks to be kept exactly at a time [s]
@@ -77,16 +57,16 @@ class MinkLoop(PeerLoop):
         return np.array(mink.solve_ik(configuration, self.tasks, self.period, SOLVER, **self._options))
 
 
-def make_loop(name: str, workload: ControlWorkload) -> MinkLoop:
+def make_loop(name: str, workload: workloads.ControlWorkload) -> MinkLoop:
     make_model, make = MINK_LOOPS[name]
-    speeds = {} if make_model is _with_loops else joint_speeds(workload.urdf())
+    speeds = {} if make_model is _with_loops else workloads.joint_speeds(workload.urdf())
     return make(MinkRobot(make_model(workload), workload.start, speeds), workload.period)
 
 
 # -- models ------------------------------------------------------------------------------------------------
 
 
-def _plain(workload: ControlWorkload) -> Any:
+def _plain(workload: workloads.ControlWorkload) -> Any:
     root = remove_masses(ElementTree.fromstring(workload.urdf()))
     return mujoco.MjModel.from_xml_string(add_mujoco_options(root))
 
@@ -98,10 +78,10 @@ def remove_masses(root: ElementTree.Element) -> ElementTree.Element:
     return root
 
 
-def _with_table(workload: ControlWorkload) -> Any:
+def _with_table(workload: workloads.ControlWorkload) -> Any:
     root = ElementTree.fromstring(workload.urdf())
     specification = mujoco.MjSpec.from_string(add_mujoco_options(root))
-    for sphere in (*HAND_SPHERES, *THIGH_SPHERES):
+    for sphere in (*workloads.HAND_SPHERES, *workloads.THIGH_SPHERES):
         specification.body(sphere.link).add_geom(
             name=sphere.link,
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -110,12 +90,16 @@ def _with_table(workload: ControlWorkload) -> Any:
             mass=0,
         )
     specification.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_BOX, pos=TABLE_CENTRE, size=np.array(TABLE_SIZE) / 2, mass=0
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=workloads.TABLE_CENTRE,
+        size=np.array(workloads.TABLE_SIZE) / 2,
+        mass=0,
     )
     return specification.compile()
 
 
-def _with_loops(workload: ControlWorkload) -> Any:
+def _with_loops(workload: workloads.ControlWorkload) -> Any:
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
         file = Path(folder, "robot.xml")
         workload.robot().save(file)
@@ -129,11 +113,6 @@ def _body_task(frame: str, position: float, orientation: float, lm_damping: floa
     return mink.FrameTask(
         frame, "body", position_cost=position, orientation_cost=orientation, lm_damping=lm_damping
     )
-
-
-def _at_start(robot: MinkRobot, tasks: Iterable[Any]) -> None:
-    for task in tasks:
-        task.set_target_from_configuration(robot.configuration)
 
 
 def _at(pose: Any, position: Array) -> Any:
@@ -156,11 +135,11 @@ def _speed_limit(robot: MinkRobot) -> Any:
 def _freeze(robot: MinkRobot, period: float) -> MinkLoop:
     gripper, posture = _body_task("panda_link8", 1.0, 1.0), mink.PostureTask(robot.model, cost=0.1)
     frozen = [mink.DofFreezingTask(robot.model, dof_indices=[0, 1, 2])]
-    _at_start(robot, (gripper, posture))
+    workloads.hold_start(robot, (gripper, posture))
     start = gripper.transform_target_to_world
 
     def move(time: float) -> None:
-        gripper.set_target(_at(start, orbit(start.translation(), time)))
+        gripper.set_target(_at(start, workloads.orbit(start.translation(), time)))
 
     def constraints(time: float) -> list[Any] | None:
         return None if (time // 5.0) % 2 else frozen
@@ -173,8 +152,8 @@ def _freeze(robot: MinkRobot, period: float) -> MinkLoop:
 def _work_at_a_table(robot: MinkRobot, period: float) -> MinkLoop:
     model = robot.model
     centre = mink.ComTask(cost=10.0)
-    feet = [_body_task(foot, 10.0, 1.0) for foot in FEET]
-    hands = [_body_task(hand, 5.0, 1.0) for hand in HANDS]
+    feet = [_body_task(foot, 10.0, 1.0) for foot in workloads.FEET]
+    hands = [_body_task(hand, 5.0, 1.0) for hand in workloads.HANDS]
     tasks = [
         _body_task("pelvis", 0.0, 1.0),
         _body_task("torso_link", 0.0, 1.0),
@@ -183,14 +162,14 @@ def _work_at_a_table(robot: MinkRobot, period: float) -> MinkLoop:
         *feet,
         *hands,
     ]
-    _at_start(robot, tasks)
+    workloads.hold_start(robot, tasks)
     starts = [hand.transform_target_to_world for hand in hands]
 
-    def names(spheres: Iterable[CollisionSphere]) -> list[str]:
+    def names(spheres: Iterable[workloads.CollisionSphere]) -> list[str]:
         return [sphere.link for sphere in spheres]
 
-    left, right = names(HAND_SPHERES)
-    left_thigh, right_thigh = names(THIGH_SPHERES)
+    left, right = names(workloads.HAND_SPHERES)
+    left_thigh, right_thigh = names(workloads.THIGH_SPHERES)
     avoid = mink.CollisionAvoidanceLimit(
         model,
         geom_pairs=[([left, right], ["table"]), ([left], [left_thigh]), ([right], [right_thigh])],
@@ -200,7 +179,7 @@ def _work_at_a_table(robot: MinkRobot, period: float) -> MinkLoop:
 
     def move(time: float) -> None:
         for hand, start in zip(hands, starts, strict=True):
-            hand.set_target(_at(start, start.translation() + lean(time)))
+            hand.set_target(_at(start, start.translation() + workloads.lean(time)))
 
     return MinkLoop(
         robot, period, tasks, move, _distance(robot, hands[0]), 0.1, [mink.ConfigurationLimit(model), avoid]
@@ -212,17 +191,14 @@ def _stand_with_closed_loops(robot: MinkRobot, period: float) -> MinkLoop:
     centre = mink.ComTask(cost=200.0)
     feet = [_body_task(f"{side}-foot", 200.0, 10.0) for side in ("left", "right")]
     tasks = [_body_task("pelvis", 0.0, 10.0, 0.0), mink.PostureTask(model, cost=1.0), centre, *feet]
-    _at_start(robot, tasks)
+    workloads.hold_start(robot, tasks)
     tasks.append(mink.EqualityConstraintTask(model, cost=500.0, gain=0.5, lm_damping=1e-3))
     start = np.array(robot.configuration.data.subtree_com[1])
 
     def move(time: float) -> None:
-        centre.set_target(start + nod(time))
+        centre.set_target(start + workloads.nod(time))
 
-    def error() -> float:
-        return float(np.linalg.norm(centre.compute_error(robot.configuration)))
-
-    return MinkLoop(robot, period, tasks, move, error, 0.1)
+    return MinkLoop(robot, period, tasks, move, workloads.measure_error(robot, centre), 0.1)
 
 
 def _grasp(robot: MinkRobot, period: float) -> MinkLoop:
@@ -232,16 +208,16 @@ def _grasp(robot: MinkRobot, period: float) -> MinkLoop:
         mink.RelativeFrameTask(
             finger, "body", "hand/palm_link", "body", position_cost=1.0, orientation_cost=0.0, lm_damping=1e-3
         )
-        for finger in FINGERS
+        for finger in workloads.FINGERS
     ]
-    _at_start(robot, (arm, posture, *fingers))
+    workloads.hold_start(robot, (arm, posture, *fingers))
     start: Any = arm.transform_target_to_world
     tips: list[Any] = [finger.transform_target_to_root for finger in fingers]
 
     def move(time: float) -> None:
-        arm.set_target(_at(start, start.translation() + figure_eight(time)))
+        arm.set_target(_at(start, start.translation() + workloads.figure_eight(time)))
         for finger, tip in zip(fingers, tips, strict=True):
-            finger.set_target(_at(tip, tip.translation() * (1.0 - 5.0 * grasp(time))))
+            finger.set_target(_at(tip, tip.translation() * (1.0 - 5.0 * workloads.grasp(time))))
 
     return MinkLoop(robot, period, [arm, posture, *fingers], move, _distance(robot, arm))
 
@@ -250,16 +226,13 @@ def _look_at(robot: MinkRobot, period: float) -> MinkLoop:
     model = robot.model
     gaze = mink.LookAtTask("camera", "body", axis=(0.0, 0.0, 1.0), cost=1.0, lm_damping=1e-3)
     posture = mink.PostureTask(model, cost=0.01)
-    _at_start(robot, (posture,))
+    workloads.hold_start(robot, (posture,))
 
     def move(time: float) -> None:
-        gaze.set_target(loop(time))
-
-    def error() -> float:
-        return float(np.linalg.norm(gaze.compute_error(robot.configuration)))
+        gaze.set_target(workloads.loop(time))
 
     limits = [mink.ConfigurationLimit(model), _speed_limit(robot)]
-    return MinkLoop(robot, period, [gaze, posture], move, error, 1e-3, limits)
+    return MinkLoop(robot, period, [gaze, posture], move, workloads.measure_error(robot, gaze), 1e-3, limits)
 
 
 def _hold_the_base(robot: MinkRobot, period: float) -> MinkLoop:
@@ -269,12 +242,12 @@ def _hold_the_base(robot: MinkRobot, period: float) -> MinkLoop:
     posture_cost, base_cost = np.full(model.nv, 1e-3), np.zeros(model.nv)
     posture_cost[base[:2]], base_cost[base] = 0.0, 100.0
     posture, damping = mink.PostureTask(model, posture_cost), mink.DampingTask(model, base_cost)
-    _at_start(robot, (gripper, posture))
+    workloads.hold_start(robot, (gripper, posture))
     start = gripper.transform_target_to_world
     tasks = [gripper, posture]
 
     def move(time: float) -> None:
-        gripper.set_target(_at(start, start.translation() + drive(time)))
+        gripper.set_target(_at(start, start.translation() + workloads.drive(time)))
         tasks[2:] = [damping] if time > 4.0 else []
 
     return MinkLoop(robot, period, tasks, move, _distance(robot, gripper))
@@ -294,18 +267,16 @@ def _open_fridge(robot: MinkRobot, period: float) -> MinkLoop:
         GRIPPERS["pr2"], "body", GRASP, "body", position_cost=1.0, orientation_cost=1.0, gain=0.5
     )
     held.set_target(mink.SE3.identity())
-    _at_start(robot, (posture,))
-
-    def error() -> float:
-        return float(np.linalg.norm(held.compute_error(robot.configuration)[:3]))
+    workloads.hold_start(robot, (posture,))
 
     limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, dict(robot.speeds))]
-    return MinkLoop(
-        robot, period, [opening, posture], lambda time: None, error, 1e-6, limits, lambda time: [held]
-    )
+    tasks, error = [opening, posture], workloads.measure_error(robot, held)
+    return MinkLoop(robot, period, tasks, lambda time: None, error, 1e-6, limits, lambda time: [held])
 
 
-MINK_LOOPS: Mapping[str, tuple[Callable[[ControlWorkload], Any], Callable[[MinkRobot, float], MinkLoop]]] = {
+MINK_LOOPS: Mapping[
+    str, tuple[Callable[[workloads.ControlWorkload], Any], Callable[[MinkRobot, float], MinkLoop]]
+] = {
     OPENING: (_plain, _open_fridge),
     "arm_panda_dof_freezing": (_plain, _freeze),
     "humanoid_g1_teleop": (_with_table, _work_at_a_table),

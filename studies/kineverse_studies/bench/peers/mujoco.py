@@ -14,19 +14,7 @@ from kineverse.geometry.shapes import Solid
 from kineverse.lie import Array, transform
 from kineverse.model.body import Capsule, Cylinder, Ellipsoid, Sphere
 from kineverse.view.poses import to_wxyz
-from kineverse_studies.bench.geometry import (
-    BOX_SIZE,
-    CAPSULE_SIZE,
-    CENTRE,
-    LINK_LENGTH,
-    LINKS,
-    RADIUS,
-    UNIT_BOX_CORNERS,
-    Clutter,
-    PairDistances,
-    RobotSurroundings,
-    solid_corners,
-)
+from kineverse_studies.bench import geometry
 from kineverse_studies.bench.harness import Contender, time_calls
 from kineverse_studies.bench.kinematics import CHECKED, CHECKED_FRAMES, stack_results
 from kineverse_studies.bench.models import SHIFT
@@ -55,7 +43,6 @@ class MujocoRobot:
         return self.pose(self.body), self.jacobian[:, self.columns]
 
     def pose(self, body: int) -> Array:
-        """Return the pose of a body, (4, 4)."""
         return transform(self.data.xmat[body].reshape(3, 3), self.data.xpos[body])
 
 
@@ -157,7 +144,7 @@ class MujocoSearch:
     centimetres.
     """
 
-    def __init__(self, clutter: Clutter) -> None:
+    def __init__(self, clutter: geometry.Clutter) -> None:
         self._start(_clutter_mjcf(clutter))
 
     def _start(self, text: str) -> None:
@@ -176,7 +163,7 @@ class MujocoSearch:
         self.results = contact.geom, contact.dist, contact.pos, contact.frame
         return self.results
 
-    def distances(self) -> PairDistances:
+    def distances(self) -> geometry.PairDistances:
         for (a, b), distance in zip(self.results[0].tolist(), self.results[1].tolist(), strict=True):
             yield self.names[a], self.names[b], distance
 
@@ -184,7 +171,7 @@ class MujocoSearch:
 class MujocoPairSearch(MujocoSearch):
     """Exact search with MuJoCo's mj_geomDistance, after a broadphase of spheres in numpy."""
 
-    def __init__(self, clutter: Clutter) -> None:
+    def __init__(self, clutter: geometry.Clutter) -> None:
         super().__init__(clutter)
         links = np.array([name.startswith("link") for name in self.names])
         self._links, self._boxes = np.flatnonzero(links), np.flatnonzero(~links)
@@ -193,43 +180,48 @@ class MujocoPairSearch(MujocoSearch):
     def query(self) -> object:
         at, links, boxes = self.data.geom_xpos, self._links, self._boxes
         apart = at[links, None] - at[boxes]
-        reach = self._radii[links, None] + self._radii[boxes] + RADIUS
+        reach = self._radii[links, None] + self._radii[boxes] + geometry.RADIUS
         near = np.einsum("ijk,ijk->ij", apart, apart) <= reach * reach
         model, data, measure, results = self.model, self.data, mujoco.mj_geomDistance, []
         first, second = np.nonzero(near)
         for i, j in zip(links[first].tolist(), boxes[second].tolist(), strict=True):
             points = np.empty(6)
-            distance = measure(model, data, i, j, RADIUS, points)
-            if distance < RADIUS:
+            distance = measure(model, data, i, j, geometry.RADIUS, points)
+            if distance < geometry.RADIUS:
                 results.append((i, j, distance, points))
         self.results = results
         return results
 
-    def distances(self) -> PairDistances:
+    def distances(self) -> geometry.PairDistances:
         return ((self.names[i], self.names[j], distance) for i, j, distance, _ in self.results)
 
 
-def _clutter_mjcf(clutter: Clutter) -> str:
+def _clutter_mjcf(clutter: geometry.Clutter) -> str:
     assets, arm, world = [], "", []
-    here = format_mjcf_numbers(CENTRE)
-    for link in reversed(range(LINKS)):
+    here = format_mjcf_numbers(geometry.CENTRE)
+    for link in reversed(range(geometry.LINKS)):
         kind = clutter.kind(link)
         if kind == "capsule":
-            radius, length = CAPSULE_SIZE
+            radius, length = geometry.CAPSULE_SIZE
             shape = f'type="capsule" size="{radius!r} {length / 2!r}" pos="{here}"'
         else:
-            corners = UNIT_BOX_CORNERS * BOX_SIZE if kind == "box" else clutter.corners[link]
+            corners = (
+                geometry.UNIT_BOX_CORNERS * geometry.BOX_SIZE if kind == "box" else clutter.corners[link]
+            )
             assets.append(
                 f'<mesh name="link{link}" vertex="{format_mjcf_numbers(corners)}" maxhullvert="-1"/>'
             )
             shape = f'type="mesh" mesh="link{link}" pos="{here}"'
         axis = format_mjcf_numbers(clutter.axis(link))
         arm = (
-            f'<body pos="0 0 {LINK_LENGTH if link else 0.0}"><joint axis="{axis}"/>'
-            f'<geom name="link{link}" {shape} margin="{RADIUS}" contype="1" conaffinity="0"/>{arm}</body>'
+            f'<body pos="0 0 {geometry.LINK_LENGTH if link else 0.0}"><joint axis="{axis}"/>'
+            f'<geom name="link{link}" {shape} margin="{geometry.RADIUS}" contype="1" conaffinity="0"/>'
+            f"{arm}</body>"
         )
     for k, (size, pose) in enumerate(zip(clutter.sizes, clutter.poses, strict=True)):
-        assets.append(f'<mesh name="box{k}" vertex="{format_mjcf_numbers(UNIT_BOX_CORNERS * size)}"/>')
+        assets.append(
+            f'<mesh name="box{k}" vertex="{format_mjcf_numbers(geometry.UNIT_BOX_CORNERS * size)}"/>'
+        )
         axes = f'pos="{format_mjcf_numbers(pose[:3, 3])}" xyaxes="{format_mjcf_numbers(pose[:3, :2].T)}"'
         world.append(f'<geom name="box{k}" type="mesh" mesh="box{k}" {axes} contype="0" conaffinity="1"/>')
     return make_mjcf(assets, [*world, arm])
@@ -250,7 +242,7 @@ def format_mjcf_numbers(numbers: Any) -> str:
 class MujocoRobotSearch(MujocoSearch):
     """Search with MuJoCo, each object of the robot a free body; see :class:`.MujocoSearch`."""
 
-    def __init__(self, room: RobotSurroundings) -> None:
+    def __init__(self, room: geometry.RobotSurroundings) -> None:
         self._room = room
         assets, world = [], []
         for k, pose in zip(room.others, room.poses(room.others), strict=True):
@@ -262,7 +254,7 @@ class MujocoRobotSearch(MujocoSearch):
             asset, geom = _mjcf_geom(k, room.solid(k))
             assets.append(asset)
             inertia = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-            mask = f'margin="{RADIUS}" contype="1" conaffinity="0"'
+            mask = f'margin="{geometry.RADIUS}" contype="1" conaffinity="0"'
             world.append(f"<body><freejoint/>{inertia}<geom {geom} {mask}/></body>")
         self._start(make_mjcf(assets, world))
         self.names = [room.names[int(name)] for name in self.names]
@@ -282,6 +274,6 @@ def _mjcf_geom(number: int, solid: Solid) -> tuple[str, str]:
     if isinstance(shape, Capsule | Cylinder):
         kind = type(shape).__name__.lower()
         return "", f'{name} type="{kind}" size="{shape.radius!r} {shape.length / 2!r}"'
-    vertices = format_mjcf_numbers(solid_corners(solid))
+    vertices = format_mjcf_numbers(geometry.solid_corners(solid))
     asset = f'<mesh {name} vertex="{vertices}" inertia="shell" maxhullvert="-1"/>'
     return asset, f'{name} type="mesh" mesh="{number}"'

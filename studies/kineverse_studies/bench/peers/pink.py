@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,30 +21,19 @@ from pink.tasks import (
 )
 
 from kineverse.lie import Array
+from kineverse_studies.bench import control_workloads as workloads
 from kineverse_studies.bench.control import DOOR, DOOR_GAIN, GRASP, GRIPPERS, OPENING
-from kineverse_studies.bench.control_workloads import (
-    FEET,
-    HANDS,
-    QUADRUPED_FEET,
-    WORKLOADS,
-    ControlWorkload,
-    PeerLoop,
-    reachable_targets,
-    split_coordinate,
-    squat,
-    swing,
-)
 from kineverse_studies.bench.inverse_kinematics import ReachingProblem, TaskReaching
 
 SOLVER = "daqp"
 
 
 class PinkRobot:
-    def __init__(self, workload: ControlWorkload) -> None:
+    def __init__(self, workload: workloads.ControlWorkload) -> None:
         self.model: Any = pin.buildModelFromXML(workload.urdf())
         q = pin.neutral(self.model)
         for name, value in workload.start.items():
-            joint, number = split_coordinate(name)
+            joint, number = workloads.split_coordinate(name)
             entry = self.model.joints[self.model.getJointId(joint)]
             if entry.nq == 2:  # a continuous joint has cosine and sine
                 q[entry.idx_q : entry.idx_q + 2] = np.cos(value), np.sin(value)
@@ -58,7 +47,7 @@ class PinkRobot:
 
 
 @dataclass
-class PinkLoop(PeerLoop):
+class PinkLoop(workloads.PeerLoop):
     options: dict[str, Any] = field(default_factory=dict)  # further options of ``pink.solve_ik``
     after: Callable[[Array], None] | None = None  # called with the velocity of each step
 
@@ -72,13 +61,8 @@ class PinkLoop(PeerLoop):
             self.after(self._velocity)
 
 
-def make_loop(name: str, workload: ControlWorkload) -> PinkLoop:
+def make_loop(name: str, workload: workloads.ControlWorkload) -> PinkLoop:
     return PINK_LOOPS[name](PinkRobot(workload), workload.period)
-
-
-def _at_start(robot: PinkRobot, tasks: Iterable[Any]) -> None:
-    for task in tasks:
-        task.set_target_from_configuration(robot.configuration)
 
 
 def _distance(robot: PinkRobot, task: Any) -> Callable[[], float]:
@@ -92,7 +76,7 @@ def _distance(robot: PinkRobot, task: Any) -> Callable[[], float]:
 def _swing(*tasks: Any) -> Callable[[float], None]:
     def move(time: float) -> None:
         for task in tasks:
-            task.transform_target_to_world.translation[1:] = swing(time)
+            task.transform_target_to_world.translation[1:] = workloads.swing(time)
 
     return move
 
@@ -100,14 +84,14 @@ def _swing(*tasks: Any) -> Callable[[float], None]:
 def _reach(robot: PinkRobot, period: float) -> PinkLoop:
     gripper = FrameTask("ee_link", position_cost=1.0, orientation_cost=1.0, lm_damping=1.0)
     posture = PostureTask(cost=1e-3)
-    _at_start(robot, (gripper, posture))
+    workloads.hold_start(robot, (gripper, posture))
     return PinkLoop(robot, period, [gripper, posture], _swing(gripper), _distance(robot, gripper))
 
 
 def _reach_smoothly(robot: PinkRobot, period: float) -> PinkLoop:
     gripper = FrameTask("ee_link", position_cost=1.0, orientation_cost=1.0, lm_damping=1.0)
     smooth = LowAccelerationTask(cost=0.1)
-    _at_start(robot, (gripper,))
+    workloads.hold_start(robot, (gripper,))
 
     def after(velocity: Array) -> None:
         smooth.set_last_integration(velocity, period)
@@ -123,7 +107,7 @@ def _fly(robot: PinkRobot, period: float) -> PinkLoop:
         for side in ("left", "right")
     ]
     tasks = [base, *arms, PostureTask(cost=1e-3)]
-    _at_start(robot, tasks)
+    workloads.hold_start(robot, tasks)
     swing_arms = _swing(*arms)
 
     def move(time: float) -> None:
@@ -135,30 +119,28 @@ def _fly(robot: PinkRobot, period: float) -> PinkLoop:
 
 def _squat_on_two_legs(robot: PinkRobot, period: float) -> PinkLoop:
     centre = ComTask(cost=200.0)
-    hands = [FrameTask(hand, position_cost=4.0, orientation_cost=0.0) for hand in HANDS]
+    hands = [FrameTask(hand, position_cost=4.0, orientation_cost=0.0) for hand in workloads.HANDS]
     tasks = [
         FrameTask("pelvis", position_cost=0.0, orientation_cost=10.0),
         PostureTask(cost=0.1),
         centre,
-        *(FrameTask(foot, position_cost=200.0, orientation_cost=10.0) for foot in FEET),
+        *(FrameTask(foot, position_cost=200.0, orientation_cost=10.0) for foot in workloads.FEET),
         *hands,
     ]
-    _at_start(robot, tasks)
+    workloads.hold_start(robot, tasks)
     for hand in hands:
         hand.transform_target_to_world.translation += np.array([-0.1, 0.0, -0.2])
 
     def move(time: float) -> None:
         centre.set_target(np.array([0.0, 0.0, 0.55 + 0.05 * np.sin(np.pi * time)]))
 
-    def error() -> float:
-        return float(np.linalg.norm(centre.compute_error(robot.configuration)))
-
-    return PinkLoop(robot, period, tasks, move, error, {"damping": 0.01, "safety_break": False})
+    options = {"damping": 0.01, "safety_break": False}
+    return PinkLoop(robot, period, tasks, move, workloads.measure_error(robot, centre), options)
 
 
 def _squat_on_four_legs(robot: PinkRobot, period: float) -> PinkLoop:
     trunk = FrameTask("base", position_cost=50.0, orientation_cost=1.0)
-    feet = [FrameTask(foot, position_cost=200.0, orientation_cost=0.0) for foot in QUADRUPED_FEET]
+    feet = [FrameTask(foot, position_cost=200.0, orientation_cost=0.0) for foot in workloads.QUADRUPED_FEET]
     barrier = PositionBarrier(
         "base",
         indices=[1, 2],
@@ -167,10 +149,10 @@ def _squat_on_four_legs(robot: PinkRobot, period: float) -> PinkLoop:
         safe_displacement_gain=1.0,
     )
     tasks = [trunk, PostureTask(cost=1e-5), *feet]
-    _at_start(robot, tasks)
+    workloads.hold_start(robot, tasks)
 
     def move(time: float) -> None:
-        trunk.transform_target_to_world.translation[1:] = squat(time)
+        trunk.transform_target_to_world.translation[1:] = workloads.squat(time)
 
     return PinkLoop(robot, period, tasks, move, _distance(robot, feet[0]), {"barriers": [barrier]})
 
@@ -195,7 +177,10 @@ class PinkTargetLoop(PinkLoop):
 
 def _solve(robot: PinkRobot, period: float) -> PinkLoop:
     name = "inverse_kinematics_ur10"
-    targets = [pin.SE3(pose) for pose in reachable_targets(name, "wrist_3_link", WORKLOADS[name].steps)]
+    targets = [
+        pin.SE3(pose)
+        for pose in workloads.reachable_targets(name, "wrist_3_link", workloads.WORKLOADS[name].steps)
+    ]
     gripper = FrameTask("wrist_3_link", position_cost=1.0, orientation_cost=1.0)
 
     def move(time: float) -> None:
@@ -216,13 +201,12 @@ def _open_fridge(robot: PinkRobot, period: float) -> PinkLoop:
     posture = PostureTask(cost=0.01)
     held = RelativeFrameTask(GRIPPERS["pr2"], GRASP, position_cost=1.0, orientation_cost=1.0, gain=0.5)
     held.set_target(pin.SE3.Identity())
-    _at_start(robot, (posture,))
-
-    def error() -> float:
-        return float(np.linalg.norm(held.compute_error(robot.configuration)[:3]))
+    workloads.hold_start(robot, (posture,))
 
     options = {"constraints": [held], "damping": 1e-6}
-    return PinkLoop(robot, period, [opening, posture], lambda time: None, error, options)
+    return PinkLoop(
+        robot, period, [opening, posture], lambda time: None, workloads.measure_error(robot, held), options
+    )
 
 
 PINK_LOOPS: Mapping[str, Callable[[PinkRobot, float], PinkLoop]] = {

@@ -101,8 +101,6 @@ class CellResult:
 
 @dataclass(frozen=True)
 class ErrorRatios:
-    """Ratios of errors to a bound, in the cells with a small bound."""
-
     near: int  # number of these cells
     direction: float  # root mean square ratios of direction and position over all fits; NaN without cells
     place: float
@@ -205,7 +203,6 @@ def _fit_one(job: tuple[Cell, int]) -> list[CellResult]:
 
 
 def fit_cell(cell: Cell, count: int) -> CellResult:
-    """Fit samples of a cell, drawn with a fixed seed."""
     samples = draw_samples(cell, count, np.random.default_rng(_seed(cell)))
     limit, reach = compute_bound(samples), compute_attainable_bound(samples)
     fits = [_fit(samples, k) for k in range(count)]

@@ -19,32 +19,7 @@ from kineverse.view.plots import Figure
 from kineverse_studies.experiments.registry import Options, Progress
 from kineverse_studies.experiments.report import Report, ReportTable, format_fixed, make_table
 
-from .accuracy import (
-    FILTERS,
-    INTERIOR_DEVIATIONS,
-    REPORTED_MAX,
-    REPORTED_MEAN,
-    CoordinateErrors,
-    Errors,
-    FilterConsistency,
-    MechanismErrors,
-    measure_consistency,
-    measure_errors,
-    measure_mechanisms,
-    measure_variants,
-)
-from .protocol import (
-    CONFIGURATIONS,
-    LEVELS,
-    OBSERVATIONS,
-    REPORTED,
-    Duration,
-    ObservedModel,
-    PoseNoise,
-    make_observed_model,
-    time_updates,
-    time_updates_by_size,
-)
+from . import accuracy, protocol
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -53,30 +28,29 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Fig4Results:
     model: str  # name of the model, and the model with its observed frames
-    scene: ObservedModel
+    scene: protocol.ObservedModel
     seeds: tuple[int, ...]  # seeds, and number of configurations of each
     configurations: int
-    errors: tuple[Errors, ...]
+    errors: tuple[accuracy.Errors, ...]
     variants: Mapping[str, list[float]]
-    by_size: list[tuple[int, dict[str, Duration]]]
-    by_noise: list[tuple[PoseNoise, dict[str, Duration]]]
-    consistency: Mapping[PoseNoise, dict[str, FilterConsistency]]
-    mechanisms: list[MechanismErrors]
+    by_size: list[tuple[int, dict[str, protocol.Duration]]]
+    by_noise: list[tuple[protocol.PoseNoise, dict[str, protocol.Duration]]]
+    consistency: Mapping[protocol.PoseNoise, dict[str, accuracy.FilterConsistency]]
+    mechanisms: list[accuracy.MechanismErrors]
 
     def numbers(self) -> dict[str, Any]:
-        """Return the results by filter."""
-        reported = zip(self.errors, REPORTED_MEAN, REPORTED_MAX, strict=True)
+        reported = zip(self.errors, accuracy.REPORTED_MEAN, accuracy.REPORTED_MAX, strict=True)
         return {
             "model": self.model,
             "degrees_of_freedom": len(self.scene.symbols),
             "symbols": [str(s) for s in self.scene.symbols],
             "seeds": self.seeds,
             "configurations": self.configurations,
-            "observations": OBSERVATIONS,
+            "observations": protocol.OBSERVATIONS,
             "errors": [
                 _by_noise(
                     errors.noise,
-                    {name: errors.summary(name) | {"nees": errors.nees[name]} for name in FILTERS},
+                    {name: errors.summary(name) | {"nees": errors.nees[name]} for name in accuracy.FILTERS},
                 )
                 | {"reported_mean": mean, "reported_max": largest}
                 for errors, mean, largest in reported
@@ -88,7 +62,7 @@ class Fig4Results:
                         "errors": [e.summary(name, slice(dof)) for e in self.errors],
                         "milliseconds": times[name],
                     }
-                    for name in FILTERS
+                    for name in accuracy.FILTERS
                 }
                 for dof, times in self.by_size
             ],
@@ -101,11 +75,11 @@ class Fig4Results:
             "mechanisms": [
                 {"mechanism": one.mechanism} | _by_noise(one.noise, one.by_filter) for one in self.mechanisms
             ],
-            "paper": {"milliseconds_below": REPORTED},
+            "paper": {"milliseconds_below": protocol.REPORTED},
         }
 
 
-def _by_noise(noise: PoseNoise, by_filter: Mapping[str, Any]) -> dict[str, Any]:
+def _by_noise(noise: protocol.PoseNoise, by_filter: Mapping[str, Any]) -> dict[str, Any]:
     return {"position": noise.position, "orientation": noise.orientation, **by_filter}
 
 
@@ -118,15 +92,16 @@ def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
     strongest = results.errors[-1]
     turning = results.scene.turning
     kinds = [(~turning, 1e3), (turning, 180 / math.pi)]
-    names = [FILTER_NAMES[name] for name in FILTERS]
-    reported = zip(results.errors, REPORTED_MEAN, REPORTED_MAX, strict=True)
+    names = [FILTER_NAMES[name] for name in accuracy.FILTERS]
+    reported = zip(results.errors, accuracy.REPORTED_MEAN, accuracy.REPORTED_MAX, strict=True)
     means = {
-        dof: [strongest.summary(name, slice(dof))["mean"] for name in FILTERS] for dof, _ in results.by_size
+        dof: [strongest.summary(name, slice(dof))["mean"] for name in accuracy.FILTERS]
+        for dof, _ in results.by_size
     }
     return (
         ReportTable(
-            f"The papers' filter: |q̂ - q| after {OBSERVATIONS} observations, m and rad together like the "
-            f"papers (configurations: {results.configurations}, seeds: {len(results.seeds)})",
+            f"The papers' filter: |q̂ - q| after {protocol.OBSERVATIONS} observations, m and rad together "
+            f"like the papers (configurations: {results.configurations}, seeds: {len(results.seeds)})",
             ("noise", "mean", "authors' code", "off by", "max, by seed", "authors' code, one run"),
             tuple(_reported_row(*row) for row in reported),
         ),
@@ -142,7 +117,7 @@ def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
                     *_format_ms(times[name]),
                 )
                 for errors, (_, times) in zip(results.errors, results.by_noise, strict=True)
-                for name in FILTERS
+                for name in accuracy.FILTERS
             ),
         ),
         ReportTable(
@@ -154,14 +129,14 @@ def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
                     *(
                         format_fixed(errors.rms(name, where), 2, unit) if where.any() else "-"
                         for where, unit in kinds
-                        for name in FILTERS
+                        for name in accuracy.FILTERS
                     ),
                 )
                 for errors in results.errors
             ),
         ),
         ReportTable(
-            f"Against degrees of freedom, at {strongest.noise}; the papers stay below {REPORTED:g} ms",
+            f"Against degrees of freedom, at {strongest.noise}; the papers: below {protocol.REPORTED:g} ms",
             (
                 "DoF",
                 *(f"{name}: mean error" for name in names),
@@ -171,7 +146,7 @@ def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
                 (
                     str(dof),
                     *(format_fixed(mean, 4) for mean in means[dof]),
-                    *(cell for name in FILTERS for cell in _format_ms(times[name])),
+                    *(cell for name in accuracy.FILTERS for cell in _format_ms(times[name])),
                 )
                 for dof, times in results.by_size
             ),
@@ -186,7 +161,7 @@ def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
     )
 
 
-def _reported_row(errors: Errors, mean: float, largest: float) -> tuple[str, ...]:
+def _reported_row(errors: accuracy.Errors, mean: float, largest: float) -> tuple[str, ...]:
     found = errors.summary("published")
     maxima = f"{min(found['maxima']):.3f} … {max(found['maxima']):.3f}"
     off = f"{100 * (found['mean'] / mean - 1):+.1f} %"
@@ -201,10 +176,10 @@ def _reported_row(errors: Errors, mean: float, largest: float) -> tuple[str, ...
 
 
 def _consistency_table(results: Fig4Results) -> ReportTable:
-    def of_kind(found: FilterConsistency, kind: str, unit: float) -> str:
+    def of_kind(found: accuracy.FilterConsistency, kind: str, unit: float) -> str:
         return f"{unit * found.rms[kind]:.2f}, {unit * found.bound[kind]:.2f}" if kind in found.rms else "-"
 
-    columns: dict[str, Callable[[tuple[PoseNoise, str, FilterConsistency]], str]] = {
+    columns: dict[str, Callable[[tuple[protocol.PoseNoise, str, accuracy.FilterConsistency]], str]] = {
         "noise": lambda one: str(one[0]),
         "filter": lambda one: FILTER_NAMES[one[1]],
         "NEES": lambda one: format_fixed(one[2].nees_inside, 3),
@@ -217,7 +192,7 @@ def _consistency_table(results: Fig4Results) -> ReportTable:
     }
     title = (
         "Gaussian noise on each axis: NEES per state (1 is right) of truths "
-        f"{INTERIOR_DEVIATIONS:g}σ inside the limits and of all, NIS and its 95 % band, "
+        f"{accuracy.INTERIOR_DEVIATIONS:g}σ inside the limits and of all, NIS and its 95 % band, "
         "and errors over the Cramér-Rao bound"
     )
     items = (
@@ -227,7 +202,7 @@ def _consistency_table(results: Fig4Results) -> ReportTable:
 
 
 def _mechanism_table(results: Fig4Results) -> ReportTable:
-    columns: dict[str, Callable[[tuple[MechanismErrors, str, CoordinateErrors]], str]] = {
+    columns: dict[str, Callable[[tuple[accuracy.MechanismErrors, str, accuracy.CoordinateErrors]], str]] = {
         "mechanism": lambda one: one[0].mechanism,
         "noise": lambda one: str(one[0].noise),
         "filter": lambda one: FILTER_NAMES[one[1]],
@@ -238,11 +213,13 @@ def _mechanism_table(results: Fig4Results) -> ReportTable:
     }
     title = "Mechanisms that are no joints: |q̂ - q| [rad], [m]; lost: a step to where the model has no value"
     return make_table(
-        title, ((one, name, one.by_filter[name]) for one in results.mechanisms for name in FILTERS), columns
+        title,
+        ((one, name, one.by_filter[name]) for one in results.mechanisms for name in accuracy.FILTERS),
+        columns,
     )
 
 
-def _format_ms(duration: Duration) -> tuple[str, ...]:
+def _format_ms(duration: protocol.Duration) -> tuple[str, ...]:
     return f"{duration.mean:.3f}", f"{duration.sd:.3f}", f"{duration.median:.3f}"
 
 
@@ -255,7 +232,7 @@ def draw_results(canvas: Canvas, results: Fig4Results) -> None:
     places = np.arange(len(results.errors))
     sizes = [dof for dof, _ in results.by_size]
     gaussian = np.arange(len(results.consistency))
-    for name in FILTERS:
+    for name in accuracy.FILTERS:
         label, color = FILTER_NAMES[name], _COLORS[name]
         found = [errors.summary(name) for errors in results.errors]
         for key, style in (("max", "^"), ("mean", "o-"), ("sd", ":")):
@@ -270,8 +247,8 @@ def draw_results(canvas: Canvas, results: Fig4Results) -> None:
         nees, ratio = [c.nees_inside for c in statistics], [c.over_bound for c in statistics]
         consistency.plot(gaussian, nees, "o-", color=color, label=f"{label}: NEES per state")
         consistency.plot(gaussian, ratio, "s--", color=color, label=f"{label}: RMSE over Cramér-Rao")
-    noise.plot(places, REPORTED_MAX, "k+", label="authors' code: max of one run")
-    noise.plot(places, REPORTED_MEAN, "kx", label="authors' code: mean")
+    noise.plot(places, accuracy.REPORTED_MAX, "k+", label="authors' code: max of one run")
+    noise.plot(places, accuracy.REPORTED_MEAN, "kx", label="authors' code: mean")
     noise.set(title="error against noise", ylabel="|q̂ - q| [m], [rad]", yscale="log")
     noise.set_ylim(bottom=1.5e-3)
     noise.set_xticks(places, [str(errors.noise) for errors in results.errors])
@@ -280,7 +257,7 @@ def draw_results(canvas: Canvas, results: Fig4Results) -> None:
     size.set(ylabel="|q̂ - q| [m], [rad]")
     size.set_ylim(bottom=0)
     size.legend(fontsize="small", loc="upper left")
-    time.axhline(REPORTED, color="0.6", label="the papers stay below")
+    time.axhline(protocol.REPORTED, color="0.6", label="the papers stay below")
     time.set(title="time of one prediction and update", ylabel="[ms]", yscale="log")
     time.set(xlabel="degrees of freedom")
     time.legend(fontsize="small", ncols=2)
@@ -297,23 +274,24 @@ TIMED = 40  # number of configurations that are timed
 def run(progress: Progress, options: Options) -> Report:
     """Track the model; ``quick`` takes one seed of four, and a tenth of the configurations."""
     model = options.model or "kitchen"
-    scene = make_observed_model(load(model))
+    scene = protocol.make_observed_model(load(model))
     seeds = range(1) if options.quick else range(4)
-    configurations = CONFIGURATIONS // 10 if options.quick else CONFIGURATIONS
+    configurations = protocol.CONFIGURATIONS // 10 if options.quick else protocol.CONFIGURATIONS
     timed = max(1, TIMED // 10) if options.quick else TIMED
     results = Fig4Results(
         model=model,
         scene=scene,
         seeds=tuple(seeds),
         configurations=configurations,
-        errors=measure_errors(scene, seeds, configurations, progress),
-        variants=measure_variants(scene, seeds, configurations, progress),
-        by_size=time_updates_by_size(scene, timed, progress),
+        errors=accuracy.measure_errors(scene, seeds, configurations, progress),
+        variants=accuracy.measure_variants(scene, seeds, configurations, progress),
+        by_size=protocol.time_updates_by_size(scene, timed, progress),
         by_noise=[
-            (noise, time_updates(scene, noise, timed)) for noise in progress(LEVELS, "fig4: time", "level")
+            (noise, protocol.time_updates(scene, noise, timed))
+            for noise in progress(protocol.LEVELS, "fig4: time", "level")
         ],
-        consistency=measure_consistency(scene, seeds, configurations, progress),
-        mechanisms=measure_mechanisms(configurations // 3, progress),
+        consistency=accuracy.measure_consistency(scene, seeds, configurations, progress),
+        mechanisms=accuracy.measure_mechanisms(configurations // 3, progress),
     )
     return Report(
         name="fig4",

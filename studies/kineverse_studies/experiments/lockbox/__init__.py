@@ -238,9 +238,7 @@ def make_lockbox_report(
             {
                 "boxes": r.job.kind,
                 "seed": r.job.seed,
-                "tries": r.tries,
-                "depth": r.depth,
-                "breadth": r.breadth,
+                **{k: getattr(r, k) for k in ("tries", "depth", "breadth")},
             }
             for r in unknown
         ],

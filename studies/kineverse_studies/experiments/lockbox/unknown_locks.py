@@ -52,7 +52,6 @@ def _places(box: Lockbox, name: str) -> list[float]:
 
 
 def is_open(state: Mapping[str, float], part: Slider) -> bool:
-    """Return whether the lock of a part is open where the parts are."""
     return all(any((state[c.part] > c.threshold) == c.beyond for c in group) for group in part.groups)
 
 

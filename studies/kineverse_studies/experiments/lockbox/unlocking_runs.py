@@ -93,14 +93,14 @@ def draw_boxes(canvas: Canvas, boxes: Mapping[tuple[Rule, int], Sequence[Unlocki
                 continue
             steps = sorted(run.steps for run in own if run.done)
             share = np.arange(len(steps) + 1) / len(own)
-            axes.step(
-                [0, *steps, longest], [*share, share[-1]], where="post", color=_COLORS[rule], label=name
-            )
+            # Later curves are thinner, so that all are seen where they agree.
+            style = {"color": _COLORS[rule], "linewidth": 4.0 - len(axes.lines), "label": name}
+            axes.step([0, *steps, longest], [*share, share[-1]], where="post", **style)
         axes.set_title(f"boxes of {count} parts")
         axes.set_xlabel("steps")
         axes.set_ylim(-0.02, 1.02)
     panels[0].set_ylabel("share opened")
-    panels[0].legend(loc="center right", frameon=False)
+    canvas.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
 
 
 def make_thesis_table(title: str, order: str, runs: Mapping[Rule, UnlockingRun]) -> ReportTable:

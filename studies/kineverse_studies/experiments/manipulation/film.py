@@ -41,7 +41,6 @@ class FilmRow:
 
 
 def make_film(rows: Sequence[FilmRow], size: tuple[int, int] = (420, 420)) -> Figure:
-    """Return the figure of rows of pictures, each picture of a size [pixel]."""
     count = max(len(row.states) for row in rows)
     scale = 3.0 / size[0]
 
@@ -93,7 +92,6 @@ class RowView:
         return RowView(scenes, wanted, points)
 
     def camera(self, direction: tuple[float, float], aspect: float) -> Camera:
-        """Return the camera from an elevation and an azimuth [rad]."""
         elevation, azimuth = direction
         return fit_camera(self.points, azimuth, elevation, aspect, margin=0.04)
 
@@ -155,9 +153,11 @@ def make_push_picture(
         handles.insert(
             0, Line2D([], [], color=_POINT, marker="o", linestyle="", label="p on the object, r on the robot")
         )
-        canvas.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+        canvas.legend(
+            handles=handles, loc="outside lower center", ncols=min(3, 1 + len(panels)), frameon=False
+        )
 
-    return Figure(draw, (6.0 * len(panels), 6.0 * size[1] / size[0] + 0.9))
+    return Figure(draw, (6.0 * len(panels), 6.0 * size[1] / size[0] + 1.2))
 
 
 def find_telling_moment(film: Sequence[Moment]) -> tuple[float, Moment | None]:

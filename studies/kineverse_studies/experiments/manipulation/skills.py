@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -26,6 +27,7 @@ from kineverse.worlds import Judge, KinematicWorld, MujocoWorld, Recorder, Senso
 from kineverse.worlds.recorder import import_mcap
 from kineverse_studies.experiments.registry import BOTH, WORLDS, Options
 
+from .paper_push import PaperPush, push_as_published
 from .trials import Failure, Moment, Trial, find_failure
 
 _AUTHORS = {
@@ -37,7 +39,6 @@ DATA_FOLDERS = ("pr2", "fetch", "hsrb", "iai_kitchen")
 
 
 def check_data(data: Path | None) -> Path | None:
-    """Return the folder of the authors' files; None if none is given."""
     if data is None:
         return None
     if not data.is_dir():
@@ -52,13 +53,13 @@ def check_data(data: Path | None) -> Path | None:
 
 
 def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[RobotSource, ...]:
-    """Return robots by name, by default those that ship, and the authors' in a folder."""
-    known = dict(SHIPPED)
-    for name, (like, file, hand) in _AUTHORS.items() if data is not None else ():
-        source = (data or Path()) / file
+    """Return robots by name, the authors' in a folder first; by default these and those that ship."""
+    known, own, folder = dict(SHIPPED), dict[str, RobotSource](), check_data(data)
+    for name, (like, file, hand) in _AUTHORS.items() if folder is not None else ():
+        source = (folder or Path()) / file
         if source.is_file():
-            known[name] = replace(SHIPPED[like], name=name, source=str(source), hand=hand)
-    return tuple(find_robot(name, known) for name in tuple(names) or known)
+            known[name] = own[like] = replace(SHIPPED[like], name=name, source=str(source), hand=hand)
+    return tuple(own.get(name) or find_robot(name, known) for name in tuple(names) or known)
 
 
 SettingOptions = ("world", "noise", "record")  # options of experiments that are read here
@@ -299,23 +300,25 @@ def run_push_trial(
     dt: float = DT,
     steps: int = 1200,
     logic: str | None = "and",
+    baseline: bool = False,
 ) -> Trial:
-    """Return the trial of a push in a world: from a start, or from one that base placement finds."""
+    """Return the trial of a push: from a start, or from one that base placement finds; or as published."""
 
     def act(watch: TrialWatch) -> Outcome:
         bodies = find_gripper(model, world.robot).bodies
         coordinate = find_object_coordinate(world, case.what)
         pushing = Pushing(model, coordinate, bodies, start, target=0.0, robot=world.robot, dt=dt, logic=logic)
         judge = PushJudge(pushing, world, watch)
-        outcome, placed, first = try_push(
-            pushing,
-            world,
-            start,
-            lambda: watch.open_session(world, dt, judge),
-            seconds=steps * dt,
-            seed=case.seed,
-            on_step=judge.watch_controller,
-        )
+        look, seconds, placed, first = judge.watch_controller, steps * dt, 0, ""
+        if baseline:
+            world.reset(start)
+            session = watch.open_session(world, dt, judge)
+            outcome = push_as_published(session, case.robot, coordinate, steps, look)
+        else:
+            begin = partial(watch.open_session, world, dt, judge)
+            outcome, placed, first = try_push(
+                pushing, world, start, begin, seconds=seconds, seed=case.seed, on_step=look
+            )
         more = {"placed": placed, "first": first, **judge.measures}
         return replace(outcome, measures={**outcome.measures, **more})
 
@@ -336,7 +339,7 @@ class PushJudge:
         self._force = self._pressed = 0.0
         self._session: Session | None = None
 
-    def watch_controller(self, pushing: Pushing) -> None:
+    def watch_controller(self, pushing: Pushing | PaperPush) -> None:
         self._touching, self._watch.view = pushing.touching, pushing.view
 
     def __call__(self, session: Session) -> None:

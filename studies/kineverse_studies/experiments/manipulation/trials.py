@@ -43,7 +43,6 @@ class StepTimeStatistics:
 
     @staticmethod
     def from_seconds(cpu: Sequence[float], wall: Sequence[float] = ()) -> StepTimeStatistics:
-        """Return the statistics of durations [s]; ``wall`` is the mean wall time."""
         if not len(cpu):
             return StepTimeStatistics()
         ms = 1e3 * np.asarray(cpu, dtype=float)
@@ -166,7 +165,6 @@ def worst(key: str, scale: float = 1.0) -> Callable[[Sequence[Trial]], float]:
 
 
 def step_times(trials: Sequence[Trial]) -> StepTimeStatistics:
-    """Return the statistics of all control steps of some trials [ms]."""
     return StepTimeStatistics.from_seconds(
         [t for trial in trials for t in trial.cpu], [t for trial in trials for t in trial.wall]
     )
@@ -190,6 +188,13 @@ ROW = (
     Column("dof", "DoF", lambda trials: trials[0].dof, 4),
 )
 """Columns with which each table begins; their keys are attributes of trials, by which rows are grouped."""
+_PAPER_DOF = {"hsr": 23, "fetch": 18, "pr2": 49}
+PAPER_DOF = Column(
+    "published_dof",
+    "paper DoF",
+    lambda trials: _PAPER_DOF.get(trials[0].robot.partition(" ")[0], math.nan),
+    4,
+)
 SUCCESS = (
     Column("objects", "objects", lambda trials: count_objects(trials).objects, 6),
     Column("done", "done", lambda trials: count_objects(trials).done, 6),
@@ -299,19 +304,23 @@ def make_trial_numbers(trials: Sequence[Trial]) -> dict[str, Any]:
 def make_success_figure(trials: Sequence[Trial], measure: str, label: str) -> Figure:
     def draw(canvas: Canvas) -> None:
         axes = canvas.add_subplot()
-        robots = list(dict.fromkeys(t.robot for t in trials))
+        robots, skills = (list(dict.fromkeys(getattr(t, of) for t in trials)) for of in ("robot", "skill"))
         colors = {"": "0.7", "collision": "tab:red", "reach": "tab:blue", "time": "tab:orange", "other": "k"}
         for failure, color in colors.items():
             own = [t for t in trials if t.failure == failure and measure in t.measures]
             # Points of one robot are spread by skill, so that opening and closing do not hide each other.
-            y = [robots.index(t.robot) + (0.12 if t.skill == "close" else -0.12) for t in own]
-            marker, size = ("|", 60) if not failure else ("o", 30)
-            axes.scatter(
-                [t.measures[measure] for t in own], y, c=color, s=size, marker=marker, label=failure or "done"
-            )
+            y = [robots.index(t.robot) + 0.24 * (skills.index(t.skill) - (len(skills) - 1) / 2) for t in own]
+            if own:
+                x, marker, size = (
+                    [t.measures[measure] for t in own],
+                    "|o"[bool(failure)],
+                    30 if failure else 60,
+                )
+                axes.scatter(x, y, c=color, s=size, marker=marker, label=failure or "done")
         axes.set_yticks(range(len(robots)), robots)
+        axes.set_ylim(len(robots) - 0.5, -0.5)
         axes.set_xlabel(label)
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        canvas.legend(loc="outside right upper", frameon=False)
 
     return Figure(draw, (9.0, 3.5))
 

@@ -26,12 +26,12 @@ from kineverse_studies.experiments.manipulation.skills import (
     SettingOptions,
     TrialCase,
     TrialSetting,
-    check_data,
     find_robots,
     make_settings,
     open_then_close,
 )
 from kineverse_studies.experiments.manipulation.trials import (
+    PAPER_DOF,
     ROW,
     TIMES,
     Column,
@@ -150,6 +150,7 @@ PROGRAM_COLUMNS = (
     ROW[0],
     Column("program", "program", lambda trials: trials[0].skill),
     ROW[3],
+    PAPER_DOF,
     Column("opened", "opened", lambda trials: sum(t.done for t in trials), 6),
     Column("runs", "of", len, 6),
     Column("solve_mean_ms", "solver mean (wall)", lambda trials: _solver_times(trials).mean),
@@ -212,14 +213,13 @@ def run(progress: Progress, options: Options) -> Report:
     """Open the objects; the option ``quick`` takes one start of each, ``count`` so many."""
     starts = options.count or (QUICK_STARTS if options.quick else STARTS)
     settings = make_settings(options)
-    robots = find_robots(options.robot, check_data(options.data))
+    robots = find_robots(options.robot, options.data)
     jobs = [OpeningJob(robot, thing, starts, options.seed, settings) for robot in robots for thing in OBJECTS]
     trials = run_jobs(run_openings, jobs, progress, "table1-open", "object", options)
     return make_opening_report(trials, starts, options.seed)
 
 
 def run_openings(job: OpeningJob) -> list[Trial]:
-    """Return the trials of the programs, and those of the skill."""
     setup = make_opening_setup(job.robot, OBJECTS[job.thing])
     start = setup.robot.start_state(setup.model)
     lower, upper = setup.model.limits(setup.what)

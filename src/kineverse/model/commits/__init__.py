@@ -1,0 +1,1 @@
+"""Commits: checks before them, their net changes, undo, and listeners and followers after them."""

@@ -1,0 +1,273 @@
+"""Listeners to the commits of a model, with filters for what they read of it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from kineverse.errors import ExpressionError, InvalidValueError
+from kineverse.expressions.expression import Expression
+from kineverse.model.body import Pose
+from kineverse.model.changes import Change, Diff
+from kineverse.model.frame import WORLD, Frame
+from kineverse.model.operation import CONSTRAINTS, FRAMES, KINDS, RATES
+from kineverse.model.rates import collect_symbols
+from kineverse.model.read_recorder import unknown_path_error
+from kineverse.symbols import Symbol, check_symbols
+
+_LOG = logging.getLogger(__name__)
+
+Callback = Callable[[Diff], None]
+
+
+class Commit:
+    """Commit as its listeners see it: the diff, and frames and rates before and after it."""
+
+    def __init__(self, diff: Diff, head: Mapping[str, Mapping[str, Any]]) -> None:
+        self.diff = diff
+        self._head = head
+
+    @cached_property
+    def _changed(self) -> dict[str, dict[str, Change]]:
+        """Changes of frames and rates by name."""
+        found: dict[str, dict[str, Change]] = {FRAMES: {}, RATES: {}}
+        for change in self.diff.changes:
+            if change.kind in found:
+                found[change.kind][change.name] = change
+        return found
+
+    def find_pose_changes(self, frame: str) -> list[Change]:
+        """Return the changes that give a frame other forward kinematics."""
+        frames, rates = self._changed[FRAMES], self._changed[RATES]
+        if not frames and not rates:
+            return []
+        after = self._chain(frame, {})
+        found: dict[str, Change] = {}
+        if frame in frames or any(name in frames for name in after):
+            before = self._chain(frame, frames)
+            if not _have_equal_motion(list(before.values()), list(after.values())):
+                found = {name: frames[name] for name in (*before, *after) if name in frames}
+        if rates:
+            moving = [x for f in after.values() for x in f.factors if isinstance(x, Expression)]
+            reached = self._reach(s.path for factor in moving for s in collect_symbols(factor))
+            return [*found.values(), *(rates[name] for name in reached if name in rates)]
+        return list(found.values())
+
+    def is_about(self, change: Change, paths: frozenset[str]) -> bool:
+        """Return whether a constraint or a rate has one of some coordinates, or one that depends on them."""
+        if change.kind not in (CONSTRAINTS, RATES):
+            return False
+        return not paths.isdisjoint(self._reach(change.coordinates, dependent=True))
+
+    def _chain(self, name: str, changed: Mapping[str, Change]) -> dict[str, Frame]:
+        """Return a frame and those above it, by name; before the commit if its changes are given."""
+        chain: dict[str, Frame] = {}
+        while name != WORLD:
+            frame = changed[name].before if name in changed else self._head[FRAMES].get(name)
+            if frame is None:
+                break
+            chain[name] = frame
+            name = frame.parent
+        return chain
+
+    def _reach(self, paths: Iterable[str], *, dependent: bool = False) -> dict[str, None]:
+        """Return coordinates with those that determine them: by all rates, or if they are dependent."""
+        rates = self._head[RATES]
+        waiting = list(paths)
+        found: dict[str, None] = {}
+        while waiting:
+            path = waiting.pop()
+            if path in found:
+                continue
+            found[path] = None
+            if path in rates:
+                entry = rates[path][1]
+                if isinstance(entry, Expression):
+                    waiting += [s.path for s in collect_symbols(entry)]
+                elif not dependent:
+                    for speed, value in entry:
+                        waiting += [speed.path, *(s.path for s in collect_symbols(value))]
+        return found
+
+
+def _have_equal_motion(before: list[Frame], after: list[Frame]) -> bool:
+    """Return whether two chains, from the tip upwards, multiply to the same motion, factor by factor."""
+    if not (before and after):
+        return False
+    for end in (-1, 0):
+        while before and after and before[end] is after[end]:
+            del before[end], after[end]
+    one, other = list(_multiply_constants(before)), list(_multiply_constants(after))
+    return len(one) == len(other) and all(
+        np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in zip(one, other, strict=True)
+    )
+
+
+def _multiply_constants(chain: list[Frame]) -> Iterator[Any]:
+    """Yield the moving factors of a chain from the root to its tip, and the products of constants between."""
+    constant = np.eye(4)
+    for frame in chain[::-1]:
+        for factor in frame.factors:
+            if isinstance(factor, Pose):
+                constant = constant @ factor.matrix
+            else:
+                yield constant
+                yield factor
+                constant = np.eye(4)
+    yield constant
+
+
+@dataclass(frozen=True)
+class CommitFilter:
+    """Paths, coordinates, tags and frames that a listener follows; None where it does not filter."""
+
+    paths: tuple[str, ...] | None = None
+    coordinates: frozenset[str] | None = None
+    tags: frozenset[str] | None = None
+    frames: tuple[str, ...] | None = None
+
+    @staticmethod
+    def of(
+        paths: Iterable[str] | None,
+        symbols: Iterable[Symbol] | None,
+        tags: Iterable[str] | None,
+        frames: Iterable[str] | None,
+    ) -> CommitFilter:
+        """Build a filter from what a listener asks for."""
+        for path in () if paths is None else _names(paths):
+            if path and str(path).partition("/")[0] not in KINDS:  # everything is below the empty path
+                raise unknown_path_error(path)
+        for name in () if frames is None else _names(frames):
+            if not isinstance(name, str):
+                raise InvalidValueError(f"A frame is followed by its name, a text, not by {name!r}.")
+        return CommitFilter(
+            None if paths is None else _names(paths),
+            None if symbols is None else frozenset(s.path for s in check_symbols(symbols)),
+            None if tags is None else frozenset(_names(tags)),
+            None if frames is None else _names(frames),
+        )
+
+    def select(self, commit: Commit) -> Diff | None:
+        """Return the part of a commit's diff that passes; None if it is empty."""
+        diff = commit.diff
+        if self == _EVERYTHING:
+            return diff
+        changes = {id(c): c for c in diff.changes if self._wants(c, commit)}
+        poses = []
+        for frame in self.frames or ():
+            found = commit.find_pose_changes(frame)
+            if found:
+                poses.append(frame)
+                changes.update((id(c), c) for c in found)
+        tags = self.tags or frozenset()
+        groups = ("added", "removed", "replaced", "moved", "rerun")
+        heard = {name: tuple(t for t in getattr(diff, name) if t in tags) for name in groups}
+        if not (changes or any(heard.values())):
+            return None
+        return replace(diff, changes=tuple(changes.values()), poses=tuple(poses), **heard)  # type: ignore[arg-type]
+
+    def _wants(self, change: Change, commit: Commit) -> bool:
+        if self.paths is not None and any(_below(change.path, p) for p in self.paths):
+            return True
+        return self.coordinates is not None and commit.is_about(change, self.coordinates)
+
+
+_EVERYTHING = CommitFilter()
+
+
+@dataclass(frozen=True, eq=False)
+class Listener:
+    """Callback with its filter; :meth:`close` unregisters it."""
+
+    callback: Callback
+    filter: CommitFilter
+    registry: Listeners
+
+    def close(self) -> None:
+        """Unregister the callback; a second call has no effect."""
+        self.registry.remove(self)
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+Witness = Callable[[Commit], None]
+"""Function that is called in a commit, before anybody else sees its version; it must be short."""
+
+
+class Listeners:
+    """Listeners of one model, called in the order of registration and of versions."""
+
+    def __init__(self) -> None:
+        self._listeners: list[Listener] = []
+        self.witnesses: list[Witness] = []
+        self._waiting: deque[tuple[int, list[tuple[Listener, Diff]]]] = deque()
+        self._delivering = False
+        self._lock = threading.Lock()
+
+    def add(self, callback: Callback, wanted: CommitFilter) -> Listener:
+        """Register a callback, which gets what passes the filter."""
+        if not callable(callback):
+            raise ExpressionError(f"A listener is called with a diff, and {callback!r} cannot be called.")
+        listener = Listener(callback, wanted, self)
+        self._listeners.append(listener)
+        return listener
+
+    def remove(self, listener: Listener) -> None:
+        """Unregister a listener."""
+        self._listeners = [known for known in self._listeners if known is not listener]
+
+    def post(self, commit: Commit) -> None:
+        """Queue what each listener gets of the present commit; called in the order of versions."""
+        for witness in tuple(self.witnesses):
+            witness(commit)
+        parts = [(listener, listener.filter.select(commit)) for listener in self._listeners]
+        heard = [(listener, part) for listener, part in parts if part is not None]
+        if heard:
+            with self._lock:
+                self._waiting.append((commit.diff.version, heard))
+
+    def deliver(self) -> None:
+        """Call the listeners with the queued diffs. An exception of a listener is logged; the others go on.
+
+        One thread delivers at a time, so diffs arrive in order. If another thread, or a callback that edits
+        the model, posts a diff meanwhile, the delivering thread takes it over.
+        """
+        while True:
+            with self._lock:
+                if self._delivering or not self._waiting:
+                    return
+                self._delivering = True
+                version, heard = self._waiting.popleft()
+            try:
+                for listener, part in heard:
+                    if listener in self._listeners:
+                        _tell(listener, part, version)
+            finally:
+                with self._lock:
+                    self._delivering = False
+
+
+def _tell(listener: Listener, part: Diff, version: int) -> None:
+    try:
+        listener.callback(part)
+    except Exception:
+        _LOG.exception("A listener of the model raised at version %d.", version)
+
+
+def _names(names: Iterable[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+def _below(path: str, root: str) -> bool:
+    return not root or path == root or path.startswith(root if root.endswith("/") else f"{root}/")

@@ -1,0 +1,267 @@
+"""Net changes of an edit as a value, and their adoption by another model."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+from kineverse.errors import EditError
+from kineverse.expressions.expression import Expression
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import Body
+from kineverse.model.changes import find_moved_tags
+from kineverse.model.constraint import Constraint
+from kineverse.model.frame import Frame
+from kineverse.model.operation import (
+    ARTICULATIONS,
+    BODIES,
+    CONSTRAINTS,
+    DATA,
+    FRAMES,
+    KINDS,
+    RATES,
+    Operation,
+)
+from kineverse.model.read_recorder import Read, Reads
+from kineverse.symbols import Symbol
+
+from .checks import check_parent, find_parents
+
+if TYPE_CHECKING:
+    from kineverse.model.history import History, HistoryEntry, TouchedEntry
+
+_PLACE = attrgetter("place")
+_TYPES = {FRAMES: Frame, BODIES: Body, ARTICULATIONS: Articulation, CONSTRAINTS: Constraint}
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedEntry:
+    """Entry of a model's history, with its place among the others.
+
+    Attributes
+    ----------
+    entry
+        Tag, operation, reads and writes.
+    after
+        Tag of the operation before it; None at the beginning.
+    at_end
+        True if nothing follows but what the edit has put there. It then goes to the end of any model, after
+        what others have put there meanwhile.
+    """
+
+    entry: HistoryEntry
+    after: str | None
+    at_end: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class NetChanges:
+    """Net effect of an edit, from :meth:`.Edit.net`; :meth:`.Model.adopt` makes it in an equal model.
+
+    Attributes
+    ----------
+    put
+        Entries that are new or have changed, in the order of the sequence.
+    replaced
+        Tags of operations in ``put`` that the edit has replaced or moved.
+    rerun
+        Tags of operations in ``put`` that were only run again, because values that they read have changed.
+    moved
+        Tags of those in ``replaced`` that are at another place among the others.
+    removed
+        Tags of operations that are gone.
+    """
+
+    put: tuple[PlacedEntry, ...] = ()
+    replaced: tuple[str, ...] = ()
+    rerun: tuple[str, ...] = ()
+    moved: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Tags of new operations, in the order of the sequence."""
+        known = {*self.replaced, *self.rerun}
+        return tuple(placed.entry.tag for placed in self.put if placed.entry.tag not in known)
+
+    @property
+    def is_empty(self) -> bool:
+        """True if the edit has done nothing so far."""
+        return not (self.put or self.removed)
+
+
+@dataclass(slots=True)
+class TouchedTags:
+    """Tags of the operations that a transaction has changed, in the order of the edit."""
+
+    added: list[str]
+    replaced: list[str]
+    removed: list[str]
+    rerun: list[str]  # in order of the sequence
+    moved: list[str]  # of those replaced, in order of the sequence
+
+
+def find_touched_tags(history: History, touched: list[TouchedEntry]) -> TouchedTags:
+    """Return the tags of what the transaction has changed so far."""
+    added, replaced, removed, rerun = [], [], [], []
+    for before, now, is_given in touched:
+        if now is None:
+            assert before is not None
+            removed.append(before.tag)
+        elif before is None:
+            added.append(now.tag)
+        elif is_given:
+            replaced.append(now.tag)
+        else:
+            rerun.append(now)
+    rerun.sort(key=_PLACE)
+    return TouchedTags(
+        added, replaced, removed, [entry.tag for entry in rerun], _find_moved(history, touched)
+    )
+
+
+def find_net_changes(history: History) -> NetChanges:
+    """Return the net changes of the transaction so far."""
+    tags = find_touched_tags(history, list(history.touched()))
+    entries, sequence = history.entries, history.sequence
+    new = {*tags.added, *tags.moved}
+    end = len(sequence)
+    while end and sequence[end - 1].tag in new:
+        end -= 1
+    put = []
+    for entry in sorted((entries[t] for t in (*tags.added, *tags.replaced, *tags.rerun)), key=_PLACE):
+        index = bisect_left(sequence, entry.place, key=_PLACE)
+        put.append(PlacedEntry(entry, sequence[index - 1].tag if index else None, index >= end))
+    groups = (tags.replaced, tags.rerun, tags.moved, tags.removed)
+    return NetChanges(tuple(put), *map(tuple, groups))
+
+
+def _find_moved(history: History, touched: list[TouchedEntry]) -> list[str]:
+    """Return a smallest set of the tags put elsewhere whose removal makes both orders equal, in order."""
+    pairs = [(before, now) for before, now, _ in touched if now is not None]
+    again = [(b, n) for b, n in pairs if b is not None and b.place != n.place]
+    if not again:
+        return []
+    strangers = sorted(n.place for b, n in pairs if b is None or b.place != n.place)
+
+    def rank(place: int) -> int:
+        """Return how many of the entries that stand still are before a place."""
+        return bisect_left(history.sequence, place, key=_PLACE) - bisect_left(strangers, place)
+
+    ranks = {rank(one.place) for pair in again for one in pair}
+
+    def order(entries: Iterable[HistoryEntry]) -> list[str | int]:
+        """Return tags in order, and a number for the entries that stand still between two of them."""
+        names: list[tuple[int, float, str | int]] = [(r, -math.inf, r) for r in ranks]
+        names += [(rank(entry.place), entry.place, entry.tag) for entry in entries]
+        return [name for *_, name in sorted(names)]
+
+    moved = find_moved_tags(order(b for b, _ in again), order(n for _, n in again), {n.tag for _, n in again})
+    return [str(tag) for tag in moved]
+
+
+def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
+    """Link the entries of net changes as they are, and run nothing.
+
+    Other operations that read what has changed are marked to run. If the changes are to be complete, they are
+    refused.
+    """
+    _check_types(changes)
+    known = {*changes.replaced, *changes.rerun}
+    for placed in changes.put:
+        tag = placed.entry.tag
+        if (tag in history.entries) != (tag in known):
+            raise EditError(
+                f"The changes do not belong to this model: {tag!r} is "
+                f"{'not there' if tag in known else 'taken'}. {_ELSEWHERE}"
+            )
+    history.settle()
+    history.take_notes()
+    with history.step():
+        for tag in (*changes.removed, *changes.moved):
+            history.remove(tag)
+        for placed in changes.put:
+            entry = placed.entry
+            if entry.tag not in changes.rerun:
+                history.note_given(entry.tag)
+            history.put(entry.at(_find_place(history, placed), _complete_reads(entry)))
+        for placed in changes.put:
+            # Parents are looked for when all are there, as frames may be replaced before them.
+            for name, parent in find_parents(placed.entry):
+                check_parent(history, name, parent, history.entries[placed.entry.tag].place)
+        for tag, cell in history.find_outdated(without={placed.entry.tag for placed in changes.put}):
+            if complete:
+                raise EditError(
+                    f"The changes do not belong to this model: {tag!r} reads {'/'.join(cell)}, which they "
+                    f"change, and is not among them. {_ELSEWHERE}"
+                )
+
+
+_ELSEWHERE = "Adopt them where the model is as it was before the edit."
+
+
+def _find_place(history: History, placed: PlacedEntry) -> int:
+    old = history.entries.get(placed.entry.tag)
+    if old is not None:
+        return old.place
+    if placed.at_end:
+        return history.place_at(len(history.sequence))
+    return history.place_at(0 if placed.after is None else history.index(placed.after) + 1)
+
+
+def _complete_reads(entry: HistoryEntry) -> Reads:
+    """Return the reads of an entry with the parents of its frames among them."""
+    cells = {(FRAMES, parent) for _, parent in find_parents(entry)} - entry.reads.cells.keys()
+    if not cells:
+        return entry.reads
+    reads = Reads()
+    reads.cells = {**entry.reads.cells, **dict.fromkeys(cells, Read.EXISTENCE)}
+    reads.listings, reads.trace = entry.reads.listings, entry.reads.trace
+    return reads
+
+
+def _check_types(changes: object) -> None:
+    """Check that changes have the form of net changes."""
+    if not isinstance(changes, NetChanges):
+        raise EditError(f"A model adopts kv.model.NetChanges, from edit.net(), not {changes!r:.80}.")
+    for wrong in _list_faults(changes):
+        raise EditError(f"The changes cannot be adopted: {wrong}. Changes come from edit.net().")
+
+
+def _list_faults(changes: NetChanges) -> Iterator[str]:
+    from kineverse.model.history import HistoryEntry  # it imports the checks of this package
+
+    tags = []
+    for placed in changes.put:
+        entry = placed.entry if isinstance(placed, PlacedEntry) else None
+        if not isinstance(entry, HistoryEntry) or not isinstance(entry.reads, Reads):
+            yield f"{placed!r:.80} is no entry with its place"
+            return
+        tags.append(entry.tag)
+        if not isinstance(entry.tag, str) or not entry.tag or not isinstance(entry.operation, Operation):
+            yield f"{entry.tag!r} has no tag or no operation"
+        for cell, value in entry.writes.items():
+            if not _is_value(cell, value):
+                yield f"{entry.tag!r} writes {value!r:.80} into {cell!r}"
+    tags += changes.removed
+    if len(set(tags)) < len(tags):
+        yield "a tag is put or removed twice"
+    if not {*changes.moved} <= {*changes.replaced} or not {*changes.replaced, *changes.rerun} <= {*tags}:
+        yield "what is replaced, moved or run again is not put"
+
+
+def _is_value(cell: Any, value: object) -> bool:
+    if not (isinstance(cell, tuple) and len(cell) == 2 and cell[0] in KINDS):
+        return False
+    if cell[0] == RATES:
+        return (
+            isinstance(value, tuple)
+            and len(value) == 2
+            and isinstance(value[0], Symbol)
+            and isinstance(value[1], Expression | tuple)
+        )
+    return cell[0] == DATA or isinstance(value, _TYPES[cell[0]])
