@@ -197,10 +197,9 @@ class History:
 
     def _finds_what_it_read(self, entry: HistoryEntry) -> bool:
         """Return whether all values that an operation read elsewhere are the same objects here."""
-        seen = entry.operation.seen
-        if seen is None:
+        if entry.operation.seen is None:
             return False
-        values, names = seen
+        values, names = entry.operation.seen
         return all(self.value_at(cell, entry.place) is value for cell, value in values.items()) and all(
             tuple(self.names_at(kind, entry.place)) == listed for kind, listed in names.items()
         )

@@ -177,9 +177,16 @@ def make_joints(count: int) -> Model:
     model = Model()
     with no_collection(), model.edit() as edit:
         for i in range(count):
-            parent = f"link{i - 1}" if i % _CHAIN else WORLD
-            limits = {"lower": -1.0 - 1e-5 * i, "upper": 1.0, "velocity": 2.0}
-            edit.apply(Revolute(name=f"joint{i}", parent=parent, child=f"link{i}", **limits))
+            edit.apply(
+                Revolute(
+                    name=f"joint{i}",
+                    parent=f"link{i - 1}" if i % _CHAIN else WORLD,
+                    child=f"link{i}",
+                    lower=-1.0 - 1e-5 * i,
+                    upper=1.0,
+                    velocity=2.0,
+                )
+            )
     return model
 
 
