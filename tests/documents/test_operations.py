@@ -67,6 +67,30 @@ def test_changed_blob_is_another_operation_or_refused(place: int, byte: int, len
         assert entry.blob in (data, None)
 
 
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        (b"\x91" * 1_000_000 + b"\x01", "nested too deeply"),
+        (b"\x91" * 150 + b"\x01", "nested too deeply"),
+        (b"\xdd\xff\xff\xff\xff", "truncated"),
+        (b"\xdf\xff\xff\xff\xff", "truncated"),
+        (b"\xdb\xff\xff\xff\xff", "truncated"),
+        (b"\x82\xa1a\x01\xa1a\x01", "a key twice"),
+        (b"\x81\x90\x01", "has one key"),
+        (b"\xcb\x7f\xf8" + bytes(6), "is infinite"),
+        (b"\xd6\xff" + bytes(4), "has one key"),
+        (b"\xa1\xff", "utf-8"),
+        (b"\xcf" + b"\xff" * 8, "more than 64 bits"),
+    ],
+)
+def test_hostile_value_is_one_error(value: bytes, reason: str) -> None:
+    """Bounded in time and memory: what a length claims is not believed."""
+    blob = kv.formats.operation_to_bytes(of_number(0.5), "data number")
+    end = blob.rindex(b"\xcb")
+    with pytest.raises(kv.errors.FormatError, match=reason):
+        kv.formats.operation_from_bytes(blob[:end] + value)
+
+
 def test_operation_below_a_prefix_is_that_of_the_document() -> None:
     whole = kv.formats.from_bytes(kv.formats.to_bytes(MODEL), "left")
     for tag in MODEL.history.tags:

@@ -177,7 +177,8 @@ def _explain(error: Exception) -> str:
     if isinstance(error, OverflowError):
         return 'an integer of more than 64 bits is {"integer": "digits"}'
     text, _, place = str(error).partition(" - at `")
-    text = _QUOTED.sub(_name_type, text[:1].lower() + text[1:])
+    text = _QUOTED.sub(_name_type, text)
+    text = text if text[1:2].isupper() else text[:1].lower() + text[1:]
     place = place.removesuffix("`").removeprefix("$").removeprefix(".").replace("[...]", "")
     return f"{place}: {text}" if place else text
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 from kineverse._runtime import no_collection
@@ -20,7 +22,14 @@ from kineverse.model.read_recorder import ABSENT, Read, Reads
 from kineverse.model.registry import FileContent
 from kineverse.model.traces.trace import find_read_nodes
 
-from .budget import COST_OF_NAME, MAX_NODES, Budget, InvalidDocumentError, spend_rate_coupling
+from .budget import (
+    COST_OF_NAME,
+    MAX_NODES,
+    Budget,
+    InvalidDocumentError,
+    check_counts,
+    spend_rate_coupling,
+)
 from .encoding import check_text, hash_blobs, read_envelope, read_operation
 from .node_graph import NodeGraph
 from .node_types import read_nodes
@@ -166,7 +175,7 @@ class _Document:
 
     def read(self, content: bytes, is_text: bool) -> list[HistoryEntry]:
         """Return the operations of a document."""
-        with _Refusing(self), no_collection():
+        with _refusing(self), no_collection():
             self._check_size(content)
             if is_text:
                 try:
@@ -179,8 +188,9 @@ class _Document:
 
     def read_alone(self, blob: bytes) -> HistoryEntry:
         """Return the operation of a blob, which does not know what it has read."""
-        with _Refusing(self), no_collection():
+        with _refusing(self), no_collection():
             self._check_size(blob)
+            check_counts(blob, False)
             operation, _ = read_operation(blob, False)
             return self._entry(operation, blob, {}, False)
 
@@ -320,24 +330,19 @@ class _Document:
         return {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}, names
 
 
-class _Refusing:
+@contextmanager
+def _refusing(document: _Document) -> Iterator[None]:
     """Turn all errors of a content into one with source and place."""
-
-    def __init__(self, document: _Document) -> None:
-        self._document = document
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, InvalidDocumentError) or (
-            isinstance(error, KineverseError) and not isinstance(error, FormatError)
-        ):
-            self._document.refuse(str(error))
-        if isinstance(error, RecursionError):
-            self._document.refuse("it is nested too deeply")
-        if isinstance(error, MemoryError):
-            self._document.refuse("there is not enough memory for it")
+    try:
+        yield
+    except FormatError:
+        raise
+    except (InvalidDocumentError, KineverseError) as error:
+        document.refuse(str(error))
+    except RecursionError:
+        document.refuse("it is nested too deeply")
+    except MemoryError:
+        document.refuse("there is not enough memory for it")
 
 
 def _folders_by_tag(envelope: Envelope) -> dict[str, dict[int, str]]:
