@@ -83,7 +83,7 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
             yield "parent", a.parent, b.parent
         if a.factors != b.factors:
             yield "transform", transform_of(a), transform_of(b)
-    elif names := _field_names(a):
+    elif names := field_names(a):
         alike: tuple[str, ...] = ()
         if isinstance(a, Mesh):
             alike = ("folder", "root", "uri") if _file(a) == _file(b) else ("folder", "root")
@@ -102,7 +102,7 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
         yield what, a, b
 
 
-def _field_names(value: Any) -> tuple[str, ...]:
+def field_names(value: Any) -> tuple[str, ...]:
     """Return the names of the parts of a record; none for any other value."""
     if isinstance(value, Struct):
         return value.__struct_fields__
