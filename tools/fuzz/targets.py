@@ -15,7 +15,6 @@ import mujoco  # noqa: F401  - its import opens files, so it comes before the fi
 import kineverse as kv
 from kineverse import gallery
 from kineverse.formats.document import read_operations
-from kineverse.formats.document.reader import read_packed_operations
 from kineverse.formats.document.structs import Document
 from kineverse.formats.mjcf import parse_mjcf
 from kineverse.formats.mjcf.operations import mjcf_operations
@@ -103,7 +102,7 @@ def _document(data: bytes, folder: Path, prefix: str | None) -> Operations:
 
 
 def _packed(data: bytes, folder: Path, prefix: str | None) -> Operations:
-    return list(read_packed_operations(data, "input.kv.msgpack", prefix))
+    return list(read_operations(data, "input.kv.msgpack", prefix, is_packed=True))
 
 
 def _in_msgpack(data: bytes) -> bytes:

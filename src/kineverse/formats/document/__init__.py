@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         from_bytes as from_bytes,
         operation_from_bytes as operation_from_bytes,
         read_operations as read_operations,
-        read_packed_operations as read_packed_operations,
     )
     from .structs import schema as schema
     from .writer import (

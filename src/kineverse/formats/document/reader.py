@@ -43,14 +43,19 @@ LONGEST_REASON = 1000
 
 
 def read_operations(
-    content: str | bytes, source: str = "document", prefix: str | None = None, root: str = NOWHERE
+    content: str | bytes,
+    source: str = "document",
+    prefix: str | None = None,
+    root: str = NOWHERE,
+    *,
+    is_packed: bool = False,
 ) -> list[tuple[str, OpaqueOperation]]:
-    """Return the operations of a document as text, each with its tag.
+    """Return the operations of a document, each with its tag.
 
     Parameters
     ----------
     content
-        Text of the document, or its bytes in UTF-8.
+        Text of the document, or its bytes: in UTF-8, or a packed document.
     source
         Name of the document in errors.
     prefix
@@ -58,6 +63,8 @@ def read_operations(
     root
         Folder below which its meshes may be opened, see :mod:`kineverse.formats.root_folder`; by default
         there is none.
+    is_packed
+        True for msgpack.
 
     Raises
     ------
@@ -68,23 +75,7 @@ def read_operations(
         content = content.encode() if isinstance(content, str) else content
     except UnicodeError as error:
         raise FormatError(f"{source}: a document is UTF-8 text, and this is not: {error}.") from None
-    return _operations(_Document(source, prefix, root).read(content, True))
-
-
-def read_packed_operations(
-    data: bytes, source: str = "document", prefix: str | None = None, root: str = NOWHERE
-) -> list[tuple[str, OpaqueOperation]]:
-    """Return the operations of a packed document; as :func:`read_operations`.
-
-    Raises
-    ------
-    FormatError
-        With the source, the place in the document and the reason.
-    """
-    return _operations(_Document(source, prefix, root).read(data, False))
-
-
-def _operations(entries: list[HistoryEntry]) -> list[tuple[str, OpaqueOperation]]:
+    entries = _Document(source, prefix, root).read(content, not is_packed)
     return [(e.tag, e.operation) for e in entries if isinstance(e.operation, OpaqueOperation)]
 
 
