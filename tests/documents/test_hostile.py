@@ -174,6 +174,20 @@ REFUSED = {
         ),
         "question 1, which is not asked",
     ),
+    "a part that an answer has not": (
+        document(
+            [ONE, ["read", 0, 7, [], []]],
+            [
+                operation("up", {"data": {"y": 2.0}}),
+                operation(
+                    "t",
+                    {"data": {"x": 1}},
+                    trace={"questions": [["datum", 0, "y"]], "writes": {"data": {"x": {"expression": 1}}}},
+                ),
+            ],
+        ),
+        "needs more than there is",
+    ),
     "an answer outside of a trace": (
         document([["read", 0, 0, [], []]], [operation("t", {"data": {"x": {"expression": 0}}})]),
         "outside of a trace",

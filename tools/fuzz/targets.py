@@ -109,7 +109,7 @@ def _in_msgpack(data: bytes) -> bytes:
     """Return a text as msgpack, in the only form that is read if it is a document."""
     try:
         return msgspec.msgpack.encode(msgspec.json.decode(data, type=Document))
-    except (msgspec.MsgspecError, ValueError, RecursionError):
+    except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError):
         pass
     return json_trees.MSGPACK.write(json_trees.JSON.read(data))
 
