@@ -112,7 +112,7 @@ def test_every_missing_extra_names_the_same_install_command():
         assert f"{DISTRIBUTION}[" not in text, file
         named |= {extra for extra in EXTRAS if f'install_command("{extra}")' in text}
         named |= {extra for extra in EXTRAS if f"install_command('{extra}')" in text}
-    assert named >= {"figures", "geometry", "decomposition", "mjcf", "view", "exchange", "recording"}
+    assert named >= {"figures", "geometry", "decomposition", "mjcf", "view", "recording"}
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         text = page.read_text(encoding="utf-8")
         assert f"{DISTRIBUTION}[" not in text, page

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 import kineverse as kv
+from kineverse.cli.diff import format_value
+from kineverse.model.body import Box, Cylinder
 
 
 @pytest.fixture
@@ -386,3 +388,8 @@ def test_behaviour_is_compared_from_python_too():
     found = kv.model.BehaviourComparison(before, after)
     assert not found.apart
     assert found.frames["added"] == ["shelf_door/mark"] or found.helpers == ["shelf_door/mark"]
+
+
+def test_geometries_are_described_by_their_sizes():
+    assert format_value(Box((1.0, 2.0, 3.0))) == "box 1 2 3"
+    assert format_value(kv.model.Shape(Cylinder(0.5, 2.0))) == "cylinder 0.5 2"

@@ -78,7 +78,7 @@ def test_validate_prints_the_version_of_documents(run, tmp_path, good):
     kv.load(good).save(path)
     status, out, _ = run(path)
     assert status == 0
-    assert f"{path}: document, version 1" in out
+    assert f"{path}: document, version 2" in out
     written = json.loads(path.read_text())
     (file,) = json.loads(run(path, "--json")[1])["files"]
     assert file["version"] == written["version"]

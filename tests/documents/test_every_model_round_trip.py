@@ -66,7 +66,14 @@ def survives(model: kv.Model) -> None:
     assert again.snapshot() == model.snapshot()
     assert to_json(again) == text
     assert kv.formats.from_bytes(kv.formats.to_bytes(model)).snapshot() == model.snapshot()
-    assert kv.formats.document_hash(model.snapshot()) == json.loads(text)["sha256"]
+    wanted = json.loads(text)["sha256"]
+    assert kv.formats.document_hash(model.snapshot()) == wanted
+    alone = kv.Model()
+    with alone.edit() as edit:
+        for tag in model.history.tags:
+            entry = kv.formats.operation_from_bytes(kv.formats.operation_to_bytes(model, tag))
+            assert edit.apply(entry.operation, entry.tag) == tag
+    assert kv.formats.document_hash(alone) == wanted  # written anew, by what came alone
     ours, theirs = sample(model), sample(again)
     home = model.default_state()
     values = np.array([home.get(s, 0.3 if s.value is None else s.value) for s in ours.symbols])

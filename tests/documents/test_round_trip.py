@@ -148,8 +148,7 @@ def test_empty_model_survives_a_round_trip(tmp_path):
     assert read.snapshot() == kv.Model().snapshot()
     assert json.loads(to_json(read)) == {
         "format": "kineverse",
-        "version": 1,
-        "nodes": [],
+        "version": 2,
         "operations": [],
         "sha256": kv.formats.document_hash(read),
     }

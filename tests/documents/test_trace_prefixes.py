@@ -82,13 +82,16 @@ def test_a_loop_is_closed_again_when_what_it_reads_changes() -> None:
     read, below = reloaded(model), kv.Model()
     _include(below, to_json(model), "left")
     board = kv.translation(0, 0, 0.01) @ model.fk("board")
-    for other, prefix in ((model, ""), (read, ""), (below, "left/")):
+    again = kv.formats.from_bytes(kv.formats.to_bytes(below))
+    deeper = kv.formats.from_bytes(kv.formats.to_bytes(below), "room")
+    read_models = ((read, ""), (below, "left/"), (again, "left/"), (deeper, "room/left/"))
+    for other, prefix in ((model, ""), *read_models):
         moved = kv.model.AddFrame(f"{prefix}board", kv.model.Frame.from_transform("world", board))
         with other.edit() as edit:
             edit.replace(f"{prefix}frame board", moved)
     crank = str(model.symbols[0])
     wanted = model.fk("rocker_end")({crank: 0.4})
-    for other, prefix in ((read, ""), (below, "left/")):
+    for other, prefix in read_models:
         assert isinstance(other.history.operation(f"{prefix}loop four_bar"), OpaqueOperation)
         pose = other.fk(f"{prefix}rocker_end")({f"{prefix}{crank}": 0.4})
         np.testing.assert_allclose(pose, wanted, rtol=1e-12, atol=1e-12)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mesh_bytes
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 import kineverse as kv
 from kineverse.formats.resource_paths import locate_mesh, locate_resource

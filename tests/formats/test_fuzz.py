@@ -14,7 +14,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.formats.document import read_operations, to_json
-from kineverse.formats.document.node_types import NODE_TYPES
+from kineverse.formats.document.structs import NODES
 from kineverse.model.traces.trace_queries import QUERY_KINDS as QUESTIONS
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -174,10 +174,10 @@ def test_grammar_documents_have_all_node_types_and_conditions():
     nodes, questions = set(), set()
     for seed in range(150):
         tree = json.loads(document.generate(Random(seed)))
-        nodes |= {node[0] for node in tree["nodes"]}
+        nodes |= {node[0] for one in tree["operations"] for node in one.get("nodes", [])}
         traces = [operation["trace"] for operation in tree["operations"] if "trace" in operation]
         questions |= {question[0] for trace in traces for question in trace["questions"]}
-    assert nodes >= set(NODE_TYPES)
+    assert nodes >= set(NODES)
     assert questions >= set(QUESTIONS)
 
 

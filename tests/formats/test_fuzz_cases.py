@@ -165,10 +165,10 @@ def test_messages_have_bounded_length(tmp_path, name, places):
 
 def document(nodes: list, *writes: dict) -> bytes:
     operations = [
-        {"tag": f"t{i}", "kind": "K", "reads": {}, "writes": write} for i, write in enumerate(writes)
+        {"tag": f"t{i}", "kind": "K", "nodes": nodes, "writes": write}
+        for i, write in enumerate(writes or [{}])
     ]
-    text = json.dumps({"format": "kineverse", "version": 1, "nodes": nodes, "operations": operations})
-    return text.encode()
+    return json.dumps({"format": "kineverse", "version": 2, "operations": operations}).encode()
 
 
 def built(data: bytes | str) -> kv.Model:
@@ -202,7 +202,7 @@ def test_reasons_have_bounded_length_for_long_symbol_names():
         ["symbol", "a", 0, "dof"],
         ["symbol", "b", 0, "dof"],
         ["matrix", [1], [0]],
-        ["implicit", "i", [1], [2], 3, [0], 3, 5, [2]],
+        ["implicit", "i", [1], [2], 3, [0], 3, 5, [2], []],
     ]
     with pytest.raises(kv.errors.FormatError, match=r"nodes\[4\]: 'i': the residual is about y") as info:
         read_operations(document(nodes))
@@ -271,7 +271,7 @@ def test_loop_without_solution_is_named_where_its_input_cancels():
         ["constant", 5],
         ["matrix", [1], [3]],
         ["matrix", [1], [0]],
-        ["implicit", "i", [1], [0], 4, [0], 5, 5, [2]],
+        ["implicit", "i", [1], [0], 4, [0], 5, 5, [2], []],
         ["element", 6, 0],
         ["symbol", "a", 1, "dof"],
         ["matrix", [4, 4], [2, 0, 0, 0, None, 7, 8, 0, 0, 0, None, 0, 0, 0, 0, 0]],

@@ -47,5 +47,5 @@ def test_document_with_a_zero_quaternion_home_is_refused():
     for operation in tree["operations"]:
         for record in operation["writes"].get("articulations", {}).values():
             record["home"] = [0.0] * 4
-    with pytest.raises(kv.errors.FormatError, match="a quaternion of length zero"):
+    with pytest.raises(kv.errors.FormatError, match="has the quaternion 0 0 0 0"):
         read_operations(json.dumps(tree))

@@ -20,7 +20,7 @@ import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.model import Edit, NetChanges, PlacedEntry
 from kineverse.model.history import HistoryEntry
-from kineverse.model.read_recorder import ABSENT, Read, Reads
+from kineverse.model.read_recorder import Reads
 
 frame = st.sampled_from(FRAMES)
 index = st.integers(0, 40)
@@ -323,33 +323,6 @@ def test_changes_adopted_in_an_edit_run_what_reads_them() -> None:
         edit.adopt(put(entry("y", Place("y", "x"), frames__y=FRAME("x", np.eye(4))), after="2"))
     assert dict(model.data) == {"a": 1, "b": 2, "c": 2}
     assert model.history.readers("frames/x") == ["y"]
-
-
-def test_an_operation_from_elsewhere_is_linked_and_run_if_it_read_something_else() -> None:
-    model = build(Put("a", 1))
-    reads = Reads()
-    reads.add(("data", "a"), Read.VALUE)
-    reads.add(("data", "q"), Read.EXISTENCE)
-    history = model.history
-    for tag, seen, runs in (
-        ("x", None, 0),
-        ("y", {("data", "a"): 1, ("data", "q"): ABSENT}, 0),
-        ("z", {("data", "a"): 3}, 1),
-        ("w", {("data", "q"): 1}, 1),
-    ):
-        before = history.runs
-        with model.edit():
-            history.link(entry(tag, Next(tag, "a"), reads, **{f"data__{tag}": 9}), seen=seen)
-        assert (history.runs - before, model.data[tag]) == (runs, 2 if runs else 9)
-    with model.edit() as edit:
-        edit.replace("0", Put("a", 4))
-    assert {model.data[tag] for tag in "xyzw"} == {5}
-    for wrong, message in (
-        (entry("x", Put("x"), data__x=1), "taken"),
-        (entry("f", Place("f", "no"), frames__f=FRAME("no", kv.translation(1, 0, 0))), "parent of frame"),
-    ):
-        with pytest.raises(kv.KineverseError, match=message), model.edit():
-            history.link(wrong)
 
 
 def test_a_commit_is_taken_back_below_later_ones_and_not_through_them() -> None:

@@ -60,17 +60,12 @@ def test_a_small_document_is_read_at_once():
     last = 0
     for _ in range(LEVELS):
         n = len(nodes)
-        nodes += [["elementary", "add", last, 1], ["elementary", "twice", last], ["select", last, n, n + 1]]
+        nodes += [["elementary", "add", [last, 1]], ["elementary", "twice", [last]]]
+        nodes.append(["select", last, n, n + 1])
         last = n + 2
     writes = {"constraints": {"c": [2, last, 1]}}
-    text = json.dumps(
-        {
-            "format": "kineverse",
-            "version": 1,
-            "nodes": nodes,
-            "operations": [{"tag": "c", "kind": "Constrain", "reads": {}, "writes": writes}],
-        }
-    )
+    operations = [{"tag": "c", "kind": "Constrain", "nodes": nodes, "writes": writes}]
+    text = json.dumps({"format": "kineverse", "version": 2, "operations": operations})
     model = kv.Model()
     with model.edit() as edit:
         for tag, operation in read_operations(text):

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from random import Random
 from typing import Any
 
+from msgspec import structs
+
 import kineverse as kv
 from kineverse.model.body import Pose
 from kineverse.model.operation import BODIES, DATA, FRAMES, Cell, map_expressions
@@ -96,7 +98,7 @@ def _change_value(kind: str, value: Any, random: Random) -> Any:
             moved = kv.translation(more, 0, 0)
         return replace(value, factors=(*value.factors, moved))
     if kind == BODIES:
-        return replace(value, visuals=())
+        return structs.replace(value, visuals=())
     if kind == DATA and random.random() < 0.5:
         return random.choice((number, more, None, "text", (1.0, (symbol,)), symbol))
     return map_expressions(kind, value, lambda e: e + more if not e.shape else e)

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
+import msgspec
 import mujoco  # noqa: F401  - its import opens files, so it comes before the files are watched
 
 import kineverse as kv
 from kineverse import gallery
 from kineverse.formats.document import read_operations
-from kineverse.formats.document.reader import read_packed_operations
+from kineverse.formats.document.structs import Document
 from kineverse.formats.mjcf import parse_mjcf
 from kineverse.formats.mjcf.operations import mjcf_operations
 from kineverse.formats.sdf.operations import sdf_operations
@@ -101,10 +102,15 @@ def _document(data: bytes, folder: Path, prefix: str | None) -> Operations:
 
 
 def _packed(data: bytes, folder: Path, prefix: str | None) -> Operations:
-    return list(read_packed_operations(data, "input.kv.msgpack", prefix))
+    return list(read_operations(data, "input.kv.msgpack", prefix, is_packed=True))
 
 
 def _in_msgpack(data: bytes) -> bytes:
+    """Return a text as msgpack, in the only form that is read if it is a document."""
+    try:
+        return msgspec.msgpack.encode(msgspec.json.decode(data, type=Document))
+    except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError):
+        pass
     return json_trees.MSGPACK.write(json_trees.JSON.read(data))
 
 

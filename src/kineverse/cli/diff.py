@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from kineverse.errors import InvalidValueError
@@ -20,6 +20,7 @@ from kineverse.model.comparison import (
     Delta,
     ModelComparison,
     ValueDifference,
+    field_names,
 )
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
@@ -143,10 +144,9 @@ def format_value(given: Any) -> str:
         return f"{format_number(given.mass)} kg"
     if isinstance(given, Pose):
         return f"at {' '.join(format_number(x) for x in given.rows[3::4])}"
-    if is_dataclass(given):
-        return " ".join(
-            [type(given).__name__.lower(), *(format_value(getattr(given, f.name)) for f in fields(given))]
-        )
+    if names := field_names(given):
+        parts = (format_value(getattr(given, name)) for name in names)
+        return " ".join([type(given).__name__.lower(), *parts])
     if isinstance(given, tuple):
         return shorten_text(" ".join(map(format_value, given)), LONGEST) or "nothing"
     return shorten_text(str(given), LONGEST)

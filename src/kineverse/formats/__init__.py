@@ -7,7 +7,20 @@ from kineverse._lazy import lazy_face
 if TYPE_CHECKING:
     from kineverse.formats import urdf as urdf
 
-    from .document import document_hash as document_hash, from_bytes as from_bytes, to_bytes as to_bytes
+    from .document import (
+        document_hash as document_hash,
+        from_bytes as from_bytes,
+        operation_digest as operation_digest,
+        operation_from_bytes as operation_from_bytes,
+        operation_to_bytes as operation_to_bytes,
+        to_bytes as to_bytes,
+    )
+    from .resources import (
+        FolderResolver as FolderResolver,
+        Resolver as Resolver,
+        add_resolver as add_resolver,
+        remove_resolver as remove_resolver,
+    )
     from .loader import load as load
     from .locate import locate_model as locate_model, shipped_models as shipped_models
     from .srdf import read_srdf as read_srdf

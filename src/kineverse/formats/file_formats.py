@@ -21,18 +21,17 @@ def _is_urdf(name: str, content: bytes) -> bool:
 def list_file_formats() -> tuple[FileFormat, ...]:
     """Return all formats; of those that read the same file, the first one counts."""
     formats = "kineverse.formats"
-    documents = zip(DOCUMENT_SUFFIXES, ("document_operations", "packed_document_operations"), strict=True)
     return (
         *(
             FileFormat(
                 name=f"document ({suffix})",
                 suffixes=(suffix,),
-                read=f"{formats}.document.reader:{read}",
+                read=f"{formats}.document.reader:document_entries",
                 written=(suffix,),
                 write=f"{formats}.document.writer:write_document",
                 exact=True,
             )
-            for suffix, read in documents
+            for suffix in DOCUMENT_SUFFIXES
         ),
         FileFormat(
             name="URDF",

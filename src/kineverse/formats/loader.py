@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
@@ -21,11 +21,9 @@ from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, che
 from .file_formats import DOCUMENT_SUFFIXES
 from .files import read_file
 from .locate import Source, locate_model
-from .loop_closures import LoopClosures
 from .names import check_prefix
 from .reader_warnings import collect_warnings, warn
 from .root_folder import NOWHERE, find_root
-from .xacro import split_arguments
 
 READ = (
     "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf), templates of xacro (.xacro) and documents "
@@ -140,7 +138,7 @@ def load(
     known = _REMEMBERED.pop(key, None)
     if known is None:
         model = Model()
-        with collect_warnings() as remarks, _blaming(found.path), model.edit() as edit, no_collection():
+        with collect_warnings() as remarks, _blaming(found.path), no_collection(), model.edit() as edit:
             for _ in _applied(edit, found, content, prefix, below, strict, loops, given):
                 pass
         if len(content) > LARGEST_REMEMBERED or not remembered:
@@ -191,6 +189,8 @@ def _arguments(
     """Return the path of a template and its arguments, of which some may follow the path."""
     given = {str(name): str(value) for name, value in (arguments or {}).items()}
     if isinstance(source, str) and ":=" in source:
+        from .xacro import split_arguments
+
         source, more = split_arguments(source)
         given |= more
     if given and not os.fspath(source).endswith(".xacro"):
@@ -213,16 +213,22 @@ def _applied(
     """Apply the operations of a source, and yield their tags."""
     prefix = source.shipped if prefix is None else prefix
     file_format = _format(source, content)
-    operations: Iterable[tuple[str, Operation]]
-    if file_format is None:
-        operations = _build(source, prefix or None)
-    else:
+    if file_format is not None:
         file = FileContent(source.path, content, prefix or None, root, strict, source.shipped, arguments)
+        if file_format.exact:
+            for entry in file_format.entries(file):
+                yield edit.link(entry)
+            return
         operations = file_format.operations(file)
+    else:
+        operations = _build(source, prefix or None)
     if file_format is None or not file_format.loop_element:
         for tag, operation in operations:
             yield edit.apply(operation, tag)
         return
+    # Imported when used, as most files have no loops: its imports take longer than a file.
+    from .loop_closures import LoopClosures
+
     closures = LoopClosures(edit, edit.model, source.path.name, file_format.loop_element, loops)
     for tag, operation in operations:
         yield from closures.apply(tag, operation)

@@ -12,10 +12,12 @@ import re
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
+
+from msgspec import structs
 
 from kineverse.errors import FormatError
 from kineverse.model.body import Body, Mesh, Shape
@@ -437,11 +439,11 @@ def restrict_meshes(body: Body, root: str, where: str) -> Body:
         wrong = find_root_violation(mesh.uri, mesh.folder, root)
         if wrong is not None:
             warn([f"{where}: names the mesh {wrong}"])
-        return replace(given, geometry=replace(mesh, root=root))
+        return structs.replace(given, geometry=structs.replace(mesh, root=root))
 
     if not any(isinstance(given.geometry, Mesh) for given in (*body.visuals, *body.collisions)):
         return body
-    return replace(
+    return structs.replace(
         body, visuals=tuple(map(shape, body.visuals)), collisions=tuple(map(shape, body.collisions))
     )
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from kineverse._extras import install_command
 from kineverse.errors import FormatError, MissingDependencyError, summarize_error
 from kineverse.formats.resource_paths import locate_mesh
+from kineverse.formats.resources import fetch_mesh
 from kineverse.formats.root_folder import is_below
 from kineverse.model.body import Mesh
 
@@ -59,8 +60,14 @@ _reading = threading.Lock()
 
 
 def find_mesh_file(mesh: Mesh) -> MeshFile:
-    """Return the file of a mesh."""
-    path = locate_mesh(mesh)
+    """Return the file of a mesh: where its description has it, else fetched by its content."""
+    try:
+        path = locate_mesh(mesh)
+    except FormatError:
+        fetched = fetch_mesh(mesh)
+        if fetched is None:
+            raise
+        path = fetched
     size = path.stat().st_size
     if size > LARGEST_FILE:
         raise OSError(

@@ -1,17 +1,18 @@
 """Rigid bodies: visual shapes, collision shapes, inertia, and constant poses.
 
 Everything here is plain immutable data in the units [m], [kg] and [kg m²]. A mesh is a reference to a file,
-and nothing here opens it.
+and nothing here opens it. Documents contain these values as they are, so their layout is that of the fields.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeAlias
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta, Struct, field
 
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import Expression
@@ -19,29 +20,38 @@ from kineverse.expressions.expression import Expression
 _RIGID = 2e-5
 _FARTHEST = 1e100  # largest coordinate of a pose [m]. Products of a chain of such poses do not overflow
 
-Vector3: TypeAlias = tuple[float, float, float]
+# A number of a document; other values, such as infinity, are refused when it is written or read.
+Finite: TypeAlias = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+Vector3: TypeAlias = tuple[Finite, Finite, Finite]
 AxisLike: TypeAlias = "Sequence[float] | npt.NDArray[Any]"  # three numbers, not all zero
-Rgba: TypeAlias = tuple[float, float, float, float]
+Rgba: TypeAlias = tuple[Finite, Finite, Finite, Finite]
+_Rows: TypeAlias = Annotated[tuple[Finite, ...], Meta(min_length=12, max_length=12)]
 
 
-@dataclass(frozen=True, slots=True)
-class Pose:
+class Pose(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """A constant rigid transform, stored as the 12 numbers of its first three rows."""
 
-    rows: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    rows: _Rows = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
     def __post_init__(self) -> None:
         if len(self.rows) != 12:
             raise ShapeError(f"A pose has 12 numbers, not {len(self.rows)}.")
         a, b, c, x, d, e, f, y, g, h, i, z = self.rows
-        squares = a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1
-        products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
-        turns = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
-        # Each comparison is False for NaN.
+        # Each comparison is False for NaN. Most poses of shapes do not turn.
+        is_close = (
+            -_FARTHEST <= x <= _FARTHEST and -_FARTHEST <= y <= _FARTHEST and -_FARTHEST <= z <= _FARTHEST
+        )
+        if a == e == i == 1.0 and b == c == d == f == g == h == 0.0 and is_close:
+            return
         if not (
-            turns
-            and all(-_RIGID < v < _RIGID for v in (*squares, *products))
-            and all(-_FARTHEST <= v <= _FARTHEST for v in (x, y, z))
+            is_close
+            and abs(a * a + b * b + c * c - 1) < _RIGID
+            and abs(d * d + e * e + f * f - 1) < _RIGID
+            and abs(g * g + h * h + i * i - 1) < _RIGID
+            and abs(a * d + b * e + c * f) < _RIGID
+            and abs(a * g + b * h + c * i) < _RIGID
+            and abs(d * g + e * h + f * i) < _RIGID
+            and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
         ):
             raise InvalidValueError(
                 f"The pose is not rigid: the first three columns of {self.rows} must be a rotation "
@@ -78,8 +88,13 @@ class Pose:
         return matrix
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
+class _Geometry(Struct, frozen=True, tag_field="kind", omit_defaults=True, forbid_unknown_fields=True):
+    """Geometry with the name of its kind, which documents and other formats use."""
+
+    kind: ClassVar[str]
+
+
+class Box(_Geometry, frozen=True, tag="box"):
     """A box centred at its origin; ``size`` are the full edge lengths along x, y, z [m]."""
 
     kind: ClassVar[str] = "box"
@@ -87,37 +102,33 @@ class Box:
     size: Vector3
 
 
-@dataclass(frozen=True, slots=True)
-class Cylinder:
+class Cylinder(_Geometry, frozen=True, tag="cylinder"):
     """A cylinder around z, centred at its origin; radius and length [m]."""
 
     kind: ClassVar[str] = "cylinder"
 
-    radius: float
-    length: float
+    radius: Finite
+    length: Finite
 
 
-@dataclass(frozen=True, slots=True)
-class Capsule:
+class Capsule(_Geometry, frozen=True, tag="capsule"):
     """A capsule around z, centred; ``length`` is that of the cylindrical part [m]."""
 
     kind: ClassVar[str] = "capsule"
 
-    radius: float
-    length: float
+    radius: Finite
+    length: Finite
 
 
-@dataclass(frozen=True, slots=True)
-class Sphere:
+class Sphere(_Geometry, frozen=True, tag="sphere"):
     """A sphere around its origin; radius [m]."""
 
     kind: ClassVar[str] = "sphere"
 
-    radius: float
+    radius: Finite
 
 
-@dataclass(frozen=True, slots=True)
-class Ellipsoid:
+class Ellipsoid(_Geometry, frozen=True, tag="ellipsoid"):
     """An ellipsoid around its origin; ``radii`` are the half axes along x, y, z [m]."""
 
     kind: ClassVar[str] = "ellipsoid"
@@ -125,64 +136,76 @@ class Ellipsoid:
     radii: Vector3
 
 
-@dataclass(frozen=True, slots=True)
-class Cone:
+class Cone(_Geometry, frozen=True, tag="cone"):
     """A cone around z, its base at -length/2 and its tip at +length/2; radius of the base and length [m]."""
 
     kind: ClassVar[str] = "cone"
 
-    radius: float
-    length: float
+    radius: Finite
+    length: Finite
 
 
-@dataclass(frozen=True, slots=True)
-class Mesh:
+class Mesh(_Geometry, frozen=True, tag="mesh", eq=False):
     """Reference to a mesh file.
 
     ``uri`` is the reference in the description (``package://...``, ``file://...`` or a path). ``folder`` is
     the folder of the description, from which the reference is resolved when its triangles are needed.
     ``root`` is the folder that the resolved path must not leave, a real path: empty if no path is allowed,
-    None if a program made the reference, which may open any file. Documents do not contain ``root``, and
-    comparisons ignore it.
+    None if a program made the reference, which may open any file. ``content`` is the SHA-256 of the file and
+    its size [byte], where they are known. Operations in documents contain only ``uri`` and ``scale``;
+    comparisons ignore ``root`` and ``content``.
     """
 
     kind: ClassVar[str] = "mesh"
 
     uri: str
-    scale: Vector3 = (1.0, 1.0, 1.0)
+    scale: Vector3 = field(default_factory=lambda: _UNSCALED)
     folder: str = ""
-    root: str | None = field(default=None, compare=False)
+    root: str | None = None
+    content: tuple[str, int] | None = None
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Mesh) and self._key == other._key
+
+    def __ne__(self, other: object) -> bool:  # that of a struct compares identities
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[str, Vector3, str]:
+        return self.uri, self.scale, self.folder
+
+
+_UNSCALED: Vector3 = (1.0, 1.0, 1.0)
+_IDENTITY = Pose()
 
 Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone | Mesh
-"""Each has the name of its ``kind``, which documents and other formats use."""
 
 
-@dataclass(frozen=True, slots=True)
-class Shape:
+class Shape(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     """Geometry at a pose in the frame of its body; visual shapes have a colour."""
 
     geometry: Geometry
-    origin: Pose = Pose()
+    origin: Pose = field(default_factory=lambda: _IDENTITY)
     name: str = ""
     color: Rgba | None = None
     texture: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Inertia:
+class Inertia(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     """Mass [kg] and rotational inertia [kg m²] about the centre of mass, in axes given by ``origin``.
 
     ``tensor`` is (ixx, ixy, ixz, iyy, iyz, izz); ``origin`` places the centre of mass in the body's frame.
     """
 
-    mass: float
-    tensor: tuple[float, float, float, float, float, float]
-    origin: Pose = Pose()
+    mass: Finite
+    tensor: tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+    origin: Pose = field(default_factory=lambda: _IDENTITY)
 
 
-@dataclass(frozen=True, slots=True)
-class Body:
+class Body(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     """Rigid body that is attached to one frame."""
 
     visuals: tuple[Shape, ...] = ()

@@ -11,6 +11,7 @@ from math import inf, isnan
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.lie import Array
@@ -82,14 +83,14 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
             yield "parent", a.parent, b.parent
         if a.factors != b.factors:
             yield "transform", transform_of(a), transform_of(b)
-    elif is_dataclass(a) and not isinstance(a, type):
+    elif names := field_names(a):
         alike: tuple[str, ...] = ()
         if isinstance(a, Mesh):
             alike = ("folder", "root", "uri") if _file(a) == _file(b) else ("folder", "root")
-        for field in fields(a):
-            if field.name not in alike:
-                name = f"{what}.{field.name}" if what else field.name
-                yield from _walk(name, getattr(a, field.name), getattr(b, field.name))
+        for field in names:
+            if field not in alike:
+                name = f"{what}.{field}" if what else field
+                yield from _walk(name, getattr(a, field), getattr(b, field))
     elif isinstance(a, tuple) and (a or b) and _are_named(a) and _are_named(b):
         one, other = ({str(name): value for name, value in pairs} for pairs in (a, b))
         for name in dict.fromkeys((*one, *other)):
@@ -99,6 +100,13 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
             yield from _walk(f"{what}[{i}]", *(side[i] if i < len(side) else None for side in (a, b)))
     elif a != b:
         yield what, a, b
+
+
+def field_names(value: Any) -> tuple[str, ...]:
+    """Return the names of the parts of a record; none for any other value."""
+    if isinstance(value, Struct):
+        return value.__struct_fields__
+    return tuple(field.name for field in fields(value)) if is_dataclass(value) else ()
 
 
 def _file(mesh: Mesh) -> str:

@@ -19,7 +19,7 @@ from .commits.net_changes import NetChanges, adopt, find_net_changes
 from .commits.undo import take_back
 from .constraint import Constraint
 from .frame import WORLD, Frame, TransformLike
-from .history import History
+from .history import History, HistoryEntry
 from .operation import Operation
 from .rates import as_row
 from .registry import LoopTreatment
@@ -72,6 +72,17 @@ class Edit:
         chosen = self._tag(operation, tag)
         self._check_open().append(chosen, operation)
         return chosen
+
+    def link(self, entry: HistoryEntry) -> str:
+        """Append an operation of a document and return its tag; it is not run where it finds what it read.
+
+        Raises
+        ------
+        DuplicateNameError, UnknownNameError, ModelError
+            As :meth:`apply`.
+        """
+        self._check_open().link(entry)
+        return entry.tag
 
     def insert(
         self,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any, TypeAlias
@@ -39,22 +39,33 @@ _PLACE = attrgetter("place")
 
 
 class HistoryEntry:
-    """Operation at its place, with the reads and writes of its last run; immutable."""
+    """Operation at its place, with the reads and writes of its last run; immutable.
 
-    __slots__ = ("operation", "place", "reads", "tag", "writes")
+    ``blob`` is its form in documents, once it is known.
+    """
+
+    __slots__ = ("blob", "operation", "place", "reads", "tag", "writes")
 
     def __init__(
-        self, tag: str, operation: Operation, place: int, reads: Reads, writes: dict[Cell, Any]
+        self,
+        tag: str,
+        operation: Operation,
+        place: int,
+        reads: Reads,
+        writes: dict[Cell, Any],
+        blob: bytes | None = None,
     ) -> None:
         self.tag = tag
         self.operation = operation
         self.place = place
         self.reads = reads
         self.writes = writes
+        self.blob = blob
 
     def at(self, place: int, reads: Reads | None = None) -> HistoryEntry:
         """Return the entry at another place, and with other reads if some are given."""
-        return HistoryEntry(self.tag, self.operation, place, reads or self.reads, self.writes)
+        blob = self.blob if reads is None or reads is self.reads else None
+        return HistoryEntry(self.tag, self.operation, place, reads or self.reads, self.writes, blob)
 
 
 TouchedEntry: TypeAlias = tuple[HistoryEntry | None, HistoryEntry | None, bool]
@@ -158,6 +169,41 @@ class History:
         """Append an operation."""
         self._add(tag, operation, self.place_at(len(self.sequence)))
 
+    def link(self, given: HistoryEntry) -> None:
+        """Append an operation with its writes elsewhere; it is run only if it finds other values here."""
+        entry = given.at(self.place_at(len(self.sequence)))
+        if self._dirty or given.tag in self.entries or not self._finds_what_it_read(entry):
+            self._add(given.tag, given.operation, entry.place)
+            return
+        check_writes(self, entry)
+        check_overwrite(self, entry)
+        self.note_given(entry.tag)
+        if any(c in self.cells or c in self.reading or self.listing[c[0]] for c in entry.writes):
+            self.put(entry)
+            return
+        # The usual case while a document is loaded, in one step.
+        self._undo.append((self._take_back, (entry,)))
+        self._index(entry)
+        for cell, value in entry.writes.items():
+            self.cells[cell] = [entry]
+            self.head[cell[0]][cell[1]] = value
+            self._before.setdefault(cell, ABSENT)
+            self._events.append((cell, ABSENT, value))
+
+    def _take_back(self, entry: HistoryEntry) -> None:
+        for cell, value in entry.writes.items():
+            self._put_head(cell, value, ABSENT)
+        self._forget(entry)
+
+    def _finds_what_it_read(self, entry: HistoryEntry) -> bool:
+        """Return whether all values that an operation read elsewhere are the same objects here."""
+        if entry.operation.seen is None:
+            return False
+        values, names = entry.operation.seen
+        return all(self.value_at(cell, entry.place) is value for cell, value in values.items()) and all(
+            tuple(self.names_at(kind, entry.place)) == listed for kind, listed in names.items()
+        )
+
     def insert(self, tag: str, operation: Operation, index: int) -> None:
         """Insert an operation before the one at ``index``."""
         self._add(tag, operation, self.place_at(index))
@@ -186,32 +232,6 @@ class History:
         self._unlink(entry)
         for cell, value in entry.writes.items():
             self._mark_readers(cell, value, ABSENT, entry.place)
-
-    def link(
-        self, entry: HistoryEntry, index: int | None = None, seen: Mapping[Cell, Any] | None = None
-    ) -> None:
-        """Insert an operation from elsewhere with the reads and writes of its run there, by default last.
-
-        It is checked, for names, parents of frames, and values of others that it would write over, and is not
-        run: without ``seen``, what it read is taken to be what is there. With the values that it read in
-        ``seen``, ABSENT for none, it is run when the edit settles if one of them differs, or if it has listed
-        names; so it is while others wait to be run.
-        """
-        with self.step():
-            self._check_new(entry.tag, entry.operation)
-            entry = entry.at(self.place_at(len(self.sequence) if index is None else index))
-            self.note_given(entry.tag)
-            if not self._dirty:
-                check_writes(self, entry)
-                check_overwrite(self, entry)
-            outdated = bool(self._dirty or (seen is not None and entry.reads.listings)) or any(
-                _differs(entry.reads.cells[cell], value, self.value_at(cell, entry.place))
-                for cell, value in (seen or {}).items()
-                if cell in entry.reads.cells
-            )
-            self.put(entry)
-            if outdated:
-                self.mark_outdated(entry.tag)
 
     def put(self, entry: HistoryEntry) -> None:
         """Link an entry at its place, or exchange the one there, and mark the readers of what it changes."""
@@ -320,11 +340,8 @@ class History:
         self.runs += 1
         tag = entry.tag
         reads = Reads()
-        reader = ReadRecorder(
-            lambda cell: self.value_at(cell, entry.place), lambda k: self.names_at(k, entry.place), reads
-        )
         try:
-            effects = entry.operation.apply(reader)
+            effects = entry.operation.apply(self._reader(entry.place, reads))
             if not isinstance(effects, Writes):
                 raise EditError(f"apply() returns kv.model.Writes, not {type(effects).__name__}.")
             writes = effects.writes()
@@ -335,6 +352,12 @@ class History:
         new = HistoryEntry(tag, entry.operation, entry.place, reads, writes)
         check_writes(self, new)
         return new
+
+    def _reader(self, place: int, reads: Reads) -> ReadRecorder:
+        """Return the model before a place, which records what is read."""
+        return ReadRecorder(
+            lambda cell: self.value_at(cell, place), lambda kind: self.names_at(kind, place), reads
+        )
 
     def _mark_readers(self, cell: Cell, old: Any, new: Any, place: int) -> None:
         """Mark the readers of a write at ``place`` as outdated."""
@@ -504,12 +527,9 @@ class History:
         self._events.append((cell, old, value))
 
     def _link(self, entry: HistoryEntry) -> None:
-        self._touched.setdefault(entry.tag, None)
-        self.entries[entry.tag] = entry
-        if not self.sequence or self.sequence[-1].place < entry.place:
-            self.sequence.append(entry)
-        else:
-            insort(self.sequence, entry, key=_PLACE)
+        if entry.operation.recorded is entry.writes:  # linked without a run
+            entry.operation.remember(self._reader(entry.place, Reads()))
+        self._index(entry)
         for cell in entry.writes:
             writers = self.cells.get(cell)
             if writers is None:
@@ -519,11 +539,20 @@ class History:
                 self._disordered.add(cell[0])
                 if cell[0] != DATA:
                     self._contested[cell] = None
+        self._undo.append((self._forget, (entry,)))
+
+    def _index(self, entry: HistoryEntry) -> None:
+        """Note an entry by its tag, its place and its reads."""
+        self._touched.setdefault(entry.tag, None)
+        self.entries[entry.tag] = entry
+        if not self.sequence or self.sequence[-1].place < entry.place:
+            self.sequence.append(entry)
+        else:
+            insort(self.sequence, entry, key=_PLACE)
         for cell, how in entry.reads.cells.items():
             self.reading.setdefault(cell, {})[entry.tag] = how
         for kind in entry.reads.listings:
             self.listing[kind].add(entry.tag)
-        self._undo.append((self._forget, (entry,)))
 
     def _unlink(self, entry: HistoryEntry) -> None:
         self._touched.setdefault(entry.tag, entry)

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from kineverse.errors import DuplicateNameError, ExpressionError, InvalidValueError, suggest
@@ -79,7 +80,7 @@ class Writes:
         return Writes(**kinds)
 
     def writes(self) -> dict[tuple[str, str], Any]:
-        """Return all values in canonical form, by kind and name, in plain coordinates."""
+        """Return all values in canonical form and plain coordinates, in the order of KINDS, then of names."""
         result: dict[tuple[str, str], Any] = {}
         for name, frame in self.frames.items():
             value = _as_frame(name, frame)
@@ -89,6 +90,16 @@ class Writes:
                     tuple(to_plain(f) if isinstance(f, Expression) else f for f in value.factors),
                 )
             result[FRAMES, name] = value
+        records: tuple[tuple[str, Mapping[str, Any]], ...] = (
+            (BODIES, self.bodies),
+            (ARTICULATIONS, self.articulations),
+        )
+        for kind, values in records:
+            for name, record in values.items():
+                _check_value(kind, name, record)
+                if isinstance(record, Articulation) and record.follows is not None and record.follows.nodes:
+                    record = replace(record, follows=to_plain(record.follows))
+                result[kind, name] = record
         for name, triple in self.constraints.items():
             c = as_constraint(triple)
             if c.lower.nodes or c.expression.nodes or c.upper.nodes:
@@ -96,18 +107,22 @@ class Writes:
             result[CONSTRAINTS, name] = c
         for coordinate, row in self.rates.items():
             result[RATES, str(coordinate)] = (coordinate, as_entry(coordinate, row))
-        others: tuple[tuple[str, Mapping[str, Any]], ...] = (
-            (BODIES, self.bodies),
-            (ARTICULATIONS, self.articulations),
-            (DATA, self.data),
-        )
-        for kind, values in others:
-            for name, datum in values.items():
-                _check_value(kind, name, datum)
-                if isinstance(datum, Articulation) and datum.follows is not None and datum.follows.nodes:
-                    datum = replace(datum, follows=to_plain(datum.follows))
-                result[kind, name] = datum
+        for name, datum in self.data.items():
+            _check_value(DATA, name, datum)
+            result[DATA, name] = datum
         return result
+
+
+class FinishedWrites(Writes):
+    """Writes of an earlier run, which are canonical already."""
+
+    def __init__(self, writes: Mapping[tuple[str, str], Any]) -> None:
+        object.__setattr__(self, "_finished", writes)
+
+    def writes(self) -> dict[tuple[str, str], Any]:
+        """Return all values by kind and name."""
+        finished: dict[tuple[str, str], Any] = vars(self)["_finished"]
+        return finished
 
 
 def _as_frame(name: str, frame: Frame | tuple[str, TransformLike | Sequence[TransformLike]]) -> Frame:
@@ -169,6 +184,12 @@ class Operation(ABC):
     overrides: ClassVar[bool] = False
     """True if the operation may overwrite frames, bodies, articulations and rates that it has not read."""
 
+    recorded: ClassVar[Mapping[tuple[str, str], Any]] = MappingProxyType({})
+    """Writes of the operation in the document that it comes from; empty if it has its code."""
+
+    seen: ClassVar[tuple[Mapping[tuple[str, str], Any], Mapping[str, tuple[str, ...]]] | None] = None
+    """Values of the cells and names of the kinds that it read there; None if they are not known."""
+
     document_kind: ClassVar[str]
     """Frozen name of the class in documents, in kinds of articulations and in tags."""
 
@@ -190,6 +211,16 @@ class Operation(ABC):
 
         The result must be a pure function of the fields and of the values read from ``model``.
         """
+
+    def remember(self, model: ReadRecorder) -> None:  # noqa: B027 - only operations from elsewhere do
+        """Take what a model contains now as what the operation has read."""
+
+    def below(self, prefix: str) -> Operation | None:
+        """Return the operation with its names below a prefix that ends with a slash.
+
+        Only the class knows which texts are names. None, the default, says that it does not.
+        """
+        return None
 
     def default_tag(self) -> str:
         """Return the default tag: the kind, and the name of the operation if it has one."""

@@ -21,6 +21,7 @@ from .operation import Operation
 
 if TYPE_CHECKING:
     from .edit import Edit
+    from .history import HistoryEntry
     from .model_view import ModelView
 
 LoopTreatment: TypeAlias = Literal["solve", "constraint", "refuse"]
@@ -59,7 +60,7 @@ class FileFormat:
 
     name: str
     suffixes: tuple[str, ...]  # endings of the file names that it reads
-    read: str  # function from a FileContent to an iterable of (tag, operation)
+    read: str  # function from a FileContent to an iterable of (tag, operation), or of entries if it is exact
     written: tuple[str, ...] = ()  # endings of the file names that it writes
     write: str = ""  # function of (model, path, leave_out, tolerance, strict) to the content of files
     recognize: Callable[[str, bytes], bool] | None = None  # of (name, content), where formats share a suffix
@@ -74,6 +75,11 @@ class FileFormat:
     def operations(self, file: FileContent) -> Iterable[tuple[str, Operation]]:
         """Yield the operations of a file, each with its tag."""
         result: Iterable[tuple[str, Operation]] = import_entry(self.read)(file)
+        return result
+
+    def entries(self, file: FileContent) -> Iterable[HistoryEntry]:
+        """Yield the operations of a file of an exact format, with what they read and wrote."""
+        result: Iterable[HistoryEntry] = import_entry(self.read)(file)
         return result
 
 

@@ -18,7 +18,14 @@ from kineverse._runtime import no_collection
 from kineverse.articulations import Revolute
 from kineverse.articulations.joint import Joint
 from kineverse.expressions import Expression
-from kineverse.formats.document import from_bytes, read_operations, to_bytes, to_json
+from kineverse.formats.document import (
+    from_bytes,
+    operation_from_bytes,
+    operation_to_bytes,
+    read_operations,
+    to_bytes,
+    to_json,
+)
 from kineverse.lie import Array
 from kineverse.model import Diff, Model, Operation, Pose, ReadRecorder, Writes
 from kineverse.model.frame import WORLD
@@ -36,6 +43,7 @@ RELEVANT, RELEVANT_NEW = "constraints_for a pose", "constraints_for a new expres
 READERS = 7  # number of operations that read the writes of the replaced one
 _AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _APPENDED = 100
+_CHAIN = 50
 _QUERIES = 100
 
 
@@ -157,6 +165,31 @@ def read_document(text: str) -> Model:
     return model
 
 
+def forget_blobs(model: Model) -> Model:
+    """Return a model without the bytes of its operations, so that they are encoded when it is written."""
+    for entry in model.history.sequence:
+        entry.blob = None
+    return model
+
+
+def make_joints(count: int) -> Model:
+    """Return a model of chains of 50 joints with limits."""
+    model = Model()
+    with no_collection(), model.edit() as edit:
+        for i in range(count):
+            edit.apply(
+                Revolute(
+                    name=f"joint{i}",
+                    parent=f"link{i - 1}" if i % _CHAIN else WORLD,
+                    child=f"link{i}",
+                    lower=-1.0 - 1e-5 * i,
+                    upper=1.0,
+                    velocity=2.0,
+                )
+            )
+    return model
+
+
 def time_document(nodes: int) -> tuple[int, dict[str, float]]:
     """Return the exact number of nodes of a document, and its times [s] by what is done."""
     model, times = make_document_model(nodes), {}
@@ -170,9 +203,9 @@ def time_document(nodes: int) -> tuple[int, dict[str, float]]:
     with no_collection():
         text = timed("written", lambda: to_json(model))
         timed("read", lambda: read_document(text))
-        data = timed("written as msgpack", lambda: to_bytes(model))
+        data = timed("written as msgpack", lambda: to_bytes(forget_blobs(model)))
         timed("read from msgpack", lambda: from_bytes(data))
-    return text.count("\n[") - 1, times
+    return text.count('["'), times
 
 
 INTEGRATOR, INTEGRATE = "kineverse, integrator", "kineverse, model.integrate"
@@ -252,6 +285,8 @@ def _checks(model: Model, q: Array, v: Array) -> list[Contender]:
 
 WRITTEN, READ = "robot and kitchen, written", "robot and kitchen, read"
 PACKED, UNPACKED = f"{WRITTEN} as msgpack", f"{READ} from msgpack"
+AGAIN = f"{WRITTEN} again as msgpack"
+JOINT_WRITTEN, JOINT_READ = "a joint, written as bytes", "a joint, read from bytes"
 OURS, MSGPACK = "robot, written and read", "robot, written and read as msgpack"
 
 
@@ -269,7 +304,19 @@ def measure_document(settings: BenchmarkSettings) -> BenchmarkResult:
     for nodes, times in growth:
         for what, seconds in times.items():
             one.note(f"{nodes:,} nodes, {what}", "s", seconds)
+    one.time(_joint_contenders())
+    many = make_joints(settings.operations)
+    start = perf_counter()
+    data = to_bytes(many)
+    middle = perf_counter()
+    from_bytes(data)
+    one.note(f"{len(many.history.tags):,} joints, written", "s", middle - start)
+    one.note(f"{len(many.history.tags):,} joints, read", "s", perf_counter() - middle)
     one.bound(0.05, WRITTEN, READ)
+    one.bound(0.008, PACKED)
+    one.bound(0.012, UNPACKED)
+    one.bound(4e-5, JOINT_WRITTEN)
+    one.bound(6e-5, JOINT_READ)
     one.bound(2e6, size.name)
     one.speed((OURS, MSGPACK), "pinocchio, archive", "mujoco, MJCF", "mujoco, MJB")
     (small, before), (large, after) = growth[0], growth[-1]
@@ -289,15 +336,24 @@ def _home_contenders(robot: BenchmarkRobot, home: Model, text: str) -> Iterator[
         values = dict.fromkeys(home.fk(robot.frame).symbols, 0.1)
         return lambda: [make().fk(robot.frame)(values)]
 
-    yield Contender(WRITTEN, time_calls(partial(to_json, home)), poses(lambda: home))
+    yield Contender(WRITTEN, time_calls(lambda: to_json(forget_blobs(home))), poses(lambda: home))
     yield Contender(READ, time_calls(partial(read_document, text)), poses(lambda: read_document(text)))
-    yield Contender(PACKED, time_calls(partial(to_bytes, home)))
+    yield Contender(PACKED, time_calls(lambda: to_bytes(forget_blobs(home))))
+    yield Contender(AGAIN, time_calls(partial(to_bytes, home)))
     yield Contender(UNPACKED, time_calls(partial(from_bytes, data)), poses(lambda: from_bytes(data)))
 
 
+def _joint_contenders() -> Iterator[Contender]:
+    model = make_joints(1)
+    (tag,) = model.history.tags
+    blob = operation_to_bytes(model, tag)
+    yield Contender(JOINT_WRITTEN, time_calls(lambda: operation_to_bytes(forget_blobs(model), tag)))
+    yield Contender(JOINT_READ, time_calls(partial(operation_from_bytes, blob)))
+
+
 def _robot_contenders(robot: BenchmarkRobot) -> Iterator[Contender]:
-    yield Contender(OURS, time_calls(lambda: read_document(to_json(robot.model))))
-    yield Contender(MSGPACK, time_calls(lambda: from_bytes(to_bytes(robot.model))))
+    yield Contender(OURS, time_calls(lambda: read_document(to_json(forget_blobs(robot.model)))))
+    yield Contender(MSGPACK, time_calls(lambda: from_bytes(to_bytes(forget_blobs(robot.model)))))
 
 
 JOINT = "kineverse, joint replaced"

@@ -23,8 +23,9 @@ VOCABULARY = (
     *words(
         """
     kineverse constant symbol elementary element matrix augment less not and or select extremum norm
-    piecewise carried composed dependent implicit read min max dof parameter contact location format version
-    nodes operations tag kind reads writes existence value listing parent factors visuals collisions inertia
+    piecewise carried composed dependent implicit read rotation translation below min max dof parameter
+    contact location format version nodes
+    operations tag kind reads writes existence value listing parent factors visuals collisions inertia
     expression float trace questions frozen parameters a b world frames/f
     """
     ),
@@ -32,7 +33,7 @@ VOCABULARY = (
 _TYPES = words(
     """
     constant symbol unary binary binary element matrix augment less not joined select extremum norm
-    piecewise carried composed dependent implicit
+    piecewise carried composed dependent implicit motion
     """
 )
 _PATHS = ("a", "b", "c/d")
@@ -47,16 +48,11 @@ def generate(random: Random) -> bytes:
     table = Table(random)
     for _ in range(random.choice((3, 10, 30))):
         table.grow()
-    given: dict[str, Any] = {
-        "format": "kineverse",
-        "version": 1,
-        "nodes": table.nodes,
-        "operations": _Writer(table, random).operations(),
-    }
-    text = json.dumps(given)
+    operations = [{**one, "nodes": table.nodes} for one in _Writer(table, random).operations()]
+    text = json.dumps({"format": "kineverse", "version": 2, "operations": operations})
     if random.random() < 0.02:
         text = text.replace(
-            '"version": 1', '"version": ' + random.choice(("0", "2", "1.0", '"1"', "1e99", "null"))
+            '"version": 2', '"version": ' + random.choice(("0", "1", "3", "2.0", '"2"', "1e99", "null"))
         )
     return text.encode()
 
@@ -129,12 +125,12 @@ class Table:
             if random.random() < 0.02:
                 role = "king"
             order = 0 if role == "parameter" else random.choice((0, 0, 1, 2, 5, 999))
-            node = ["symbol", path, order, role]
-            self.add(node + ([0.5] if role == "parameter" else []), ())
+            node = ["parameter", path, 0.5] if role == "parameter" else ["symbol", path, order, role]
+            self.add(node, ())
         elif kind == "unary":
-            self.add(["elementary", random.choice(list(UNARY)), self.ref()], ())
+            self.add(["elementary", random.choice(list(UNARY)), [self.ref()]], ())
         elif kind == "binary":
-            self.add(["elementary", random.choice(list(BINARY)), self.ref(), self.ref()], ())
+            self.add(["elementary", random.choice(list(BINARY)), [self.ref(), self.ref()]], ())
         elif kind == "element":
             array = self.matrix(random.choice(((2,), (4, 4), (2, 1, 2))))
             self.add(["element", array, random.randrange(math.prod(self.shapes[array]))], ())
@@ -144,6 +140,10 @@ class Table:
             getattr(self, f"_{kind}")(shape)
         else:
             getattr(self, f"_{kind}")()
+
+    def _motion(self) -> None:
+        axis = self.random.choice(([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0, 0, 1], [0.6, 0.0, 0.8], [1, 1, 0]))
+        self.add([self.random.choice(("rotation", "translation")), axis, self.ref()], (4, 4))
 
     def _augment(self, shape: tuple[int, ...]) -> None:
         keys = sorted({self.symbol(1) for _ in range(self.random.choice((0, 1, 2)))})
@@ -162,14 +162,14 @@ class Table:
 
     def _joined(self, shape: tuple[int, ...]) -> None:
         refs = [self.ref(shape) for _ in range(self.random.choice((0, *[1, 2, 5] * 10)))]
-        self.add([self.random.choice(("and", "or")), *refs], shape)
+        self.add([self.random.choice(("and", "or")), refs], shape)
 
     def _select(self, shape: tuple[int, ...]) -> None:
         self.add(["select", *(self.ref(shape) for _ in range(3))], shape)
 
     def _extremum(self, shape: tuple[int, ...]) -> None:
         refs = [self.ref(shape) for _ in range(self.random.choice((1, *[2] * 15, *[3] * 15)))]
-        self.add(["extremum", self.random.choice(("min", "max")), *refs], shape)
+        self.add(["extremum", self.random.choice(("min", "max")), refs], shape)
 
     def _norm(self, shape: tuple[int, ...]) -> None:
         self.add(["norm", self.matrix(self.random.choice((*[(3,)] * 20, *[(1,)] * 10, (0,), (2, 2))))], ())
@@ -218,10 +218,10 @@ class Table:
         unknown, given = random.sample([place for place, _, order in self.symbols if order == 0], 2)
         residual = self.ref()
         if random.random() < 0.7:
-            residual = self.add(["elementary", "sub", unknown, given], ())
+            residual = self.add(["elementary", "sub", [unknown, given]], ())
         column, seed = self.add(["matrix", [1], [residual]], (1,)), self.add(["matrix", [1], [given]], (1,))
         steps = random.choice((0, 1, 5, 100))
-        function = ["implicit", "i", [unknown], [given], column, [0], seed, steps, [self.ref()]]
+        function = ["implicit", "i", [unknown], [given], column, [0], seed, steps, [self.ref()], []]
         place = self.add(function, (1,))
         self.add(["element", place, 0], ())
 
@@ -278,7 +278,7 @@ class _Writer:
         if tag == "mapping":
             return {"mapping": [[inner(), inner()] for _ in range(random.choice((0, 1, 2)))]}
         if tag == "record":
-            return {"record": "R", "fields": {"a": inner(), "b": inner()}}
+            return {"record": ["R", {"a": inner(), "b": inner()}]}
         if tag == "list":
             return [inner(), inner()]
         path = f"{random.choice(KINDS)}/{random.choice((*self.frames, 'a', 'x'))}"
@@ -290,7 +290,7 @@ class _Writer:
         for _ in range(random.choice((0, 1, 2))):
             if random.random() < 0.5:
                 factors.append(
-                    random.choice((_IDENTITY, [random.gauss(0, 1) for _ in range(12)], [0] * 12, [0]))
+                    random.choice(([_IDENTITY], [[random.gauss(0, 1) for _ in range(12)]], [[0] * 12], [0]))
                 )
             else:
                 factors.append(self.table.ref((4, 4)))
@@ -302,10 +302,11 @@ class _Writer:
     def _bodies(self) -> tuple[str, Any]:
         random = self.random
         form = random.choice((
-            {"box": {"size": [1, 2, 3]}}, {"sphere": {"radius": random.choice((1, -1, "inf", 1e308))}}, {},
-            {"mesh": {"uri": random.choice(NAMES), "scale": [1, 1, 1], "folder": ""}},
+            {"kind": "box", "size": [1, 2, 3]}, {},
+            {"kind": "sphere", "radius": random.choice((1, -1, "inf", 1e308))},
+            {"kind": "mesh", "uri": random.choice(NAMES), "scale": [1, 1, 1]},
         ))  # fmt: skip
-        shape = {"geometry": form, "origin": _IDENTITY, "color": [0, 1, 0, 1]}
+        shape = {"geometry": form, "origin": [_IDENTITY], "color": [0, 1, 0, 1]}
         return random.choice(self.frames), {"visuals": [shape], "collisions": []}
 
     def _articulations(self) -> tuple[str, Any]:

@@ -1,13 +1,12 @@
-"""The native document ``.kv.json``: a model as the list of its operations, exact to the last bit.
+"""Documents ``.kv.json`` and ``.kv.msgpack``: a model as the list of its operations, exact to the last bit.
 
-A document is one JSON object::
+A document is one object::
 
-    {"format": "kineverse", "version": 1, "nodes": [...], "operations": [...], "sha256": "..."}
+    {"format": "kineverse", "version": 2, "operations": [...], "sha256": "..."}
 
-``nodes`` is the table of all expressions of the model, each node made of earlier ones (:mod:`.node_table`
-lists the types); ``operations`` has the reads and writes of every operation; ``sha256`` is the hash of the
-content (:mod:`.encoding`), and is optional. Reading a document runs no code and imports no name. A
-``.kv.msgpack`` file is the same in binary form.
+Each operation stands for itself: it has its tag, its kind, its reads and writes, and a table of the
+expressions in them (:mod:`.structs` has the layout). Its msgpack is its *blob* (:mod:`.encoding`). Reading
+runs no code and imports no name.
 """
 
 from typing import TYPE_CHECKING
@@ -15,15 +14,17 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .json_values import schema as schema
     from .opaque_operation import OpaqueOperation as OpaqueOperation
     from .reader import (
         from_bytes as from_bytes,
+        operation_from_bytes as operation_from_bytes,
         read_operations as read_operations,
-        read_packed_operations as read_packed_operations,
     )
+    from .structs import schema as schema
     from .writer import (
         document_hash as document_hash,
+        operation_digest as operation_digest,
+        operation_to_bytes as operation_to_bytes,
         to_bytes as to_bytes,
         to_json as to_json,
         write_document as write_document,

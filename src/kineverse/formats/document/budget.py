@@ -15,8 +15,6 @@ from kineverse.expressions.expression import Expression
 from kineverse.model.rates import collect_symbols
 from kineverse.symbols import Symbol
 
-from .json_values import InvalidDocumentError
-
 MAX_NODES = 1 << 22
 MAX_LISTS = 10_000_000  # most lists and objects in a document
 MAX_VALUES = 1 << 26  # most values in a document
@@ -43,11 +41,16 @@ COST_OF_FRAME = 5  # cost of a frame for each pose in a trace whose kinematic ch
 COST_OF_STEP = 1000  # cost of a Newton step in addition to that of its residual
 
 
+class InvalidDocumentError(Exception):
+    """Reason why a document is refused, without its place; the reader raises a FormatError with both."""
+
+
 class Budget:
     """Work that remains for the reading of one document, in steps."""
 
     def __init__(self) -> None:
         self._left = MAX_WORK
+        self.functions: dict[bytes, int] = {}  # work of implicit functions, by their keys
 
     def spend(self, steps: int) -> None:
         """Spend steps on work before it is done."""
@@ -58,14 +61,23 @@ class Budget:
             )
 
 
-def check_counts(content: bytes) -> None:
-    """Check the number of parts of a JSON text before it is parsed."""
-    lists = content.count(b"[") + content.count(b"{")
+# First bytes of lists and maps of msgpack; they also occur inside of numbers and texts, so their count is an
+# upper bound.
+_LISTS = bytes((*range(0x80, 0xA0), 0xDC, 0xDD, 0xDE, 0xDF))
+
+
+def check_counts(content: bytes, is_text: bool) -> None:
+    """Check the number of parts of a document before it is decoded."""
+    if is_text:
+        lists = content.count(b"[") + content.count(b"{")
+        values = lists + content.count(b",")
+    else:
+        lists = values = len(content) - len(content.translate(None, _LISTS))
     if lists > MAX_LISTS:
         raise InvalidDocumentError(
             f"more than {MAX_LISTS:,} lists and objects; a document has up to {MAX_NODES:,} nodes"
         )
-    if lists + content.count(b",") > MAX_VALUES:
+    if values > MAX_VALUES:
         raise InvalidDocumentError(f"more than {MAX_VALUES:,} values, the most a document has")
 
 

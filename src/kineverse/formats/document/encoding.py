@@ -1,139 +1,188 @@
-"""Canonical JSON text of a document, its hash, and its binary form (msgpack).
+"""Bytes of documents: canonical blobs of operations, digests, and the text of the same content.
 
-The text of a document is canonical. Its hash is SHA-256 over that text, in UTF-8, without the hash itself and
-without line breaks. Another layout of the same JSON keeps the content, so the reader then computes the hash
-from the parsed values. The order of names (of frames in the writes of an operation, say) is part of the
-content.
+A blob is the msgpack of an :class:`.structs.OperationValue`, in the one form that msgspec writes. Texts are
+decoded to the same structs, and so have the same blobs. A digest is SHA-256 of a blob; the hash of a model is
+SHA-256 of its operations' digests, one after the other.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from typing import Any
+import re
+from collections.abc import Iterable
+from typing import Any, NoReturn
 
-from kineverse._extras import install_command
-from kineverse.errors import MissingDependencyError
-from kineverse.model.operation import KINDS
+import msgspec
+import numpy as np
 
-from .budget import MAX_LISTS
-from .json_values import InvalidDocumentError
+from .budget import InvalidDocumentError, check_counts
+from .structs import FORMAT, VERSION, Envelope, Header, OperationValue
 
 HASH = "sha256"
-_LEAD, _TAIL = f',\n"{HASH}":"', '"}\n'
-_DIGITS = 64
-
-# Members of the format in the order in which they are written, for all objects.
-_ORDER = (
-    *("format", "version", "nodes", "operations"),
-    *("tag", "kind", "parameters", "reads", "existence", "value", "listing", "questions", "writes"),
-    *("trace", "frozen", *KINDS, "record", "fields"),
-    *("parent", "child", "factors", "coordinates", "home", "speeds", "dynamics", "follows"),
-    *("visuals", "collisions", "inertia", "mass", "tensor", "geometry", "origin", "name", "color", "texture"),
-    *("size", "radius", "length", "radii", "uri", "scale", "folder"),
-)
-_RANK = {name: i for i, name in enumerate(_ORDER)}
-# Objects whose members have names of the model.
-_NAMED = frozenset(("parameters", "fields", *KINDS))
-_WITHOUT_OBJECTS = frozenset(("nodes", "factors"))
-
-dump_json = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
 
 
-def append_hash(body: str) -> str:
-    """Return the text of a document from its text without hash and closing brace."""
-    return f"{body}{_LEAD}{_digest(body.encode())}{_TAIL}"
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (str, float, int)):  # instances of a subclass
+        return next(kind(value) for kind in (str, float, int) if isinstance(value, kind))
+    raise TypeError(f"a {type(value).__name__} has no place in a document")
 
 
-def read_hash(text: str) -> str:
-    """Return the hash in a canonical text."""
-    return text[-len(_TAIL) - _DIGITS : -len(_TAIL)]
+_PACK = msgspec.msgpack.Encoder(enc_hook=_plain).encode
+_UNPACK = msgspec.msgpack.Decoder(OperationValue).decode
+_UNPACK_ENVELOPE = msgspec.msgpack.Decoder(Envelope).decode
+_PRINT = msgspec.json.Encoder().encode
+_PARSE = msgspec.json.Decoder(OperationValue).decode
+_PARSE_ENVELOPE = msgspec.json.Decoder(Envelope).decode
 
 
-def check_hash(claim: Any, content: bytes, given: dict[str, Any]) -> None:
-    """Check the hash of a document."""
-    if type(claim) is not str or len(claim) != _DIGITS or set(claim) - set("0123456789abcdef"):
-        raise InvalidDocumentError(f"{HASH!r} is {_DIGITS} digits from 0 to f")
-    end = f"{_LEAD}{claim}{_TAIL}".encode()
-    if content.endswith(end) and _digest(content[: -len(end)]) == claim:
+def make_blob(operation: dict[str, Any]) -> bytes:
+    """Return the blob of an encoded operation, in canonical form."""
+    try:
+        return _PACK(_UNPACK(_PACK(operation)))
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise InvalidDocumentError(_explain(error)) from None
+
+
+def digest(blob: bytes) -> bytes:
+    """Return the digest of a blob."""
+    return hashlib.sha256(blob).digest()
+
+
+def hash_blobs(blobs: Iterable[bytes]) -> str:
+    """Return the hash of a model from the blobs of its operations, in order."""
+    return hashlib.sha256(b"".join(map(digest, blobs))).hexdigest()
+
+
+# -- documents -----------------------------------------------------------------------------------------------
+
+
+def pack_document(blobs: list[bytes], **others: Any) -> bytes:
+    """Return a document in msgpack from the blobs of its operations, and other members of the envelope."""
+    raw = [msgspec.Raw(blob) for blob in blobs]
+    return _PACK(Envelope(format=FORMAT, version=VERSION, operations=raw, sha256=hash_blobs(blobs), **others))
+
+
+def print_document(blobs: list[bytes], **others: Any) -> str:
+    """Return a document as text, an operation a line."""
+    lines = [_PRINT(_UNPACK(blob)) for blob in blobs]
+    empty = Envelope(format=FORMAT, version=VERSION, operations=[], sha256=hash_blobs(blobs), **others)
+    return _lay_out(lines, empty).decode()
+
+
+def _lay_out(lines: list[bytes], empty: Envelope) -> bytes:
+    """Return the text of a document from the texts of its operations and an envelope without them."""
+    head, _, tail = _PRINT(empty).partition(b'"operations":[]')
+    body = b"\n" + b",\n".join(lines) + b"\n" if lines else b""
+    return head + b'\n"operations":[' + body + b"]" + tail.replace(b',"sha256"', b',\n"sha256"') + b"\n"
+
+
+def read_envelope(content: bytes, is_text: bool) -> Envelope:
+    """Return the envelope of a document, with operations that are not decoded yet."""
+    check_counts(content, is_text)
+    try:
+        envelope: Envelope = (_PARSE_ENVELOPE if is_text else _UNPACK_ENVELOPE)(content)
+    except (msgspec.MsgspecError, UnicodeError, OverflowError) as error:
+        _refuse_envelope(content, is_text, error)
+    if not is_text and _PACK(envelope) != content:
+        _refuse_form()
+    return envelope
+
+
+def _refuse_envelope(content: bytes, is_text: bool, error: Exception) -> NoReturn:
+    try:
+        header = (msgspec.json if is_text else msgspec.msgpack).decode(content, type=Header)
+    except msgspec.ValidationError:
+        header = Header()
+    except (msgspec.MsgspecError, UnicodeError, OverflowError) as problem:
+        what = "JSON" if is_text else "msgpack"
+        raise InvalidDocumentError(f"it is not {what}: {_explain(problem)}") from None
+    if header.format != FORMAT:
+        raise InvalidDocumentError(
+            f'it does not begin with {{"format": "{FORMAT}", and so is not one of Kineverse'
+        ) from None
+    version = header.version
+    if type(version) is not int or version < 1:
+        raise InvalidDocumentError("its version is not a whole number from 1 on") from None
+    if version > VERSION:
+        shown = version if version < 1_000_000 else "a million or more"
+        raise InvalidDocumentError(
+            f"it is of version {shown}, and this Kineverse reads version {VERSION}; update Kineverse"
+        ) from None
+    if version < VERSION:
+        raise InvalidDocumentError(
+            f"it is of version {version}, and this Kineverse reads version {VERSION} alone; save the model "
+            "again, from the description or the code that it was made of"
+        ) from None
+    raise InvalidDocumentError(_explain(error)) from None
+
+
+def read_operation(raw: bytes, is_text: bool) -> tuple[OperationValue, bytes]:
+    """Return an operation and its blob, from its part of a document."""
+    try:
+        operation: OperationValue = (_PARSE if is_text else _UNPACK)(raw)
+        blob = _PACK(operation)
+    except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
+        raise InvalidDocumentError(_explain(error)) from None
+    if not is_text and blob != raw:
+        _refuse_form()
+    return operation, blob
+
+
+def check_text(content: bytes, envelope: Envelope, operations: list[OperationValue]) -> None:
+    """Check that no object of a text has a key twice, which decoding does not notice."""
+    empty = msgspec.structs.replace(envelope, operations=[])
+    if _lay_out([_PRINT(operation) for operation in operations], empty) == content:
         return
-    rest = {key: value for key, value in given.items() if key != HASH}
     try:
-        same = claim in (_digest_of(rest), _digest_of(_order_members(rest)))
-    except (TypeError, ValueError):
-        raise InvalidDocumentError("it contains what JSON has no place for") from None
-    if not same:
-        raise InvalidDocumentError(
-            f"its content is not what {HASH!r} says; it was changed or damaged since it was written. Get "
-            f"another copy, or, if the change is intended, delete the member {HASH!r}: it is written again "
-            "when the model is saved, for instance by 'kineverse convert'"
-        )
+        json.loads(content, object_pairs_hook=_object, parse_int=str, parse_float=str)
+    except ValueError as error:
+        raise InvalidDocumentError(f"it is not JSON: {error}") from None
 
 
-def _digest(body: bytes) -> str:
-    digest = hashlib.sha256(body.replace(b"\n", b""))
-    digest.update(b"}")
-    return digest.hexdigest()
+def _object(pairs: list[tuple[str, Any]]) -> None:
+    seen: set[str] = set()
+    for key, _ in pairs:
+        if key in seen:
+            raise InvalidDocumentError(f"the key {key[:60]!r} occurs twice in one object")
+        seen.add(key)
 
 
-def _digest_of(tree: Any) -> str:
-    return hashlib.sha256(dump_json(tree).encode("utf-8", "surrogatepass")).hexdigest()
+def _refuse_form() -> NoReturn:
+    raise InvalidDocumentError(
+        "an object has a key twice or members in another order, or numbers and lengths are not in their "
+        "shortest form, or numbers that are not whole have less than 64 bits"
+    )
 
 
-def _order_members(value: Any) -> Any:
-    """Return a JSON value with the members of the format in canonical order."""
-    if type(value) is list:
-        return [_order_members(item) for item in value]
-    if type(value) is not dict:
-        return value
-    result = {}
-    for key in sorted(value, key=lambda key: _RANK.get(key, len(_RANK))):
-        if key in _NAMED:
-            result[key] = _order_named(value[key])
-        else:
-            result[key] = value[key] if key in _WITHOUT_OBJECTS else _order_members(value[key])
-    return result
+_QUOTED = re.compile("`([^`]*)`")
+_TYPES = {
+    "str": "a text",
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "null": "null",
+    "object": "an object",
+    "array": "a list",
+    "bytes": "bytes",
+    "ext": "an extension",
+    "datetime": "a date",
+}
 
 
-def _order_named(value: Any) -> Any:
-    return {key: _order_members(item) for key, item in value.items()} if type(value) is dict else value
+def _explain(error: Exception) -> str:
+    """Return the message of an error of msgspec with its place first, in words of JSON."""
+    if isinstance(error, OverflowError):
+        return 'an integer of more than 64 bits is {"integer": "digits"}'
+    text, _, place = str(error).partition(" - at `")
+    text = _QUOTED.sub(_name_type, text)
+    text = text if text[1:2].isupper() else text[:1].lower() + text[1:]
+    place = place.removesuffix("`").removeprefix("$").removeprefix(".").replace("[...]", "")
+    return f"{place}: {text}" if place else text
 
 
-# First bytes of lists and maps; they also occur inside of numbers and texts, so the count is an upper bound.
-_LISTS = bytes((*range(0x80, 0xA0), 0xDC, 0xDD, 0xDE, 0xDF))
-
-
-def pack_document(text: str) -> bytes:
-    """Return the text of a document as msgpack."""
-    data: bytes = _msgpack().encode(json.loads(text))
-    return data
-
-
-def unpack_document(data: bytes) -> Any:
-    """Return the JSON value of a packed document."""
-    msgpack = _msgpack()
-    if len(data) - len(data.translate(None, _LISTS)) > MAX_LISTS:
-        raise InvalidDocumentError(
-            f"it may have more than {MAX_LISTS:,} lists and maps, the most a document has"
-        )
-    try:
-        tree = msgpack.decode(data)
-    except (ValueError, OverflowError) as error:
-        raise InvalidDocumentError(f"it is not msgpack: {error}") from None
-    # A duplicate key is lost on decoding, so the text encoded again is shorter.
-    if not isinstance(tree, dict) or msgpack.encode(tree) != data:
-        raise InvalidDocumentError(
-            "it is no map, or has a key twice, or numbers and lengths are not in their shortest form, or "
-            "numbers that are not whole have less than 64 bits"
-        )
-    return tree
-
-
-def _msgpack() -> Any:
-    try:
-        import msgspec.msgpack
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"Documents as msgpack need msgspec: {install_command('exchange')}"
-        ) from error
-    return msgspec.msgpack
+def _name_type(quoted: re.Match[str]) -> str:
+    names = quoted[1].split(" | ")
+    return " or ".join(_TYPES[name] for name in names) if set(names) <= _TYPES.keys() else f"'{quoted[1]}'"

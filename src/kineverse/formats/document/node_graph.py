@@ -1,4 +1,4 @@
-"""Expressions of a document by their place in its node table."""
+"""Expressions of an operation by their place in its node table."""
 
 from __future__ import annotations
 
@@ -24,18 +24,21 @@ from .budget import (
     MAX_LENGTH,
     MAX_NESTING,
     Budget,
+    InvalidDocumentError,
 )
-from .json_values import InvalidDocumentError, check_integer, check_length, check_list, describe_value
+from .structs import Pairs, Refs
+
+_FEW = 256  # most steps of a table that are spent for each expression without counting its own
 
 
 class NodeGraph:
-    """Expressions of a document, by their place in its node table."""
+    """Expressions of an operation, by their place in its node table."""
 
-    def __init__(self, prefix: str | None) -> None:
-        self.before = f"{prefix}/" if prefix else ""
+    def __init__(self, before: str, budget: Budget) -> None:
+        self.before = before  # prefix of all names, with its slash
         self.has_read_nodes = False
-        self.budget = Budget()
-        self.work: dict[bytes, int] = {}
+        self.budget = budget
+        self.steps = 0  # CasADi's steps for all nodes so far, at most
         self.sx: list[Any] = []
         self.shapes: list[layout.ArrayShape] = []
         self.depths: list[int] = []
@@ -44,16 +47,21 @@ class NodeGraph:
         self._below: dict[Node, int] = {}
         self._compositions: dict[Node, int] = {}
 
+    @property
+    def has_opaque_nodes(self) -> bool:
+        """True if a node has a gradient of its own."""
+        return bool(self._owners)
+
     # -- access --------------------------------------------------------------------------------------------
 
-    def expression(self, ref: Any) -> Expression:
+    def expression(self, ref: int) -> Expression:
         """Return the expression at a place of the table."""
         place = self.check_ref(ref)
         known = self._expressions[place]
         if known is None:
             sx, nodes = self.sx[place], NO_NODES
             # Finding its symbols and comparing it traverse all of it.
-            self.budget.spend(ca.n_nodes(sx))
+            self.budget.spend(self.steps if self.steps <= _FEW else ca.n_nodes(sx))
             if self.depths[place]:
                 owners = self._owners
                 found = (owners.get(e.element_hash()) for e in ca.symvar(sx))
@@ -62,11 +70,20 @@ class NodeGraph:
             known = self._expressions[place] = from_casadi(sx, self.shapes[place], nodes)
         return known
 
-    def scalar(self, ref: Any) -> Expression:
+    def graph_of(self, place: int) -> Any:
+        """Return CasADi's graph at a place of the table."""
+        sx = self.sx[place]
+        if sx is None:
+            expression = self._expressions[place]
+            assert expression is not None
+            sx = self.sx[place] = expression.sx
+        return sx
+
+    def scalar(self, ref: int) -> Expression:
         """Return the scalar at a place of the table."""
         return self.expression(self.check_scalar_ref(ref))
 
-    def symbol(self, ref: Any, least: int = 0) -> Symbol:
+    def symbol(self, ref: int, least: int = 0) -> Symbol:
         """Return the symbol at a place of the table, of order ``least`` or more."""
         result = self._expressions[self.check_ref(ref)]
         if not isinstance(result, Symbol) or result.order < least:
@@ -74,11 +91,10 @@ class NodeGraph:
             raise InvalidDocumentError(f"node {ref} should be {what}")
         return result
 
-    def pairs(self, value: Any, least: int) -> list[tuple[Symbol, Expression]]:
+    def pairs(self, given: Pairs, least: int) -> list[tuple[Symbol, Expression]]:
         """Return pairs of symbol and expression, every symbol once."""
         result = {}
-        for item in check_list(value, "pairs"):
-            key, entry = check_length(check_list(item, "a pair"), 2)
+        for key, entry in given:
             symbol = self.symbol(key, least)
             if symbol in result:
                 raise InvalidDocumentError(f"'{symbol}' is given twice")
@@ -89,24 +105,23 @@ class NodeGraph:
         """Return the node of a scalar expression that is one node, None for any other expression."""
         return None if expression.shape else self._owners.get(expression.sx.element_hash())
 
-    def check_ref(self, ref: Any) -> int:
+    def check_ref(self, ref: int) -> int:
         """Return the place of an earlier node after checking that it is one."""
         if type(ref) is not int or not 0 <= ref < len(self.sx):
-            raise InvalidDocumentError(f"{describe_value(ref)} is not the place of an earlier node")
+            raise InvalidDocumentError(f"{str(ref)[:60]} is not the place of an earlier node")
         return ref
 
-    def check_scalar_ref(self, ref: Any) -> int:
+    def check_scalar_ref(self, ref: int) -> int:
         """Return the place of an earlier node after checking that it is a scalar."""
         place = self.check_ref(ref)
         if self.shapes[place]:
             raise InvalidDocumentError(f"node {place} should be a scalar, and has shape {self.shapes[place]}")
         return place
 
-    def shape(self, given: Any) -> layout.ArrayShape:
+    def shape(self, shape: layout.ArrayShape) -> layout.ArrayShape:
         """Return a shape after checking its size against limits and budget."""
-        if len(check_list(given, "a shape")) > MAX_DIMENSIONS:
+        if len(shape) > MAX_DIMENSIONS:
             raise InvalidDocumentError(f"more than {MAX_DIMENSIONS} dimensions")
-        shape = tuple(check_integer(length, MAX_LENGTH) for length in given)
         # CasADi keeps a number for each column, even where there are no rows.
         lengths = math.prod(length for length in shape if length)
         if lengths > (MAX_LENGTH if math.prod(shape) else MAX_ELEMENTS):
@@ -119,13 +134,14 @@ class NodeGraph:
     def add(
         self, sx: Any, shape: layout.ArrayShape, depth: int, expression: Expression | None = None
     ) -> None:
-        """Add a node."""
+        """Add a node; its graph is None if it is made from the expression when it is needed."""
+        self.steps += 1
         self.sx.append(sx)
         self.shapes.append(shape)
         self.depths.append(depth)
         self._expressions.append(expression)
 
-    def add_alike(self, kind: type[Node], refs: list[Any], options: tuple[Any, ...] = ()) -> None:
+    def add_alike(self, kind: type[Node], refs: Refs, options: tuple[Any, ...] = ()) -> None:
         """Add a node with a gradient of its own that has the shape of its arguments."""
         shapes = {self.shapes[self.check_ref(ref)] for ref in refs}
         if len(shapes) != 1:
@@ -135,10 +151,10 @@ class NodeGraph:
     def add_opaque(
         self,
         kind: type[Node],
-        refs: list[Any],
+        refs: Refs,
         shape: layout.ArrayShape,
         options: tuple[Any, ...],
-        inside: Iterable[Any] = (),
+        inside: Iterable[int] = (),
     ) -> None:
         """Add a node with a gradient of its own; ``inside`` are the nodes in its options."""
         # Checked before construction, which already traverses the arguments.

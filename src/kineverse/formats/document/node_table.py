@@ -1,265 +1,291 @@
-"""Node table of a document, written from expressions.
+"""Node table of an operation, written from expressions.
 
-Every node is a list that begins with its type; a reference is the place of an earlier node in the table.
-``docs/documents.md`` lists the types, :mod:`.node_types` defines them.
+Every node is a tuple that begins with its type, in the layout of :mod:`.structs`; a reference is the place of
+an earlier node in the table. CasADi lists the instructions of large expressions; small ones are walked.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import casadi as ca
 
 from kineverse.errors import FormatError
 from kineverse.expressions import layout
-from kineverse.expressions.expression import Expression
+from kineverse.expressions.expression import NODES, SYMBOLS, Expression
 from kineverse.expressions.graph import leaves, topological_order
 from kineverse.expressions.implicit import Implicit, ImplicitFunction
+from kineverse.expressions.layout import SX
 from kineverse.expressions.node import Augment, Node
 from kineverse.expressions.nonsmooth import Extremum, Norm, Power, Select
 from kineverse.expressions.piecewise import Piecewise
 from kineverse.logic import And, Less, Not, Or
 from kineverse.model.rates import Carried, Composed, Dependent
 from kineverse.model.traces import ReadNode
+from kineverse.spatial import OneAxisTransform, as_one_axis_transform
 from kineverse.symbols import Symbol
 
 from .budget import MAX_ELEMENTS, MAX_NODES
 from .node_types import ELEMENTARY_NAMES
+from .structs import VERSION
 
-_PLAIN = (Not, And, Or, Select, Norm)
-
-# A step of CasADi's program: a leaf (owner, element), a constant, or (name, steps ...).
-_Leaf = tuple["Symbol | Node", int]
+_PLAIN = (Not, Select, Norm)
+_FEW = 40  # steps of an expression up to which walking it is faster than a function of CasADi
 
 
 class NodeTable:
     """Topologically sorted table of the nodes of expressions; :meth:`ref` returns the place of one.
 
-    Equal parts are one node, in the order in which the expressions need them: equal models have equal texts.
+    Equal parts are one node, in the order in which the expressions need them, operands first, from left to
+    right: equal operations have equal tables.
     """
 
-    def __init__(self, expressions: Iterable[Expression]) -> None:
-        self.lines: list[str] = []
+    def __init__(self) -> None:
+        self.nodes: list[tuple[Any, ...]] = []
+        self._made: dict[Any, int] = {}
         self._symbols: dict[Symbol, int] = {}
-        self._nodes: dict[Node, int] = {}
-        self._made: dict[str, int] = {}
-        roots = list({id(e): e for e in expressions}.values())
-        inner = topological_order(
-            {n: None for e in roots for n in leaves(e)[1]}, lambda n: n.parts, lambda _: False
-        )
-        parts = [*roots, *(part for node in inner for part in node.parts)]
-        self._program = _Program(list({id(e): e for e in parts}.values()))
-        self._steps: list[int] = [-1] * len(self._program.steps)
+        self._opaque: dict[Node, int] = {}
+        self._elements: dict[int, int] = {}  # places of CasADi's elements, by hash
+        self._indices: dict[Node, dict[int, int]] = {}
         self._known: dict[int, int] = {}
+        # Expressions are kept, so that neither their ids nor hashes of their elements are used again.
+        self._keep: list[Expression] = []
 
     def ref(self, expression: Expression) -> int:
-        """Return the place of an expression given to the constructor, or of any symbol."""
-        if isinstance(expression, Symbol):
+        """Return the place of an expression."""
+        if type(expression) is Symbol:
             return self._symbol(expression)
         known = self._known.get(id(expression))
         if known is None:
-            for node in topological_order(leaves(expression)[1], lambda n: n.parts, self._nodes.__contains__):
-                self._nodes[node] = self._node(node)
-            known = self._known[id(expression)] = self._array(expression)
+            self._keep.append(expression)
+            known = self._known[id(expression)] = self._place(expression)
         return known
 
-    def _array(self, expression: Expression) -> int:
-        places, steps = self._program.elements[id(expression)]
-        size = expression.size
-        if not expression.shape and steps:
-            return self._scalar(steps[0])
-        if len(steps) == size and size:
-            owner = self._program.steps[steps[0]]
-            if isinstance(owner, tuple) and isinstance(owner[0], Node) and owner[0].shape == expression.shape:
-                if [self._program.steps[s] for s in steps] == [(owner[0], i) for i in range(size)]:
-                    return self._nodes[owner[0]]
-        refs = ["null"] * size
-        for place, step in zip(places, steps, strict=True):
-            refs[place] = str(self._scalar(step))
-        return self._shared(f'["matrix",[{",".join(map(str, expression.shape))}],[{",".join(refs)}]]')
+    def _place(self, expression: Expression) -> int:
+        if expression.shape == (4, 4):
+            expression = as_one_axis_transform(expression)
+            self._keep.append(expression)
+            if isinstance(expression, OneAxisTransform):
+                kind = "rotation" if expression.is_rotation else "translation"
+                direction = tuple(map(float, expression.direction))
+                amount = self.ref(expression.amount)
+                return self._shared((kind, direction, amount), (kind, str(direction), amount))
+        if expression.nodes:
+            opaque = leaves(expression)[1]
+            for node in topological_order(opaque, lambda n: n.parts, self._opaque.__contains__):
+                self._opaque[node] = self._node(node)
+        sx = expression.sx
+        if not expression.shape and sx.nnz():
+            return self._scalar(sx)
+        return self._array(sx, expression.shape)
 
-    def _scalar(self, wanted: int) -> int:
-        places, steps = self._steps, self._program.steps
-        if places[wanted] >= 0:
-            return places[wanted]
+    def _array(self, sx: SX, shape: layout.ArrayShape) -> int:
+        elements = sx.nonzeros()
+        size, columns = math.prod(shape), layout.rows_and_columns(shape)[1]
+        if len(elements) == size and size and elements[0].op() == ca.OP_PARAMETER:
+            owner = NODES.get(elements[0].element_hash())
+            if owner is not None and owner.shape == shape and ca.is_equal(owner.sx, sx):
+                return self._opaque[owner]
+        stored = zip(sx.sparsity().row(), sx.sparsity().get_col(), elements, strict=True)
+        refs: list[int | None] = [None] * size
+        for row, column, element in sorted(stored, key=_row_and_column):
+            refs[row * columns + column] = self._scalar(element)
+        return self._shared(("matrix", shape, tuple(refs)))
+
+    def _scalar(self, root: SX) -> int:
+        """Return the place of an element, after those of its operands."""
+        if root.op() == ca.OP_CONST:
+            return self._constant(float(root))
+        places, steps = self._elements, 0
+        goal = root.element_hash()
+        stack: list[tuple[SX, int, list[tuple[SX, int]] | None]] = [(root, goal, None)]
+        while stack:
+            sx, key, operands = stack.pop()
+            if key in places:
+                continue
+            code = sx.op()
+            if code == ca.OP_CONST:
+                places[key] = self._constant(float(sx))
+                continue
+            if code == ca.OP_PARAMETER:
+                places[key] = self._leaf(key)
+                continue
+            if operands is None:
+                found = [sx.dep(k) for k in range(sx.n_dep())]
+                operands = [(operand, operand.element_hash()) for operand in found]
+                missing = [(operand, its, None) for operand, its in operands if its not in places]
+                if missing:
+                    steps += 1
+                    if steps > _FEW:
+                        return self._run(root)
+                    stack += [(sx, key, operands), *reversed(missing)]
+                    continue
+            places[key] = self._elementary(code, [places[its] for _, its in operands])
+        return places[goal]
+
+    def _run(self, root: SX) -> int:
+        """Return the place of an element by CasADi's program for it, in which memory is used again."""
+        inputs = ca.symvar(root)
+        function = ca.Function("document", [ca.vertcat(*inputs)], [root])
+        operation, arguments = function.instruction_id, function.instruction_input
+        results = function.instruction_output
+        steps: list[Any] = []
+        memory: dict[int, int] = {}
+        wanted = -1
+        for k in range(function.n_instructions()):
+            code = operation(k)
+            if code == ca.OP_OUTPUT:
+                wanted = memory[arguments(k)[0]]
+                continue
+            if code == ca.OP_CONST:
+                steps.append(function.instruction_constant(k))
+            elif code == ca.OP_INPUT:
+                steps.append((None, inputs[arguments(k)[1]].element_hash()))
+            else:
+                steps.append((code, *(memory[a] for a in arguments(k))))
+            memory[results(k)[0]] = len(steps) - 1
+        places = [-1] * len(steps)
         stack = [wanted]
         while stack:
             step = stack[-1]
             what = steps[step]
-            if places[step] >= 0:
-                stack.pop()
-            elif isinstance(what, float):
-                places[stack.pop()] = self._shared(f'["constant",{encode_float(what)}]')
-            elif not isinstance(what[0], str):
-                places[stack.pop()] = self._leaf(what)
-            else:
-                missing = [a for a in what[1:] if places[a] < 0]
-                if missing:
-                    stack.extend(reversed(missing))
-                    continue
-                arguments = ",".join(str(places[a]) for a in what[1:])
-                places[stack.pop()] = self._shared(f'["elementary","{what[0]}",{arguments}]')
+            if places[step] < 0:
+                if isinstance(what, float):
+                    places[step] = self._constant(what)
+                elif what[0] is None:
+                    places[step] = self._leaf(what[1])
+                else:
+                    missing = [a for a in what[1:] if places[a] < 0]
+                    if missing:
+                        stack.extend(reversed(missing))
+                        continue
+                    places[step] = self._elementary(what[0], [places[a] for a in what[1:]])
+            stack.pop()
+        self._elements[root.element_hash()] = places[wanted]
         return places[wanted]
 
-    def _leaf(self, leaf: _Leaf) -> int:
-        owner, element = leaf
-        if isinstance(owner, Symbol):
-            return self._symbol(owner)
-        place = self._nodes[owner]
-        return self._shared(f'["element",{place},{element}]') if owner.shape else place
+    def _elementary(self, code: int, refs: list[int]) -> int:
+        if code not in ELEMENTARY_NAMES:
+            raise FormatError(f"A document of version {VERSION} has no function with CasADi's code {code}.")
+        return self._shared(("elementary", ELEMENTARY_NAMES[code], tuple(refs)))
+
+    def _constant(self, value: float) -> int:
+        # 0.0 and -0.0 are equal keys.
+        return self._shared(("constant", encode_number(value)), value or str(value))
+
+    def _leaf(self, key: int) -> int:
+        symbol = SYMBOLS.get(key)
+        if symbol is not None:
+            return self._symbol(symbol)
+        owner = NODES[key]
+        place = self._opaque[owner]
+        if not owner.shape:
+            return place
+        if owner not in self._indices:
+            elements = layout.column(owner.sx, owner.shape).nonzeros()
+            self._indices[owner] = {element.element_hash(): i for i, element in enumerate(elements)}
+        return self._shared(("element", place, self._indices[owner][key]))
 
     def _symbol(self, symbol: Symbol) -> int:
         place = self._symbols.get(symbol)
         if place is None:
-            value = "" if symbol.value is None else f",{encode_float(symbol.value)}"
-            place = self._add(
-                f'["symbol",{encode_string(symbol.path)},{symbol.order},"{symbol.role}"{value}]'
-            )
-            self._symbols[symbol] = place
+            if symbol.role == "parameter":
+                node: tuple[Any, ...] = ("parameter", symbol.path, encode_number(symbol.value))
+            else:
+                node = ("symbol", symbol.path, symbol.order, symbol.role)
+            place = self._symbols[symbol] = self._add(node)
         return place
 
     def _node(self, node: Node) -> int:
         if type(node) is Carried:
-            return self._shared(f'["carried",{self.ref(node.coordinate)},{self._rates(node)}]')
+            return self._shared(("carried", self.ref(node.coordinate), self._rates(node)))
         if type(node) is ReadNode:
-            shape = ",".join(map(str, node.shape))
-            path = ",".join(f"[{self.ref(key)},{str(trends).lower()}]" for key, trends in node.path)
-            return self._shared(f'["read",{node.query},{node.part},[{shape}],[{path}]]')
+            path = tuple((self.ref(key), trends) for key, trends in node.path)
+            return self._shared(("read", node.query, node.part, node.shape, path))
         if node.size * max(len(node.arguments), 1) > MAX_ELEMENTS:
             raise FormatError(
                 f"The model has a node '{node.label}' of shape {node.shape} with {len(node.arguments)} "
                 f"arguments; a document has up to {MAX_ELEMENTS} elements in all arguments of one."
             )
-        refs = [self.ref(argument) for argument in node.arguments]
-        joined = ",".join(map(str, refs))
+        refs = tuple(self.ref(argument) for argument in node.arguments)
         if type(node) is Augment:
             entries = self._pairs(node.options[2:], refs[1:])
-            flags = f"{str(node.replace).lower()},{str(node.heuristic).lower()}"
-            return self._shared(f'["augment",{refs[0]},{flags},{entries}]')
+            return self._shared(("augment", refs[0], node.replace, node.heuristic, entries))
         if type(node) is Less:
-            return self._shared(f'["less",{joined},{encode_float(node.options[0])}]')
+            return self._shared(("less", *refs, float(node.options[0])))
         if type(node) is Extremum:
-            return self._shared(f'["extremum","{node.options[0]}",{joined}]')
+            return self._shared(("extremum", node.options[0], refs))
         if type(node) is Piecewise:
-            pieces = ",".join(_encode_floats(piece) for piece in node.pieces)
-            knots = _encode_floats(node.knots)
-            return self._shared(f'["piecewise",{joined},{str(node.periodic).lower()},{knots},[{pieces}]]')
+            pieces = tuple(map(_floats, node.pieces))
+            made = ("piecewise", *refs, node.periodic, _floats(node.knots), pieces)
+            return self._shared(made, repr(made))
         if type(node) is Composed:
-            return self._shared(f'["composed",{refs[0]},{self._pairs(node.options, refs[1:])}]')
+            return self._shared(("composed", refs[0], self._pairs(node.options, refs[1:])))
         if type(node) is Dependent:
-            return self._shared(f'["dependent",{joined},{self.ref(node.coordinate)}]')
+            return self._shared(("dependent", *refs, self.ref(node.coordinate)))
         if type(node) is Implicit:
-            f = node.function
-            within = ",".join(_encode_floats(ends) for ends in f.domain)
-            domain = f",[{within}]" if within else ""
-            return self._shared(f'["implicit",{self._function(f)},[{joined}]{domain}]')
+            return self._implicit(node.function, refs)
         if type(node) is Power:
-            return self._shared(f'["elementary","pow",{joined}]')
+            return self._shared(("elementary", "pow", refs))
+        if type(node) in (And, Or):
+            return self._shared((node.kind, refs))
         if type(node) in _PLAIN:
-            return self._shared(f'["{node.kind}",{joined}]')
+            return self._shared((node.kind, *refs))
         raise FormatError(
-            f"A document of version 1 has no node '{node.kind}' ({type(node).__name__}); the model cannot be "
-            "saved with it."
+            f"A document of version {VERSION} has no node '{node.kind}' ({type(node).__name__}); the model "
+            "cannot be saved with it."
         )
 
-    def _rates(self, node: Carried) -> str:
+    def _rates(self, node: Carried) -> tuple[Any, ...]:
         rows = []
         for coordinate, row in sorted(node.rates.items(), key=lambda item: item[0].sort_key):
             pairs = self._pairs(list(row), [self.ref(entry) for entry in row.values()])
-            rows.append(f"[{self.ref(coordinate)},{pairs}]")
-        return f"[{','.join(rows)}]"
+            rows.append((self.ref(coordinate), pairs))
+        return tuple(rows)
 
-    def _function(self, f: ImplicitFunction) -> str:
-        unknowns, inputs = (
-            "[" + ",".join(str(self.ref(s)) for s in symbols) + "]" for symbols in (f.unknowns, f.inputs)
-        )
-        rows = "[" + ",".join(map(str, f.rows)) + "]"
+    def _implicit(self, f: ImplicitFunction, refs: tuple[int, ...]) -> int:
+        unknowns, inputs = (tuple(map(self.ref, symbols)) for symbols in (f.unknowns, f.inputs))
         residual, seed = self.ref(f.residual), self.ref(f.seed)
-        return f"{encode_string(f.name)},{unknowns},{inputs},{residual},{rows},{seed},{f.steps}"
+        domain = tuple(tuple(map(encode_number, ends)) for ends in f.domain)
+        made = ("implicit", f.name, unknowns, inputs, residual, tuple(f.rows), seed, f.steps, refs, domain)
+        return self._shared(made, repr(made))
 
-    def _pairs(self, symbols: Sequence[Symbol], refs: Sequence[int]) -> str:
-        pairs = (f"[{self._symbol(s)},{ref}]" for s, ref in zip(symbols, refs, strict=True))
-        return f"[{','.join(pairs)}]"
+    def _pairs(self, symbols: Sequence[Symbol], refs: Sequence[int]) -> tuple[tuple[int, int], ...]:
+        return tuple((self._symbol(s), ref) for s, ref in zip(symbols, refs, strict=True))
 
-    def _shared(self, line: str) -> int:
-        place = self._made.get(line)
+    def _shared(self, node: tuple[Any, ...], key: Any = None) -> int:
+        """Return the place of a node; its key tells apart what compares as equal."""
+        key = node if key is None else key
+        place = self._made.get(key)
         if place is None:
-            place = self._made[line] = self._add(line)
+            place = self._made[key] = self._add(node)
         return place
 
-    def _add(self, line: str) -> int:
-        if len(self.lines) >= MAX_NODES:
+    def _add(self, node: tuple[Any, ...]) -> int:
+        if len(self.nodes) >= MAX_NODES:
             raise FormatError(f"The model has more than {MAX_NODES:,} nodes, the most a document has.")
-        self.lines.append(line)
-        return len(self.lines) - 1
+        self.nodes.append(node)
+        return len(self.nodes) - 1
 
 
-class _Program:
-    """CasADi's program for all elements of expressions, with every common subexpression once."""
-
-    def __init__(self, expressions: list[Expression]) -> None:
-        self._keep = expressions
-        self.steps: list[float | _Leaf | tuple[str, int] | tuple[str, int, int]] = []
-        self.elements: dict[int, tuple[list[int], list[int]]] = {}
-        if not expressions:
-            return
-        owners: dict[Symbol | Node, None] = {}
-        for expression in expressions:
-            symbols, nodes = leaves(expression)
-            owners.update(dict.fromkeys(symbols))
-            owners.update(dict.fromkeys(nodes))
-        inputs = []
-        leaf_of: list[_Leaf] = []
-        for owner in owners:
-            sx, shape = owner.sx, owner.shape
-            inputs.append(layout.column(sx, shape))
-            leaf_of.extend((owner, i) for i in range(math.prod(shape)))
-        columns = [layout.column(e.sx, e.shape) for e in expressions]
-        given = ca.vertcat(*inputs) if inputs else ca.SX(0, 1)
-        outputs = self._run(ca.Function("document", [given], [ca.vertcat(*columns)]), leaf_of)
-        offset = 0
-        for expression, column in zip(expressions, columns, strict=True):
-            places = column.sparsity().row()
-            self.elements[id(expression)] = places, outputs[offset : offset + len(places)]
-            offset += len(places)
-
-    def _run(self, function: ca.Function, leaf_of: list[_Leaf]) -> list[int]:
-        """Trace the program, which reuses its memory, and return the steps of its outputs."""
-        operation, arguments = function.instruction_id, function.instruction_input
-        results = function.instruction_output
-        steps = self.steps
-        memory: dict[int, int] = {}
-        outputs = [-1] * function.nnz_out(0)
-        for k in range(function.n_instructions()):
-            code = operation(k)
-            if code == ca.OP_OUTPUT:
-                outputs[results(k)[1]] = memory[arguments(k)[0]]
-                continue
-            if code == ca.OP_CONST:
-                steps.append(function.instruction_constant(k))
-            elif code == ca.OP_INPUT:
-                steps.append(leaf_of[arguments(k)[1]])
-            elif code in ELEMENTARY_NAMES:
-                steps.append((ELEMENTARY_NAMES[code], *(memory[a] for a in arguments(k))))  # type: ignore[arg-type]
-            else:
-                raise FormatError(f"A document of version 1 has no function with CasADi's code {code}.")
-            memory[results(k)[0]] = len(steps) - 1
-        return outputs
+def _row_and_column(stored: tuple[int, int, SX]) -> tuple[int, int]:
+    return stored[:2]
 
 
-def _encode_floats(values: Sequence[float]) -> str:
-    return f"[{','.join(map(encode_float, values))}]"
+def _floats(values: Sequence[float]) -> tuple[float, ...]:
+    return tuple(map(float, values))
 
 
-def encode_float(value: float) -> str:
-    """Encode a number as JSON text that is read back as the same bits."""
-    if value != value:
-        raise FormatError("NaN has no place in a document.")
-    if value in (math.inf, -math.inf):
-        return '"inf"' if value > 0 else '"-inf"'
-    return repr(float(value))
-
-
-encode_string = json.JSONEncoder(ensure_ascii=False).encode
+def encode_number(value: Any) -> float | str:
+    """Encode a number; infinities are texts."""
+    try:
+        result = float(value) if isinstance(value, float | int) else float(value.item())
+    except OverflowError:
+        raise FormatError("an integer is too large for a 64-bit float") from None
+    except (AttributeError, TypeError, ValueError):
+        raise FormatError(f"a number is wanted, not {value!r}") from None
+    if math.isnan(result):
+        raise FormatError("NaN has no place in a document")
+    return result if math.isfinite(result) else ("inf" if result > 0 else "-inf")

@@ -1,17 +1,19 @@
-"""Node types of a document and their readers: elementary, logic, rates, implicit functions."""
+"""Readers of the node types of a document: elementary functions, logic, rates, implicit functions."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
+from msgspec import Struct
 
 from kineverse.errors import KineverseError
 from kineverse.expressions import layout
-from kineverse.expressions.expression import Expression
+from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
 from kineverse.expressions.graph import leaves, topological_order
 from kineverse.expressions.implicit import Implicit, ImplicitFunction
 from kineverse.expressions.node import Augment, Node
@@ -20,123 +22,227 @@ from kineverse.expressions.piecewise import Piecewise, check_pieces
 from kineverse.logic import And, Less, Not, Or
 from kineverse.model.rates import Carried, Composed, Dependent, Rates, as_row, collect_symbols
 from kineverse.model.traces import ReadNode
-from kineverse.symbols import ROLES, Symbol
+from kineverse.spatial import X, Y, Z, rotation_about, translation_along
+from kineverse.symbols import Symbol
 
-from .budget import (
-    COST_OF_STEP,
-    MAX_LENGTH,
-    MAX_NORM,
-    MAX_ORDER,
-    MAX_PATH,
-    MAX_PIECES,
-    MAX_QUESTIONS,
-    MAX_STEPS,
-)
-from .json_values import (
-    InvalidDocumentError,
-    check_entity_name,
-    check_integer,
-    check_length,
-    check_list,
-    check_number,
-    check_numbers,
-    check_type,
-    describe_value,
-)
+from .budget import COST_OF_STEP, MAX_NORM, MAX_PIECES, InvalidDocumentError
 from .node_graph import NodeGraph
+from .structs import NODES, AnyNode
 
-UNARY: dict[str, int] = {
-    "neg": ca.OP_NEG,
-    "exp": ca.OP_EXP,
-    "log": ca.OP_LOG,
-    "expm1": ca.OP_EXPM1,
-    "log1p": ca.OP_LOG1P,
-    "sqrt": ca.OP_SQRT,
-    "square": ca.OP_SQ,
-    "twice": ca.OP_TWICE,
-    "inv": ca.OP_INV,
-    "sin": ca.OP_SIN,
-    "cos": ca.OP_COS,
-    "tan": ca.OP_TAN,
-    "arcsin": ca.OP_ASIN,
-    "arccos": ca.OP_ACOS,
-    "arctan": ca.OP_ATAN,
-    "sinh": ca.OP_SINH,
-    "cosh": ca.OP_COSH,
-    "tanh": ca.OP_TANH,
-    "arcsinh": ca.OP_ASINH,
-    "arccosh": ca.OP_ACOSH,
-    "arctanh": ca.OP_ATANH,
-    "erf": ca.OP_ERF,
-    "abs": ca.OP_FABS,
-    "sign": ca.OP_SIGN,
-    "floor": ca.OP_FLOOR,
-    "ceil": ca.OP_CEIL,
-    "not": ca.OP_NOT,
-}
+_UNARY = """neg exp log expm1 log1p sqrt square=SQ twice inv sin cos tan arcsin=ASIN arccos=ACOS arctan=ATAN
+    sinh cosh tanh arcsinh=ASINH arccosh=ACOSH arctanh=ATANH erf abs=FABS sign floor ceil not"""
+# if_else_zero is b where a holds, else 0, even if b is NaN.
+_BINARY = """add sub mul div pow constpow arctan2=ATAN2 hypot copysign fmod remainder min=FMIN max=FMAX
+    lt le eq ne and or if_else_zero"""
 
-BINARY: dict[str, int] = {
-    "add": ca.OP_ADD,
-    "sub": ca.OP_SUB,
-    "mul": ca.OP_MUL,
-    "div": ca.OP_DIV,
-    "pow": ca.OP_POW,
-    "constpow": ca.OP_CONSTPOW,
-    "arctan2": ca.OP_ATAN2,
-    "hypot": ca.OP_HYPOT,
-    "copysign": ca.OP_COPYSIGN,
-    "fmod": ca.OP_FMOD,
-    "remainder": ca.OP_REMAINDER,
-    "min": ca.OP_FMIN,
-    "max": ca.OP_FMAX,
-    "lt": ca.OP_LT,
-    "le": ca.OP_LE,
-    "eq": ca.OP_EQ,
-    "ne": ca.OP_NE,
-    "and": ca.OP_AND,
-    "or": ca.OP_OR,
-    # b where a holds, else 0, even if b is NaN.
-    "if_else_zero": ca.OP_IF_ELSE_ZERO,
-}
 
+def _codes(names: str) -> dict[str, int]:
+    """Return CasADi's codes by our names, of which some are those of numpy."""
+    pairs = (pair.partition("=") for pair in names.split())
+    return {name: getattr(ca, f"OP_{other or name.upper()}") for name, _, other in pairs}
+
+
+UNARY, BINARY = _codes(_UNARY), _codes(_BINARY)
 ELEMENTARY_NAMES: dict[int, str] = {code: name for name, code in (*UNARY.items(), *BINARY.items())}
 
 
-def read_implicit(graph: NodeGraph, node: list[Any]) -> None:
-    """Add an implicit function applied to arguments."""
-    # Documents of earlier versions have no domain, and neither has a function that holds everywhere.
-    _, label, unknowns, inputs, residual, rows, seed, steps, arguments, *domain = check_length(
-        node, 10 if len(node) > 9 else 9
-    )
-    x = tuple(graph.symbol(ref) for ref in check_list(unknowns, "the unknowns"))
-    u = tuple(graph.symbol(ref) for ref in check_list(inputs, "the inputs"))
-    r, first = graph.expression(residual), graph.expression(seed)
-    # Spent before construction, which evaluates the function and so takes the steps.
-    work = _newton_work(graph, r, x, check_integer(steps, MAX_STEPS))
+_AXES = (X, Y, Z)
+_UNIT_TOLERANCE = 1e-9  # largest difference of the length of a direction from 1
+_STEPS_OF_MOTION = 6  # CasADi's steps for the matrix of a rotation or translation, at most
+
+
+def read_nodes(graph: NodeGraph, nodes: tuple[AnyNode, ...]) -> None:
+    """Add the nodes of a table to the graph."""
+    for node in nodes:
+        try:
+            _READERS[type(node)](graph, node)
+        except (InvalidDocumentError, KineverseError) as error:
+            raise InvalidDocumentError(f"nodes[{len(graph.sx)}]: {error}") from None
+
+
+def decode_number(value: float | str) -> float:
+    """Decode a number, of which infinities are texts."""
+    return float(value)
+
+
+@lru_cache(4096)
+def _make_constant(value: float, sign: float) -> Expression:
+    # 0.0 and -0.0 are equal keys.
+    return from_casadi(ca.SX(value), (), NO_NODES)
+
+
+def _constant(graph: NodeGraph, node: Any) -> None:
+    value = decode_number(node.value)
+    made = _make_constant(value, math.copysign(1.0, value))
+    graph.add(made.sx, (), 0, made)
+
+
+def check_name(name: str) -> str:
+    """Return a name after checking that none of its parts is empty."""
+    if not name or "//" in f"/{name}/":
+        raise InvalidDocumentError(f"a name is expected, whose parts are not empty, not {name[:60]!r}")
+    return name
+
+
+def _symbol(graph: NodeGraph, node: Any) -> None:
+    symbol = Symbol(graph.before + check_name(node.path), node.order, node.role)
+    graph.add(symbol.sx, (), 0, symbol)
+
+
+def _parameter(graph: NodeGraph, node: Any) -> None:
+    symbol = Symbol(graph.before + check_name(node.path), 0, "parameter", decode_number(node.value))
+    graph.add(symbol.sx, (), 0, symbol)
+
+
+def _elementary(graph: NodeGraph, node: Any) -> None:
+    sx, depths, function = graph.sx, graph.depths, node.function
+    refs = [graph.check_scalar_ref(ref) for ref in node.arguments]
+    if len(refs) != (2 if function in BINARY else 1):
+        raise InvalidDocumentError(f"{function[:60]!r} has {len(refs)} arguments")
+    if function in BINARY:
+        a, b = refs
+        if function == "pow" and Power.is_needed(sx[a], sx[b]):
+            graph.add_alike(Power, node.arguments)
+            return
+        result, depth = ca.SX.binary(BINARY[function], sx[a], sx[b]), max(depths[a], depths[b])
+    elif function in UNARY:
+        result, depth = ca.SX.unary(UNARY[function], sx[refs[0]]), depths[refs[0]]
+    else:
+        raise InvalidDocumentError(f"there is no elementary function {function[:60]!r}")
+    if result.op() == ca.OP_CONST and math.isnan(float(result)):
+        raise InvalidDocumentError("the value is NaN")
+    graph.add(result, (), depth)
+
+
+def _element(graph: NodeGraph, node: Any) -> None:
+    place = graph.check_ref(node.array)
+    shape = graph.shapes[place]
+    size = math.prod(shape)
+    if not shape or not size:
+        raise InvalidDocumentError(f"node {place} has no elements to choose from")
+    if node.index >= size:
+        raise InvalidDocumentError(f"node {place} has {size} elements, and none at {node.index}")
+    row, column = divmod(node.index, layout.rows_and_columns(shape)[1])
+    graph.add(graph.graph_of(place)[row, column], (), graph.depths[place])
+
+
+def _matrix(graph: NodeGraph, node: Any) -> None:
+    shape, refs = graph.shape(node.shape), node.elements
+    if math.prod(shape) != len(refs):
+        raise InvalidDocumentError(f"{len(refs)} elements do not fill the shape {shape}")
+    stored = [i for i, ref in enumerate(refs) if ref is not None]
+    places = [graph.check_scalar_ref(ref) for ref in refs if ref is not None]
+    elements = ca.vertcat(*(graph.sx[p] for p in places)) if places else ca.SX(0, 1)
+    column = ca.SX(ca.Sparsity(len(refs), 1, [0, len(stored)], stored), elements)
+    rows, columns = layout.rows_and_columns(shape)
+    sx = layout.from_column(column, shape) if refs else ca.SX(rows, columns)
+    graph.add(sx, shape, max((graph.depths[p] for p in places), default=0))
+
+
+def _rotation(graph: NodeGraph, node: Any) -> None:
+    if node.axis not in _AXES:
+        raise InvalidDocumentError("a rotation is about one of the axes x, y and z")
+    place = graph.check_scalar_ref(node.angle)
+    graph.add(None, (4, 4), graph.depths[place], rotation_about(node.axis, graph.expression(place)))
+    graph.steps += _STEPS_OF_MOTION
+
+
+def _translation(graph: NodeGraph, node: Any) -> None:
+    if not abs(math.hypot(*node.direction) - 1) <= _UNIT_TOLERANCE:
+        raise InvalidDocumentError("the direction of a translation is of length 1")
+    place = graph.check_scalar_ref(node.distance)
+    graph.add(None, (4, 4), graph.depths[place], translation_along(node.direction, graph.expression(place)))
+    graph.steps += _STEPS_OF_MOTION
+
+
+def _augment(graph: NodeGraph, node: Any) -> None:
+    keys = [key for key, _ in graph.pairs(node.entries, 1)]
+    if keys != sorted(keys, key=lambda symbol: symbol.sort_key):
+        raise InvalidDocumentError("the entries are not sorted by path and order")
+    refs = (node.value, *(ref for _, ref in node.entries))
+    graph.add_alike(Augment, refs, (node.replace, node.heuristic, *keys))
+
+
+def _less(graph: NodeGraph, node: Any) -> None:
+    if not node.contrast > 0:
+        raise InvalidDocumentError("the contrast is a positive number")
+    graph.add_alike(Less, (node.left, node.right), (node.contrast,))
+
+
+def _norm(graph: NodeGraph, node: Any) -> None:
+    shape = graph.shapes[graph.check_ref(node.argument)]
+    if len(shape) != 1 or not shape[0]:
+        raise InvalidDocumentError(f"the norm is that of a vector, not of shape {shape}")
+    if shape[0] > MAX_NORM:
+        raise InvalidDocumentError(f"the norm of {shape[0]} elements, more than {MAX_NORM}")
+    graph.add_opaque(Norm, (node.argument,), (), ())
+
+
+def _piecewise(graph: NodeGraph, node: Any) -> None:
+    options = check_pieces(node.periodic, node.knots, list(node.pieces))
+    # Each element evaluates the whole table.
+    work = sum(map(len, node.pieces)) * math.prod(graph.shapes[graph.check_ref(node.argument)])
+    if work > MAX_PIECES:
+        raise InvalidDocumentError(f"{work} coefficients, for all elements together, more than {MAX_PIECES}")
     graph.budget.spend(work)
-    graph.check_elements(r.shape)
+    graph.add_alike(Piecewise, (node.argument,), options)
+
+
+def _carried(graph: NodeGraph, node: Any) -> None:
+    coordinate = graph.symbol(node.coordinate)
+    rows = {}
+    for key, row in node.rates:
+        symbol = graph.symbol(key)
+        if symbol in rows:
+            raise InvalidDocumentError(f"'{symbol}' has two rows")
+        rows[symbol] = as_row(symbol, dict(graph.pairs(row, 1)))
+    if coordinate not in rows:
+        raise InvalidDocumentError(f"the table has no row for '{coordinate}'")
+    inside = [entry for _, row in node.rates for _, entry in row]
+    # The form that models have and write: rows of other coordinates are substituted into this one.
+    graph.add_opaque(Carried, (node.coordinate,), (), (Rates(rows).closure(coordinate),), inside)
+
+
+def _composed(graph: NodeGraph, node: Any) -> None:
+    if not isinstance(graph.owner(graph.expression(node.coordinate)), (Carried, Composed)):
+        raise InvalidDocumentError(f"node {node.coordinate} should be a carried coordinate")
+    pairs = graph.pairs(node.replacements, 0)
+    if any(entry.shape for _, entry in pairs):
+        raise InvalidDocumentError("a symbol is replaced by a scalar")
+    refs = (node.coordinate, *(entry for _, entry in node.replacements))
+    graph.add_opaque(Composed, refs, (), tuple(key for key, _ in pairs))
+
+
+def _dependent(graph: NodeGraph, node: Any) -> None:
+    value = graph.check_scalar_ref(node.value)
+    graph.add_opaque(Dependent, (value,), (), (graph.symbol(node.coordinate),))
+
+
+def _implicit(graph: NodeGraph, node: Any) -> None:
+    unknowns = tuple(map(graph.symbol, node.unknowns))
+    inputs = tuple(map(graph.symbol, node.inputs))
+    residual, seed = graph.expression(node.residual), graph.expression(node.seed)
+    # Spent before construction, which evaluates the function and so takes the steps.
+    work = _newton_work(graph, residual, unknowns, node.steps)
+    graph.budget.spend(work)
+    graph.check_elements(residual.shape)
     function = ImplicitFunction(
-        name=graph.before + check_entity_name(label),
-        unknowns=x,
-        inputs=u,
-        residual=r,
-        rows=tuple(check_integer(row, MAX_LENGTH) for row in check_list(rows, "the rows that are solved")),
-        seed=first,
-        steps=steps,
-        domain=tuple(_domain_interval(ends) for given in domain for ends in check_list(given, "a domain")),
+        name=graph.before + check_name(node.name),
+        unknowns=unknowns,
+        inputs=inputs,
+        residual=residual,
+        rows=node.rows,
+        seed=seed,
+        steps=node.steps,
+        domain=tuple((decode_number(lower), decode_number(upper)) for lower, upper in node.domain),
     )
-    if domain and not function.domain:
+    if node.domain and not function.domain:
         raise InvalidDocumentError("a domain has a bound, or is left out")
-    graph.work[function.key] = work
-    if len(check_list(arguments, "the arguments")) != len(u):
-        raise InvalidDocumentError(f"{len(arguments)} arguments for {len(u)} inputs")
-    refs = [graph.check_scalar_ref(ref) for ref in arguments]
-    graph.add_opaque(Implicit, refs, (len(x),), (function,), (residual, seed))
-
-
-def _domain_interval(ends: Any) -> tuple[float, float]:
-    lower, upper = check_numbers(ends, 2)
-    return lower, upper
+    graph.budget.functions[function.key] = work
+    if len(node.arguments) != len(inputs):
+        raise InvalidDocumentError(f"{len(node.arguments)} arguments for {len(inputs)} inputs")
+    refs = tuple(map(graph.check_scalar_ref, node.arguments))
+    graph.add_opaque(Implicit, refs, (len(unknowns),), (function,), (node.residual, node.seed))
 
 
 def _newton_work(graph: NodeGraph, residual: Expression, unknowns: tuple[Symbol, ...], steps: int) -> int:
@@ -151,7 +257,7 @@ def _newton_work(graph: NodeGraph, residual: Expression, unknowns: tuple[Symbol,
         size += sum(ca.n_nodes(part.sx) for part in inner.arguments)
         if isinstance(inner, Implicit):
             again = any(collect_symbols(a).intersection(unknowns) for a in inner.arguments)
-            size += graph.work[inner.function.key] if again else 0
+            size += graph.budget.functions[inner.function.key] if again else 0
     return int((steps + 1) * (COST_OF_STEP + (n + 2) * size + n**3))
 
 
@@ -159,197 +265,42 @@ def _arguments_of(node: Node) -> tuple[Expression, ...]:
     return node.arguments
 
 
-def read_node(graph: NodeGraph, node: Any) -> None:
-    """Add the next node of a table to the graph."""
-    if type(node) is not list or not node or type(node[0]) is not str:
-        raise InvalidDocumentError("a node is a list that begins with its type")
-    reader = NODE_TYPES.get(node[0])
-    if reader is None:
-        raise InvalidDocumentError(
-            f"there is no node type {node[0][:40]!r}; types are {', '.join(NODE_TYPES)}"
-        )
-    try:
-        reader(graph, node)
-    except KineverseError as error:
-        raise InvalidDocumentError(str(error)) from None
-
-
-def _constant(graph: NodeGraph, node: list[Any]) -> None:
-    _, value = check_length(node, 2)
-    graph.add(ca.SX(check_number(value)), (), 0)
-
-
-def _symbol(graph: NodeGraph, node: list[Any]) -> None:
-    path, order, role = check_length(node, 5 if node[3:4] == ["parameter"] else 4)[1:4]
-    value = float(check_number(node[4])) if role == "parameter" else None
-    if type(role) is not str or role not in ROLES:
-        raise InvalidDocumentError(f"{describe_value(role)} is not a role; roles are {', '.join(ROLES)}")
-    symbol = Symbol(graph.before + check_entity_name(path), check_integer(order, MAX_ORDER), role, value)
-    graph.add(symbol.sx, (), 0, symbol)
-
-
-def _elementary(graph: NodeGraph, node: list[Any]) -> None:
-    sx, depths = graph.sx, graph.depths
-    function = node[1] if len(node) > 2 and type(node[1]) is str else ""
-    if function in BINARY:
-        a, b = map(graph.check_scalar_ref, check_length(node, 4)[2:])
-        if function == "pow" and Power.is_needed(sx[a], sx[b]):
-            graph.add_alike(Power, node[2:])
-            return
-        result, depth = ca.SX.binary(BINARY[function], sx[a], sx[b]), max(depths[a], depths[b])
-    elif function in UNARY:
-        a = graph.check_scalar_ref(check_length(node, 3)[2])
-        result, depth = ca.SX.unary(UNARY[function], sx[a]), depths[a]
-    else:
-        raise InvalidDocumentError(
-            f"there is no elementary function {describe_value(node[1] if node[1:] else None)}"
-        )
-    if result.op() == ca.OP_CONST and math.isnan(float(result)):
-        raise InvalidDocumentError("the value is NaN")
-    graph.add(result, (), depth)
-
-
-def _element(graph: NodeGraph, node: list[Any]) -> None:
-    _, ref, index = check_length(node, 3)
-    place = graph.check_ref(ref)
-    shape = graph.shapes[place]
-    size = math.prod(shape)
-    if not shape or not size:
-        raise InvalidDocumentError(f"node {place} has no elements to choose from")
-    row, column = divmod(check_integer(index, size - 1), layout.rows_and_columns(shape)[1])
-    graph.add(graph.sx[place][row, column], (), graph.depths[place])
-
-
-def _matrix(graph: NodeGraph, node: list[Any]) -> None:
-    _, given, refs = check_length(node, 3)
-    shape = graph.shape(given)
-    if math.prod(shape) != len(check_list(refs, "the elements")):
-        raise InvalidDocumentError(f"{len(refs)} elements do not fill the shape {shape}")
-    stored = [i for i, ref in enumerate(refs) if ref is not None]
-    places = [graph.check_scalar_ref(refs[i]) for i in stored]
-    elements = ca.vertcat(*(graph.sx[p] for p in places)) if places else ca.SX(0, 1)
-    column = ca.SX(ca.Sparsity(len(refs), 1, [0, len(stored)], stored), elements)
-    rows, columns = layout.rows_and_columns(shape)
-    sx = layout.from_column(column, shape) if refs else ca.SX(rows, columns)
-    graph.add(sx, shape, max((graph.depths[p] for p in places), default=0))
-
-
-def _augment(graph: NodeGraph, node: list[Any]) -> None:
-    _, value, replace, heuristic, entries = check_length(node, 5)
-    keys = [key for key, _ in graph.pairs(entries, 1)]
-    if keys != sorted(keys, key=lambda symbol: symbol.sort_key):
-        raise InvalidDocumentError("the entries are not sorted by path and order")
-    flags = check_type(bool, replace, "true or false"), check_type(bool, heuristic, "true or false")
-    graph.add_alike(Augment, [value, *(ref for _, ref in entries)], (*flags, *keys))
-
-
-def _less(graph: NodeGraph, node: list[Any]) -> None:
-    _, a, b, contrast = check_length(node, 4)
-    if not 0 < check_number(contrast) < math.inf:
-        raise InvalidDocumentError("the contrast is a positive number")
-    graph.add_alike(Less, [a, b], (float(contrast),))
-
-
-def _extremum(graph: NodeGraph, node: list[Any]) -> None:
-    if len(node) < 4:
-        raise InvalidDocumentError("an extremum is one of at least two expressions")
-    _, which, *refs = node
-    if which not in ("min", "max"):
-        raise InvalidDocumentError(f"an extremum is 'min' or 'max', not {describe_value(which)}")
-    graph.add_alike(Extremum, refs, (which,))
-
-
-def _norm(graph: NodeGraph, node: list[Any]) -> None:
-    (ref,) = check_length(node, 2)[1:]
-    shape = graph.shapes[graph.check_ref(ref)]
-    if len(shape) != 1 or not shape[0]:
-        raise InvalidDocumentError(f"the norm is that of a vector, not of shape {shape}")
-    if shape[0] > MAX_NORM:
-        raise InvalidDocumentError(f"the norm of {shape[0]} elements, more than {MAX_NORM}")
-    graph.add_opaque(Norm, [ref], (), ())
-
-
-def _piecewise(graph: NodeGraph, node: list[Any]) -> None:
-    _, ref, periodic, knots, pieces = check_length(node, 5)
-    table = [check_numbers(piece) for piece in check_list(pieces, "pieces")]
-    options = check_pieces(check_type(bool, periodic, "true or false"), check_numbers(knots), table)
-    # Each element evaluates the whole table.
-    work = sum(map(len, table)) * math.prod(graph.shapes[graph.check_ref(ref)])
-    if work > MAX_PIECES:
-        raise InvalidDocumentError(f"{work} coefficients, for all elements together, more than {MAX_PIECES}")
-    graph.budget.spend(work)
-    graph.add_alike(Piecewise, [ref], options)
-
-
-def _carried(graph: NodeGraph, node: list[Any]) -> None:
-    _, ref, table = check_length(node, 3)
-    coordinate = graph.symbol(ref)
-    rows = {}
-    for item in check_list(table, "a rate table"):
-        key, row = check_length(check_list(item, "a row"), 2)
-        symbol = graph.symbol(key)
-        if symbol in rows:
-            raise InvalidDocumentError(f"'{symbol}' has two rows")
-        rows[symbol] = as_row(symbol, dict(graph.pairs(row, 1)))
-    if coordinate not in rows:
-        raise InvalidDocumentError(f"the table has no row for '{coordinate}'")
-    inside = [entry for _, row in table for _, entry in row]
-    # The form that models have and write: rows of other coordinates are substituted into this one.
-    graph.add_opaque(Carried, [ref], (), (Rates(rows).closure(coordinate),), inside)
-
-
-def _composed(graph: NodeGraph, node: list[Any]) -> None:
-    _, ref, replacements = check_length(node, 3)
-    if not isinstance(graph.owner(graph.expression(ref)), (Carried, Composed)):
-        raise InvalidDocumentError(f"node {ref} should be a carried coordinate")
-    pairs = graph.pairs(replacements, 0)
-    if any(entry.shape for _, entry in pairs):
-        raise InvalidDocumentError("a symbol is replaced by a scalar")
-    refs = [ref, *(entry for _, entry in replacements)]
-    graph.add_opaque(Composed, refs, (), tuple(key for key, _ in pairs))
-
-
-def _dependent(graph: NodeGraph, node: list[Any]) -> None:
-    _, ref, coordinate = check_length(node, 3)
-    graph.add_opaque(Dependent, [graph.check_scalar_ref(ref)], (), (graph.symbol(coordinate),))
-
-
-def _read(graph: NodeGraph, node: list[Any]) -> None:
-    _, question, part, given, steps = check_length(node, 5)
-    if len(check_list(steps, "a path")) > MAX_PATH:
-        raise InvalidDocumentError(f"a path has up to {MAX_PATH} steps")
-    path = []
-    for step in steps:
-        ref, trends = check_length(check_list(step, "a symbol, and whether trends count"), 2)
-        path.append((graph.symbol(ref, 1), check_type(bool, trends, "true or false")))
-    shape = graph.shape(given)
+def _read(graph: NodeGraph, node: Any) -> None:
+    path = tuple((graph.symbol(ref, 1), trends) for ref, trends in node.path)
+    shape = graph.shape(node.shape)
     graph.check_elements(shape)
-    question, part = check_integer(question, MAX_QUESTIONS), check_integer(part, MAX_QUESTIONS)
-    graph.keep(ReadNode.empty(shape, question, part, tuple(path)), 1)
+    graph.keep(ReadNode.empty(shape, node.question, node.part, path), 1)
     graph.has_read_nodes = True
 
 
-NODE_TYPES: Mapping[str, Callable[[NodeGraph, list[Any]], None]] = MappingProxyType(
+_READERS: Mapping[type[Struct], Callable[[NodeGraph, Any], None]] = MappingProxyType(
     {
-        "constant": _constant,
-        "symbol": _symbol,
-        "elementary": _elementary,
-        "element": _element,
-        "matrix": _matrix,
-        "augment": _augment,
-        "less": _less,
-        "not": lambda graph, node: graph.add_alike(Not, check_length(node, 2)[1:]),
-        "and": lambda graph, node: graph.add_alike(And, node[1:]),
-        "or": lambda graph, node: graph.add_alike(Or, node[1:]),
-        "select": lambda graph, node: graph.add_alike(Select, check_length(node, 4)[1:]),
-        "extremum": _extremum,
-        "norm": _norm,
-        "piecewise": _piecewise,
-        "carried": _carried,
-        "composed": _composed,
-        "dependent": _dependent,
-        "implicit": read_implicit,
-        "read": _read,
+        NODES[tag]: reader
+        for tag, reader in {
+            "constant": _constant,
+            "symbol": _symbol,
+            "parameter": _parameter,
+            "elementary": _elementary,
+            "element": _element,
+            "matrix": _matrix,
+            "rotation": _rotation,
+            "translation": _translation,
+            "augment": _augment,
+            "less": _less,
+            "not": lambda graph, node: graph.add_alike(Not, (node.argument,)),
+            "and": lambda graph, node: graph.add_alike(And, node.arguments),
+            "or": lambda graph, node: graph.add_alike(Or, node.arguments),
+            "select": lambda graph, node: graph.add_alike(
+                Select, (node.condition, node.chosen, node.otherwise)
+            ),
+            "extremum": lambda graph, node: graph.add_alike(Extremum, node.arguments, (node.which,)),
+            "norm": _norm,
+            "piecewise": _piecewise,
+            "carried": _carried,
+            "composed": _composed,
+            "dependent": _dependent,
+            "implicit": _implicit,
+            "read": _read,
+        }.items()
     }
 )
-"""Readers of all node types, by the name of the type."""

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 from kineverse.errors import KineverseError, ModelError, UnknownNameError
-from kineverse.loops import CloseLoop
-from kineverse.model.operation import Cell, Operation, Writes
+from kineverse.model.operation import Cell, FinishedWrites, Operation, Writes
 from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder
 from kineverse.model.traces import Trace
+from kineverse.model.traces.replay import writes_agree
+from kineverse.model.traces.trace import run_query, substitute_results
+from kineverse.model.traces.trace_queries import QueryResult
 
-from .parameters import rebuild_parameter
+from .parameters import OPERATIONS, OpaqueRecord, UnsupportedParameter, rebuild_parameter
 
 
 @dataclass(frozen=True)
@@ -21,9 +22,9 @@ class OpaqueOperation(Operation):
     """Operation from a document, without the class of the original.
 
     While its reads are unchanged, it writes what the original wrote, to the last bit. When a read changes, it
-    is run again by its trace. Without a trace it is *frozen*: a loop (``kv.CloseLoop``) is closed again, any
-    other change is refused. Then, or if the original branched on the changed value, replace it by one
-    of its class in the same edit.
+    is run again by its trace. Without a trace it is *frozen*: an operation of the library is made again from
+    its parameters, any other change is refused. Then, or if the original branched on the changed value,
+    replace it by one of its class in the same edit.
 
     Attributes
     ----------
@@ -34,30 +35,35 @@ class OpaqueOperation(Operation):
     reads
         Cells (kind, name) that were read, with the kind of access.
     listings
-        Kinds of which all names were listed, with these names.
-    writes
+        Kinds of which all names were listed.
+    recorded
         Values it writes, by cell, in order.
     trace
         Writes as expressions of the reads.
     frozen
         Reason for a missing trace of an operation that read values, else empty.
-    seen
-        Values of the cells that were read.
     scope
-        Prefix of all names of the document.
+        Prefix that the names in its parameters lack, with its slash.
+    seen
+        Values of the cells that were read, and names of the kinds that were listed; None until it is linked
+        or run for the first time, if it comes without its document.
     overrides
         True if it overwrites writes of operations before it in the document.
     """
 
     kind: str
     given: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    reads: tuple[tuple[Cell, Read], ...] = ()
-    listings: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    writes: tuple[tuple[Cell, Any], ...] = field(default=(), repr=False)
+    reads: Mapping[Cell, Read] = field(default_factory=dict, hash=False)
+    listings: frozenset[str] = frozenset()
+    recorded: Mapping[Cell, Any] = field(  # type: ignore[misc]
+        default_factory=dict, hash=False, repr=False
+    )
     trace: Trace | None = field(default=None, repr=False)
     frozen: str = ""
-    seen: Mapping[Cell, Any] = field(default_factory=dict, repr=False, compare=False)
     scope: str = ""
+    seen: tuple[Mapping[Cell, Any], Mapping[str, tuple[str, ...]]] | None = field(  # type: ignore[misc]
+        default=None, repr=False, compare=False
+    )
     overrides: bool = field(default=False, repr=False, compare=False)  # type: ignore[misc]
 
     @property
@@ -66,11 +72,11 @@ class OpaqueOperation(Operation):
 
         Names in them are as they were saved, without the prefix that the document was loaded under.
         """
-        writes = {f"{kind}/{name}": value for (kind, name), value in self.writes}
+        writes = {f"{kind}/{name}": value for (kind, name), value in self.recorded.items()}
         return {name: rebuild_parameter(value, writes) for name, value in self.given.items()}
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write what the original wrote, or what its trace computes from changed reads.
+        """Write what the original wrote, or what its trace or its class makes of changed reads.
 
         Raises
         ------
@@ -79,24 +85,62 @@ class OpaqueOperation(Operation):
         ModelError
             If a read has changed in a way that the trace cannot follow.
         """
-        model = self._in_scope(model)
-        changed = self._changed(model)
+        scope = self._in_scope(model)
+        if self.seen is None:
+            return self._run_first(scope)
+        changed = self._changed(scope)
         if not changed:
-            return self._effects
-        if self.kind == "CloseLoop" and self.trace is None:
-            return CloseLoop(**self.parameters).below(self.scope).apply(model)
+            return FinishedWrites(self.recorded)
         error: KineverseError = ModelError(f"{self.frozen or 'it looked whether it is there'}.")
         if self.trace is not None:
             try:
-                return self.trace.run(model, self._before(model))
+                return self.trace.run(scope, scope.replaced(*self.seen))
             except KineverseError as problem:
                 error = problem
+        else:
+            again = self._made_again()
+            if again is not None:
+                return again.apply(scope)
         kind = UnknownNameError if isinstance(error, UnknownNameError) else ModelError
         raise kind(
             f"{changed[0]} has changed, and this {self.kind} was made from it: {error} It comes from a "
             "document, without its code; in the same edit, remove it, or replace it by "
             f"a new {self.kind}(...).{self._hint}"
         ) from None
+
+    def remember(self, model: ReadRecorder) -> None:
+        """Take what a model contains now as what the original has read."""
+        if self.seen is None:
+            model = self._in_scope(model)
+            values = {cell: model.read(cell, how) for cell, how in self.reads.items()}
+            names = {kind: tuple(model.list_names(kind)) for kind in self.listings}
+            silent = model.replaced({}, {})
+            overrides = any(silent.read(cell, Read.EXISTENCE) is not ABSENT for cell in self.recorded)
+            object.__setattr__(self, "seen", (values, names))
+            object.__setattr__(self, "overrides", self.overrides or overrides)
+
+    def _run_first(self, model: ReadRecorder) -> Writes:
+        """Write what the original wrote, unless the trace shows that it has read other values."""
+        self.remember(model)
+        if self.trace is None:
+            return FinishedWrites(self.recorded)
+        results: list[QueryResult] = []
+        for step in self.trace.steps:
+            results.append(run_query(substitute_results(step.query, results), model))
+        effects = self.trace.compute_writes(results)
+        return FinishedWrites(self.recorded) if writes_agree(effects.writes(), self.recorded) else effects
+
+    def _made_again(self) -> Operation | None:
+        """Return the operation of the library that it was, below the prefix; None for any other."""
+        kind, parameters = OPERATIONS.get(self.kind), self.parameters
+        unknown = (OpaqueRecord, UnsupportedParameter)
+        if kind is None or any(isinstance(parameter, unknown) for parameter in parameters.values()):
+            return None
+        try:
+            made = kind(**parameters)
+        except (TypeError, KineverseError):  # a class of somebody else has the same name
+            return None
+        return made.below(self.scope) if self.scope else made
 
     @property
     def _hint(self) -> str:
@@ -112,26 +156,21 @@ class OpaqueOperation(Operation):
 
     def _changed(self, model: ReadRecorder) -> list[str]:
         """Read what the original read, and return the names of what has changed."""
-        changed = []
-        for kind, names in self.listings:
-            if tuple(model.list_names(kind)) != names:
-                changed.append(f"the list of all {kind}")
-        for cell, how in self.reads:
-            now, then = model.read(cell, how), self.seen.get(cell, ABSENT)
+        assert self.seen is not None
+        values, names = self.seen
+        changed = [
+            f"the list of all {kind}"
+            for kind in sorted(self.listings)
+            if tuple(model.list_names(kind)) != names[kind]
+        ]
+        for cell, how in sorted(self.reads.items()):
+            now, then = model.read(cell, how), values.get(cell, ABSENT)
             if now is then:
                 continue
             if then is ABSENT or now is ABSENT or (how & Read.VALUE and now != then):
                 changed.append("/".join(cell))
         return changed
 
-    def _before(self, model: ReadRecorder) -> ReadRecorder:
-        """Return a reader with the values that the original read; the rest cannot have mattered to it."""
-        return model.replaced(self.seen, dict(self.listings))
-
-    @cached_property
-    def _effects(self) -> Writes:
-        return Writes.from_cells(dict(self.writes))
-
     def default_tag(self) -> str:
         """Return the kind and the name of the first write."""
-        return f"{self.kind} {self.writes[0][0][1]}" if self.writes else self.kind
+        return f"{self.kind} {next(iter(self.recorded))[1]}" if self.recorded else self.kind

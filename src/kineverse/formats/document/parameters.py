@@ -1,4 +1,4 @@
-"""Parameters of operations as JSON values, and the frozen names of classes in documents.
+"""Parameters of operations in documents, and the frozen names of classes.
 
 Parameters document an operation, are compared in differences, and rebuild it. They are data as under
 ``data``, poses (``{"pose": [12 numbers]}``), mappings (``{"mapping": [[key, value], ...]}``), dataclasses
@@ -9,38 +9,29 @@ Parameters document an operation, are compared in differences, and rebuild it. T
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from types import MappingProxyType
 from typing import Any
+
+import msgspec
 
 from kineverse import articulations as a
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.loops import CloseLoop, LoopConstraint
+from kineverse.model import basic_operations as basic
+from kineverse.model import body
 from kineverse.model.articulation import Articulation
-from kineverse.model.basic_operations import AddFrame, Attach, Constrain, SetData, SetRate
-from kineverse.model.body import (
-    Body,
-    Box,
-    Capsule,
-    Cone,
-    Cylinder,
-    Ellipsoid,
-    Inertia,
-    Mesh,
-    Pose,
-    Shape,
-    Sphere,
-)
+from kineverse.model.body import Mesh, Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
 from kineverse.model.operation import Cell, Operation
 
-from .budget import MAX_DEPTH, check_depth
-from .json_values import InvalidDocumentError, check_keys, check_length, check_list, check_text
+from .budget import MAX_DEPTH, InvalidDocumentError, check_depth
 from .node_graph import NodeGraph
-from .values import DATUM_TAGS, Ref, Rename, decode_datum, decode_pose, encode_datum, encode_pose
+from .values import DATUM_TAGS, Names, Ref, decode_datum, encode_datum, tagged
 
 TAGS = ("pose", "mapping", "record", "written", "unwritten", *DATUM_TAGS)
 
@@ -68,7 +59,8 @@ class UnsupportedParameter:
 
 
 _OPERATIONS: tuple[type[Operation], ...] = (
-    *(AddFrame, Attach, Constrain, SetRate, SetData, CloseLoop, LoopConstraint),
+    *(basic.AddFrame, basic.Attach, basic.Constrain, basic.SetRate, basic.SetData, basic.SetBody),
+    *(basic.SetHome, basic.SoftLimits, basic.Override, CloseLoop, LoopConstraint),
     *(a.Fixed, a.Revolute, a.Continuous, a.Prismatic, a.Screw, a.Cylindrical),
     *(a.Planar, a.Universal, a.Ball, a.Floating, a.Gearbox, a.RackAndPinion, a.Cam),
     *(a.OmniBase, a.DifferentialDrive, a.Ackermann, a.Mecanum),
@@ -76,28 +68,23 @@ _OPERATIONS: tuple[type[Operation], ...] = (
     *(a.PedalBin, a.PistonAndRod, a.Ratchet, a.ScissorLift, a.ScrewAndNut),
 )
 
+OPERATIONS: Mapping[str, type[Operation]] = MappingProxyType({o.document_kind: o for o in _OPERATIONS})
+"""Classes that operations of a document are made again of, by their frozen names."""
+
 RECORDS: Mapping[str, type] = MappingProxyType(
     {
         "Limits": a.Limits,
         "Frame": Frame,
         "Constraint": Constraint,
         "Articulation": Articulation,
-        "Body": Body,
-        "Shape": Shape,
-        "Inertia": Inertia,
-        "Box": Box,
-        "Capsule": Capsule,
-        "Cone": Cone,
-        "Cylinder": Cylinder,
-        "Ellipsoid": Ellipsoid,
-        "Mesh": Mesh,
-        "Sphere": Sphere,
-        **{operation.document_kind: operation for operation in _OPERATIONS},
+        **{kind.__name__: kind for kind in (body.Body, body.Shape, body.Inertia, body.Box, body.Capsule)},
+        **{kind.__name__: kind for kind in (body.Cone, body.Cylinder, body.Ellipsoid, Mesh, body.Sphere)},
+        **OPERATIONS,
     }
 )
 """Classes that a record in a document is rebuilt as, by the frozen name that documents have for them.
 
-Operations are among them, because :class:`kineverse.model.Override` has one as its parameter.
+Operations are among them, because an override has one as its parameter.
 """
 
 _NAMES = {kind: name for name, kind in RECORDS.items()}
@@ -108,59 +95,62 @@ def document_kind(kind: type) -> str:
     return kind.document_kind if issubclass(kind, Operation) else _NAMES.get(kind, kind.__name__)
 
 
+@cache
+def _fields(kind: Any) -> tuple[str, ...] | None:
+    """Return the names of the constructor arguments of a class; None for one without fields."""
+    if issubclass(kind, msgspec.Struct):
+        # The place of a mesh on this machine is no part of it.
+        return kind.__struct_fields__[:2] if kind is Mesh else kind.__struct_fields__
+    if not dataclasses.is_dataclass(kind):
+        return None
+    return tuple(f.name for f in dataclasses.fields(kind) if f.init and f.compare)
+
+
 def operation_parameters(operation: Operation) -> dict[str, Any]:
     """Return the constructor arguments of an operation by name; none for one that is no dataclass."""
-    if not dataclasses.is_dataclass(operation):
-        return {}
-    return {f.name: getattr(operation, f.name) for f in dataclasses.fields(operation) if f.init}
+    return {name: getattr(operation, name) for name in _arguments(type(operation))}
 
 
-def expressions_in_parameter(parameter: Any, writes: Mapping[Cell, Any]) -> list[Expression]:
-    """Return the expressions in a parameter that :func:`encode_parameter` encodes."""
-    result: list[Expression] = []
-
-    def note(expression: Expression) -> int:
-        result.append(expression)
-        return 0
-
-    encode_parameter(parameter, writes, note)
-    return result
+@cache
+def _arguments(kind: type[Operation]) -> tuple[str, ...]:
+    return tuple(f.name for f in dataclasses.fields(kind) if f.init) if dataclasses.is_dataclass(kind) else ()
 
 
-def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: int = 0) -> Any:
-    """Encode a parameter as a JSON value."""
-
-    def inner(item: Any) -> Any:
-        return encode_parameter(item, writes, ref, depth + 1)
-
-    if depth > MAX_DEPTH:
-        return {"unwritten": document_kind(type(value))}
-    if value is None or isinstance(value, (bool, int, float, str, Expression)):
+def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: int = 0) -> Any:
+    """Encode a parameter; ``written`` has the paths of the operation's writes by the id of the value."""
+    if value is None or type(value) in (str, bool):
+        return value
+    if isinstance(value, (int, float, str, Expression)):
         try:
             return encode_datum(value, ref)
         except FormatError:
             return {"unwritten": document_kind(type(value))}
+    if depth > MAX_DEPTH:
+        return {"unwritten": document_kind(type(value))}
+
+    def inner(item: Any) -> Any:
+        return encode_parameter(item, written, ref, depth + 1)
+
     if isinstance(value, (tuple, list)):
         return [inner(item) for item in value]
     if isinstance(value, Pose):
-        return {"pose": encode_pose(value)}
+        return {"pose": list(value.rows)}
     if isinstance(value, WrittenReference):
         return {"written": value.path}
     if isinstance(value, UnsupportedParameter):
         return {"unwritten": value.kind}
     if isinstance(value, Mapping):
         return {"mapping": [[inner(key), inner(item)] for key, item in value.items()]}
-    for (kind, name), written in writes.items():
-        if written is value:
-            return {"written": f"{kind}/{name}"}
+    # Not so tuples: equal ones are one object in some programs, and several in others.
+    if id(value) in written:
+        return {"written": written[id(value)]}
     if isinstance(value, OpaqueRecord):
-        return {"record": value.kind, "fields": {key: inner(item) for key, item in value.fields}}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        parts = {
-            f.name: inner(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init and f.compare
-        }
-        return {"record": document_kind(type(value)), "fields": parts}
-    return {"unwritten": document_kind(type(value))}
+        return {"record": [value.kind, {key: inner(item) for key, item in value.fields}]}
+    kind: Any = type(value)
+    names = _fields(kind)
+    if names is None:
+        return {"unwritten": document_kind(kind)}
+    return {"record": [document_kind(kind), {name: inner(getattr(value, name)) for name in names}]}
 
 
 def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
@@ -184,48 +174,38 @@ def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
 
 
 def decode_parameter(
-    value: Any,
-    graph: NodeGraph,
-    rename: Rename,
-    path: Callable[[str], str],
-    written: Collection[str],
-    depth: int = 0,
+    value: Any, graph: NodeGraph, names: Names, written: Mapping[Cell, Any], depth: int = 0
 ) -> Any:
-    """Decode a parameter from its JSON value."""
+    """Decode a parameter."""
+    if type(value) is not list and type(value) is not dict:
+        return decode_datum(value, graph)
 
     def inner(item: Any) -> Any:
-        return decode_parameter(item, graph, rename, path, written, depth + 1)
+        return decode_parameter(item, graph, names, written, depth + 1)
 
     check_depth(depth)
     if type(value) is list:
-        return tuple(map(inner, value))
-    if type(value) is not dict:
-        return decode_datum(value, graph, rename)
-    tag = next((tag for tag in TAGS if tag in value), None)
-    if tag == "pose":
-        return decode_pose(check_keys(value, ("pose",))["pose"])
-    if tag == "mapping":
-        pairs = [
-            check_length(check_list(p, "key and value"), 2)
-            for p in check_list(check_keys(value, (tag,))[tag], tag)
-        ]
-        try:
+        return tuple([inner(item) for item in value])
+    tag, content = tagged(value, TAGS)
+    if tag in DATUM_TAGS:
+        return decode_datum(value, graph)
+    try:
+        if tag == "pose":
+            return msgspec.convert([content], Pose)
+        if tag == "mapping":
+            pairs = msgspec.convert(content, tuple[tuple[Any, Any], ...])
             return {inner(key): inner(item) for key, item in pairs}
-        except TypeError:
-            raise InvalidDocumentError("a mapping has keys that cannot be compared") from None
-    if tag == "record":
-        given = check_keys(value, ("record", "fields"))
-        if type(given["fields"]) is not dict:
-            raise InvalidDocumentError("the fields of a record are an object")
-        parts = tuple((check_text(key), inner(item)) for key, item in given["fields"].items())
-        return OpaqueRecord(check_text(given["record"]), parts)
-    if tag == "written":
-        named = path(check_text(check_keys(value, (tag,))[tag]))
-        if named not in written:
-            raise InvalidDocumentError(f"{named[:60]!r} is not among the values that it writes")
-        return WrittenReference(named)
+        if tag == "record":
+            kind, given = msgspec.convert(content, tuple[str, dict[str, Any]])
+            return OpaqueRecord(kind, tuple((key, inner(item)) for key, item in given.items()))
+        text = msgspec.convert(content, str)
+    except msgspec.ValidationError as error:
+        raise InvalidDocumentError(str(error) if tag == "pose" else f"it is no {tag}: {error}") from None
+    except TypeError:
+        raise InvalidDocumentError("a mapping has keys that cannot be compared") from None
     if tag == "unwritten":
-        return UnsupportedParameter(check_text(check_keys(value, (tag,))[tag]))
-    if tag is None:
-        raise InvalidDocumentError(f"an object among parameters has one of the keys {', '.join(TAGS)}")
-    return decode_datum(value, graph, rename)
+        return UnsupportedParameter(text)
+    cell = names.path_cell(text)
+    if cell not in written:
+        raise InvalidDocumentError(f"{text[:60]!r} is not among the values that it writes")
+    return WrittenReference("/".join(cell))

@@ -1,4 +1,4 @@
-"""Traces of operations as JSON values, and their consistency with reads and writes.
+"""Traces of operations in documents, and their consistency with reads and writes.
 
 A trace is ``{"questions": [[kind, access, argument, ...], ...], "writes": {...}}``: the queries, the access
 to each result (0 none, 1 its symbols, 2 its value), and writes like those of the operation, whose expressions
@@ -8,7 +8,7 @@ contain ``read`` nodes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import casadi as ca
@@ -26,22 +26,16 @@ from kineverse.model.traces.replay import ExpressionPair, writes_agree
 from kineverse.model.traces.trace import find_read_nodes, run_query, substitute_results
 from kineverse.model.traces.trace_queries import DATA_QUERIES, EXPRESSION_QUERIES, QUERY_KINDS, QueryResult
 
-from .budget import COST_OF_FRAME, COST_OF_NAME, COST_OF_NODE_BELOW, MAX_QUESTIONS, MAX_WORK
-from .json_values import InvalidDocumentError, check_integer, check_length, check_list
+from . import structs
+from .budget import COST_OF_FRAME, COST_OF_NAME, COST_OF_NODE_BELOW, MAX_WORK, Budget, InvalidDocumentError
 from .node_graph import NodeGraph
-from .values import Ref
+from .values import Names, Ref, decode_writes
 
 _KIND_OF = {question: kind for kind, question in DATA_QUERIES.items()}
 
 
-def trace_expressions(trace: Trace) -> list[Expression]:
-    """Return the expressions in the queries and writes of a trace."""
-    asked = [a for step in trace.steps for a in step.query.arguments if isinstance(a, Expression)]
-    return asked + [e for (kind, _), value in trace.writes for e in find_expressions(kind, value)]
-
-
 def encode_queries(trace: Trace, ref: Ref) -> list[list[Any]]:
-    """Encode the queries of a trace as JSON values."""
+    """Encode the queries of a trace."""
     return [
         [
             step.query.kind,
@@ -52,28 +46,31 @@ def encode_queries(trace: Trace, ref: Ref) -> list[list[Any]]:
     ]
 
 
-def decode_queries(value: Any, graph: NodeGraph, cell: Callable[[str, Any], Cell]) -> tuple[TraceStep, ...]:
-    """Decode the queries of a trace from their JSON value."""
-    steps = []
-    if len(check_list(value, "questions")) > MAX_QUESTIONS:
-        raise InvalidDocumentError(f"{len(value)} questions, more than {MAX_QUESTIONS}")
-    for place, item in enumerate(value):
-        if len(check_list(item, "a question")) < 2:
+def decode_trace(given: structs.TraceValue, graph: NodeGraph, names: Names) -> Trace:
+    """Decode a trace."""
+    steps: list[TraceStep] = []
+    for item in given.questions:
+        if len(item) < 2:
             raise InvalidDocumentError(
                 "a question is its kind, how closely it was looked at, and what it is about"
             )
         kind, look, *arguments = item
         if type(kind) is not str or kind not in QUERY_KINDS:
             raise InvalidDocumentError(f"a question is one of {', '.join(QUERY_KINDS)}")
-        check_length(arguments, QUERY_KINDS[kind].arguments)
-        steps.append(
-            TraceStep(
-                Query(kind, _decode_arguments(kind, arguments, graph, cell)), Access(check_integer(look, 2))
+        if type(look) is not int or not 0 <= look <= 2:
+            raise InvalidDocumentError("how closely an answer was looked at is 0, 1 or 2")
+        if len(arguments) != QUERY_KINDS[kind].arguments:
+            raise InvalidDocumentError(
+                f"the question {kind!r} has {QUERY_KINDS[kind].arguments} arguments, not {len(arguments)}"
             )
-        )
-        for expression in (a for a in steps[-1].query.arguments if isinstance(a, Expression)):
-            check_read_nodes(expression, place)
-    return tuple(steps)
+        query = Query(kind, _decode_arguments(kind, arguments, graph, names))
+        for expression in (a for a in query.arguments if isinstance(a, Expression)):
+            check_read_nodes(expression, len(steps))
+        steps.append(TraceStep(query, Access(look)))
+    writes = tuple(decode_writes(given.writes, graph, names, is_trace=True))
+    for expression in (e for (kind, _), value in writes for e in find_expressions(kind, value)):
+        check_read_nodes(expression, len(steps))
+    return Trace(tuple(steps), writes)
 
 
 def check_read_nodes(expression: Expression, questions: int) -> None:
@@ -85,18 +82,34 @@ def check_read_nodes(expression: Expression, questions: int) -> None:
             )
 
 
-def _decode_arguments(
-    kind: str, given: list[Any], graph: NodeGraph, cell: Callable[[str, Any], Cell]
-) -> tuple[Any, ...]:
+def _decode_arguments(kind: str, given: list[Any], graph: NodeGraph, names: Names) -> tuple[Any, ...]:
     if kind == "exists":
-        return cell(given[0], given[1])
+        return names.cell(given[0], given[1])
     if kind == "names":
-        return (cell(given[0], "x")[0],)
+        return (names.cell(given[0], "x")[0],)
     if kind in ("fk", "between"):
-        return tuple(cell(FRAMES, name)[1] for name in given)
+        return tuple(names.cell(FRAMES, name)[1] for name in given)
     if kind in EXPRESSION_QUERIES:
         return tuple(map(graph.expression, given))
-    return (cell(FRAMES if kind in ("body", "factors") else _KIND_OF[kind], given[0])[1],)
+    # The body of the world is that of a frame of this name.
+    return (names.cell(FRAMES if kind == "body" else _KIND_OF.get(kind, FRAMES), given[0])[1],)
+
+
+def named_reads(trace: Trace) -> Reads:
+    """Return the reads that follow from the names in the queries of a trace, whatever the model contains."""
+    reads = Reads()
+    for step in trace.steps:
+        kind, arguments = step.query.kind, step.query.arguments
+        if kind == "exists":
+            reads.add((arguments[0], arguments[1]), Read.EXISTENCE)
+        elif kind == "names":
+            reads.listings.add(arguments[0])
+        elif kind in ("fk", "between"):
+            for name in set(arguments) - {WORLD}:
+                reads.add((FRAMES, name), Read.EXISTENCE)
+        elif kind not in EXPRESSION_QUERIES:
+            reads.add((_KIND_OF.get(kind, FRAMES), arguments[0]), Read.VALUE)
+    return reads
 
 
 _COST_OF_POSE = 1000  # cost of a frame in a composed pose, about its number of products and sums
@@ -110,13 +123,13 @@ class TraceConsistency:
     beyond a budget far above that of all known documents, a million nodes and more, it is skipped.
     """
 
-    def __init__(self, graph: NodeGraph, cells: Mapping[Cell, Any], names: Mapping[str, set[str]]) -> None:
-        self._graph, self._cells, self._names = graph, cells, names
+    def __init__(self, budget: Budget, cells: Mapping[Cell, Any], names: Mapping[str, set[str]]) -> None:
+        self._budget, self._cells, self._names = budget, cells, names
         self._left = MAX_WORK
 
-    def reads_of(self, trace: Trace, writes: tuple[tuple[Cell, Any], ...]) -> Reads:
+    def reads_of(self, trace: Trace, writes: Mapping[Cell, Any]) -> Reads:
         """Return the reads of the queries of a trace."""
-        if [cell for cell, _ in trace.writes] != [cell for cell, _ in writes]:
+        if [cell for cell, _ in trace.writes] != list(writes):
             raise InvalidDocumentError("it writes other things than the operation, and one of them is wrong")
         reads = Reads()
         try:
@@ -127,8 +140,8 @@ class TraceConsistency:
         except KineverseError as error:
             raise InvalidDocumentError(f"it cannot be followed: {error}") from None
         # Writes have a fixed order of kinds; only the order of names within a kind counts.
-        in_order = {cell: again[cell] for cell, _ in writes if cell in again}
-        if len(in_order) < len(again) or not writes_agree(in_order, dict(writes), self._spend_comparison):
+        in_order = {cell: again[cell] for cell in writes if cell in again}
+        if len(in_order) < len(again) or not writes_agree(in_order, writes, self._spend_comparison):
             raise InvalidDocumentError("it leads to other values than the writes, and one of them is wrong")
         return reads
 
@@ -164,13 +177,13 @@ class TraceConsistency:
             base, down = branches(frame, relative_to, lambda name: self._cells[FRAMES, name])
         except (KineverseError, KeyError):
             return []
-        self._graph.budget.spend(COST_OF_FRAME * (len(base) + len(down)))
+        self._budget.spend(COST_OF_FRAME * (len(base) + len(down)))
         return [*base, *down]
 
     def _record_chain(self, names: list[str], ends: Iterable[str], reads: Reads) -> None:
         """Record the reads of a pose without composing it, which is large for a long chain."""
         reader = self._reader(reads)
-        self._graph.budget.spend(2 * COST_OF_FRAME * len(names))
+        self._budget.spend(2 * COST_OF_FRAME * len(names))
         for name in names:
             for factor in reader.frames[name].factors:
                 if isinstance(factor, Expression):
@@ -182,7 +195,7 @@ class TraceConsistency:
         return ReadRecorder(lambda cell: self._cells.get(cell, ABSENT), self._sorted, reads)
 
     def _sorted(self, kind: str) -> list[str]:
-        self._graph.budget.spend(COST_OF_NAME * len(self._names[kind]))
+        self._budget.spend(COST_OF_NAME * len(self._names[kind]))
         return sorted(self._names[kind])
 
     def _spend(self, work: int) -> bool:
@@ -197,18 +210,11 @@ class TraceConsistency:
         work = 0
         for expression in (e for pair in pairs for e in pair):
             inner = topological_order(leaves(expression)[1], lambda n: n.parts, lambda _: False)
-            steps = sum(self._graph.work.get(n.function.key, 0) for n in inner if isinstance(n, Implicit))
+            functions = [n.function.key for n in inner if isinstance(n, Implicit)]
+            steps = sum(self._budget.functions.get(key, 0) for key in functions)
             parts = _nodes(expression) + sum(_nodes(part) for node in inner for part in node.parts)
             work += (steps + parts) * (1 + len(expression.symbols))
         return self._spend(work)
-
-
-def merge_reads(cells: Mapping[Cell, Read], reads: Reads) -> dict[Cell, Read]:
-    """Return the union of the reads on record and derived ones, by cell."""
-    result = dict(cells)
-    for cell, how in reads.cells.items():
-        result[cell] = result.get(cell, Read(0)) | how
-    return result
 
 
 def _size(question: Query) -> int:

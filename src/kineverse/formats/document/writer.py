@@ -1,31 +1,38 @@
-"""Writer of documents, as JSON text, msgpack bytes and files."""
+"""Writer of documents: blobs of operations, and documents as text, msgpack bytes and files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 from kineverse._runtime import no_collection
-from kineverse.errors import FormatError
-from kineverse.expressions.expression import Expression
+from kineverse.errors import FormatError, UnknownNameError, suggest
 from kineverse.formats.files import replace_file
+from kineverse.formats.resources import files_of, measure_content
 from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.model_view import ModelView
-from kineverse.model.operation import ARTICULATIONS, DATA, KINDS, Cell, find_expressions
+from kineverse.model.operation import BODIES, Cell
 from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Reads
 from kineverse.model.traces import Trace, UntraceableError, record_trace
 
-from .encoding import append_hash, dump_json, pack_document, read_hash
-from .node_table import NodeTable, encode_string
+from . import encoding
+from .budget import InvalidDocumentError
+from .node_table import NodeTable
 from .opaque_operation import OpaqueOperation
-from .parameters import document_kind, encode_parameter, expressions_in_parameter, operation_parameters
-from .traces import encode_queries, trace_expressions
-from .values import encode_value
+from .parameters import document_kind, encode_parameter, operation_parameters
+from .structs import Resource
+from .traces import encode_queries
+from .values import encode_writes, meshes_of
 
-FORMAT = "kineverse"
-VERSION = 1
+# Flags are compared as wholes, because operations on them are slow.
+_WITH_EXISTENCE = (Read.EXISTENCE, Read.EXISTENCE | Read.VALUE)
+_WITH_VALUE = (Read.VALUE, Read.EXISTENCE | Read.VALUE)
+
+# Values before an operation, by cell.
+Before = Callable[[], dict[Cell, Any]]
 
 
 def write_document(model: ModelView, target: Path) -> None:
@@ -42,77 +49,58 @@ def write_document(model: ModelView, target: Path) -> None:
     ------
     FormatError
         If the file cannot be written, or for content that a document cannot carry; it is unchanged then.
-    MissingDependencyError
-        If the package for msgpack is needed and not installed.
     """
+    is_packed = target.name.endswith(".kv.msgpack")
     try:
-        text = to_json(model)
+        content = to_bytes(model) if is_packed else to_json(model).encode()
     except FormatError as error:
         raise FormatError(f"{target} is not written. {error}") from None
-    replace_file(target, pack_document(text) if target.name.endswith(".kv.msgpack") else text.encode())
+    replace_file(target, content)
 
 
-def to_json(model: ModelView) -> str:
+def to_json(model: ModelView, *, resources: bool = False) -> str:
     """Return a model as the text of a document; equal for models made by the same operations.
+
+    Parameters
+    ----------
+    model
+        Model or snapshot.
+    resources
+        True to add SHA-256 and size of each mesh and texture that is found, see :func:`.add_resolver`.
 
     Raises
     ------
     FormatError
         For content that a document cannot carry.
     """
-    snapshot = model.snapshot() if isinstance(model, Model) else model
-    if not isinstance(snapshot, Snapshot):
-        raise FormatError(f"A model or a snapshot is saved, not a {type(model).__name__}.")
-    try:
-        with no_collection():
-            return _write_text(snapshot)
-    except RecursionError:
-        raise FormatError("The model contains data or gradients that are nested too deeply.") from None
+    entries = _entries(model)
+    return encoding.print_document(_blobs(entries), **_beside(entries, resources))
 
 
-def to_bytes(model: ModelView) -> bytes:
+def to_bytes(model: ModelView, *, resources: bool = False) -> bytes:
     """Return a model as a document in msgpack, as in ``.kv.msgpack`` files; equal for equal models.
 
     Parameters
     ----------
     model
         Model or snapshot.
+    resources
+        True to add SHA-256 and size of each mesh and texture that is found, see :func:`.add_resolver`.
 
     Raises
     ------
     FormatError
         For content that a document cannot carry.
-    MissingDependencyError
-        If msgspec is not installed, which the extra ``exchange`` brings.
     """
-    return pack_document(to_json(model))
-
-
-def _write_text(snapshot: Snapshot) -> str:
-    parts = [_Parts(entry, cells) for entry, cells in _with_cells_before(snapshot.entries)]
-    table = NodeTable(e for part in parts for e in part.expressions)
-    operations = [_encode_operation(part, table) for part in parts]
-    body = "".join(
-        (
-            f'{{"format":"{FORMAT}","version":{VERSION},\n"nodes":[',
-            *_lines(table.lines),
-            '],\n"operations":[',
-            *_lines(operations),
-            "]",
-        )
-    )
-    try:
-        return append_hash(body)
-    except UnicodeEncodeError as error:
-        bad = ascii(body[max(error.start - 20, 0) : error.end])
-        raise FormatError(f"Half a surrogate pair is no text: {bad}.") from None
+    entries = _entries(model)
+    return encoding.pack_document(_blobs(entries), **_beside(entries, resources))
 
 
 def document_hash(model: ModelView) -> str:
     """Return the hash of a model's content, 64 hexadecimal digits.
 
     It is equal for models made by the same operations, in any process. Saving and loading a model as a
-    document preserves it, in either encoding. Names are part of the content, so a prefix changes it.
+    document preserves it, in either form. Names are part of the content, so a prefix changes it.
 
     Parameters
     ----------
@@ -124,45 +112,131 @@ def document_hash(model: ModelView) -> str:
     FormatError
         For content that a document cannot carry.
     """
-    return read_hash(to_json(model))
+    return encoding.hash_blobs(_blobs(_entries(model)))
 
 
-def _with_cells_before(entries: Sequence[HistoryEntry]) -> Iterator[tuple[HistoryEntry, dict[Cell, Any]]]:
-    """Yield the operations, each with the cells before it, in one dictionary that is updated in place."""
+def operation_to_bytes(model: ModelView, tag: str) -> bytes:
+    """Return an operation of a model as bytes, its *blob*; equal operations have equal blobs.
+
+    Parameters
+    ----------
+    model
+        Model or snapshot.
+    tag
+        Tag of the operation.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such operation.
+    FormatError
+        For content that a document cannot carry.
+    """
+    if isinstance(model, Model) and model._edit is None:
+        entries: Sequence[HistoryEntry] = model.history.sequence  # without a snapshot, which lists all values
+        entry = model.history.entry(tag)
+    else:
+        entries = _entries(model)
+        by_tag = {entry.tag: entry for entry in entries}
+        if tag not in by_tag:
+            raise UnknownNameError(f"There is no operation {tag!r}. {suggest(str(tag), by_tag, 'tag')}")
+        entry = by_tag[tag]
+
+    def before() -> dict[Cell, Any]:
+        earlier = takewhile(lambda other: other is not entry, entries)
+        return {cell: value for other in earlier for cell, value in other.writes.items()}
+
+    return entry.blob or _blob(entry, before)
+
+
+def operation_digest(model: ModelView, tag: str) -> str:
+    """Return SHA-256 of :func:`operation_to_bytes`, 64 hexadecimal digits."""
+    return encoding.digest(operation_to_bytes(model, tag)).hex()
+
+
+def _entries(model: ModelView) -> Sequence[HistoryEntry]:
+    snapshot = model.snapshot() if isinstance(model, Model) else model
+    if not isinstance(snapshot, Snapshot):
+        raise FormatError(f"A model or a snapshot is saved, not a {type(model).__name__}.")
+    return snapshot.entries
+
+
+def _blobs(entries: Sequence[HistoryEntry]) -> list[bytes]:
+    """Return the blobs of operations; those that are known are not encoded again."""
+    blobs: list[bytes] = []
     cells: dict[Cell, Any] = {}
-    for entry in entries:
-        yield entry, cells
-        cells.update(entry.writes)
+    done = 0
+
+    def before() -> dict[Cell, Any]:
+        nonlocal done
+        for entry in entries[done : len(blobs)]:
+            cells.update(entry.writes)
+        done = len(blobs)
+        return cells
+
+    with no_collection():
+        for entry in entries:
+            blobs.append(entry.blob or _blob(entry, before))  # noqa: PERF401 - before() counts them
+    return blobs
 
 
-class _Parts:
-    """Content of a document for one operation."""
+def _blob(entry: HistoryEntry, before: Before) -> bytes:
+    """Return the blob of an operation, and keep it."""
+    try:
+        entry.blob = encoding.make_blob(_encode_operation(entry, before))
+    except RecursionError:
+        raise FormatError("The model contains data or gradients that are nested too deeply.") from None
+    except InvalidDocumentError as error:
+        raise FormatError(
+            f"The operation {entry.tag!r} has a value that has no place in a document: {error}."
+        ) from None
+    return entry.blob
 
+
+def _encode_operation(entry: HistoryEntry, before: Before) -> dict[str, Any]:
+    operation, writes = entry.operation, entry.writes
     trace: Trace | None = None
-    frozen = ""
-
-    def __init__(self, entry: HistoryEntry, cells: dict[Cell, Any]) -> None:
-        self.entry = entry
-        operation = entry.operation
-        if isinstance(operation, OpaqueOperation):
-            self.kind, self.parameters = operation.kind, operation.given
-            self.trace, self.frozen = operation.trace, operation.frozen
-            return
-        self.kind, self.parameters = document_kind(type(operation)), operation_parameters(operation)
-        if entry.reads.listings or any(how & Read.VALUE for how in entry.reads.cells.values()):
+    table = NodeTable()
+    result: dict[str, Any] = {"tag": entry.tag}
+    if isinstance(operation, OpaqueOperation):
+        kind, parameters, trace = operation.kind, operation.given, operation.trace
+        result["frozen"], result["below"] = operation.frozen, operation.scope
+    else:
+        kind, parameters = document_kind(type(operation)), operation_parameters(operation)
+        if entry.reads.listings or any(how in _WITH_VALUE for how in entry.reads.cells.values()):
             if entry.reads.trace is None:
-                entry.reads.trace = _find_trace(entry, cells)
+                entry.reads.trace = _find_trace(entry, before())
             found = entry.reads.trace
-            self.trace, self.frozen = (found, "") if isinstance(found, Trace) else (None, str(found))
+            if isinstance(found, Trace):
+                trace = found
+            else:
+                result["frozen"] = str(found)
+    result["kind"] = kind
+    result["writes"] = encode_writes(entry.tag, writes, table.ref)
+    if parameters:
+        written = {id(value): f"{kind}/{name}" for (kind, name), value in writes.items()}
+        result["parameters"] = {
+            name: encode_parameter(value, written, table.ref) for name, value in parameters.items()
+        }
+    if entry.reads.cells or entry.reads.listings:
+        result["reads"] = _encode_reads(entry.reads)
+    if trace is not None:
+        queries = encode_queries(trace, table.ref)
+        result["trace"] = {
+            "questions": queries,
+            "writes": encode_writes(entry.tag, dict(trace.writes), table.ref),
+        }
+    result["nodes"] = table.nodes
+    return result
 
-    @property
-    def expressions(self) -> Iterator[Expression]:
-        for (kind, _), value in self.entry.writes.items():
-            yield from find_expressions(kind, value)
-        for parameter in self.parameters.values():
-            yield from expressions_in_parameter(parameter, self.entry.writes)
-        if self.trace is not None:
-            yield from trace_expressions(self.trace)
+
+def _encode_reads(reads: Reads) -> dict[str, list[str]]:
+    cells = sorted(reads.cells.items())
+    return {
+        "existence": [f"{kind}/{name}" for (kind, name), how in cells if how in _WITH_EXISTENCE],
+        "value": [f"{kind}/{name}" for (kind, name), how in cells if how in _WITH_VALUE],
+        "listing": sorted(reads.listings),
+    }
 
 
 def _find_trace(entry: HistoryEntry, cells: dict[Cell, Any]) -> Trace | str:
@@ -178,49 +252,38 @@ def _find_trace(entry: HistoryEntry, cells: dict[Cell, Any]) -> Trace | str:
         return str(error)
 
 
-def _lines(items: list[str]) -> Iterator[str]:
-    for i, item in enumerate(items):
-        yield ",\n" if i else "\n"
-        yield item
-    if items:
-        yield "\n"
+def _beside(entries: Sequence[HistoryEntry], resources: bool) -> dict[str, Any]:
+    """Return the members of a document that are no part of its content."""
+    return {"folders": _folders(entries), "resources": _resources(entries, resources)}
 
 
-def _encode_operation(what: _Parts, table: NodeTable) -> str:
-    entry = what.entry
-    cells = sorted(entry.reads.cells.items())
-    reads = {
-        "existence": [f"{kind}/{name}" for (kind, name), how in cells if how & Read.EXISTENCE],
-        "value": [f"{kind}/{name}" for (kind, name), how in cells if how & Read.VALUE],
-        "listing": sorted(entry.reads.listings),
-    }
-    parameters = {
-        name: encode_parameter(value, entry.writes, table.ref) for name, value in what.parameters.items()
-    }
-    parts = {"tag": entry.tag, "kind": what.kind}
-    members = {key: encode_string(value) for key, value in parts.items()}
-    if parameters:
-        members["parameters"] = dump_json(parameters)
-    members["reads"] = dump_json({how: names for how, names in reads.items() if names})
-    members["writes"] = dump_json(_encode_writes(entry.tag, entry.writes, table))
-    if what.trace is not None:
-        questions = encode_queries(what.trace, table.ref)
-        writes = _encode_writes(entry.tag, dict(what.trace.writes), table)
-        members["trace"] = dump_json({"questions": questions, "writes": writes})
-    if what.frozen:
-        members["frozen"] = encode_string(what.frozen)
-    joined = ",".join(f'"{key}":{value}' for key, value in members.items())
-    return f"{{{joined}}}"
+def _resources(entries: Sequence[HistoryEntry], measured: bool) -> tuple[Resource, ...]:
+    """Return the contents of files that are known, or measured, each address once."""
+    result: dict[tuple[str, str], Resource] = {}
+    for entry in entries:
+        for (kind, _), body in entry.writes.items():
+            for file in files_of(body) if kind == BODIES else ():
+                known = measure_content(file) if measured else file.content
+                if known is not None:
+                    resource = Resource(file.uri, known[0], known[1], file.folder)
+                    result.setdefault((file.folder, file.uri), resource)
+    return tuple(result.values())
 
 
-def _encode_writes(tag: str, writes: Mapping[Cell, Any], table: NodeTable) -> dict[str, dict[str, Any]]:
-    kinds: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
-    for (kind, name), value in writes.items():
-        try:
-            kinds[kind][name] = encode_value(kind, value, table.ref)
-        except FormatError as error:
-            noun = "The datum" if kind in (DATA, ARTICULATIONS) else "What is"
-            raise FormatError(
-                f"{noun} under '{kind}/{name}', written by {tag!r}, has no place in a document: {error}"
-            ) from None
-    return {kind: values for kind, values in kinds.items() if values}
+def _folders(entries: Sequence[HistoryEntry]) -> dict[str, dict[str, tuple[int, ...]]]:
+    """Return the operations with meshes below a folder, by folder, each with those meshes if not all are."""
+    result: dict[str, dict[str, tuple[int, ...]]] = {}
+    for entry in entries:
+        found = list(_mesh_folders(entry))
+        for folder in dict.fromkeys(found):
+            if folder:
+                places = tuple(i for i, other in enumerate(found) if other == folder)
+                result.setdefault(folder, {})[entry.tag] = () if len(places) == len(found) else places
+    return result
+
+
+def _mesh_folders(entry: HistoryEntry) -> Iterator[str]:
+    for (kind, _), body in entry.writes.items():
+        if kind == BODIES:
+            for mesh in meshes_of(body):
+                yield mesh.folder

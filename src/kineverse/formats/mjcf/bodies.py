@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec.structs import replace
 
 from kineverse.formats import poses
 from kineverse.formats.names import NameFaultHandler, UniqueNames, drop_empty_parts

@@ -12,6 +12,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
+from msgspec import structs
+
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.resource_paths import find_root_violation
 from kineverse.formats.xml_reader import Element, ElementError, find_child, label, quote, read_name
@@ -164,8 +166,8 @@ class UrdfLinkReader:
             color, texture = self.materials.final_appearance(material, element)
             link = links[name]
             visuals = list(link.body.visuals)
-            visuals[index] = replace(visuals[index], color=color, texture=texture)
-            links[name] = replace(link, body=replace(link.body, visuals=tuple(visuals)))
+            visuals[index] = structs.replace(visuals[index], color=color, texture=texture)
+            links[name] = replace(link, body=structs.replace(link.body, visuals=tuple(visuals)))
 
     def _shape(self, element: Element, link: Element, name: str = "", index: int = -1) -> Shape | None:
         """Return the shape of a ``<visual>`` or ``<collision>``; None, with a remark, if it has none."""

@@ -11,11 +11,11 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from kineverse._runtime import no_collection
 from kineverse.articulations.multi_axis import rotation_from_z

@@ -12,6 +12,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from msgspec import structs
+
 from kineverse.articulations import Prismatic, Revolute
 from kineverse.articulations.mechanisms.mechanism import shift
 from kineverse.model.body import Pose, Vector3
@@ -237,4 +239,4 @@ def _moved(solid: MaterialShape, by: Vector3) -> MaterialShape:
     rows = list(solid.shape.origin.rows)
     for k, step in zip((3, 7, 11), by, strict=True):
         rows[k] = round(rows[k] + step, 7)
-    return replace(solid, shape=replace(solid.shape, origin=Pose(tuple(rows))))
+    return replace(solid, shape=structs.replace(solid.shape, origin=Pose(tuple(rows))))

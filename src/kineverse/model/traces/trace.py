@@ -256,9 +256,9 @@ class Trace:
         fill = _into(results)
 
         def fill_datum(expression: Expression) -> Expression | float:
+            result = fill(expression)  # raises for an answer that is not there
             # An expression of numbers is converted back to a number.
             parts = [results[a.query].parts[a.part] for a in find_read_nodes(expression)]
-            result = fill(expression)
             of_numbers = bool(parts) and all(isinstance(part, float) for part in parts)
             is_number = of_numbers and not result.shape and result.is_constant
             if not is_number:
