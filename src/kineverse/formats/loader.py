@@ -21,11 +21,9 @@ from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, che
 from .file_formats import DOCUMENT_SUFFIXES
 from .files import read_file
 from .locate import Source, locate_model
-from .loop_closures import LoopClosures
 from .names import check_prefix
 from .reader_warnings import collect_warnings, warn
 from .root_folder import NOWHERE, find_root
-from .xacro import split_arguments
 
 READ = (
     "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf), templates of xacro (.xacro) and documents "
@@ -191,6 +189,8 @@ def _arguments(
     """Return the path of a template and its arguments, of which some may follow the path."""
     given = {str(name): str(value) for name, value in (arguments or {}).items()}
     if isinstance(source, str) and ":=" in source:
+        from .xacro import split_arguments  # for start-up time, as the next
+
         source, more = split_arguments(source)
         given |= more
     if given and not os.fspath(source).endswith(".xacro"):
@@ -226,6 +226,8 @@ def _applied(
         for tag, operation in operations:
             yield edit.apply(operation, tag)
         return
+    from .loop_closures import LoopClosures
+
     closures = LoopClosures(edit, edit.model, source.path.name, file_format.loop_element, loops)
     for tag, operation in operations:
         yield from closures.apply(tag, operation)

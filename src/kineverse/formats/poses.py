@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from struct import Struct
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kineverse.lie import snap, to_quaternion, to_rpy
 from kineverse.model.body import Pose, Vector3
 
-from .description import Matrix
+if TYPE_CHECKING:
+    from .description import Matrix
 
 _KEY = Struct("6d")
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
 from .xml_reader import Element, ElementError, label
-
-_log = logging.getLogger("kineverse.formats")
 
 _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
 
@@ -55,7 +52,9 @@ class ReaderWarnings:
 def warn(remarks: Iterable[str]) -> None:
     """Log warnings, each with its source in front, and add them to the lists of :func:`collect_warnings`."""
     for remark in remarks:
-        _log.info("%s", remark)
+        import logging  # for start-up time
+
+        logging.getLogger("kineverse.formats").info("%s", remark)
         for heard in _listeners.get():
             heard.append(remark)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 from bisect import bisect_left
@@ -126,8 +125,6 @@ def _longest(places: Sequence[int]) -> set[int]:
     return kept
 
 
-_LOG = logging.getLogger(__name__)
-
 Callback = Callable[[Diff], None]
 
 
@@ -238,7 +235,11 @@ class Listeners:
         try:
             listener.callback(part)
         except Exception:
-            _LOG.exception("A listener of the model raised at version %d.", diff.version)
+            import logging  # for start-up time
+
+            logging.getLogger(__name__).exception(
+                "A listener of the model raised at version %d.", diff.version
+            )
 
 
 def _names(names: Iterable[str]) -> tuple[str, ...]:

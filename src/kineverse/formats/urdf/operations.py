@@ -11,16 +11,8 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from kineverse.articulations import (
-    Ball,
-    Continuous,
-    Fixed,
-    Floating,
-    OneDofJoint,
-    Planar,
-    Prismatic,
-    Revolute,
-)
+from kineverse import articulations
+from kineverse.articulations import Continuous, Fixed, OneDofJoint, Prismatic, Revolute
 from kineverse.articulations import Joint as JointOperation
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
@@ -116,13 +108,13 @@ def _joint_operations(
     if joint.kind == "fixed":
         yield Fixed(**common)
     elif joint.kind == "floating":
-        yield Floating(**common)
+        yield articulations.Floating(**common)
     elif joint.kind == "spherical":
-        yield Ball(**common)
+        yield articulations.Ball(**common)
     elif joint.kind == "planar":
         assert joint.axis is not None
         limits = joint.limits
-        yield Planar(
+        yield articulations.Planar(
             **common, axis=joint.axis, lower=limits.lower, upper=limits.upper, velocity=limits.velocity
         )
     else:
