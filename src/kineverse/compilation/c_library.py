@@ -11,9 +11,10 @@ import time
 import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from weakref import WeakMethod
+
+from msgspec import Struct
 
 from .build_queue import BuildJob, request
 from .cache import library_cache
@@ -188,8 +189,7 @@ class SourceLibrary:
         return code
 
 
-@dataclass(frozen=True, slots=True)
-class CompilerInformation:
+class CompilerInformation(Struct, frozen=True):
     """Compiler, vector instructions, cores and cache of this machine.
 
     Attributes

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 from .xml_reader import Element, ElementError, label
 
@@ -18,8 +19,7 @@ class Fault(str):
     __slots__ = ()
 
 
-@dataclass(slots=True)
-class ReaderWarnings:
+class ReaderWarnings(Struct):
     """Warnings about one document; with ``strict``, mistakes raise instead."""
 
     source: str  # name of the document

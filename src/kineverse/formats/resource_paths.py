@@ -12,12 +12,11 @@ import re
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from msgspec import structs
+from msgspec import Struct, field, structs
 
 from kineverse.errors import FormatError
 from kineverse.model.body import Body, Mesh, Shape
@@ -129,8 +128,7 @@ def model_paths() -> Iterator[tuple[str, Path]]:
             yield variable, Path(place).absolute()
 
 
-@dataclass
-class _SearchLog:
+class _SearchLog(Struct):
     """Log of the search for a package, for the error message."""
 
     places: list[str] = field(default_factory=list)  # folders searched, as text
@@ -192,9 +190,33 @@ def _find_substitute(name: str, insides: list[list[str]], folder: Path, root: st
     return None
 
 
-def _may_open(path: Folder, root: str, package: Path | None = None, folder: Folder = "") -> bool:
+class RealPaths:
+    """Real paths of the files that one description names: that of a folder is found once."""
+
+    def __init__(self) -> None:
+        self._folders: dict[str, str] = {}
+
+    def __call__(self, path: Folder) -> str:
+        """Return the real path of a file or folder."""
+        folder, name = os.path.split(path)
+        if name in ("", ".", ".."):
+            return os.path.realpath(path)
+        real = self._folders.get(folder)
+        if real is None:
+            real = self._folders[folder] = os.path.realpath(folder)
+        file = os.path.join(real, name)
+        return os.path.realpath(file) if os.path.islink(file) else file
+
+
+def _may_open(
+    path: Folder,
+    root: str,
+    package: Path | None = None,
+    folder: Folder = "",
+    real_path: Callable[[Folder], str] = os.path.realpath,
+) -> bool:
     """Return True if a path leads into the root, its package, ``../meshes``, or a folder of a variable."""
-    real = os.path.realpath(path)
+    real = real_path(path)
     return any(is_below(real, allowed) for allowed in _allowed_folders(root, package, folder))
 
 
@@ -208,13 +230,20 @@ def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterato
     yield from declared_folders()
 
 
-def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatError | None:
-    """Return the error for a path or a package outside of the root; None for any other."""
+def find_root_violation(
+    uri: str, folder: Folder, root: str | None, real_path: Callable[[Folder], str] = os.path.realpath
+) -> FormatError | None:
+    """Return the error for a path or a package outside of the root; None for any other.
+
+    A reader of many files gives one :class:`RealPaths`.
+    """
     scheme, colon, rest = uri.partition("://")
     if root is None:
         return None
     if colon and scheme.lower() != "file":
-        return _outside_package(uri, folder, root) if scheme.lower() in ("package", "model") else None
+        return (
+            _outside_package(uri, folder, root, real_path) if scheme.lower() in ("package", "model") else None
+        )
     if root == NOWHERE and not colon and not os.path.isabs(uri):
         return None  # a text without a folder: relative paths lead nowhere
     path = (
@@ -222,12 +251,15 @@ def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatErr
         if colon
         else Path(folder).absolute() / uri
     )
-    return None if "\0" in uri or _may_open(path, root, folder=folder) else outside_root_error(uri, root)
+    allowed = "\0" in uri or _may_open(path, root, folder=folder, real_path=real_path)
+    return None if allowed else outside_root_error(uri, root)
 
 
-def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
+def _outside_package(
+    uri: str, folder: Folder, root: str, real_path: Callable[[Folder], str]
+) -> FormatError | None:
     """Return the error for a package that is only found from a folder outside of the root."""
-    if root == NOWHERE or _may_open(folder, root):
+    if root == NOWHERE or _may_open(folder, root, real_path=real_path):
         return None
     for bound in (root, None):
         try:

@@ -7,6 +7,7 @@ operations name the elements: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elb
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -41,6 +42,7 @@ _SUFFIXES = {
     "floating": ("x", "y", "z", "qx", "qy", "qz", "qw", "wx", "wy", "wz"),
 }
 _ROOT = Pose()
+_CONTROL = re.compile(r"[\0-\x1f]")
 
 
 def urdf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
@@ -190,9 +192,9 @@ def _assign_names(
         every = set(plain.values())
         for thing in things:
             name = plain[thing.name]
-            if not name or any(ord(character) < 32 for character in name):
+            if not name or _CONTROL.search(name):
                 problem = "the name has nothing but slashes, or a control character"
-                name = "".join(c if ord(c) >= 32 else "_" for c in name) or what
+                name = _CONTROL.sub("_", name) or what
                 name = rename(what, thing, problem, name, every)
             elif name in known:
                 problem = f"only slashes tell it from the one on line {known[name].line}"
