@@ -176,7 +176,7 @@ def _check(path: str, order: int, role: str, value: float | None) -> None:
         raise ExpressionError(
             f"A symbol needs a path, a non-empty text such as 'kitchen/fridge_door', not {path!r}."
         )
-    if any(not part for part in path.split("/")) or _UNPRINTABLE.search(path):
+    if "" in path.split("/") or _UNPRINTABLE.search(path):
         raise ExpressionError(
             f"The path {path!r} has an empty part, a control character or half of a surrogate pair."
         )

@@ -11,10 +11,9 @@ import time
 import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from weakref import WeakMethod
-
-from msgspec import Struct
 
 from .build_queue import BuildJob, request
 from .cache import library_cache
@@ -189,7 +188,8 @@ class SourceLibrary:
         return code
 
 
-class CompilerInformation(Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class CompilerInformation:
     """Compiler, vector instructions, cores and cache of this machine.
 
     Attributes

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeAlias
 from urllib.parse import unquote, urlsplit
 
 from msgspec import Struct, field, structs
@@ -34,6 +35,8 @@ from .root_folder import (
     split_path_variable,
 )
 from .xml_reader import quote
+
+RealPath: TypeAlias = Callable[[Folder], str]
 
 MAX_DEPTH = 4  # depth of the search for packages below a folder of a workspace variable
 MAX_FOLDERS = 20_000  # most folders to visit below one such folder
@@ -190,21 +193,18 @@ def _find_substitute(name: str, insides: list[list[str]], folder: Path, root: st
     return None
 
 
-class RealPaths:
-    """Real paths of the files that one description names: that of a folder is found once."""
+class RealPaths(dict[str, str]):
+    """Real paths of the folders that one description names, each found once."""
 
-    def __init__(self) -> None:
-        self._folders: dict[str, str] = {}
+    def __missing__(self, folder: str) -> str:
+        return self.setdefault(folder, os.path.realpath(folder))
 
     def __call__(self, path: Folder) -> str:
         """Return the real path of a file or folder."""
         folder, name = os.path.split(path)
         if name in ("", ".", ".."):
             return os.path.realpath(path)
-        real = self._folders.get(folder)
-        if real is None:
-            real = self._folders[folder] = os.path.realpath(folder)
-        file = os.path.join(real, name)
+        file = os.path.join(self[folder], name)
         return os.path.realpath(file) if os.path.islink(file) else file
 
 
@@ -213,11 +213,11 @@ def _may_open(
     root: str,
     package: Path | None = None,
     folder: Folder = "",
-    real_path: Callable[[Folder], str] = os.path.realpath,
+    real: RealPath = os.path.realpath,
 ) -> bool:
     """Return True if a path leads into the root, its package, ``../meshes``, or a folder of a variable."""
-    real = real_path(path)
-    return any(is_below(real, allowed) for allowed in _allowed_folders(root, package, folder))
+    place = real(path)
+    return any(is_below(place, allowed) for allowed in _allowed_folders(root, package, folder))
 
 
 def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterator[str]:
@@ -231,19 +231,14 @@ def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterato
 
 
 def find_root_violation(
-    uri: str, folder: Folder, root: str | None, real_path: Callable[[Folder], str] = os.path.realpath
+    uri: str, folder: Folder, root: str | None, real: RealPath = os.path.realpath
 ) -> FormatError | None:
-    """Return the error for a path or a package outside of the root; None for any other.
-
-    A reader of many files gives one :class:`RealPaths`.
-    """
+    """Return the error for a path or a package outside of the root; None for any other."""
     scheme, colon, rest = uri.partition("://")
     if root is None:
         return None
     if colon and scheme.lower() != "file":
-        return (
-            _outside_package(uri, folder, root, real_path) if scheme.lower() in ("package", "model") else None
-        )
+        return _outside_package(uri, folder, root, real) if scheme.lower() in ("package", "model") else None
     if root == NOWHERE and not colon and not os.path.isabs(uri):
         return None  # a text without a folder: relative paths lead nowhere
     path = (
@@ -251,15 +246,14 @@ def find_root_violation(
         if colon
         else Path(folder).absolute() / uri
     )
-    allowed = "\0" in uri or _may_open(path, root, folder=folder, real_path=real_path)
-    return None if allowed else outside_root_error(uri, root)
+    if "\0" in uri or _may_open(path, root, folder=folder, real=real):
+        return None
+    return outside_root_error(uri, root)
 
 
-def _outside_package(
-    uri: str, folder: Folder, root: str, real_path: Callable[[Folder], str]
-) -> FormatError | None:
+def _outside_package(uri: str, folder: Folder, root: str, real: RealPath) -> FormatError | None:
     """Return the error for a package that is only found from a folder outside of the root."""
-    if root == NOWHERE or _may_open(folder, root, real_path=real_path):
+    if root == NOWHERE or _may_open(folder, root, real=real):
         return None
     for bound in (root, None):
         try:
