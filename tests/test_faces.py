@@ -118,7 +118,7 @@ def imported(program: str, *others: str) -> list[int]:
 def test_a_face_imports_nothing_before_it_is_used() -> None:
     assert imported("import kineverse", "numpy", "casadi") == [3, 0, 0]
     count, *heavy = imported("\n".join(f"import {package}" for package in find_faces()), "numpy", "casadi")
-    assert count <= len(find_faces()) + 20
+    assert count <= len(find_faces()) + 4
     assert heavy == [0, 0]
 
 
@@ -131,7 +131,15 @@ QUIETLY = (
 def test_help_imports_nothing_heavy() -> None:
     unneeded = ("numpy", "casadi", "rich", "viser", "trimesh", "scipy", "PIL", "websockets")
     count, *heavy = imported(QUIETLY.format(words=["--help"]), *unneeded)
-    assert count <= 40
+    assert count <= 10
+    assert not any(heavy)
+
+
+def test_a_model_that_is_only_read_imports_what_reads_it() -> None:
+    program = "import kineverse as kv; kv.load('kitchen').fk('kitchen/fridge_door_handle')"
+    unneeded = ("compilation.function", "model.integration", "model.projection", "loops.close_loop")
+    count, *heavy = imported(program, "logging", "subprocess", *(f"kineverse.{name}" for name in unneeded))
+    assert count <= 70
     assert not any(heavy)
 
 
@@ -152,5 +160,5 @@ def test_a_skill_imports_what_it_needs() -> None:
     words = ["push", "kitchen", "--robot", "hsr", "--what", "kitchen/sink_left_upper_drawer"]
     unneeded = ("mujoco_world", "recorder")
     count, *others = imported(QUIETLY.format(words=words), *(f"kineverse.worlds.{name}" for name in unneeded))
-    assert count <= 350
+    assert count <= 250
     assert others == [0, 0]

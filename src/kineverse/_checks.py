@@ -66,5 +66,5 @@ def as_entries(argument: str, given: Any, kinds: type | tuple[type, ...], wanted
 
 def check_flag(name: str, given: object) -> None:
     """Check that a keyword argument is True or False, since a text such as 'no' counts as true."""
-    if not isinstance(given, bool | np.bool_):
+    if not isinstance(given, (bool, np.bool_)):
         raise InvalidValueError(f"{name}= is True or False, not {given!r}.")

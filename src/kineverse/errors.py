@@ -6,7 +6,6 @@ All of them derive from :class:`KineverseError`, and also from the corresponding
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -184,6 +183,8 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
     limit
         The largest number of listed names.
     """
+    import difflib  # for start-up time
+
     names = sorted(set(available))
     if not names:
         return f"There is no {what} at all."
@@ -209,6 +210,8 @@ def unknown_attribute_error(
     ``owner`` is the subject of a sentence; ``elsewhere`` leads from names of other libraries to their
     equivalents here, ``below`` from names in packages below the object to their full names.
     """
+    import difflib
+
     below = below or {}
     problem = f"{owner} has no {name!r}."
     if name.startswith("_"):

@@ -23,7 +23,6 @@ from kineverse.errors import (
     suggest,
     unknown_attribute_error,
 )
-from kineverse.expressions.printing import html_table
 from kineverse.lie import Array
 from kineverse.symbols import Symbol, parse_symbol_name
 
@@ -275,6 +274,8 @@ class State(Mapping[Symbol, float]):
         return f"State({{{shown}{more}}}{when})"
 
     def _repr_html_(self) -> str:
+        from kineverse.expressions.printing import html_table  # for start-up time
+
         about = [f"{len(self)} values"]
         about += [] if self.stamp is None else [f"at {self.stamp:g} s"]
         about += [f"from {self.source}"] if self.source else []

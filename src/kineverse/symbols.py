@@ -89,8 +89,10 @@ class Symbol(Expression):
         bracket = ":" if path.startswith("[") else ""
         self._set(ca.SX.sym(f"{bracket}{self._text}{kind}"), (), NO_NODES)
         self._leaves = ((self,), ())
-        self.path, self.order, self.role, self.value = path, order, role, value
-        self.sort_key = (path, order, role, 0.0 if value is None else value)  # from here on immutable
+        sort_key = (path, order, role, 0.0 if value is None else value)
+        given = {"path": path, "order": order, "role": role, "value": value, "sort_key": sort_key}
+        for name, fact in given.items():
+            object.__setattr__(self, name, fact)
         with _INTERNING:
             known = _INTERNED.get(key)
             if known is None:
@@ -103,7 +105,7 @@ class Symbol(Expression):
         pass
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if not name.startswith("_") and hasattr(self, "sort_key"):
+        if not name.startswith("_"):
             raise ExpressionError(f"Symbols are immutable: '{self}' keeps its {name}.")
         object.__setattr__(self, name, value)
 
@@ -174,7 +176,7 @@ def _check(path: str, order: int, role: str, value: float | None) -> None:
         raise ExpressionError(
             f"A symbol needs a path, a non-empty text such as 'kitchen/fridge_door', not {path!r}."
         )
-    if any(not part for part in path.split("/")) or _UNPRINTABLE.search(path):
+    if "" in path.split("/") or _UNPRINTABLE.search(path):
         raise ExpressionError(
             f"The path {path!r} has an empty part, a control character or half of a surrogate pair."
         )

@@ -226,7 +226,7 @@ def test_construction_does_not_search_for_similar_names(monkeypatch):
     def looked(*_):
         raise AssertionError("names were compared")
 
-    monkeypatch.setattr("kineverse.errors.difflib.get_close_matches", looked)
+    monkeypatch.setattr("difflib.get_close_matches", looked)
     assert State({a: 1.0}, stamp=2.0).updated({a: 3.0})[a] == 3.0
     assert kv.position("never before").path == "never before"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.formats.reader_warnings import collect_warnings
-from kineverse.formats.resource_paths import locate_mesh, locate_resource
+from kineverse.formats.resource_paths import RealPaths, locate_mesh, locate_resource
 from kineverse.formats.root_folder import NOWHERE, find_root, is_below
 from kineverse.formats.sdf.include import find_included
 from kineverse.geometry.mesh_files import find_mesh_file
@@ -41,6 +42,23 @@ def put(tmp_path):
         return file
 
     return put
+
+
+def test_a_memory_of_folders_finds_the_real_paths_of_the_system(tmp_path, put, monkeypatch):
+    put("d/d/file")
+    for link, target in (
+        ("d/out", "/etc"),
+        ("d/up", ".."),
+        ("d/f", "d/file"),
+        ("d/d/loop", "loop"),
+        ("d/gone", "x"),
+    ):
+        (tmp_path / link).symlink_to(target)
+    monkeypatch.chdir(tmp_path / "d")
+    real_path, parts = RealPaths(), ("d", "out", "up", "f", "loop", "gone", "file", "..", ".", "")
+    for names in itertools.product(parts, repeat=3):
+        for path in ("/".join(names), f"{tmp_path}/d/{'/'.join(names)}"):
+            assert real_path(path) == os.path.realpath(path), path
 
 
 def robot(uri: str) -> str:

@@ -6,18 +6,17 @@ import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse import gallery
+from kineverse import formats, gallery
 from kineverse.errors import KineverseError
 from kineverse.expressions.printing import format_number
 from kineverse.formats import shipped_models
-from kineverse.formats.document import document_hash
+from kineverse.formats.file_formats import DOCUMENT_SUFFIXES
 from kineverse.formats.locate import GALLERY
 from kineverse.formats.reader_warnings import collect_warnings
-from kineverse.formats.validate import ModelProblem
 from kineverse.geometry import DistanceResult, Scene
 from kineverse.geometry.exclusions import find_unusable_shapes, is_installed
 from kineverse.geometry.objects import bodies_with_visual_collision
@@ -28,11 +27,13 @@ from kineverse.reasoning import Interlocks, interlocks
 from kineverse.symbols import Symbol
 from kineverse.view.drawables import collect_drawables
 from kineverse.view.poses import FramePoses, complete
-from kineverse.view.rasterizer import TriangleSoup
 from kineverse.view.sliders import infer_units
 
 from .arguments import add_model_options, load_model
 from .output import format_count, format_table, truncate_lines
+
+if TYPE_CHECKING:
+    from kineverse.formats.validate import ModelProblem
 
 HELP = """\
 examples:
@@ -236,6 +237,8 @@ def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
 
 def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
     """Yield the pairs of bodies that penetrate each other at the default state."""
+    from kineverse.formats.validate import ModelProblem  # for start-up time
+
     import_coal()
     for pair in find_contacts(model) or ():
         if pair.distance < -CONTACT_DEPTH:
@@ -297,9 +300,10 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
         del pose_of[frame]
     drawables = collect_drawables(model)
     loaded = [part for part in drawables if not part.placeholder and part.frame in pose_of]
-    corners = TriangleSoup.from_drawables(loaded, pose_of).corners.reshape(-1, 3)
-    if not len(corners):
-        corners = np.array([pose[:3, 3] for pose in pose_of.values()])
+    placed = [
+        part.surface.vertices @ pose_of[part.frame][:3, :3].T + pose_of[part.frame][:3, 3] for part in loaded
+    ]
+    corners = np.concatenate(placed or [np.array([pose[:3, 3] for pose in pose_of.values()])])
     low, high = corners.min(axis=0), corners.max(axis=0)
     free = model.degrees_of_freedom
     unit = infer_units(model, values, [str(symbol) for symbol in free])
@@ -319,7 +323,7 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
         interlocks=interlocks(model),
         touched_as_seen=bodies_with_visual_collision(model),
         contacts=find_contacts(model),
-        sha256=document_hash(model) if name.endswith((".kv.json", ".kv.msgpack")) else "",
+        sha256=formats.document.document_hash(model) if name.endswith(DOCUMENT_SUFFIXES) else "",
     )
 
 

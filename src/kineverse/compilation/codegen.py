@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import casadi as ca
+from msgspec import Struct
 
 from .program import Program, c_literal
 from .schedule import CFunction, Instruction, Schedule, StraightLine, read_instructions, schedule
@@ -21,8 +21,7 @@ from .simd_functions import Scalar
 PART_LENGTH = 1000
 
 
-@dataclass(frozen=True, slots=True)
-class Dialect:
+class Dialect(Struct, frozen=True):
     """C notation of a program's operations."""
 
     type: str  # type of values

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -24,16 +23,15 @@ from kineverse.expressions.layout import SX, ArrayShape
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .batch import Batch
-from .c_library import ProgramLibrary, open_library
-from .call_extension import MOST_OUTPUTS, call_extension
 from .evaluator import Evaluator, bind, make_pooled_call
 from .program import FUNCTION_NAME, SINGLE_KIND, CasadiFunction, Program
 from .signature import make_signature
-from .toolchain import optimisation_level
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
+
+    from .batch import Batch
+    from .c_library import ProgramLibrary
 
     Results = TypeVar("Results", default=Any)  # without brackets the type of the results is Any
 else:
@@ -41,7 +39,7 @@ else:
 
     Results = TypeVar("Results")
 
-logger = logging.getLogger("kineverse.compile")
+# Modules about C are imported where a function is compiled: CasADi's interpreter needs none of them.
 
 Tier: TypeAlias = Literal["interpreter", "c"]
 WantedTier: TypeAlias = Literal["auto", "interpreter", "c"]
@@ -178,13 +176,16 @@ class CompiledFunction(Generic[Results]):
         self._batch: Batch | None = None
         self._library: ProgramLibrary[_Code] | None = None
         if tier == "c" or (tier == "auto" and program.instructions >= _WORTH_COMPILING):
+            from .c_library import ProgramLibrary
+            from .call_extension import call_extension
+            from .toolchain import optimisation_level
+
             level = optimisation_level(program.instructions)
             self._library = ProgramLibrary(
                 program, SINGLE_KIND, program.source, _load, level, ready=self._ready
             )
             if tier == "c" and self._library.error:
                 raise CompileError(f"The function cannot be compiled: {self._library.error}.")
-        if self._library is not None:
             # First, so that it is ready when the function's own library is, also for those who wait.
             call_extension.prepare(self._ready, urgent=wait)
         if self._library is not None and self._library.find():
@@ -246,6 +247,8 @@ class CompiledFunction(Generic[Results]):
             If ``x`` is not an array of n columns of numbers, or ``out`` does not fit.
         """
         if self._batch is None:
+            from .batch import Batch
+
             self._batch = Batch(self._program, self._signature, self.shapes, self._single, self._wanted)
         results: Results = self._batch(x, out, self._function)
         return results
@@ -278,6 +281,8 @@ class CompiledFunction(Generic[Results]):
         """
         if self._library is None:
             return False
+        from .call_extension import call_extension
+
         begin = perf_counter()
         call_extension.wait(timeout)  # first, so that evaluators which are bound from now on are its own
         left = None if timeout is None else max(timeout - (perf_counter() - begin), 0.0)
@@ -300,20 +305,23 @@ class CompiledFunction(Generic[Results]):
     def _evaluate_by(self, function: CasadiFunction, code: _Code | None) -> None:
         """Replace the function from the next call on."""
         shapes, check, convert = self.shapes, self._program.checked, self._signature.vector
-        if code is not None and len(shapes) <= MOST_OUTPUTS and call_extension.module is not None:
-            native: _Code | None = code
+        native: _Code | None = None
+        if code is not None:
+            from .call_extension import MOST_OUTPUTS, call_extension
+
+            native = code if len(shapes) <= MOST_OUTPUTS and call_extension.module is not None else None
+        if native is not None:
             call = call_extension.module.Call(
-                code.address,
+                native.address,
                 self._signature.size,
                 shapes,
                 self._single,
                 self._program.instructions > _LENGTHY,
                 convert,
                 check,
-                code,
+                native,
             )
         else:
-            native = None
             call = make_pooled_call(function, self._signature.size, shapes, self._single, convert, check)
         with self._lock:
             self._function = function
@@ -335,6 +343,8 @@ class CompiledFunction(Generic[Results]):
             evaluator._evaluate_by(*bind(self._function, evaluator.input, evaluator.outputs, check))
 
     def _native_evaluator(self, code: _Code, vector: Array, outputs: tuple[Array, ...]) -> Evaluator:
+        from .call_extension import call_extension
+
         lengthy = self._program.instructions > _LENGTHY
         evaluator: Evaluator = call_extension.module.Evaluator(
             code.address, vector, outputs, lengthy, self._signature.vector, self._program.checked, code
@@ -367,6 +377,8 @@ class _Code:
 
 
 def _load(path: str) -> _Code:
+    from .c_library import open_library
+
     library = open_library(path)
     address = ctypes.cast(library[FUNCTION_NAME], ctypes.c_void_p).value
     return _Code(ca.external(FUNCTION_NAME, path), address or 0, library)

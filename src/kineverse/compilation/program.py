@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import casadi as ca
@@ -55,17 +56,19 @@ class Program:
         self._columns = ca.substitute(columns, [symbols], [self._vector])
         self._function: CasadiFunction = None
         # Common parts are shared later, since that takes time and an existing library does not need it.
-        graph = self._graph()
-        self.instructions: int = graph.n_instructions()
+        self.instructions: int = self._graph().n_instructions()
         # Closed loops, which may have no solution.
         self.implicit = implicit_nodes(outputs)
         self._symbols = tuple(inputs)
-        text = f"{_PRELUDE} {ca.CasadiMeta.version()} {graph.serialize()}"
-        self.digest = hashlib.sha256(text.encode())
+
+    @cached_property
+    def _digest(self) -> hashlib._Hash:
+        text = f"{_PRELUDE} {ca.CasadiMeta.version()} {self._graph().serialize()}"
+        return hashlib.sha256(text.encode())
 
     def key(self, *details: str) -> str:
         """Return the digest of this program and of its compilation, the same in every process."""
-        digest = self.digest.copy()
+        digest = self._digest.copy()
         digest.update(repr(details).encode())
         return digest.hexdigest()[:40]
 

@@ -9,9 +9,9 @@ store.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 
 import casadi as ca
+from msgspec import Struct, field
 
 from kineverse.expressions.implicit import FLOAT_RESIDUAL_TOLERANCE, RESIDUAL_TOLERANCE
 
@@ -21,8 +21,7 @@ from .program import CasadiFunction
 _LEAVES = (ca.OP_INPUT, ca.OP_PARAMETER, ca.OP_CONST)
 
 
-@dataclass(frozen=True, slots=True)
-class Instruction:
+class Instruction(Struct, frozen=True):
     """An operation and the numbers of its arguments, which defines one value.
 
     The argument of an input (``OP_INPUT``) is its place in the input vector, that of a kept number
@@ -34,16 +33,14 @@ class Instruction:
     constant: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class StraightLine:
+class StraightLine(Struct, frozen=True):
     """A program without branches and loops."""
 
     steps: list[Instruction]  # instructions of all values, by their numbers. Some may be for no output
     outputs: list[tuple[int, int]]  # pairs of a place in the outputs and its value
 
 
-@dataclass(slots=True)
-class CFunction:
+class CFunction(Struct):
     """The values, loads and saves of one C function."""
 
     values: list[int] = field(default_factory=list)  # computed values, in order
@@ -52,8 +49,7 @@ class CFunction:
     outputs: list[tuple[int, int]] = field(default_factory=list)
 
 
-@dataclass(frozen=True, slots=True)
-class Schedule:
+class Schedule(Struct, frozen=True):
     """The C functions of a program."""
 
     steps: list[Instruction]  # instructions of all values, by their numbers

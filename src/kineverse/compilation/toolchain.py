@@ -18,7 +18,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 logger = logging.getLogger("kineverse.compile.toolchain")
 
@@ -40,8 +41,7 @@ _CPU_LINES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Toolchain:
+class Toolchain(Struct, frozen=True):
     """A C compiler."""
 
     command: tuple[str, ...]  # absolute path of the compiler, and its constant arguments

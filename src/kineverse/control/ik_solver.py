@@ -20,8 +20,8 @@ import numpy as np
 from kineverse._checks import as_count, as_tolerance
 from kineverse.errors import NotFiniteError
 from kineverse.lie import Array
+from kineverse.model.constraint import TOLERANCE
 from kineverse.model.model_view import ModelView
-from kineverse.model.projection import TOLERANCE
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 

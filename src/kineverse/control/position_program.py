@@ -26,9 +26,9 @@ from kineverse.errors import DuplicateNameError, InvalidValueError, NoSolutionEr
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
 from kineverse.expressions.gradient import stack_columns
 from kineverse.lie import Array
-from kineverse.model.constraint import Constraint
+from kineverse.model.constraint import TOLERANCE, Constraint
 from kineverse.model.model_view import ModelView
-from kineverse.model.projection import TOLERANCE, is_equality
+from kineverse.model.projection import is_equality
 from kineverse.model.rates import Rates, to_plain
 from kineverse.model.velocity_constraints.speed_limits import INFINITE, ZERO, raw_max, raw_min
 from kineverse.model.velocity_constraints.velocity_rows import velocity_rows

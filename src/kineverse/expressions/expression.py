@@ -112,6 +112,8 @@ class Expression(ArrayMethods):
     @property
     def symbols(self) -> tuple[Symbol, ...]:
         """The free symbols V(e) of the values, sorted by path and order (2022 paper, III-A)."""
+        if self._leaves is not None and not self._leaves[1]:
+            return self._leaves[0]
         from .graph import free_symbols
 
         return free_symbols(self)
@@ -539,12 +541,14 @@ class Expression(ArrayMethods):
 
 def access_listener(expression: Expression) -> AccessListener | None:
     """Return the listener of an expression that stands for a traced read; None outside of tracing."""
+    if not expression._nodes:
+        return None
     return next((node.listener for node in expression._nodes if node.listener is not None), None)
 
 
 def notify_access(expression: Expression) -> Expression:
     """Notify the listener that code inspects an expression, and return the expression with its content."""
-    listener = access_listener(expression) if expression._nodes else None
+    listener = access_listener(expression)
     return expression if listener is None else listener.notify(expression)
 
 

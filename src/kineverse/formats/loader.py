@@ -189,7 +189,7 @@ def _arguments(
     """Return the path of a template and its arguments, of which some may follow the path."""
     given = {str(name): str(value) for name, value in (arguments or {}).items()}
     if isinstance(source, str) and ":=" in source:
-        from .xacro import split_arguments
+        from .xacro import split_arguments  # for start-up time, as the next
 
         source, more = split_arguments(source)
         given |= more

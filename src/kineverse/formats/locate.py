@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import sysconfig
 from collections import Counter
@@ -191,7 +190,9 @@ def _alike(name: str, files: list[str]) -> list[str]:
             shown |= {f"{group}/{member}": f"{group}/{member}" for member in collection.names()}
     last = {_end(p).casefold() for p in shown}
     alike = sorted(end for end in last if sorted(end) == sorted(wanted))  # 'hrs', too short to be alike
-    alike += difflib.get_close_matches(wanted, last, n=_LISTED, cutoff=0.7)
+    from difflib import get_close_matches  # for start-up time
+
+    alike += get_close_matches(wanted, last, n=_LISTED, cutoff=0.7)
     close = [n for end in alike for p, n in shown.items() if _end(p).casefold() == end]
     within = [n for p, n in shown.items() if wanted in p.casefold()]
     found = list(dict.fromkeys(close + sorted(within, key=lambda n: (len(n), n))))[:_LISTED]

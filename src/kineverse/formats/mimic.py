@@ -7,8 +7,9 @@ resolved once, so that chains of any length take linear time.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
 from typing import Generic, TypeVar
+
+from msgspec import Struct
 
 from .xml_reader import quote
 from .xml_values import LARGEST, SMALLEST
@@ -16,8 +17,7 @@ from .xml_values import LARGEST, SMALLEST
 K = TypeVar("K", bound=Hashable)
 
 
-@dataclass(frozen=True, slots=True)
-class MimicRelation(Generic[K]):
+class MimicRelation(Struct, Generic[K], frozen=True):
     """Position as an affine function of another one: ``multiplier * leader + offset``."""
 
     leader: K

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 from .xml_reader import Element, ElementError, label
-
-_log = logging.getLogger("kineverse.formats")
 
 _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
 
@@ -27,8 +25,7 @@ class ChangedMotion(Fault):
     __slots__ = ()
 
 
-@dataclass(slots=True)
-class ReaderWarnings:
+class ReaderWarnings(Struct):
     """Warnings about one document; with ``strict``, mistakes raise instead."""
 
     source: str  # name of the document
@@ -60,7 +57,10 @@ class ReaderWarnings:
 def warn(remarks: Iterable[str]) -> None:
     """Log warnings, each with its source in front, and add them to the lists of :func:`collect_warnings`."""
     for remark in remarks:
-        _log.log(logging.WARNING if isinstance(remark, ChangedMotion) else logging.INFO, "%s", remark)
+        import logging  # for start-up time
+
+        level = logging.WARNING if isinstance(remark, ChangedMotion) else logging.INFO
+        logging.getLogger("kineverse.formats").log(level, "%s", remark)
         for heard in _listeners.get():
             heard.append(remark)
 

@@ -12,12 +12,12 @@ import re
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeAlias
 from urllib.parse import unquote, urlsplit
 
-from msgspec import structs
+from msgspec import Struct, field, structs
 
 from kineverse.errors import FormatError
 from kineverse.model.body import Body, Mesh, Shape
@@ -35,6 +35,8 @@ from .root_folder import (
     split_path_variable,
 )
 from .xml_reader import quote
+
+RealPath: TypeAlias = Callable[[Folder], str]
 
 MAX_DEPTH = 4  # depth of the search for packages below a folder of a workspace variable
 MAX_FOLDERS = 20_000  # most folders to visit below one such folder
@@ -129,8 +131,7 @@ def model_paths() -> Iterator[tuple[str, Path]]:
             yield variable, Path(place).absolute()
 
 
-@dataclass
-class _SearchLog:
+class _SearchLog(Struct):
     """Log of the search for a package, for the error message."""
 
     places: list[str] = field(default_factory=list)  # folders searched, as text
@@ -192,10 +193,31 @@ def _find_substitute(name: str, insides: list[list[str]], folder: Path, root: st
     return None
 
 
-def _may_open(path: Folder, root: str, package: Path | None = None, folder: Folder = "") -> bool:
+class RealPaths(dict[str, str]):
+    """Real paths of the folders that one description names, each found once."""
+
+    def __missing__(self, folder: str) -> str:
+        return self.setdefault(folder, os.path.realpath(folder))
+
+    def __call__(self, path: Folder) -> str:
+        """Return the real path of a file or folder."""
+        folder, name = os.path.split(path)
+        if name in ("", ".", ".."):
+            return os.path.realpath(path)
+        file = os.path.join(self[folder], name)
+        return os.path.realpath(file) if os.path.islink(file) else file
+
+
+def _may_open(
+    path: Folder,
+    root: str,
+    package: Path | None = None,
+    folder: Folder = "",
+    real: RealPath = os.path.realpath,
+) -> bool:
     """Return True if a path leads into the root, its package, ``../meshes``, or a folder of a variable."""
-    real = os.path.realpath(path)
-    return any(is_below(real, allowed) for allowed in _allowed_folders(root, package, folder))
+    place = real(path)
+    return any(is_below(place, allowed) for allowed in _allowed_folders(root, package, folder))
 
 
 def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterator[str]:
@@ -208,13 +230,15 @@ def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterato
     yield from declared_folders()
 
 
-def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatError | None:
+def find_root_violation(
+    uri: str, folder: Folder, root: str | None, real: RealPath = os.path.realpath
+) -> FormatError | None:
     """Return the error for a path or a package outside of the root; None for any other."""
     scheme, colon, rest = uri.partition("://")
     if root is None:
         return None
     if colon and scheme.lower() != "file":
-        return _outside_package(uri, folder, root) if scheme.lower() in ("package", "model") else None
+        return _outside_package(uri, folder, root, real) if scheme.lower() in ("package", "model") else None
     if root == NOWHERE and not colon and not os.path.isabs(uri):
         return None  # a text without a folder: relative paths lead nowhere
     path = (
@@ -222,12 +246,14 @@ def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatErr
         if colon
         else Path(folder).absolute() / uri
     )
-    return None if "\0" in uri or _may_open(path, root, folder=folder) else outside_root_error(uri, root)
+    if "\0" in uri or _may_open(path, root, folder=folder, real=real):
+        return None
+    return outside_root_error(uri, root)
 
 
-def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
+def _outside_package(uri: str, folder: Folder, root: str, real: RealPath) -> FormatError | None:
     """Return the error for a package that is only found from a folder outside of the root."""
-    if root == NOWHERE or _may_open(folder, root):
+    if root == NOWHERE or _may_open(folder, root, real=real):
         return None
     for bound in (root, None):
         try:

@@ -16,9 +16,10 @@ import os
 import re
 import types
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from kineverse._extras import install_command
 from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError, summarize_error

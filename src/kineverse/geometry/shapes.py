@@ -7,11 +7,12 @@ import logging
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any, TypeAlias
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from kineverse._extras import install_command
 from kineverse.compilation.cache import ContentCache, private_subfolder
@@ -95,16 +96,14 @@ def check_extent(points: Floats) -> None:
 Primitive: TypeAlias = Box | Sphere | Cylinder | Capsule | Cone | Ellipsoid
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Hull:
+class Hull(Struct, frozen=True, eq=False):
     """Convex polytope: the points x with ``normals @ x <= offsets``; (F, 3) and (F,) [m]."""
 
     normals: Floats
     offsets: Floats
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Core:
+class Core(Struct, frozen=True, eq=False):
     """Description of a convex solid by its support function, see :mod:`.support_c`.
 
     A core is the hull of corners; or the Minkowski sum of a box, an ellipsoid and a ball about the origin; or
@@ -128,8 +127,7 @@ class Core:
         return Core(np.zeros(3), corners=corners)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Solid:
+class Solid(Struct, frozen=True, eq=False):
     """Immutable shape for distance computation; equal geometries share one solid."""
 
     engine: Any  # geometry of coal, which keeps pointers only: the solid outlives all functors made of it

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from kineverse.formats.srdf.description import Srdf
 from kineverse.model.frame import WORLD, is_of_robot
@@ -16,8 +17,7 @@ from .hand_model import bodies_with_shapes
 MOST_JOINTS = 3  # most free coordinates of one finger
 
 
-@dataclass(frozen=True, slots=True)
-class Branch:
+class Branch(Struct, frozen=True):
     """Part of a kinematic tree that a joint moves on a rigid link."""
 
     root: str  # frame that moves in its parent
@@ -25,8 +25,7 @@ class Branch:
     joints: tuple[Symbol, ...]  # free coordinates that move their bodies on the link, sorted
 
 
-@dataclass(frozen=True, slots=True)
-class Palm:
+class Palm(Struct, frozen=True):
     """Rigid link with branches that may be fingers."""
 
     root: str  # frame of the link that moves in its parent, or stands in the world

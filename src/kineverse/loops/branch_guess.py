@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from kineverse.errors import NoSolutionError
 from kineverse.expressions.expression import Expression, array
@@ -31,8 +31,7 @@ MARGIN = 0.2
 Estimates and controllers overstep limits."""
 
 
-@dataclass(frozen=True)
-class InputDomain:
+class InputDomain(Struct, frozen=True):
     """Domain of one input: limits, or a full revolution."""
 
     lower: float  # [m] or [rad]
@@ -95,8 +94,7 @@ class InputDomain:
         return result[: degree + 1]
 
 
-@dataclass(frozen=True)
-class BranchGuess:
+class BranchGuess(Struct, frozen=True):
     """Fitted guess: Σ coefficient · product of basis functions, plus a linear term in periodic inputs."""
 
     intervals: tuple[InputDomain, ...]  # (k,), of the inputs

@@ -15,6 +15,8 @@ from kineverse.symbols import Symbol
 
 ConstraintLike: TypeAlias = "Constraint | Sequence[ExpressionLike]"
 
+TOLERANCE = 1e-9  # excess or residual up to which a constraint is satisfied, in its unit
+
 
 @dataclass(frozen=True)
 class Constraint:

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from itertools import islice
 
 from kineverse.expressions.expression import Expression
-from kineverse.expressions.printing import html_table
 
 from .articulation import Articulation
 from .body import Body, Pose
@@ -66,4 +65,6 @@ def as_html(title: str, rows: Iterable[tuple[str, object]], count: int) -> str:
     """Return the first rows as an HTML table."""
     shown = [(name, format_line(value)) for name, value in islice(rows, _HTML_ROWS)]
     more = f", the first {_HTML_ROWS}" if count > _HTML_ROWS else ""
+    from kineverse.expressions.printing import html_table  # for start-up time
+
     return html_table(f"{title}{more}", ("name", "value"), shown)

@@ -7,11 +7,11 @@ Constants are multiplied numerically before they enter an expression, so rigidly
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from kineverse.errors import ModelError
 from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
@@ -26,8 +26,7 @@ from .frame import WORLD, Frame
 FrameLookup = Callable[[str], Frame]
 
 
-@dataclass(frozen=True, slots=True)
-class ChainStep:
+class ChainStep(Struct, frozen=True):
     """Moving factor of a chain, with the rotation and position of the chain before it."""
 
     rotation: SX
@@ -36,8 +35,7 @@ class ChainStep:
     factor: Expression
 
 
-@dataclass(frozen=True, slots=True)
-class Placement:
+class Placement(Struct, frozen=True):
     """Pose of a frame in the root of a chain.
 
     Rotation and position of the anchor (None for the identity), and the constant offset.
@@ -175,8 +173,7 @@ def relative_pose(frame: str, relative_to: str, lookup: FrameLookup) -> Expressi
     return root @ tip if down else root
 
 
-@dataclass(slots=True)
-class Twist:
+class Twist(Struct):
     """Twist of a frame per unit of one speed: velocity of the origin and angular velocity."""
 
     linear: SX

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,20 +16,24 @@ from kineverse._checks import check_flag
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.expressions.substitution import apply_substitution
-from kineverse.intervals.arithmetic import RealInterval
-from kineverse.intervals.enclosure import enclose_bound
 from kineverse.state import State, StateLike, as_state, check_meant
 from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
 from . import registry
-from .constraint import Constraint, ConstraintLike, as_constraint
-from .integration import Integrator, StateIntegrator
+from .constraint import TOLERANCE, Constraint, ConstraintLike, as_constraint
 from .operation import ARTICULATIONS, CONSTRAINTS
-from .projection import TOLERANCE, EqualityConstraints, project
 from .registry import SaveResult
 from .symbolic_view import SymbolicView, cached_for_version
-from .velocity_constraints.velocity_rows import Recovery, VelocityRows, velocity_rows
-from .violations import ConstraintChecker, Violations, find_violations
+
+if TYPE_CHECKING:
+    from kineverse.intervals.arithmetic import RealInterval
+
+    from .integration import Integrator
+    from .projection import EqualityConstraints
+    from .velocity_constraints.velocity_rows import Recovery, VelocityRows
+    from .violations import ConstraintChecker, Violations
+
+# Modules that compute with states are imported at first use: a model is often only read, or edited.
 
 
 class ModelView(SymbolicView):
@@ -92,7 +95,7 @@ class ModelView(SymbolicView):
                 ) from None
             raise error
 
-    def violations(self, values: StateLike, tolerance: float = 1e-9) -> Violations:
+    def violations(self, values: StateLike, tolerance: float = TOLERANCE) -> Violations:
         """Return the violated constraints as (name, value, lower, upper, excess), the largest excess first.
 
         Constraints without any of the given symbols, or with speeds that are not given, are listed as
@@ -114,6 +117,8 @@ class ModelView(SymbolicView):
         DuplicateNameError
             If a symbol has two values, by name and by symbol, or several symbols have one name.
         """
+        from .violations import find_violations
+
         with self._lock:
             self._catch_up()
             if self._checker is None:
@@ -138,6 +143,8 @@ class ModelView(SymbolicView):
             return self._make_checker(self.symbols if symbols is None else tuple(check_symbols(symbols)))
 
     def _make_checker(self, symbols: tuple[Symbol, ...] | None) -> ConstraintChecker:
+        from .violations import ConstraintChecker
+
         self._catch_up()
         followed = {name: self._eliminate_dependent(c) for name, c in self._head[CONSTRAINTS].items()}
         return ConstraintChecker(followed, symbols, self.rates.dependent.values())
@@ -196,6 +203,8 @@ class ModelView(SymbolicView):
             return float(bound), float(bound)
 
         def compute() -> RealInterval:
+            from kineverse.intervals.enclosure import enclose_bound
+
             followed = apply_substitution(bound, dict(self.rates.dependent))
             return enclose_bound(followed, {s: self._constant_limits(s) for s in followed.symbols})
 
@@ -344,6 +353,8 @@ class ModelView(SymbolicView):
         InvalidValueError
             For a step, gain or recovery that is not possible, or an extra constraint that is none.
         """
+        from .velocity_constraints.velocity_rows import velocity_rows
+
         with self._lock:
             every = dict(self.constraints)
             added = self._extra_constraints({} if extra is None else extra)
@@ -404,6 +415,8 @@ class ModelView(SymbolicView):
         InvalidValueError
             For NaN or an infinite step, or if coordinates diverge.
         """
+        from .integration import StateIntegrator
+
         with self._lock:
             self._settle()
             check_flag("clip", clip)
@@ -439,6 +452,8 @@ class ModelView(SymbolicView):
         DuplicateNameError
             If a symbol is given twice.
         """
+        from .integration import Integrator
+
         with self._lock:
             layout = self.symbols if symbols is None else tuple(check_symbols(symbols))
             columns = self.speeds if speeds is None else tuple(check_symbols(speeds))
@@ -476,6 +491,8 @@ class ModelView(SymbolicView):
         UnknownNameError
             If a value is missing, or a name is unknown.
         """
+        from .projection import project
+
         with self._lock:
             self._catch_up()
             if self._equalities is None:
@@ -484,6 +501,8 @@ class ModelView(SymbolicView):
 
     def select_equalities(self, names: Collection[str] | None) -> EqualityConstraints:
         """Return the equality constraints of some names, or all."""
+        from .projection import EqualityConstraints
+
         self._catch_up()
         return EqualityConstraints(
             dict(self._head[CONSTRAINTS]), self.rates, self._head[ARTICULATIONS], names
@@ -533,6 +552,8 @@ class ModelView(SymbolicView):
         return f"<{type(self).__name__}: {self}>"
 
     def _repr_html_(self) -> str:
+        from html import escape
+
         with self._lock:
             mappings = [self.frames, self.articulations, self.constraints, self.bodies, self.data]
             parts = [part._repr_html_() for part in mappings if part]  # type: ignore[attr-defined]

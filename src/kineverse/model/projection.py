@@ -28,7 +28,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .articulation import Articulation
-from .constraint import Constraint
+from .constraint import TOLERANCE, Constraint
 from .rates import Rates
 
 _QUATERNION = ("qx", "qy", "qz", "qw")
@@ -147,8 +147,6 @@ def _line(value: Expression) -> tuple[float, float] | None:
 def _limits_single(row: ResidualRow) -> bool:
     return len(row.value.symbols) == 1 and _line(row.value) is not None
 
-
-TOLERANCE = 1e-9  # largest residual of a satisfied constraint, as in :meth:kineverse.Model.violations
 
 _STEPS, _NEARER = 100, 40
 _LONGEST = 0.5  # longest step [m], [rad]. Linearisations are not valid beyond

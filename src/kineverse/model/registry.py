@@ -10,10 +10,11 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+
+from msgspec import Struct, field
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
@@ -41,8 +42,7 @@ def check_loops(loops: object) -> None:
 # -- records -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class FileContent:
+class FileContent(Struct, frozen=True):
     """Content of a model file and the options of its reader."""
 
     path: Path
@@ -54,8 +54,7 @@ class FileContent:
     arguments: Mapping[str, str] = field(default_factory=dict)  # arguments of a template, by name
 
 
-@dataclass(frozen=True, slots=True)
-class FileFormat:
+class FileFormat(Struct, frozen=True):
     """File format of models, with its reader and its writer."""
 
     name: str
@@ -83,8 +82,7 @@ class FileFormat:
         return result
 
 
-@dataclass(frozen=True, slots=True)
-class ModelCollection:
+class ModelCollection(Struct, frozen=True):
     """Models that functions build, or documents that ship, loaded as ``collection/name``."""
 
     list_names: str  # function that returns all names
@@ -111,8 +109,7 @@ class ModelCollection:
         yield from import_entry(self.build)(name, prefix)
 
 
-@dataclass(frozen=True, slots=True)
-class FrameDeviation:
+class FrameDeviation(Struct, frozen=True):
     """Upper bound on the error of a frame while all coordinates are within their limits.
 
     ``position`` bounds the distance of the origin from its true place [m], ``angle`` the angle of the
@@ -126,8 +123,7 @@ class FrameDeviation:
         return f"{self.position:.3g} m and {self.angle:.3g} rad"
 
 
-@dataclass(frozen=True, slots=True)
-class SaveResult:
+class SaveResult(Struct, frozen=True):
     """Report on a model that was saved."""
 
     path: Path  # path of the file

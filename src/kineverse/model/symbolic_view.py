@@ -24,13 +24,15 @@ from .body import Body
 from .constraint import Constraint
 from .display import as_html, as_lines
 from .frame import WORLD, Frame
-from .integration import StateIntegrator
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES, Cell
-from .projection import EqualityConstraints
 from .rates import RateEntry, Rates
 from .read_recorder import ABSENT, unknown_name_error
 from .relevance import Relevance, SymbolIndex
-from .violations import ConstraintChecker
+
+if TYPE_CHECKING:
+    from .integration import StateIntegrator
+    from .projection import EqualityConstraints
+    from .violations import ConstraintChecker
 
 
 class NamedMapping(Mapping[str, Any]):

@@ -11,8 +11,13 @@ the URDF, exceeds that, so that the door stays where it is left.
 
 from __future__ import annotations
 
-from kineverse.articulations import DifferentialDrive, Joint, OmniBase
+from typing import TYPE_CHECKING
+
+from kineverse import articulations
 from kineverse.model.frame import WORLD
+
+if TYPE_CHECKING:
+    from kineverse.articulations import Joint
 
 
 def mobile_base(model: str, prefix: str | None) -> Joint | None:
@@ -23,9 +28,9 @@ def mobile_base(model: str, prefix: str | None) -> Joint | None:
 
     name = named("base")
     if model in ("pr2", "hsr"):
-        return OmniBase(name=name, parent=WORLD, child=name, speed=1.0, turn=0.6)
+        return articulations.OmniBase(name=name, parent=WORLD, child=name, speed=1.0, turn=0.6)
     if model == "fetch":
-        return DifferentialDrive(
+        return articulations.DifferentialDrive(
             name=name,
             parent=WORLD,
             child=name,

@@ -7,15 +7,15 @@ groups, states and end effectors are those of the file.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import TypeAlias
+
+from msgspec import Struct, field
 
 CollisionRule: TypeAlias = "tuple[str, str, bool, str]"
 """Rule of the collision filter as data: two bodies, whether the pair is checked, and the reason."""
 
 
-@dataclass(frozen=True, slots=True)
-class SrdfGroup:
+class SrdfGroup(Struct, frozen=True):
     """Planning group: joints and links that belong together, such as an arm.
 
     Attributes
@@ -39,8 +39,7 @@ class SrdfGroup:
     states: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class EndEffector:
+class EndEffector(Struct, frozen=True):
     """End effector: a group that is attached to a link.
 
     Attributes
@@ -59,8 +58,7 @@ class EndEffector:
     parent_group: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class VirtualJoint:
+class VirtualJoint(Struct, frozen=True):
     """Joint between the robot and the frame in which it stands, which the URDF does not have.
 
     The model decides how a robot stands or drives, with its bases; this is what the file says.
@@ -81,8 +79,7 @@ class VirtualJoint:
     child_link: str
 
 
-@dataclass(frozen=True, slots=True)
-class Srdf:
+class Srdf(Struct, frozen=True):
     """Semantic description of a robot: collision rules, groups, end effectors and named states.
 
     Attributes

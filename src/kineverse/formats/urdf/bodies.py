@@ -8,14 +8,13 @@ among those that other visuals define.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
 from msgspec import structs
 
 from kineverse.formats.reader_warnings import ReaderWarnings
-from kineverse.formats.resource_paths import find_root_violation
+from kineverse.formats.resource_paths import RealPaths, find_root_violation
 from kineverse.formats.xml_reader import Element, ElementError, find_child, label, quote, read_name
 from kineverse.formats.xml_values import (
     parse_numbers,
@@ -128,7 +127,7 @@ class UrdfLinkReader:
         self, folder: str, version: tuple[int, int], remarks: ReaderWarnings, root: str | None = None
     ):
         self.materials = UrdfMaterials(remarks)
-        self._folder, self._root = folder, root
+        self._folder, self._root, self._real_path = folder, root, RealPaths()
         self._version = version
         self._remarks = remarks
         self._undefined_materials: list[tuple[str, int, Element, Element]] = []
@@ -167,7 +166,7 @@ class UrdfLinkReader:
             link = links[name]
             visuals = list(link.body.visuals)
             visuals[index] = structs.replace(visuals[index], color=color, texture=texture)
-            links[name] = replace(link, body=structs.replace(link.body, visuals=tuple(visuals)))
+            links[name] = structs.replace(link, body=structs.replace(link.body, visuals=tuple(visuals)))
 
     def _shape(self, element: Element, link: Element, name: str = "", index: int = -1) -> Shape | None:
         """Return the shape of a ``<visual>`` or ``<collision>``; None, with a remark, if it has none."""
@@ -225,7 +224,7 @@ class UrdfLinkReader:
         uri = mesh[1].get("filename")
         if not uri:
             raise ElementError(mesh, "has no filename; the specification requires it.")
-        violation = find_root_violation(uri, self._folder, self._root)
+        violation = find_root_violation(uri, self._folder, self._root, self._real_path)
         if violation is not None:
             self._remarks.add(mesh, f"names {violation}", link)
         return Mesh(uri, self._scale(mesh, link), self._folder, self._root)

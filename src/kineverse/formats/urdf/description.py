@@ -6,8 +6,9 @@ only, and meshes have not been opened.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
+
+from msgspec import Struct
 
 from kineverse.model.body import Body, Pose, Vector3
 
@@ -36,8 +37,7 @@ _IDENTITY = Pose()
 _EMPTY_BODY = Body()
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfLimits:
+class UrdfLimits(Struct, frozen=True):
     """Limits of one joint; None for no limit.
 
     ``lower`` and ``upper`` bound the position [rad] or [m], ``velocity`` the magnitude of the velocity
@@ -58,8 +58,7 @@ class UrdfLimits:
 UNLIMITED = UrdfLimits()
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfSafetyController:
+class UrdfSafetyController(Struct, frozen=True):
     """Soft limits and gains of a joint's safety controller (ROS wiki, pr2_controller_manager/safety_limits).
 
     The controller keeps the velocity between ``-k_position (q - soft_lower)`` and ``-k_position (q -
@@ -79,8 +78,7 @@ class UrdfSafetyController:
         return self.soft_lower < self.soft_upper
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfMimic:
+class UrdfMimic(Struct, frozen=True):
     """Position of a joint that follows another: ``multiplier * joint + offset``.
 
     Chains are resolved: ``joint`` is the independent joint at the end of the chain, and the factors are
@@ -92,8 +90,7 @@ class UrdfMimic:
     offset: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfDynamics:
+class UrdfDynamics(Struct, frozen=True):
     """Damping [N s/m] or [N m s/rad] and static friction [N] or [N m] of a joint."""
 
     damping: float = 0.0
@@ -103,8 +100,7 @@ class UrdfDynamics:
 FRICTIONLESS = UrdfDynamics()
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfJoint:
+class UrdfJoint(Struct, frozen=True):
     """Joint between two links.
 
     ``origin`` is parent_T_joint, the pose of the child link in the parent link at position zero. ``axis`` is
@@ -127,8 +123,7 @@ class UrdfJoint:
     line: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfLink:
+class UrdfLink(Struct, frozen=True):
     """Link: a frame and the body attached to it."""
 
     name: str
@@ -136,8 +131,7 @@ class UrdfLink:
     line: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfRobot:
+class UrdfRobot(Struct, frozen=True):
     """Tree of links and joints.
 
     ``links`` are in the order of the file. ``joints`` are ordered from the ``root`` outwards, each after the

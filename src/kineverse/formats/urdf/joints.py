@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from kineverse.errors import FormatError, suggest
 from kineverse.formats.mimic import MimicRelation, resolve_mimic_chains
@@ -365,6 +366,8 @@ def resolve_mimic_joints(joints: Iterable[UrdfJoint], remarks: ReaderWarnings) -
     return [
         replace(joint, mimic=UrdfMimic(end.leader, end.multiplier, end.offset))
         if (end := resolved.get(joint.name))
+        else joint
+        if joint.mimic is None
         else replace(joint, mimic=None)
         for joint in joints
     ]

@@ -7,20 +7,13 @@ operations name the elements: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elb
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from kineverse.articulations import (
-    Ball,
-    Continuous,
-    Fixed,
-    Floating,
-    OneDofJoint,
-    Planar,
-    Prismatic,
-    Revolute,
-)
+from kineverse import articulations
+from kineverse.articulations import Continuous, Fixed, OneDofJoint, Prismatic, Revolute
 from kineverse.articulations import Joint as JointOperation
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
@@ -49,6 +42,7 @@ _SUFFIXES = {
     "floating": ("x", "y", "z", "qx", "qy", "qz", "qw", "wx", "wy", "wz"),
 }
 _ROOT = Pose()
+_CONTROL = re.compile(r"[\0-\x1f]")
 
 
 def urdf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
@@ -116,13 +110,13 @@ def _joint_operations(
     if joint.kind == "fixed":
         yield Fixed(**common)
     elif joint.kind == "floating":
-        yield Floating(**common)
+        yield articulations.Floating(**common)
     elif joint.kind == "spherical":
-        yield Ball(**common)
+        yield articulations.Ball(**common)
     elif joint.kind == "planar":
         assert joint.axis is not None
         limits = joint.limits
-        yield Planar(
+        yield articulations.Planar(
             **common, axis=joint.axis, lower=limits.lower, upper=limits.upper, velocity=limits.velocity
         )
     else:
@@ -198,9 +192,9 @@ def _assign_names(
         every = set(plain.values())
         for thing in things:
             name = plain[thing.name]
-            if not name or any(ord(character) < 32 for character in name):
+            if not name or _CONTROL.search(name):
                 problem = "the name has nothing but slashes, or a control character"
-                name = "".join(c if ord(c) >= 32 else "_" for c in name) or what
+                name = _CONTROL.sub("_", name) or what
                 name = rename(what, thing, problem, name, every)
             elif name in known:
                 problem = f"only slashes tell it from the one on line {known[name].line}"

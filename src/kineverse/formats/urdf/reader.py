@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
+
+from msgspec.structs import replace
 
 from kineverse.errors import FormatError
 from kineverse.formats.files import read_file

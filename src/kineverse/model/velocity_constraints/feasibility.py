@@ -25,11 +25,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from typing import TypeAlias
 
 import casadi as ca
+from msgspec import Struct
 
 from kineverse.expressions.expression import Expression, as_expression, binary
 from kineverse.expressions.functions import norm
@@ -59,16 +59,14 @@ _FLAT = as_expression(1e-8)
 RequestedSpeeds: TypeAlias = tuple[Mapping[Symbol, Expression], Mapping[Symbol, Expression]]
 
 
-@dataclass(frozen=True)
-class RecoveryBound:
+class RecoveryBound(Struct, frozen=True):
     """Bound of a position constraint as a velocity row ``away·v >= -room``."""
 
     away: Weights  # coefficients of the speeds in the rate of the distance to the bound, positive inwards
     room: Expression  # largest speed towards the bound; negative if the bound is violated
 
 
-@dataclass(frozen=True)
-class RecoveryBounds:
+class RecoveryBounds(Struct, frozen=True):
     """Bounds of one constraint; ``apart`` is True if at most one of them can be violated."""
 
     bounds: tuple[RecoveryBound, ...]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import casadi as ca
+from msgspec import Struct
 
 from kineverse.expressions.expression import Expression, array, as_expression, binary, unary
 from kineverse.expressions.functions import norm
@@ -65,8 +65,7 @@ INFINITE = as_expression(math.inf)
 _ONE = as_expression(1.0)
 
 
-@dataclass(frozen=True)
-class SpeedRow:
+class SpeedRow(Struct, frozen=True):
     """Row ``lower <= Σ weight·speed <= upper`` of a constraint."""
 
     name: str  # name of the constraint
@@ -81,8 +80,7 @@ class SpeedRow:
         return len(self.weights) == 1 and not any(w.symbols for w in self.weights.values())
 
 
-@dataclass(frozen=True)
-class SpeedBounds:
+class SpeedBounds(Struct, frozen=True):
     """Bounds ``lower <= v <= upper`` of single speeds v, those of several constraints merged.
 
     The greatest of the lower bounds counts, and the least of the upper bounds. At states where constraints on
@@ -97,16 +95,14 @@ class SpeedBounds:
     names: tuple[tuple[str, ...], ...]  # names of the constraints of each speed
 
 
-@dataclass(frozen=True)
-class NormBound:
+class NormBound(Struct, frozen=True):
     """Upper bound on the norm of components ``Σ weight·speed``."""
 
     components: tuple[Weights, ...]
     radius: Expression
 
 
-@dataclass(frozen=True)
-class AdmissibleSpeeds:
+class AdmissibleSpeeds(Struct, frozen=True):
     """Set of admissible speeds while all other speeds are zero; zero speed is assumed to be admissible."""
 
     box: SpeedBox  # lower limits <= 0 and upper limits >= 0 of single speeds

@@ -24,9 +24,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias
+
+from msgspec.structs import replace
 
 from kineverse._checks import real_number
 from kineverse.errors import InvalidValueError
