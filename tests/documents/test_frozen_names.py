@@ -30,7 +30,7 @@ from kineverse.articulations import joint
 from kineverse.articulations.mechanisms import latched_doors
 from kineverse.formats.document import to_json
 from kineverse.formats.document.opaque_operation import OpaqueOperation
-from kineverse.formats.document.parameters import RECORDS, document_kind
+from kineverse.formats.document.parameters import CLASSES, document_kind, find_class
 from kineverse.formats.locate import shipped_models
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Sphere
 from kineverse.model.operation import Operation
@@ -249,7 +249,8 @@ def test_records_have_frozen_names() -> None:
         for kind in KINDS[module].values()
     }
     left_out = {"Family", "FamilyMotion"}
-    assert set(RECORDS) == (parameters | operations) - left_out
+    assert set(CLASSES) == (parameters | operations) - left_out
+    assert [document_kind(find_class(name)) for name in CLASSES] == list(CLASSES)
 
 
 def test_kinds_of_geometries_are_frozen() -> None:

@@ -17,7 +17,7 @@ import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse import gallery
 from kineverse.formats.document import OpaqueOperation
-from kineverse.formats.document.parameters import OPERATIONS
+from kineverse.formats.document.parameters import find_class
 from kineverse.geometry.mesh_files import read_mesh
 from kineverse.model.body import Body, Box, Mesh, Shape
 from kineverse.model.history import HistoryEntry
@@ -154,7 +154,7 @@ def test_every_operation_of_the_library_is_made_again_from_kind_and_parameters(n
         for tag in model.history.tags:
             operation = model.history.operation(tag)
             assert isinstance(operation, OpaqueOperation)
-            edit.apply(OPERATIONS[operation.kind](**operation.parameters), tag)
+            edit.apply(find_class(operation.kind)(**operation.parameters), tag)
     assert kv.formats.document_hash(again) == kv.formats.document_hash(model)
 
 

@@ -14,7 +14,7 @@ from kineverse.model.traces.replay import writes_agree
 from kineverse.model.traces.trace import run_query, substitute_results
 from kineverse.model.traces.trace_queries import QueryResult
 
-from .parameters import OPERATIONS, OpaqueRecord, UnsupportedParameter, rebuild_parameter
+from .parameters import OpaqueRecord, UnsupportedParameter, find_class, rebuild_parameter
 
 
 @dataclass(frozen=True)
@@ -132,9 +132,11 @@ class OpaqueOperation(Operation):
 
     def _made_again(self) -> Operation | None:
         """Return the operation of the library that it was, below the prefix; None for any other."""
-        kind, parameters = OPERATIONS.get(self.kind), self.parameters
+        kind, parameters = find_class(self.kind), self.parameters
         unknown = (OpaqueRecord, UnsupportedParameter)
-        if kind is None or any(isinstance(parameter, unknown) for parameter in parameters.values()):
+        if not (kind and issubclass(kind, Operation)) or any(
+            isinstance(parameter, unknown) for parameter in parameters.values()
+        ):
             return None
         try:
             made = kind(**parameters)

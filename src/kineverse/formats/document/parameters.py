@@ -9,6 +9,7 @@ Parameters document an operation, are compared in differences, and rebuild it. T
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -17,16 +18,9 @@ from typing import Any
 
 import msgspec
 
-from kineverse import articulations as a
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
-from kineverse.loops import CloseLoop, LoopConstraint
-from kineverse.model import basic_operations as basic
-from kineverse.model import body
-from kineverse.model.articulation import Articulation
 from kineverse.model.body import Mesh, Pose
-from kineverse.model.constraint import Constraint
-from kineverse.model.frame import Frame
 from kineverse.model.operation import Cell, Operation
 
 from .budget import MAX_DEPTH, InvalidDocumentError, check_depth
@@ -58,41 +52,44 @@ class UnsupportedParameter:
     kind: str
 
 
-_OPERATIONS: tuple[type[Operation], ...] = (
-    *(basic.AddFrame, basic.Attach, basic.Constrain, basic.SetRate, basic.SetData, basic.SetBody),
-    *(basic.SetHome, basic.SoftLimits, basic.Override, CloseLoop, LoopConstraint),
-    *(a.Fixed, a.Revolute, a.Continuous, a.Prismatic, a.Screw, a.Cylindrical),
-    *(a.Planar, a.Universal, a.Ball, a.Floating, a.Gearbox, a.RackAndPinion, a.Cam),
-    *(a.OmniBase, a.DifferentialDrive, a.Ackermann, a.Mecanum),
-    *(a.DeskLamp, a.DoorWithHandle, a.Faucet, a.FoldingDoor, a.GarageDoor, a.Latch, a.Microwave),
-    *(a.PedalBin, a.PistonAndRod, a.Ratchet, a.ScissorLift, a.ScrewAndNut),
-)
-
-OPERATIONS: Mapping[str, type[Operation]] = MappingProxyType({o.document_kind: o for o in _OPERATIONS})
-"""Classes that operations of a document are made again of, by their frozen names."""
-
-RECORDS: Mapping[str, type] = MappingProxyType(
+# Modules by the class in them: most are imported once an operation is made again, and not with a document.
+CLASSES: Mapping[str, str] = MappingProxyType(
     {
-        "Limits": a.Limits,
-        "Frame": Frame,
-        "Constraint": Constraint,
-        "Articulation": Articulation,
-        **{kind.__name__: kind for kind in (body.Body, body.Shape, body.Inertia, body.Box, body.Capsule)},
-        **{kind.__name__: kind for kind in (body.Cone, body.Cylinder, body.Ellipsoid, Mesh, body.Sphere)},
-        **OPERATIONS,
+        "Frame": "model.frame",
+        "Constraint": "model.constraint",
+        "Articulation": "model.articulation",
+        **dict.fromkeys(("Body", "Shape", "Inertia", "Box", "Capsule", "Cone"), "model.body"),
+        **dict.fromkeys(("Cylinder", "Ellipsoid", "Mesh", "Sphere"), "model.body"),
+        **dict.fromkeys(("AddFrame", "Attach", "Constrain", "SetRate", "Write"), "model.basic_operations"),
+        **dict.fromkeys(("SetBody", "SetHome", "SoftLimits", "Override"), "model.basic_operations"),
+        **dict.fromkeys(("CloseLoop", "LoopConstraint"), "loops"),
+        **dict.fromkeys(("Limits", "Fixed", "Revolute", "Continuous", "Prismatic", "Screw"), "articulations"),
+        **dict.fromkeys(("Cylindrical", "Planar", "Universal", "Ball", "Floating"), "articulations"),
+        **dict.fromkeys(
+            ("Gearbox", "RackAndPinion", "Cam", "OmniBase", "DifferentialDrive"), "articulations"
+        ),
+        **dict.fromkeys(("Ackermann", "Mecanum", "DeskLamp", "DoorWithHandle", "Faucet"), "articulations"),
+        **dict.fromkeys(("FoldingDoor", "GarageDoor", "Latch", "Microwave", "PedalBin"), "articulations"),
+        **dict.fromkeys(("PistonAndRod", "Ratchet", "ScissorLift", "ScrewAndNut"), "articulations"),
     }
 )
-"""Classes that a record in a document is rebuilt as, by the frozen name that documents have for them.
+"""Classes that documents are rebuilt with, by their frozen names: operations, and records in parameters."""
 
-Operations are among them, because an override has one as its parameter.
-"""
+_RENAMED = {"Write": "SetData"}
 
-_NAMES = {kind: name for name, kind in RECORDS.items()}
+
+def find_class(name: str) -> type | None:
+    """Return the class of a frozen name; None for the name of a class of others."""
+    if name not in CLASSES:
+        return None
+    module = importlib.import_module(f"kineverse.{CLASSES[name]}")
+    found: type = getattr(module, _RENAMED.get(name, name))
+    return found
 
 
 def document_kind(kind: type) -> str:
     """Return the name that documents have for a class: frozen for those that ship, else that of the class."""
-    return kind.document_kind if issubclass(kind, Operation) else _NAMES.get(kind, kind.__name__)
+    return kind.document_kind if issubclass(kind, Operation) else kind.__name__
 
 
 @cache
@@ -163,11 +160,9 @@ def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
         }
     if isinstance(value, WrittenReference):
         return writes.get(value.path, value)
-    if isinstance(value, OpaqueRecord) and value.kind in RECORDS:
+    if isinstance(value, OpaqueRecord) and (kind := find_class(value.kind)) is not None:
         try:
-            return RECORDS[value.kind](
-                **{name: rebuild_parameter(item, writes) for name, item in value.fields}
-            )
+            return kind(**{name: rebuild_parameter(item, writes) for name, item in value.fields})
         except (TypeError, KineverseError):  # a user's class of the same name
             return value
     return value
