@@ -22,7 +22,7 @@ from scenes import SCENES, build_scene
 KINDS: dict[str, type[kv.Operation]] = {
     name: kind
     for space in (kv, kv.articulations)
-    for name, kind in vars(space).items()
+    for name, kind in inspect.getmembers(space)  # faces are lazy: vars() has what was used so far
     if inspect.isclass(kind) and issubclass(kind, kv.Operation) and not inspect.isabstract(kind)
 }
 
