@@ -153,6 +153,8 @@ class Edit:
         ------
         EditError
             If a later edit has changed an operation that this one would change, or the commit is not kept.
+        InvalidValueError
+            If the version is not an integer.
         """
         take_back(self._check_open(), version)
 

@@ -216,7 +216,7 @@ class Model(ModelView):
             Paths such as ``frames/kitchen``, for all values at or below them.
         symbols
             Symbols, for constraints with their coordinates in expression, bounds or gradient, and for rates
-            of them or with them. What is about a dependent coordinate is about those that determine it.
+            of them, with them, or behind them. A dependent coordinate stands for those that determine it.
         tags
             Tags of operations that are added, removed, replaced, moved or run again.
         frames

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
@@ -170,7 +170,11 @@ def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
     Other operations that read what has changed are marked to run. If the changes are to be complete, they are
     refused.
     """
-    _check_types(changes)
+    if not isinstance(changes, NetChanges):
+        raise EditError(f"A model adopts kv.model.NetChanges, from edit.net(), not {changes!r:.80}.")
+    fault = _find_fault(changes)
+    if fault:
+        raise EditError(f"The changes cannot be adopted: {fault}. Changes come from edit.net().")
     known = {*changes.replaced, *changes.rerun}
     for placed in changes.put:
         tag = placed.entry.tag
@@ -224,38 +228,53 @@ def _complete_reads(entry: HistoryEntry) -> Reads:
     return reads
 
 
-def _check_types(changes: object) -> None:
-    """Check that changes have the form of net changes."""
-    if not isinstance(changes, NetChanges):
-        raise EditError(f"A model adopts kv.model.NetChanges, from edit.net(), not {changes!r:.80}.")
-    for wrong in _list_faults(changes):
-        raise EditError(f"The changes cannot be adopted: {wrong}. Changes come from edit.net().")
-
-
-def _list_faults(changes: NetChanges) -> Iterator[str]:
+def _find_fault(changes: NetChanges) -> str:
+    """Return what is wrong with the form of net changes, else an empty text."""
     from kineverse.model.history import HistoryEntry  # it imports the checks of this package
 
-    tags = []
+    groups = (changes.replaced, changes.rerun, changes.moved, changes.removed)
+    for group in (changes.put, *groups):
+        if not isinstance(group, tuple | list):
+            return f"{group!r:.80} is no tuple"
+    for tag in (tag for group in groups for tag in group):
+        if not isinstance(tag, str):
+            return f"{tag!r:.80} is no tag"
     for placed in changes.put:
         entry = placed.entry if isinstance(placed, PlacedEntry) else None
-        if not isinstance(entry, HistoryEntry) or not isinstance(entry.reads, Reads):
-            yield f"{placed!r:.80} is no entry with its place"
-            return
-        tags.append(entry.tag)
+        if not isinstance(entry, HistoryEntry) or not _are_reads(entry.reads):
+            return f"{placed!r:.80} is no entry with its place and its reads"
         if not isinstance(entry.tag, str) or not entry.tag or not isinstance(entry.operation, Operation):
-            yield f"{entry.tag!r} has no tag or no operation"
+            return f"{entry.tag!r:.80} has no tag or no operation"
+        if not isinstance(entry.writes, dict):
+            return f"{entry.tag!r} writes {entry.writes!r:.80}"
         for cell, value in entry.writes.items():
             if not _is_value(cell, value):
-                yield f"{entry.tag!r} writes {value!r:.80} into {cell!r}"
-    tags += changes.removed
-    if len(set(tags)) < len(tags):
-        yield "a tag is put or removed twice"
-    if not {*changes.moved} <= {*changes.replaced} or not {*changes.replaced, *changes.rerun} <= {*tags}:
-        yield "what is replaced, moved or run again is not put"
+                return f"{entry.tag!r} writes {value!r:.80} into {cell!r:.80}"
+    put = [placed.entry.tag for placed in changes.put]
+    known = {*changes.replaced, *changes.rerun}
+    if len({*put, *changes.removed}) < len(put) + len(changes.removed):
+        return "a tag is put or removed twice"
+    if not ({*changes.moved} <= {*changes.replaced} and known <= {*put}):
+        return "what is replaced, moved or run again is not put"
+    return ""
+
+
+def _are_reads(reads: object) -> bool:
+    return (
+        isinstance(reads, Reads)
+        and isinstance(reads.cells, dict)
+        and isinstance(reads.listings, set)
+        and all(_is_cell(cell) and isinstance(how, Read) for cell, how in reads.cells.items())
+        and reads.listings <= {*KINDS}
+    )
+
+
+def _is_cell(cell: object) -> bool:
+    return isinstance(cell, tuple) and len(cell) == 2 and cell[0] in KINDS and isinstance(cell[1], str)
 
 
 def _is_value(cell: Any, value: object) -> bool:
-    if not (isinstance(cell, tuple) and len(cell) == 2 and cell[0] in KINDS):
+    if not _is_cell(cell):
         return False
     if cell[0] == RATES:
         return (
