@@ -52,9 +52,9 @@ class HistoryEntry:
         self.reads = reads
         self.writes = writes
 
-    def at(self, place: int, reads: Reads | None = None) -> HistoryEntry:
-        """Return the entry at another place, and with other reads if some are given."""
-        return HistoryEntry(self.tag, self.operation, place, reads or self.reads, self.writes)
+    def at(self, place: int) -> HistoryEntry:
+        """Return the entry at another place."""
+        return HistoryEntry(self.tag, self.operation, place, self.reads, self.writes)
 
 
 TouchedEntry: TypeAlias = tuple[HistoryEntry | None, HistoryEntry | None, bool]
@@ -84,7 +84,6 @@ class History:
         self._given: dict[str, None] = {}
         self._touched: dict[str, HistoryEntry | None] = {}
         self.commits: dict[int, CommitRecord] = {}
-        self._seen: dict[tuple[str, Cell], Any] | None = None
         self._disordered: set[str] = set()
         with no_collection():
             self._fill(entries)
@@ -280,7 +279,7 @@ class History:
             yield
         except BaseException:
             self._undo_to(mark)
-            self._dirty, self._seen = dirty, None
+            self._dirty = dirty
             raise
 
     # -- running -------------------------------------------------------------------------------------------
@@ -365,29 +364,29 @@ class History:
                 and (following is None or reader <= following)
                 and (how & Read.VALUE or existence)
             ):
-                self._note_change(tag, cell, old)
+                self.mark_outdated(tag)
         if existence:
             for tag in self.listing[kind]:
                 reader = self.entries[tag].place
                 if reader > place and (following is None or reader <= following):
-                    self._note_change(tag, cell, old)
+                    self.mark_outdated(tag)
 
-    def _note_change(self, tag: str, cell: Cell, old: Any) -> None:
-        self.mark_outdated(tag)
-        if self._seen is not None:
-            self._seen.setdefault((tag, cell), old)
+    def list_reads(self, cells: Iterable[Cell], without: Container[str]) -> list[tuple[str, Cell, Any]]:
+        """Return who else reads or lists some cells, and what each finds there, for :meth:`find_outdated`."""
+        return [
+            (tag, cell, self.value_at(cell, self.entries[tag].place))
+            for cell in cells
+            for tag in (*self.reading.get(cell, ()), *self.listing[cell[0]])
+            if tag not in without
+        ]
 
-    def take_notes(self) -> None:
-        """Note from now on what readers see before each change, for :meth:`find_outdated`."""
-        self._seen = {}
-
-    def find_outdated(self, without: Container[str]) -> list[tuple[str, Cell]]:
-        """Return who reads other values than when notes were begun, and what; only these remain marked."""
-        seen, self._seen, self._dirty = self._seen or {}, None, []
+    def find_outdated(self, seen: Iterable[tuple[str, Cell, Any]]) -> list[tuple[str, Cell]]:
+        """Return who finds something else than before, and where; only these remain marked."""
+        self._dirty = []
         found = []
-        for (tag, cell), before in seen.items():
+        for tag, cell, before in seen:
             entry = self.entries.get(tag)
-            if entry is not None and tag not in without:
+            if entry is not None:
                 how = entry.reads.cells.get(cell, Read.EXISTENCE)
                 if _differs(how, before, self.value_at(cell, entry.place)):
                     self.mark_outdated(tag)

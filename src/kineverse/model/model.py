@@ -13,7 +13,7 @@ from kineverse.symbols import Symbol
 
 from .changes import Change, Diff
 from .commits.listeners import Commit, CommitFilter, Listener, Listeners
-from .commits.net_changes import NetChanges, adopt, find_touched_tags
+from .commits.net_changes import NetChanges, adopt, group_tags
 from .commits.undo import keep_commit
 from .edit import Edit
 from .history import History, HistoryEntry, TouchedEntry
@@ -141,17 +141,7 @@ class Model(ModelView):
             Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
             for (kind, name), before, after in history.changes()
         ]
-        tags = find_touched_tags(history, touched)
-        diff = Diff(
-            version,
-            tuple(changes),
-            tuple(tags.added),
-            tuple(tags.removed),
-            tuple(tags.replaced),
-            reruns,
-            tuple(tags.moved),
-            tuple(tags.rerun),
-        )
+        diff = Diff(version, tuple(changes), reruns=reruns, **group_tags(history, touched))
         keep_commit(history, version, touched)
         history.begin()
         self._version = version

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import EditError
@@ -94,20 +93,9 @@ class NetChanges:
         return not (self.put or self.removed)
 
 
-@dataclass(slots=True)
-class TouchedTags:
-    """Tags of the operations that a transaction has changed, in the order of the edit."""
-
-    added: list[str]
-    replaced: list[str]
-    removed: list[str]
-    rerun: list[str]  # in order of the sequence
-    moved: list[str]  # of those replaced, in order of the sequence
-
-
-def find_touched_tags(history: History, touched: list[TouchedEntry]) -> TouchedTags:
-    """Return the tags of what the transaction has changed so far."""
-    added, replaced, removed, rerun = [], [], [], []
+def group_tags(history: History, touched: Iterable[TouchedEntry]) -> dict[str, tuple[str, ...]]:
+    """Return the tags of what the transaction has changed so far, by the names of these groups in a diff."""
+    added, removed, replaced, rerun = [], [], [], []
     for before, now, is_given in touched:
         if now is None:
             assert before is not None
@@ -115,53 +103,48 @@ def find_touched_tags(history: History, touched: list[TouchedEntry]) -> TouchedT
         elif before is None:
             added.append(now.tag)
         elif is_given:
-            replaced.append(now.tag)
+            replaced.append((before, now))
         else:
             rerun.append(now)
-    rerun.sort(key=_PLACE)
-    return TouchedTags(
-        added, replaced, removed, [entry.tag for entry in rerun], _find_moved(history, touched)
-    )
+    return {
+        "added": tuple(added),
+        "removed": tuple(removed),
+        "replaced": tuple(now.tag for _, now in replaced),
+        "rerun": tuple(entry.tag for entry in sorted(rerun, key=_PLACE)),
+        "moved": _find_moved(history, added, replaced),
+    }
+
+
+def _find_moved(
+    history: History, added: list[str], replaced: list[tuple[HistoryEntry, HistoryEntry]]
+) -> tuple[str, ...]:
+    """Return a smallest set of the tags put elsewhere whose removal makes both orders equal, in order."""
+    again = [(old.place, new.place, new.tag) for old, new in replaced if old.place != new.place]
+    others = sorted([*(history.entries[tag].place for tag in added), *(place for _, place, _ in again)])
+
+    def rank(place: int) -> int:
+        """Return how many of the entries that stand still are before a place."""
+        return bisect_left(history.sequence, place, key=_PLACE) - bisect_left(others, place)
+
+    between = [one for one in again if rank(one[0]) == rank(one[1])]  # the same two that stand still
+    old, new = ([tag for *_, tag in sorted(between, key=itemgetter(side))] for side in (0, 1))
+    still = {*new}.difference(find_moved_tags(old, new))
+    return tuple(tag for *_, tag in sorted(again, key=itemgetter(1)) if tag not in still)
 
 
 def find_net_changes(history: History) -> NetChanges:
     """Return the net changes of the transaction so far."""
-    tags = find_touched_tags(history, list(history.touched()))
-    entries, sequence = history.entries, history.sequence
-    new = {*tags.added, *tags.moved}
+    groups = group_tags(history, history.touched())
+    added, entries, sequence = groups.pop("added"), history.entries, history.sequence
+    new = {*added, *groups["moved"]}
     end = len(sequence)
     while end and sequence[end - 1].tag in new:
         end -= 1
     put = []
-    for entry in sorted((entries[t] for t in (*tags.added, *tags.replaced, *tags.rerun)), key=_PLACE):
+    for entry in sorted((entries[t] for t in (*added, *groups["replaced"], *groups["rerun"])), key=_PLACE):
         index = bisect_left(sequence, entry.place, key=_PLACE)
         put.append(PlacedEntry(entry, sequence[index - 1].tag if index else None, index >= end))
-    groups = (tags.replaced, tags.rerun, tags.moved, tags.removed)
-    return NetChanges(tuple(put), *map(tuple, groups))
-
-
-def _find_moved(history: History, touched: list[TouchedEntry]) -> list[str]:
-    """Return a smallest set of the tags put elsewhere whose removal makes both orders equal, in order."""
-    pairs = [(before, now) for before, now, _ in touched if now is not None]
-    again = [(b, n) for b, n in pairs if b is not None and b.place != n.place]
-    if not again:
-        return []
-    strangers = sorted(n.place for b, n in pairs if b is None or b.place != n.place)
-
-    def rank(place: int) -> int:
-        """Return how many of the entries that stand still are before a place."""
-        return bisect_left(history.sequence, place, key=_PLACE) - bisect_left(strangers, place)
-
-    ranks = {rank(one.place) for pair in again for one in pair}
-
-    def order(entries: Iterable[HistoryEntry]) -> list[str | int]:
-        """Return tags in order, and a number for the entries that stand still between two of them."""
-        names: list[tuple[int, float, str | int]] = [(r, -math.inf, r) for r in ranks]
-        names += [(rank(entry.place), entry.place, entry.tag) for entry in entries]
-        return [name for *_, name in sorted(names)]
-
-    moved = find_moved_tags(order(b for b, _ in again), order(n for _, n in again), {n.tag for _, n in again})
-    return [str(tag) for tag in moved]
+    return NetChanges(tuple(put), **groups)
 
 
 def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
@@ -184,20 +167,25 @@ def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
                 f"{'not there' if tag in known else 'taken'}. {_ELSEWHERE}"
             )
     history.settle()
-    history.take_notes()
+    tags = {placed.entry.tag for placed in changes.put}
+    written = [e for tag in (*changes.removed, *tags & known) if (e := history.entries.get(tag))]
+    cells = {cell: None for entry in (*written, *(p.entry for p in changes.put)) for cell in entry.writes}
     with history.step():
+        seen = history.list_reads(cells, without=tags)
         for tag in (*changes.removed, *changes.moved):
             history.remove(tag)
         for placed in changes.put:
             entry = placed.entry
+            for _, parent in find_parents(entry):
+                entry.reads.add((FRAMES, parent), Read.EXISTENCE)
             if entry.tag not in changes.rerun:
                 history.note_given(entry.tag)
-            history.put(entry.at(_find_place(history, placed), _complete_reads(entry)))
+            history.put(entry.at(_find_place(history, placed)))
         for placed in changes.put:
             # Parents are looked for when all are there, as frames may be replaced before them.
             for name, parent in find_parents(placed.entry):
                 check_parent(history, name, parent, history.entries[placed.entry.tag].place)
-        for tag, cell in history.find_outdated(without={placed.entry.tag for placed in changes.put}):
+        for tag, cell in history.find_outdated(seen):
             if complete:
                 raise EditError(
                     f"The changes do not belong to this model: {tag!r} reads {'/'.join(cell)}, which they "
@@ -215,17 +203,6 @@ def _find_place(history: History, placed: PlacedEntry) -> int:
     if placed.at_end:
         return history.place_at(len(history.sequence))
     return history.place_at(0 if placed.after is None else history.index(placed.after) + 1)
-
-
-def _complete_reads(entry: HistoryEntry) -> Reads:
-    """Return the reads of an entry with the parents of its frames among them."""
-    cells = {(FRAMES, parent) for _, parent in find_parents(entry)} - entry.reads.cells.keys()
-    if not cells:
-        return entry.reads
-    reads = Reads()
-    reads.cells = {**entry.reads.cells, **dict.fromkeys(cells, Read.EXISTENCE)}
-    reads.listings, reads.trace = entry.reads.listings, entry.reads.trace
-    return reads
 
 
 def _find_fault(changes: NetChanges) -> str:
