@@ -287,8 +287,10 @@ WRONG: dict[str, tuple[Any, str]] = {
         "There is a frame 'f' already",
     ),
     "a reader that is left out": (NetChanges(removed=("0",)), "'3' reads data/a"),
-    "a value of another type": (put(entry("x", Put("x"), frames__x=3)), "writes 3 into"),
-    "an unknown kind": (put(entry("x", Put("x"), things__x=3)), "writes 3 into"),
+    "a value of another type": (put(entry("x", Put("x"), frames__x=3)), "writes of wrong"),
+    "an unknown kind": (put(entry("x", Put("x"), things__x=3)), "writes of wrong"),
+    "a value that can be changed": (put(entry("x", Put("x"), data__x=[])), "writes of wrong"),
+    "a value in another form": (put(entry("x", Put("x"), constraints__x=(0, 1, 2))), "writes of wrong"),
     "no entry": (NetChanges((PlacedEntry("x", None),)), "no entry"),
     "no operation": (put(entry("x", 3, data__x=1)), "no operation"),
     "a tag twice": (put(*[entry("x", Put("x"), data__x=1)] * 2), "twice"),
@@ -298,7 +300,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "a tag that is none": (NetChanges(moved=([],)), "is no tag"),  # type: ignore[arg-type]
     "writes that are none": (
         NetChanges((PlacedEntry(HistoryEntry("x", Put("x"), 0, Reads(), 3), None),)),
-        "writes 3",
+        "writes of wrong",
     ),  # type: ignore[arg-type]
     "reads of an unknown kind": (put(entry("x", Put("x"), WRONG_READS)), "and its reads"),
     "a name that is none": (put(entry("x", Put("x"), **{"data__x//y": 1})), "not a name"),

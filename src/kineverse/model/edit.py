@@ -169,9 +169,7 @@ class Edit:
                 changes = edit.net()
                 start.roll_back()
         """
-        point = Savepoint(self, self._check_open().mark())
-        self._savepoints.append(point)
-        return point
+        return Savepoint(self)
 
     # -- shorthands ----------------------------------------------------------------------------------------
 
@@ -281,13 +279,6 @@ class Edit:
             )
         return operation.default_tag()
 
-    def _roll_back(self, point: Savepoint) -> None:
-        history = self._check_open()
-        if point not in self._savepoints:
-            raise EditError("This savepoint is gone, because the edit was rolled back to an earlier one.")
-        del self._savepoints[self._savepoints.index(point) + 1 :]
-        history.return_to(point.mark)
-
     def _check_open(self) -> History:
         if not self._open:
             raise EditError("This edit is over; start another one with model.edit().")
@@ -297,9 +288,10 @@ class Edit:
 class Savepoint:
     """Point of an edit, from :meth:`Edit.savepoint`."""
 
-    def __init__(self, edit: Edit, mark: tuple[Any, ...]) -> None:
+    def __init__(self, edit: Edit) -> None:
         self._edit = edit
-        self.mark = mark
+        self._mark = edit._check_open().mark()
+        edit._savepoints.append(self)
 
     def roll_back(self) -> None:
         """Undo what the edit has done since this point; the edit goes on.
@@ -309,4 +301,8 @@ class Savepoint:
         EditError
             If the edit is over, or was rolled back to an earlier point.
         """
-        self._edit._roll_back(self)
+        history, known = self._edit._check_open(), self._edit._savepoints
+        if self not in known:
+            raise EditError("This savepoint is gone, because the edit was rolled back to an earlier one.")
+        del known[known.index(self) + 1 :]
+        history.return_to(self._mark)

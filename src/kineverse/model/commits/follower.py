@@ -177,8 +177,7 @@ class Follower(Generic[T]):
 
     def _work(self) -> None:
         while True:
-            built: BuiltValue[T] | None = None
-            error: BaseException | None = None
+            built, error = self.current, None
             snapshot = self._model.snapshot()
             try:
                 built = BuiltValue(self._build(snapshot), snapshot.version)
@@ -189,7 +188,7 @@ class Follower(Generic[T]):
                 error = problem
             with self._changed:
                 if not self._is_closed:
-                    self.current, self.error = built or self.current, error
+                    self.current, self.error = built, error
                 self._tried = snapshot.version
                 self._changed.notify_all()
                 if self._is_closed or self._tried >= self._relevant:

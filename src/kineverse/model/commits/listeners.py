@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from kineverse._checks import as_entries
-from kineverse.errors import ExpressionError, InvalidValueError
+from kineverse.errors import ExpressionError
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Pose
 from kineverse.model.changes import Change, Diff
@@ -138,7 +138,7 @@ class CommitFilter:
 
     paths: tuple[str, ...] | None = None
     coordinates: frozenset[str] | None = None
-    tags: frozenset[str] | None = None
+    tags: tuple[str, ...] | None = None
     frames: tuple[str, ...] | None = None
 
     @staticmethod
@@ -149,22 +149,15 @@ class CommitFilter:
         frames: Iterable[str] | None,
     ) -> CommitFilter:
         """Build a filter from what a listener asks for."""
-        texts = {
-            what: None
-            if given is None
-            else as_entries(f"{what}=", given, str, f"{what} of the model, as texts")
-            for what, given in (("paths", paths), ("tags", tags), ("frames", frames))
-        }
-        for path in texts["paths"] or ():
+        paths = _texts("paths", paths)
+        for path in paths or ():
             if path and path.partition("/")[0] not in KINDS:  # everything is below the empty path
                 raise unknown_path_error(path)
-        if symbols is not None and not isinstance(symbols, Iterable):
-            raise InvalidValueError(f"symbols= takes symbols of the model, not {symbols!r:.80}.")
         return CommitFilter(
-            texts["paths"],
+            paths,
             None if symbols is None else frozenset(s.path for s in check_symbols(symbols)),
-            None if texts["tags"] is None else frozenset(texts["tags"]),
-            texts["frames"],
+            _texts("tags", tags),
+            _texts("frames", frames),
         )
 
     def select(self, commit: Commit) -> Diff | None:
@@ -181,7 +174,7 @@ class CommitFilter:
             if moving:
                 poses.append(frame)
                 found += moving
-        tags = self.tags or frozenset()
+        tags = self.tags or ()
         groups = ("added", "removed", "replaced", "moved", "rerun")
         heard = {name: tuple(t for t in getattr(diff, name) if t in tags) for name in groups}
         if not (found or any(heard.values())):
@@ -276,6 +269,10 @@ def _tell(listener: Listener, part: Diff, version: int) -> None:
         listener.callback(part)
     except Exception:
         _LOG.exception("A listener of the model raised at version %d.", version)
+
+
+def _texts(name: str, given: Iterable[str] | None) -> tuple[str, ...] | None:
+    return None if given is None else as_entries(f"{name}=", given, str, f"{name} of the model, as texts")
 
 
 def _below(path: str, root: str) -> bool:

@@ -9,24 +9,9 @@ from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import EditError
-from kineverse.expressions.expression import Expression
-from kineverse.model.articulation import Articulation
-from kineverse.model.body import Body
 from kineverse.model.changes import find_moved_tags
-from kineverse.model.constraint import Constraint
-from kineverse.model.frame import Frame
-from kineverse.model.operation import (
-    ARTICULATIONS,
-    BODIES,
-    CONSTRAINTS,
-    DATA,
-    FRAMES,
-    KINDS,
-    RATES,
-    Operation,
-)
+from kineverse.model.operation import FRAMES, KINDS, Operation, Writes
 from kineverse.model.read_recorder import Read, Reads
-from kineverse.symbols import Symbol
 
 from .checks import check_parent, find_parents
 
@@ -34,7 +19,6 @@ if TYPE_CHECKING:
     from kineverse.model.history import History, HistoryEntry, TouchedEntry
 
 _PLACE = attrgetter("place")
-_TYPES = {FRAMES: Frame, BODIES: Body, ARTICULATIONS: Articulation, CONSTRAINTS: Constraint}
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,11 +206,8 @@ def _find_fault(changes: NetChanges) -> str:
             return f"{placed!r:.80} is no entry with its place and its reads"
         if not isinstance(entry.tag, str) or not entry.tag or not isinstance(entry.operation, Operation):
             return f"{entry.tag!r:.80} has no tag or no operation"
-        if not isinstance(entry.writes, dict):
-            return f"{entry.tag!r} writes {entry.writes!r:.80}"
-        for cell, value in entry.writes.items():
-            if not _is_value(cell, value):
-                return f"{entry.tag!r} writes {value!r:.80} into {cell!r:.80}"
+        if not _are_writes(entry.writes):
+            return f"{entry.tag!r} has writes of wrong kinds or types, {entry.writes!r:.80}"
     put = [placed.entry.tag for placed in changes.put]
     known = {*changes.replaced, *changes.rerun}
     if len({*put, *changes.removed}) < len(put) + len(changes.removed):
@@ -250,14 +231,9 @@ def _is_cell(cell: object) -> bool:
     return isinstance(cell, tuple) and len(cell) == 2 and cell[0] in KINDS and isinstance(cell[1], str)
 
 
-def _is_value(cell: Any, value: object) -> bool:
-    if not _is_cell(cell):
+def _are_writes(writes: Any) -> bool:
+    """Return whether values by cell are those of an operation, in canonical form."""
+    try:
+        return bool(Writes.from_cells(writes).writes() == writes)
+    except Exception:
         return False
-    if cell[0] == RATES:
-        return (
-            isinstance(value, tuple)
-            and len(value) == 2
-            and isinstance(value[0], Symbol)
-            and isinstance(value[1], Expression | tuple)
-        )
-    return cell[0] == DATA or isinstance(value, _TYPES[cell[0]])
