@@ -219,6 +219,9 @@ def test_net_changes_name_what_is_put_with_its_anchor() -> None:
         edit.apply(Put("other"), "other")
     model.adopt(net)
     assert model.history.tags == ["x", "0", "2", "other", "y", "1", "z"]
+    last = PlacedEntry(entry("last", Put("last"), data__last=1), "gone", at_end=True)
+    model.adopt(NetChanges((last,)))  # whatever became of what was before it
+    assert model.history.tags[-1] == "last"
 
 
 def test_an_edit_that_does_nothing_is_no_commit() -> None:

@@ -19,7 +19,7 @@ from .commits.net_changes import NetChanges, adopt, find_net_changes
 from .commits.undo import take_back
 from .constraint import Constraint
 from .frame import WORLD, Frame, TransformLike
-from .history import History
+from .history import History, check_operation
 from .operation import Operation
 from .rates import as_row
 from .registry import LoopTreatment
@@ -70,7 +70,7 @@ class Edit:
         if override and isinstance(operation, Operation):
             operation = Override(operation)
         chosen = self._tag(operation, tag)
-        self._check_open().append(chosen, operation)
+        self._check_open().insert(chosen, operation)
         return chosen
 
     def insert(
@@ -273,10 +273,7 @@ class Edit:
     def _tag(self, operation: Operation, tag: str | None) -> str:
         if tag is not None:
             return tag
-        if not isinstance(operation, Operation):
-            raise EditError(
-                f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass."
-            )
+        check_operation(operation)
         return operation.default_tag()
 
     def _check_open(self) -> History:

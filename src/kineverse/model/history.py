@@ -153,13 +153,19 @@ class History:
 
     # -- changes of the sequence ---------------------------------------------------------------------------
 
-    def append(self, tag: str, operation: Operation) -> None:
-        """Append an operation."""
-        self._add(tag, operation, self.place_at(len(self.sequence)))
-
-    def insert(self, tag: str, operation: Operation, index: int) -> None:
-        """Insert an operation before the one at ``index``."""
-        self._add(tag, operation, self.place_at(index))
+    def insert(self, tag: str, operation: Operation, index: int | None = None) -> None:
+        """Run an operation and insert it before the one at ``index``, by default last."""
+        self._check_new(tag, operation)
+        with self.step():
+            self.note_given(tag)
+            entry = HistoryEntry(tag, operation, self.place_at(index), Reads(), {})
+            if self._dirty:
+                self._link(entry)
+                self.mark_outdated(tag)
+            else:
+                entry = self._apply(entry)
+                check_overwrite(self, entry)
+                self.put(entry)
 
     def index(self, tag: str) -> int:
         """Return the position of a tag in the sequence."""
@@ -168,7 +174,7 @@ class History:
     def replace(self, tag: str, operation: Operation) -> None:
         """Replace an operation, at its place and under its tag."""
         old = self.entry(tag)
-        _check_operation(operation)
+        check_operation(operation)
         with self.step():
             self.note_given(tag)
             self._exchange(HistoryEntry(tag, operation, old.place, old.reads, old.writes))
@@ -198,7 +204,7 @@ class History:
         """
         with self.step():
             self._check_new(entry.tag, entry.operation)
-            entry = entry.at(self.place_at(len(self.sequence) if index is None else index))
+            entry = entry.at(self.place_at(index))
             self.note_given(entry.tag)
             if not self._dirty:
                 check_writes(self, entry)
@@ -226,9 +232,9 @@ class History:
                 cell, old.writes.get(cell, ABSENT), entry.writes.get(cell, ABSENT), entry.place
             )
 
-    def place_at(self, index: int) -> int:
-        """Return a free place before the entry at an index."""
-        if index >= len(self.sequence):
+    def place_at(self, index: int | None) -> int:
+        """Return a free place before the entry at an index, by default the last one of all."""
+        if index is None or index >= len(self.sequence):
             return self.sequence[-1].place + _GAP if self.sequence else 0
         after = self.sequence[index].place
         before = self.sequence[index - 1].place if index else after - 2 * _GAP
@@ -246,24 +252,11 @@ class History:
     def _check_new(self, tag: str, operation: object) -> None:
         if not isinstance(tag, str) or not tag:
             raise EditError(f"A tag is a non-empty text, not {tag!r}.")
-        _check_operation(operation)
+        check_operation(operation)
         if tag in self.entries:
             raise DuplicateNameError(
                 f"The tag {tag!r} is taken; give another one with tag=, or replace the operation."
             )
-
-    def _add(self, tag: str, operation: Operation, place: int) -> None:
-        self._check_new(tag, operation)
-        with self.step():
-            self.note_given(tag)
-            entry = HistoryEntry(tag, operation, place, Reads(), {})
-            if self._dirty:
-                self._link(entry)
-                self.mark_outdated(tag)
-            else:
-                entry = self._apply(entry)
-                check_overwrite(self, entry)
-                self.put(entry)
 
     def note_given(self, tag: str) -> None:
         """Note a tag as one that the edit itself puts, moves or removes."""
@@ -608,7 +601,8 @@ def as_cell(path: str) -> Cell:
     return kind, name
 
 
-def _check_operation(operation: object) -> None:
+def check_operation(operation: object) -> None:
+    """Check that something is an operation."""
     if not isinstance(operation, Operation):
         raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
 

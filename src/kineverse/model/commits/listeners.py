@@ -38,28 +38,24 @@ class Commit:
     @cached_property
     def _changed(self) -> dict[str, dict[str, Change]]:
         """Changes of frames and rates by name."""
-        found: dict[str, dict[str, Change]] = {FRAMES: {}, RATES: {}}
-        for change in self.diff.changes:
-            if change.kind in found:
-                found[change.kind][change.name] = change
-        return found
+        kinds = (FRAMES, RATES)
+        return {kind: {c.name: c for c in self.diff.changes if c.kind == kind} for kind in kinds}
 
     def find_pose_changes(self, frame: str) -> list[Change]:
         """Return the changes that give a frame other forward kinematics."""
         frames, rates = self._changed[FRAMES], self._changed[RATES]
         if not frames and not rates:
             return []
-        after = self._chain(frame, {})
-        found: dict[str, Change] = {}
-        if frame in frames or any(name in frames for name in after):
+        after, found = self._chain(frame, {}), []
+        if frame in frames or not frames.keys().isdisjoint(after):
             before = self._chain(frame, frames)
             if not _have_equal_motion(list(before.values()), list(after.values())):
-                found = {name: frames[name] for name in (*before, *after) if name in frames}
+                found = [frames[name] for name in {**before, **after} if name in frames]
         if rates:
             moving = [x for f in after.values() for x in f.factors if isinstance(x, Expression)]
             reached = self._reach(s.path for factor in moving for s in collect_symbols(factor))
-            return [*found.values(), *(rates[name] for name in reached if name in rates)]
-        return list(found.values())
+            found += [rates[name] for name in reached if name in rates]
+        return found
 
     def find_changes_about(self, paths: Iterable[str]) -> list[Change]:
         """Return the changes of constraints and rates that concern coordinates or what they depend on."""

@@ -185,7 +185,7 @@ def _find_place(history: History, placed: PlacedEntry) -> int:
     if old is not None:
         return old.place
     if placed.at_end:
-        return history.place_at(len(history.sequence))
+        return history.place_at(None)
     return history.place_at(0 if placed.after is None else history.index(placed.after) + 1)
 
 
