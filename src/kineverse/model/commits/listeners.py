@@ -170,7 +170,7 @@ class CommitFilter:
             if moving:
                 poses.append(frame)
                 found += moving
-        tags = self.tags or ()
+        tags = frozenset(self.tags or ())
         groups = ("added", "removed", "replaced", "moved", "rerun")
         heard = {name: tuple(t for t in getattr(diff, name) if t in tags) for name in groups}
         if not (found or any(heard.values())):

@@ -142,20 +142,18 @@ def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
     fault = _find_fault(changes)
     if fault:
         raise EditError(f"The changes cannot be adopted: {fault}. Changes come from edit.net().")
-    known = {*changes.replaced, *changes.rerun}
-    for placed in changes.put:
-        tag = placed.entry.tag
-        if (tag in history.entries) != (tag in known):
-            raise EditError(
-                f"The changes do not belong to this model: {tag!r} is "
-                f"{'not there' if tag in known else 'taken'}. {_ELSEWHERE}"
-            )
+    put = {placed.entry.tag: placed.entry for placed in changes.put}
+    again, known = {*changes.replaced, *changes.rerun}, history.entries
+    for tag in put:
+        is_new = tag not in again
+        if is_new == (tag in known):
+            what = "taken" if is_new else "not there"
+            raise EditError(f"The changes do not belong to this model: {tag!r} is {what}. {_ELSEWHERE}")
     history.settle()
-    tags = {placed.entry.tag for placed in changes.put}
-    written = [e for tag in (*changes.removed, *tags & known) if (e := history.entries.get(tag))]
-    cells = {cell: None for entry in (*written, *(p.entry for p in changes.put)) for cell in entry.writes}
+    before = [known[tag] for tag in (*changes.removed, *put) if tag in known]
+    cells = dict.fromkeys(cell for entry in (*before, *put.values()) for cell in entry.writes)
     with history.step():
-        seen = history.list_reads(cells, without=tags)
+        seen = history.list_reads(cells, without=put)
         for tag in (*changes.removed, *changes.moved):
             history.remove(tag)
         for placed in changes.put:
@@ -165,10 +163,10 @@ def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
             if entry.tag not in changes.rerun:
                 history.note_given(entry.tag)
             history.put(entry.at(_find_place(history, placed)))
-        for placed in changes.put:
+        for tag, entry in put.items():
             # Parents are looked for when all are there, as frames may be replaced before them.
-            for name, parent in find_parents(placed.entry):
-                check_parent(history, name, parent, history.entries[placed.entry.tag].place)
+            for name, parent in find_parents(entry):
+                check_parent(history, name, parent, history.entries[tag].place)
         for tag, cell in history.find_outdated(seen):
             if complete:
                 raise EditError(
