@@ -294,6 +294,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "an unknown kind": (put(entry("x", Put("x"), things__x=3)), "writes of wrong"),
     "a value that can be changed": (put(entry("x", Put("x"), data__x=[])), "writes of wrong"),
     "a value in another form": (put(entry("x", Put("x"), constraints__x=(0, 1, 2))), "writes of wrong"),
+    "a rate of nothing": (put(entry("x", Put("x"), rates__x=(1, ()))), "writes of wrong"),
     "no entry": (NetChanges((PlacedEntry("x", None),)), "no entry"),
     "no operation": (put(entry("x", 3, data__x=1)), "no operation"),
     "a tag twice": (put(*[entry("x", Put("x"), data__x=1)] * 2), "twice"),

@@ -3,22 +3,41 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from operator import attrgetter, itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kineverse.errors import EditError
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import Body
 from kineverse.model.changes import find_moved_tags
-from kineverse.model.operation import FRAMES, KINDS, Operation, Writes
+from kineverse.model.constraint import Constraint
+from kineverse.model.frame import Frame
+from kineverse.model.history import History, HistoryEntry, TouchedEntry
+from kineverse.model.operation import (
+    ARTICULATIONS,
+    BODIES,
+    CONSTRAINTS,
+    DATA,
+    FRAMES,
+    KINDS,
+    RATES,
+    Operation,
+)
 from kineverse.model.read_recorder import Read, Reads
+from kineverse.symbols import Symbol
 
 from .checks import check_parent, find_parents
 
-if TYPE_CHECKING:
-    from kineverse.model.history import History, HistoryEntry, TouchedEntry
-
 _PLACE = attrgetter("place")
+_TYPES = {
+    FRAMES: Frame,
+    BODIES: Body,
+    ARTICULATIONS: Articulation,
+    CONSTRAINTS: Constraint,
+    DATA: Hashable,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +123,8 @@ def _find_moved(
 ) -> tuple[str, ...]:
     """Return a smallest set of the tags put elsewhere whose removal makes both orders equal, in order."""
     again = [(old.place, new.place, new.tag) for old, new in replaced if old.place != new.place]
+    if not again:
+        return ()
     others = sorted([*(history.entries[tag].place for tag in added), *(place for _, place, _ in again)])
 
     def rank(place: int) -> int:
@@ -189,8 +210,6 @@ def _find_place(history: History, placed: PlacedEntry) -> int:
 
 def _find_fault(changes: NetChanges) -> str:
     """Return what is wrong with the form of net changes, else an empty text."""
-    from kineverse.model.history import HistoryEntry  # it imports the checks of this package
-
     groups = (changes.replaced, changes.rerun, changes.moved, changes.removed)
     for group in (changes.put, *groups):
         if not isinstance(group, tuple | list):
@@ -204,7 +223,9 @@ def _find_fault(changes: NetChanges) -> str:
             return f"{placed!r:.80} is no entry with its place and its reads"
         if not isinstance(entry.tag, str) or not entry.tag or not isinstance(entry.operation, Operation):
             return f"{entry.tag!r:.80} has no tag or no operation"
-        if not _are_writes(entry.writes):
+        if not isinstance(entry.writes, dict) or not all(
+            _is_write(cell, value) for cell, value in entry.writes.items()
+        ):
             return f"{entry.tag!r} has writes of wrong kinds or types, {entry.writes!r:.80}"
     put = [placed.entry.tag for placed in changes.put]
     known = {*changes.replaced, *changes.rerun}
@@ -229,9 +250,9 @@ def _is_cell(cell: object) -> bool:
     return isinstance(cell, tuple) and len(cell) == 2 and cell[0] in KINDS and isinstance(cell[1], str)
 
 
-def _are_writes(writes: Any) -> bool:
-    """Return whether values by cell are those of an operation, in canonical form."""
-    try:
-        return bool(Writes.from_cells(writes).writes() == writes)
-    except Exception:
+def _is_write(cell: Any, value: Any) -> bool:
+    if not _is_cell(cell):
         return False
+    if cell[0] == RATES:
+        return isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], Symbol)
+    return isinstance(value, _TYPES[cell[0]])
