@@ -15,29 +15,16 @@ from kineverse.model.changes import find_moved_tags
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
 from kineverse.model.history import History, HistoryEntry, TouchedEntry
-from kineverse.model.operation import (
-    ARTICULATIONS,
-    BODIES,
-    CONSTRAINTS,
-    DATA,
-    FRAMES,
-    KINDS,
-    RATES,
-    Operation,
-)
+from kineverse.model.operation import FRAMES, KINDS, RATES, Operation
 from kineverse.model.read_recorder import Read, Reads
 from kineverse.symbols import Symbol
 
 from .checks import check_parent, find_parents
 
 _PLACE = attrgetter("place")
-_TYPES = {
-    FRAMES: Frame,
-    BODIES: Body,
-    ARTICULATIONS: Articulation,
-    CONSTRAINTS: Constraint,
-    DATA: Hashable,
-}
+_TYPES: dict[str, Any] = dict(
+    zip(KINDS, (Frame, Body, Articulation, Constraint, tuple, Hashable), strict=True)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,8 +238,8 @@ def _is_cell(cell: object) -> bool:
 
 
 def _is_write(cell: Any, value: Any) -> bool:
-    if not _is_cell(cell):
-        return False
-    if cell[0] == RATES:
-        return isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], Symbol)
-    return isinstance(value, _TYPES[cell[0]])
+    return (
+        _is_cell(cell)
+        and isinstance(value, _TYPES[cell[0]])
+        and (cell[0] != RATES or (len(value) == 2 and isinstance(value[0], Symbol)))
+    )
