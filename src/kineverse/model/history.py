@@ -197,9 +197,9 @@ class History:
     ) -> None:
         """Insert an operation from elsewhere with the reads and writes of its run there, by default last.
 
-        It is checked and not run: without ``seen``, what it read is taken to be what is there. With the values
-        that it read in ``seen``, ABSENT for none, it is run when the edit settles if one of them differs, or if
-        it has listed names; so it is while others wait to be run.
+        It is checked, not run: without ``seen``, what it read is taken to be what is there. With the values
+        that it read in ``seen``, ABSENT for none, it is run when the edit settles if one of them differs, or
+        if it has listed names; so it is while others wait to be run.
         """
         with self.step():
             self._check_new(entry.tag, entry.operation)
