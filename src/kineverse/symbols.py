@@ -264,6 +264,8 @@ def check_symbols(symbols: Iterable[object]) -> Sequence[Symbol]:
         raise ExpressionError(
             f"A sequence of symbols is wanted, not the text {symbols!r}: [model.symbol({symbols!r})]."
         )
+    if not isinstance(symbols, Iterable):
+        raise ExpressionError(f"A sequence of symbols is wanted, not {symbols!r:.80}.")
     checked = []
     for item in symbols:
         if not isinstance(item, Symbol):

@@ -112,12 +112,26 @@ def test_what_carries_a_coordinate_is_heard_of_as_the_coordinate_is() -> None:
             edit.constrain(f"x{number}", 0, x, 1)
     assert [d.poses for d in heard[-3:]] == [("hand",)] * 3
     assert [d.paths for d in about] == [("rates/x",), ("rates/y",), ("rates/y",)]
-    for wrong in ([3], [("a",)]):
-        with pytest.raises(kv.KineverseError, match="followed by its name"):
-            model.listen(print, frames=wrong)
+    followed: list[kv.model.Diff] = []
+    model.listen(followed.append, symbols=[x])
+    with model.edit() as edit:  # what carries x, too: the speed of y, and what y is driven by
+        edit.set_rate(y, {kv.velocity("wheel"): 3.0}, override=True, tag="y2")
+    with model.edit() as edit:
+        edit.apply(Follows("t", kv.position("u") * 2), "t")
+        edit.apply(Follows("x", kv.position("t") * 1), "x")
+    with model.edit() as edit:  # x now depends on t and u
+        edit.constrain("u", 0, kv.position("u"), 1)
+    assert "u" in model.constraints_for([x])
+    assert [d.paths for d in followed] == [("rates/y",), ("rates/t", "rates/x"), ("constraints/u",)]
+    for name in ("paths", "tags", "frames", "symbols"):
+        for wrong in (3, [3], [["a"]]):
+            with pytest.raises(kv.KineverseError):
+                model.listen(print, **{name: wrong})  # type: ignore[arg-type]
 
 
 class Follows(kv.Operation):
+    overrides = True
+
     def __init__(self, name: str, expression: kv.Expression) -> None:
         self.name, self.expression = name, expression
 
@@ -179,14 +193,18 @@ def test_a_follower_ends_at_the_newest_of_many_versions() -> None:
         assert builds == sorted(set(builds))
 
 
+def cannot_start(thread: threading.Thread) -> None:
+    raise RuntimeError("no thread")
+
+
 def test_a_builder_that_fails_keeps_the_old_value_until_one_succeeds(
-    caplog: pytest.LogCaptureFixture,
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = arm()
 
     def build(snapshot: kv.model.Snapshot) -> float:
         if height(snapshot) > 5:
-            raise ValueError("too high")
+            raise (SystemExit if height(snapshot) == 9 else ValueError)("too high")
         return height(snapshot)
 
     with kv.follow(model, build, paths="frames", symbols=[x]) as follower, caplog.at_level(logging.ERROR):
@@ -194,9 +212,19 @@ def test_a_builder_that_fails_keeps_the_old_value_until_one_succeeds(
         assert not follower.wait(timeout=60)
         assert (follower.value, follower.version, str(follower.error)) == (0, 1, "too high")
         assert "too high" in caplog.text
+        shift(model, 9)
+        assert not follower.wait(timeout=60)
+        with monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, "start", cannot_start)
+            shift(model, 3)
+        assert not follower.wait(timeout=60)
+        assert (follower.version, str(follower.error)) == (1, "no thread")
         shift(model, 4)
         assert follower.wait(timeout=60)
-        assert (follower.value, follower.version, follower.error) == (4, 3, None)
+        assert (follower.value, follower.version, follower.error) == (4, 5, None)
+        for arguments in ({"version": "a"}, {"version": 1.5}, {"timeout": float("nan")}, {"timeout": "a"}):
+            with pytest.raises(kv.errors.InvalidValueError):
+                follower.wait(**arguments)  # type: ignore[arg-type]
     shift(model, 7)
     with pytest.raises(ValueError, match="too high"):
         kv.follow(model, build)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Container, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, TypeVar
@@ -96,30 +96,16 @@ class Diff:
 Tag = TypeVar("Tag", bound=Hashable)
 
 
-def find_moved_tags(before: Sequence[Tag], after: Sequence[Tag], among: Container[Tag]) -> tuple[Tag, ...]:
+def find_moved_tags(before: Sequence[Tag], after: Sequence[Tag]) -> tuple[Tag, ...]:
     """Return a smallest set of tags whose removal makes both orders equal, in the new order."""
-    present = set(after)
-    place = {tag: i for i, tag in enumerate(tag for tag in before if tag in present)}
+    place = {tag: i for i, tag in enumerate(before)}
     common = [tag for tag in after if tag in place]
-    kept = _longest_in_order([place[tag] for tag in common], [tag not in among for tag in common])
+    kept = _longest([place[tag] for tag in common])
     return tuple(tag for i, tag in enumerate(common) if i not in kept)
 
 
-def _longest_in_order(places: Sequence[int], wanted: Sequence[bool]) -> set[int]:
-    """Return the indices of a longest increasing part that has all that are wanted, which increase."""
-    kept: set[int] = set()  # what stands still leaves room for the others only in between
-    low, start = -1, 0
-    for end in (*(i for i, is_wanted in enumerate(wanted) if is_wanted), len(places)):
-        high = places[end] if end < len(places) else max(places, default=0) + 1
-        inside = [i for i in range(start, end) if low < places[i] < high]
-        kept.update(inside[k] for k in _longest([places[i] for i in inside]))
-        if end < len(places):
-            kept.add(end)
-            low, start = high, end + 1
-    return kept
-
-
 def _longest(places: Sequence[int]) -> set[int]:
+    """Return the indices of a longest increasing part."""
     ends: list[int] = []  # ends[k]: the least end of an increasing part of k + 1 places
     lengths: list[int] = []
     for place in places:

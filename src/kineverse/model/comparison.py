@@ -257,7 +257,7 @@ def compare_models(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
             for tag in common
             if entries[tag] is not later[tag] and entries[tag].writes != later[tag].writes
         ),
-        moved=find_moved_tags(common, list(later), entries),
+        moved=find_moved_tags(common, list(later)),
     )
 
 

@@ -19,7 +19,7 @@ from .commits.net_changes import NetChanges, adopt, find_net_changes
 from .commits.undo import take_back
 from .constraint import Constraint
 from .frame import WORLD, Frame, TransformLike
-from .history import History, HistoryEntry
+from .history import History, HistoryEntry, check_operation
 from .operation import Operation
 from .rates import as_row
 from .registry import LoopTreatment
@@ -70,7 +70,7 @@ class Edit:
         if override and isinstance(operation, Operation):
             operation = Override(operation)
         chosen = self._tag(operation, tag)
-        self._check_open().append(chosen, operation)
+        self._check_open().insert(chosen, operation)
         return chosen
 
     def link(self, entry: HistoryEntry) -> str:
@@ -164,6 +164,8 @@ class Edit:
         ------
         EditError
             If a later edit has changed an operation that this one would change, or the commit is not kept.
+        InvalidValueError
+            If the version is not an integer.
         """
         take_back(self._check_open(), version)
 
@@ -178,9 +180,7 @@ class Edit:
                 changes = edit.net()
                 start.roll_back()
         """
-        point = Savepoint(self, self._check_open().mark())
-        self._savepoints.append(point)
-        return point
+        return Savepoint(self)
 
     # -- shorthands ----------------------------------------------------------------------------------------
 
@@ -284,18 +284,8 @@ class Edit:
     def _tag(self, operation: Operation, tag: str | None) -> str:
         if tag is not None:
             return tag
-        if not isinstance(operation, Operation):
-            raise EditError(
-                f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass."
-            )
+        check_operation(operation)
         return operation.default_tag()
-
-    def _roll_back(self, point: Savepoint) -> None:
-        history = self._check_open()
-        if point not in self._savepoints:
-            raise EditError("This savepoint is gone, because the edit was rolled back to an earlier one.")
-        del self._savepoints[self._savepoints.index(point) + 1 :]
-        history.return_to(point.mark)
 
     def _check_open(self) -> History:
         if not self._open:
@@ -306,9 +296,10 @@ class Edit:
 class Savepoint:
     """Point of an edit, from :meth:`Edit.savepoint`."""
 
-    def __init__(self, edit: Edit, mark: tuple[Any, ...]) -> None:
+    def __init__(self, edit: Edit) -> None:
         self._edit = edit
-        self.mark = mark
+        self._mark = edit._check_open().mark()
+        edit._savepoints.append(self)
 
     def roll_back(self) -> None:
         """Undo what the edit has done since this point; the edit goes on.
@@ -318,4 +309,8 @@ class Savepoint:
         EditError
             If the edit is over, or was rolled back to an earlier point.
         """
-        self._edit._roll_back(self)
+        history, known = self._edit._check_open(), self._edit._savepoints
+        if self not in known:
+            raise EditError("This savepoint is gone, because the edit was rolled back to an earlier one.")
+        del known[known.index(self) + 1 :]
+        history.return_to(self._mark)

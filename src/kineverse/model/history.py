@@ -62,10 +62,9 @@ class HistoryEntry:
         self.writes = writes
         self.blob = blob
 
-    def at(self, place: int, reads: Reads | None = None) -> HistoryEntry:
-        """Return the entry at another place, and with other reads if some are given."""
-        blob = self.blob if reads is None or reads is self.reads else None
-        return HistoryEntry(self.tag, self.operation, place, reads or self.reads, self.writes, blob)
+    def at(self, place: int) -> HistoryEntry:
+        """Return the entry at another place."""
+        return HistoryEntry(self.tag, self.operation, place, self.reads, self.writes, self.blob)
 
 
 TouchedEntry: TypeAlias = tuple[HistoryEntry | None, HistoryEntry | None, bool]
@@ -95,7 +94,6 @@ class History:
         self._given: dict[str, None] = {}
         self._touched: dict[str, HistoryEntry | None] = {}
         self.commits: dict[int, CommitRecord] = {}
-        self._seen: dict[tuple[str, Cell], Any] | None = None
         self._disordered: set[str] = set()
         with no_collection():
             self._fill(entries)
@@ -165,15 +163,25 @@ class History:
 
     # -- changes of the sequence ---------------------------------------------------------------------------
 
-    def append(self, tag: str, operation: Operation) -> None:
-        """Append an operation."""
-        self._add(tag, operation, self.place_at(len(self.sequence)))
+    def insert(self, tag: str, operation: Operation, index: int | None = None) -> None:
+        """Run an operation and insert it before the one at ``index``, by default last."""
+        self._check_new(tag, operation)
+        with self.step():
+            self.note_given(tag)
+            entry = HistoryEntry(tag, operation, self.place_at(index), Reads(), {})
+            if self._dirty:
+                self._link(entry)
+                self.mark_outdated(tag)
+            else:
+                entry = self._apply(entry)
+                check_overwrite(self, entry)
+                self.put(entry)
 
     def link(self, given: HistoryEntry) -> None:
         """Append an operation with its writes elsewhere; it is run only if it finds other values here."""
-        entry = given.at(self.place_at(len(self.sequence)))
+        entry = given.at(self.place_at())
         if self._dirty or given.tag in self.entries or not self._finds_what_it_read(entry):
-            self._add(given.tag, given.operation, entry.place)
+            self.insert(given.tag, given.operation)
             return
         check_writes(self, entry)
         check_overwrite(self, entry)
@@ -204,10 +212,6 @@ class History:
             tuple(self.names_at(kind, entry.place)) == listed for kind, listed in names.items()
         )
 
-    def insert(self, tag: str, operation: Operation, index: int) -> None:
-        """Insert an operation before the one at ``index``."""
-        self._add(tag, operation, self.place_at(index))
-
     def index(self, tag: str) -> int:
         """Return the position of a tag in the sequence."""
         return bisect_left(self.sequence, self.entry(tag).place, key=_PLACE)
@@ -215,7 +219,7 @@ class History:
     def replace(self, tag: str, operation: Operation) -> None:
         """Replace an operation, at its place and under its tag."""
         old = self.entry(tag)
-        _check_operation(operation)
+        check_operation(operation)
         with self.step():
             self.note_given(tag)
             self._exchange(HistoryEntry(tag, operation, old.place, old.reads, old.writes))
@@ -247,9 +251,9 @@ class History:
                 cell, old.writes.get(cell, ABSENT), entry.writes.get(cell, ABSENT), entry.place
             )
 
-    def place_at(self, index: int) -> int:
-        """Return a free place before the entry at an index."""
-        if index >= len(self.sequence):
+    def place_at(self, index: int | None = None) -> int:
+        """Return a free place before the entry at an index, by default the last one of all."""
+        if index is None or index >= len(self.sequence):
             return self.sequence[-1].place + _GAP if self.sequence else 0
         after = self.sequence[index].place
         before = self.sequence[index - 1].place if index else after - 2 * _GAP
@@ -267,24 +271,11 @@ class History:
     def _check_new(self, tag: str, operation: object) -> None:
         if not isinstance(tag, str) or not tag:
             raise EditError(f"A tag is a non-empty text, not {tag!r}.")
-        _check_operation(operation)
+        check_operation(operation)
         if tag in self.entries:
             raise DuplicateNameError(
                 f"The tag {tag!r} is taken; give another one with tag=, or replace the operation."
             )
-
-    def _add(self, tag: str, operation: Operation, place: int) -> None:
-        self._check_new(tag, operation)
-        with self.step():
-            self.note_given(tag)
-            entry = HistoryEntry(tag, operation, place, Reads(), {})
-            if self._dirty:
-                self._link(entry)
-                self.mark_outdated(tag)
-            else:
-                entry = self._apply(entry)
-                check_overwrite(self, entry)
-                self.put(entry)
 
     def note_given(self, tag: str) -> None:
         """Note a tag as one that the edit itself puts, moves or removes."""
@@ -300,7 +291,7 @@ class History:
             yield
         except BaseException:
             self._undo_to(mark)
-            self._dirty, self._seen = dirty, None
+            self._dirty = dirty
             raise
 
     # -- running -------------------------------------------------------------------------------------------
@@ -388,29 +379,29 @@ class History:
                 and (following is None or reader <= following)
                 and (how & Read.VALUE or existence)
             ):
-                self._note_change(tag, cell, old)
+                self.mark_outdated(tag)
         if existence:
             for tag in self.listing[kind]:
                 reader = self.entries[tag].place
                 if reader > place and (following is None or reader <= following):
-                    self._note_change(tag, cell, old)
+                    self.mark_outdated(tag)
 
-    def _note_change(self, tag: str, cell: Cell, old: Any) -> None:
-        self.mark_outdated(tag)
-        if self._seen is not None:
-            self._seen.setdefault((tag, cell), old)
+    def list_reads(self, cells: Iterable[Cell], without: Container[str]) -> list[tuple[str, Cell, Any]]:
+        """Return who else reads or lists some cells, and what each finds there, for :meth:`find_outdated`."""
+        return [
+            (tag, cell, self.value_at(cell, self.entries[tag].place))
+            for cell in cells
+            for tag in (*self.reading.get(cell, ()), *self.listing[cell[0]])
+            if tag not in without
+        ]
 
-    def take_notes(self) -> None:
-        """Note from now on what readers see before each change, for :meth:`find_outdated`."""
-        self._seen = {}
-
-    def find_outdated(self, without: Container[str]) -> list[tuple[str, Cell]]:
-        """Return who reads other values than when notes were begun, and what; only these remain marked."""
-        seen, self._seen, self._dirty = self._seen or {}, None, []
+    def find_outdated(self, seen: Iterable[tuple[str, Cell, Any]]) -> list[tuple[str, Cell]]:
+        """Return who finds something else than before, and where; only these remain marked."""
+        self._dirty = []
         found = []
-        for (tag, cell), before in seen.items():
+        for tag, cell, before in seen:
             entry = self.entries.get(tag)
-            if entry is not None and tag not in without:
+            if entry is not None:
                 how = entry.reads.cells.get(cell, Read.EXISTENCE)
                 if _differs(how, before, self.value_at(cell, entry.place)):
                     self.mark_outdated(tag)
@@ -638,7 +629,8 @@ def as_cell(path: str) -> Cell:
     return kind, name
 
 
-def _check_operation(operation: object) -> None:
+def check_operation(operation: object) -> None:
+    """Check that something is an operation."""
     if not isinstance(operation, Operation):
         raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
 

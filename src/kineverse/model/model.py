@@ -13,7 +13,7 @@ from kineverse.symbols import Symbol
 
 from .changes import Change, Diff
 from .commits.listeners import Commit, CommitFilter, Listener, Listeners
-from .commits.net_changes import NetChanges, adopt, find_touched_tags
+from .commits.net_changes import NetChanges, adopt, group_tags
 from .commits.undo import keep_commit
 from .edit import Edit
 from .history import History, HistoryEntry, TouchedEntry
@@ -141,17 +141,7 @@ class Model(ModelView):
             Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
             for (kind, name), before, after in history.changes()
         ]
-        tags = find_touched_tags(history, touched)
-        diff = Diff(
-            version,
-            tuple(changes),
-            tuple(tags.added),
-            tuple(tags.removed),
-            tuple(tags.replaced),
-            reruns,
-            tuple(tags.moved),
-            tuple(tags.rerun),
-        )
+        diff = Diff(version, tuple(changes), reruns=reruns, **group_tags(history, touched))
         keep_commit(history, version, touched)
         history.begin()
         self._version = version
@@ -216,7 +206,7 @@ class Model(ModelView):
             Paths such as ``frames/kitchen``, for all values at or below them.
         symbols
             Symbols, for constraints with their coordinates in expression, bounds or gradient, and for rates
-            of them or with them. What is about a dependent coordinate is about those that determine it.
+            of them, with them, or behind them. A dependent coordinate stands for those that determine it.
         tags
             Tags of operations that are added, removed, replaced, moved or run again.
         frames

@@ -22,8 +22,17 @@ if TYPE_CHECKING:
     from .operation import Cell
 
 V = TypeVar("V")
-ABSENT: Any = object()
 _MANY = 100
+
+
+class _Absent:
+    """Type of :data:`ABSENT`, of which copies and pickles are the same object."""
+
+    def __reduce__(self) -> str:
+        return "ABSENT"
+
+
+ABSENT: Any = _Absent()
 
 
 class Read(IntFlag):

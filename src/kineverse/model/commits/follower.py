@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Generic, NamedTuple, TypeVar
 
+from kineverse._checks import as_count, as_tolerance
 from kineverse.errors import EditError, ExpressionError
 from kineverse.model.model import Model, Snapshot
 from kineverse.symbols import Symbol
@@ -82,7 +83,7 @@ class Follower(Generic[T]):
     """
 
     current: BuiltValue[T]
-    error: Exception | None
+    error: BaseException | None
 
     def __init__(self, model: Model, build: Callable[[Snapshot], T], wanted: CommitFilter) -> None:
         self._model = model
@@ -132,13 +133,14 @@ class Follower(Generic[T]):
         bool
             False if the time is over, the follower is closed, or the build for that version has failed.
         """
-        wanted = self._model.version if version is None else version
+        wanted = self._model.version if version is None else as_count("version", version, 0)
+        limit = None if timeout is None else as_tolerance(timeout, "A timeout")
 
         def is_done() -> bool:
             return self._is_closed or (self._heard >= wanted and self._tried >= min(self._relevant, wanted))
 
         with self._changed:
-            return self._changed.wait_for(is_done, timeout) and not self._is_closed and self.error is None
+            return self._changed.wait_for(is_done, limit) and not self._is_closed and self.error is None
 
     def close(self) -> None:
         """End the following; the value stays. A second call has no effect."""
@@ -167,23 +169,26 @@ class Follower(Generic[T]):
         if self._tried < self._relevant and not (self._is_building or self._is_closed):
             self._is_building = True
             # A daemon, which ends with the process, and with the last build: none waits for commits.
-            threading.Thread(target=self._work, name="kineverse-follow", daemon=True).start()
+            try:
+                threading.Thread(target=self._work, name="kineverse-follow", daemon=True).start()
+            except RuntimeError as error:  # too many threads, or the program ends; the commit stands
+                _LOG.exception("A value that follows a model could not be built: no thread starts.")
+                self._is_building, self._tried, self.error = False, self._relevant, error
 
     def _work(self) -> None:
         while True:
-            built: BuiltValue[T] | None = None
-            error: Exception | None = None
+            built, error = self.current, None
             snapshot = self._model.snapshot()
             try:
                 built = BuiltValue(self._build(snapshot), snapshot.version)
-            except Exception as problem:
+            except BaseException as problem:  # SystemExit too, as somebody may wait for the value
                 _LOG.exception(
                     "A value that follows a model could not be built at version %d.", snapshot.version
                 )
                 error = problem
             with self._changed:
                 if not self._is_closed:
-                    self.current, self.error = built or self.current, error
+                    self.current, self.error = built, error
                 self._tried = snapshot.version
                 self._changed.notify_all()
                 if self._is_closed or self._tried >= self._relevant:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -12,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.errors import ExpressionError, InvalidValueError
+from kineverse._checks import as_entries
+from kineverse.errors import ExpressionError
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Pose
 from kineverse.model.changes import Change, Diff
@@ -21,8 +21,6 @@ from kineverse.model.operation import CONSTRAINTS, FRAMES, KINDS, RATES
 from kineverse.model.rates import collect_symbols
 from kineverse.model.read_recorder import unknown_path_error
 from kineverse.symbols import Symbol, check_symbols
-
-_LOG = logging.getLogger(__name__)
 
 Callback = Callable[[Diff], None]
 
@@ -37,34 +35,37 @@ class Commit:
     @cached_property
     def _changed(self) -> dict[str, dict[str, Change]]:
         """Changes of frames and rates by name."""
-        found: dict[str, dict[str, Change]] = {FRAMES: {}, RATES: {}}
-        for change in self.diff.changes:
-            if change.kind in found:
-                found[change.kind][change.name] = change
-        return found
+        kinds = (FRAMES, RATES)
+        return {kind: {c.name: c for c in self.diff.changes if c.kind == kind} for kind in kinds}
 
     def find_pose_changes(self, frame: str) -> list[Change]:
         """Return the changes that give a frame other forward kinematics."""
         frames, rates = self._changed[FRAMES], self._changed[RATES]
         if not frames and not rates:
             return []
-        after = self._chain(frame, {})
-        found: dict[str, Change] = {}
-        if frame in frames or any(name in frames for name in after):
+        after, found = self._chain(frame, {}), []
+        if frame in frames or not frames.keys().isdisjoint(after):
             before = self._chain(frame, frames)
             if not _have_equal_motion(list(before.values()), list(after.values())):
-                found = {name: frames[name] for name in (*before, *after) if name in frames}
+                found = [frames[name] for name in {**before, **after} if name in frames]
         if rates:
             moving = [x for f in after.values() for x in f.factors if isinstance(x, Expression)]
             reached = self._reach(s.path for factor in moving for s in collect_symbols(factor))
-            return [*found.values(), *(rates[name] for name in reached if name in rates)]
-        return list(found.values())
+            found += [rates[name] for name in reached if name in rates]
+        return found
 
-    def is_about(self, change: Change, paths: frozenset[str]) -> bool:
-        """Return whether a constraint or a rate has one of some coordinates, or one that depends on them."""
-        if change.kind not in (CONSTRAINTS, RATES):
-            return False
-        return not paths.isdisjoint(self._reach(change.coordinates, dependent=True))
+    def find_changes_about(self, paths: Iterable[str]) -> list[Change]:
+        """Return the changes of constraints and rates that concern coordinates or what they depend on."""
+        about, driving = self._reach(paths, dependent=True).keys(), self._reach(paths)
+        return [
+            change
+            for change in self.diff.changes
+            if change.kind in (CONSTRAINTS, RATES)
+            and (
+                not about.isdisjoint(self._reach(change.coordinates, dependent=True))
+                or (change.kind == RATES and change.name in driving)
+            )
+        ]
 
     def _chain(self, name: str, changed: Mapping[str, Change]) -> dict[str, Frame]:
         """Return a frame and those above it, by name; before the commit if its changes are given."""
@@ -130,7 +131,7 @@ class CommitFilter:
 
     paths: tuple[str, ...] | None = None
     coordinates: frozenset[str] | None = None
-    tags: frozenset[str] | None = None
+    tags: tuple[str, ...] | None = None
     frames: tuple[str, ...] | None = None
 
     @staticmethod
@@ -141,17 +142,15 @@ class CommitFilter:
         frames: Iterable[str] | None,
     ) -> CommitFilter:
         """Build a filter from what a listener asks for."""
-        for path in () if paths is None else _names(paths):
-            if path and str(path).partition("/")[0] not in KINDS:  # everything is below the empty path
+        paths = _texts("paths", paths)
+        for path in paths or ():
+            if path and path.partition("/")[0] not in KINDS:  # everything is below the empty path
                 raise unknown_path_error(path)
-        for name in () if frames is None else _names(frames):
-            if not isinstance(name, str):
-                raise InvalidValueError(f"A frame is followed by its name, a text, not by {name!r}.")
         return CommitFilter(
-            None if paths is None else _names(paths),
+            paths,
             None if symbols is None else frozenset(s.path for s in check_symbols(symbols)),
-            None if tags is None else frozenset(_names(tags)),
-            None if frames is None else _names(frames),
+            _texts("tags", tags),
+            _texts("frames", frames),
         )
 
     def select(self, commit: Commit) -> Diff | None:
@@ -159,24 +158,22 @@ class CommitFilter:
         diff = commit.diff
         if self == _EVERYTHING:
             return diff
-        changes = {id(c): c for c in diff.changes if self._wants(c, commit)}
+        found = [c for c in diff.changes if any(_below(c.path, path) for path in self.paths or ())]
+        if self.coordinates:
+            found += commit.find_changes_about(self.coordinates)
         poses = []
         for frame in self.frames or ():
-            found = commit.find_pose_changes(frame)
-            if found:
+            moving = commit.find_pose_changes(frame)
+            if moving:
                 poses.append(frame)
-                changes.update((id(c), c) for c in found)
-        tags = self.tags or frozenset()
+                found += moving
+        tags = frozenset(self.tags or ())
         groups = ("added", "removed", "replaced", "moved", "rerun")
         heard = {name: tuple(t for t in getattr(diff, name) if t in tags) for name in groups}
-        if not (changes or any(heard.values())):
+        if not (found or any(heard.values())):
             return None
-        return replace(diff, changes=tuple(changes.values()), poses=tuple(poses), **heard)  # type: ignore[arg-type]
-
-    def _wants(self, change: Change, commit: Commit) -> bool:
-        if self.paths is not None and any(_below(change.path, p) for p in self.paths):
-            return True
-        return self.coordinates is not None and commit.is_about(change, self.coordinates)
+        changes = tuple({id(change): change for change in found}.values())
+        return replace(diff, changes=changes, poses=tuple(poses), **heard)  # type: ignore[arg-type]
 
 
 _EVERYTHING = CommitFilter()
@@ -220,12 +217,14 @@ class Listeners:
         if not callable(callback):
             raise ExpressionError(f"A listener is called with a diff, and {callback!r} cannot be called.")
         listener = Listener(callback, wanted, self)
-        self._listeners.append(listener)
+        with self._lock:
+            self._listeners.append(listener)
         return listener
 
     def remove(self, listener: Listener) -> None:
         """Unregister a listener."""
-        self._listeners = [known for known in self._listeners if known is not listener]
+        with self._lock:
+            self._listeners = [known for known in self._listeners if known is not listener]
 
     def post(self, commit: Commit) -> None:
         """Queue what each listener gets of the present commit; called in the order of versions."""
@@ -262,11 +261,13 @@ def _tell(listener: Listener, part: Diff, version: int) -> None:
     try:
         listener.callback(part)
     except Exception:
-        _LOG.exception("A listener of the model raised at version %d.", version)
+        import logging  # for start-up time
+
+        logging.getLogger(__name__).exception("A listener of the model raised at version %d.", version)
 
 
-def _names(names: Iterable[str]) -> tuple[str, ...]:
-    return (names,) if isinstance(names, str) else tuple(names)
+def _texts(name: str, given: Iterable[str] | None) -> tuple[str, ...] | None:
+    return None if given is None else as_entries(f"{name}=", given, str, f"{name} of the model, as texts")
 
 
 def _below(path: str, root: str) -> bool:

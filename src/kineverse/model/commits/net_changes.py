@@ -2,40 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from operator import attrgetter, itemgetter
+from typing import Any
 
 from kineverse.errors import EditError
-from kineverse.expressions.expression import Expression
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Body
 from kineverse.model.changes import find_moved_tags
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
-from kineverse.model.operation import (
-    ARTICULATIONS,
-    BODIES,
-    CONSTRAINTS,
-    DATA,
-    FRAMES,
-    KINDS,
-    RATES,
-    Operation,
-)
+from kineverse.model.history import History, HistoryEntry, TouchedEntry
+from kineverse.model.operation import FRAMES, KINDS, RATES, Operation
 from kineverse.model.read_recorder import Read, Reads
 from kineverse.symbols import Symbol
 
 from .checks import check_parent, find_parents
 
-if TYPE_CHECKING:
-    from kineverse.model.history import History, HistoryEntry, TouchedEntry
-
 _PLACE = attrgetter("place")
-_TYPES = {FRAMES: Frame, BODIES: Body, ARTICULATIONS: Articulation, CONSTRAINTS: Constraint}
+_TYPES: dict[str, Any] = dict(
+    zip(KINDS, (Frame, Body, Articulation, Constraint, tuple, Hashable), strict=True)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,20 +83,9 @@ class NetChanges:
         return not (self.put or self.removed)
 
 
-@dataclass(slots=True)
-class TouchedTags:
-    """Tags of the operations that a transaction has changed, in the order of the edit."""
-
-    added: list[str]
-    replaced: list[str]
-    removed: list[str]
-    rerun: list[str]  # in order of the sequence
-    moved: list[str]  # of those replaced, in order of the sequence
-
-
-def find_touched_tags(history: History, touched: list[TouchedEntry]) -> TouchedTags:
-    """Return the tags of what the transaction has changed so far."""
-    added, replaced, removed, rerun = [], [], [], []
+def group_tags(history: History, touched: Iterable[TouchedEntry]) -> dict[str, tuple[str, ...]]:
+    """Return the tags of what the transaction has changed so far, by the names of these groups in a diff."""
+    added, removed, replaced, rerun = [], [], [], []
     for before, now, is_given in touched:
         if now is None:
             assert before is not None
@@ -115,53 +93,50 @@ def find_touched_tags(history: History, touched: list[TouchedEntry]) -> TouchedT
         elif before is None:
             added.append(now.tag)
         elif is_given:
-            replaced.append(now.tag)
+            replaced.append((before, now))
         else:
             rerun.append(now)
-    rerun.sort(key=_PLACE)
-    return TouchedTags(
-        added, replaced, removed, [entry.tag for entry in rerun], _find_moved(history, touched)
-    )
+    return {
+        "added": tuple(added),
+        "removed": tuple(removed),
+        "replaced": tuple(now.tag for _, now in replaced),
+        "rerun": tuple(entry.tag for entry in sorted(rerun, key=_PLACE)),
+        "moved": _find_moved(history, added, replaced),
+    }
+
+
+def _find_moved(
+    history: History, added: list[str], replaced: list[tuple[HistoryEntry, HistoryEntry]]
+) -> tuple[str, ...]:
+    """Return a smallest set of the tags put elsewhere whose removal makes both orders equal, in order."""
+    again = [(old.place, new.place, new.tag) for old, new in replaced if old.place != new.place]
+    if not again:
+        return ()
+    others = sorted([*(history.entries[tag].place for tag in added), *(place for _, place, _ in again)])
+
+    def rank(place: int) -> int:
+        """Return how many of the entries that stand still are before a place."""
+        return bisect_left(history.sequence, place, key=_PLACE) - bisect_left(others, place)
+
+    between = [one for one in again if rank(one[0]) == rank(one[1])]  # the same two that stand still
+    old, new = ([tag for *_, tag in sorted(between, key=itemgetter(side))] for side in (0, 1))
+    still = {*new}.difference(find_moved_tags(old, new))
+    return tuple(tag for *_, tag in sorted(again, key=itemgetter(1)) if tag not in still)
 
 
 def find_net_changes(history: History) -> NetChanges:
     """Return the net changes of the transaction so far."""
-    tags = find_touched_tags(history, list(history.touched()))
-    entries, sequence = history.entries, history.sequence
-    new = {*tags.added, *tags.moved}
+    groups = group_tags(history, history.touched())
+    added, entries, sequence = groups.pop("added"), history.entries, history.sequence
+    new = {*added, *groups["moved"]}
     end = len(sequence)
     while end and sequence[end - 1].tag in new:
         end -= 1
     put = []
-    for entry in sorted((entries[t] for t in (*tags.added, *tags.replaced, *tags.rerun)), key=_PLACE):
+    for entry in sorted((entries[t] for t in (*added, *groups["replaced"], *groups["rerun"])), key=_PLACE):
         index = bisect_left(sequence, entry.place, key=_PLACE)
         put.append(PlacedEntry(entry, sequence[index - 1].tag if index else None, index >= end))
-    groups = (tags.replaced, tags.rerun, tags.moved, tags.removed)
-    return NetChanges(tuple(put), *map(tuple, groups))
-
-
-def _find_moved(history: History, touched: list[TouchedEntry]) -> list[str]:
-    """Return a smallest set of the tags put elsewhere whose removal makes both orders equal, in order."""
-    pairs = [(before, now) for before, now, _ in touched if now is not None]
-    again = [(b, n) for b, n in pairs if b is not None and b.place != n.place]
-    if not again:
-        return []
-    strangers = sorted(n.place for b, n in pairs if b is None or b.place != n.place)
-
-    def rank(place: int) -> int:
-        """Return how many of the entries that stand still are before a place."""
-        return bisect_left(history.sequence, place, key=_PLACE) - bisect_left(strangers, place)
-
-    ranks = {rank(one.place) for pair in again for one in pair}
-
-    def order(entries: Iterable[HistoryEntry]) -> list[str | int]:
-        """Return tags in order, and a number for the entries that stand still between two of them."""
-        names: list[tuple[int, float, str | int]] = [(r, -math.inf, r) for r in ranks]
-        names += [(rank(entry.place), entry.place, entry.tag) for entry in entries]
-        return [name for *_, name in sorted(names)]
-
-    moved = find_moved_tags(order(b for b, _ in again), order(n for _, n in again), {n.tag for _, n in again})
-    return [str(tag) for tag in moved]
+    return NetChanges(tuple(put), **groups)
 
 
 def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
@@ -170,30 +145,37 @@ def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
     Other operations that read what has changed are marked to run. If the changes are to be complete, they are
     refused.
     """
-    _check_types(changes)
-    known = {*changes.replaced, *changes.rerun}
-    for placed in changes.put:
-        tag = placed.entry.tag
-        if (tag in history.entries) != (tag in known):
-            raise EditError(
-                f"The changes do not belong to this model: {tag!r} is "
-                f"{'not there' if tag in known else 'taken'}. {_ELSEWHERE}"
-            )
+    if not isinstance(changes, NetChanges):
+        raise EditError(f"A model adopts kv.model.NetChanges, from edit.net(), not {changes!r:.80}.")
+    fault = _find_fault(changes)
+    if fault:
+        raise EditError(f"The changes cannot be adopted: {fault}. Changes come from edit.net().")
+    put = {placed.entry.tag: placed.entry for placed in changes.put}
+    again, known = {*changes.replaced, *changes.rerun}, history.entries
+    for tag in put:
+        is_new = tag not in again
+        if is_new == (tag in known):
+            what = "taken" if is_new else "not there"
+            raise EditError(f"The changes do not belong to this model: {tag!r} is {what}. {_ELSEWHERE}")
     history.settle()
-    history.take_notes()
+    before = [known[tag] for tag in (*changes.removed, *put) if tag in known]
+    cells = dict.fromkeys(cell for entry in (*before, *put.values()) for cell in entry.writes)
     with history.step():
+        seen = history.list_reads(cells, without=put)
         for tag in (*changes.removed, *changes.moved):
             history.remove(tag)
         for placed in changes.put:
             entry = placed.entry
+            for _, parent in find_parents(entry):
+                entry.reads.add((FRAMES, parent), Read.EXISTENCE)
             if entry.tag not in changes.rerun:
                 history.note_given(entry.tag)
-            history.put(entry.at(_find_place(history, placed), _complete_reads(entry)))
-        for placed in changes.put:
+            history.put(entry.at(_find_place(history, placed)))
+        for tag, entry in put.items():
             # Parents are looked for when all are there, as frames may be replaced before them.
-            for name, parent in find_parents(placed.entry):
-                check_parent(history, name, parent, history.entries[placed.entry.tag].place)
-        for tag, cell in history.find_outdated(without={placed.entry.tag for placed in changes.put}):
+            for name, parent in find_parents(entry):
+                check_parent(history, name, parent, history.entries[tag].place)
+        for tag, cell in history.find_outdated(seen):
             if complete:
                 raise EditError(
                     f"The changes do not belong to this model: {tag!r} reads {'/'.join(cell)}, which they "
@@ -209,59 +191,55 @@ def _find_place(history: History, placed: PlacedEntry) -> int:
     if old is not None:
         return old.place
     if placed.at_end:
-        return history.place_at(len(history.sequence))
+        return history.place_at(None)
     return history.place_at(0 if placed.after is None else history.index(placed.after) + 1)
 
 
-def _complete_reads(entry: HistoryEntry) -> Reads:
-    """Return the reads of an entry with the parents of its frames among them."""
-    cells = {(FRAMES, parent) for _, parent in find_parents(entry)} - entry.reads.cells.keys()
-    if not cells:
-        return entry.reads
-    reads = Reads()
-    reads.cells = {**entry.reads.cells, **dict.fromkeys(cells, Read.EXISTENCE)}
-    reads.listings, reads.trace = entry.reads.listings, entry.reads.trace
-    return reads
-
-
-def _check_types(changes: object) -> None:
-    """Check that changes have the form of net changes."""
-    if not isinstance(changes, NetChanges):
-        raise EditError(f"A model adopts kv.model.NetChanges, from edit.net(), not {changes!r:.80}.")
-    for wrong in _list_faults(changes):
-        raise EditError(f"The changes cannot be adopted: {wrong}. Changes come from edit.net().")
-
-
-def _list_faults(changes: NetChanges) -> Iterator[str]:
-    from kineverse.model.history import HistoryEntry  # it imports the checks of this package
-
-    tags = []
+def _find_fault(changes: NetChanges) -> str:
+    """Return what is wrong with the form of net changes, else an empty text."""
+    groups = (changes.replaced, changes.rerun, changes.moved, changes.removed)
+    for group in (changes.put, *groups):
+        if not isinstance(group, tuple | list):
+            return f"{group!r:.80} is no tuple"
+    for tag in (tag for group in groups for tag in group):
+        if not isinstance(tag, str):
+            return f"{tag!r:.80} is no tag"
     for placed in changes.put:
         entry = placed.entry if isinstance(placed, PlacedEntry) else None
-        if not isinstance(entry, HistoryEntry) or not isinstance(entry.reads, Reads):
-            yield f"{placed!r:.80} is no entry with its place"
-            return
-        tags.append(entry.tag)
+        if not isinstance(entry, HistoryEntry) or not _are_reads(entry.reads):
+            return f"{placed!r:.80} is no entry with its place and its reads"
         if not isinstance(entry.tag, str) or not entry.tag or not isinstance(entry.operation, Operation):
-            yield f"{entry.tag!r} has no tag or no operation"
-        for cell, value in entry.writes.items():
-            if not _is_value(cell, value):
-                yield f"{entry.tag!r} writes {value!r:.80} into {cell!r}"
-    tags += changes.removed
-    if len(set(tags)) < len(tags):
-        yield "a tag is put or removed twice"
-    if not {*changes.moved} <= {*changes.replaced} or not {*changes.replaced, *changes.rerun} <= {*tags}:
-        yield "what is replaced, moved or run again is not put"
+            return f"{entry.tag!r:.80} has no tag or no operation"
+        if not isinstance(entry.writes, dict) or not all(
+            _is_write(cell, value) for cell, value in entry.writes.items()
+        ):
+            return f"{entry.tag!r} has writes of wrong kinds or types, {entry.writes!r:.80}"
+    put = [placed.entry.tag for placed in changes.put]
+    known = {*changes.replaced, *changes.rerun}
+    if len({*put, *changes.removed}) < len(put) + len(changes.removed):
+        return "a tag is put or removed twice"
+    if not ({*changes.moved} <= {*changes.replaced} and known <= {*put}):
+        return "what is replaced, moved or run again is not put"
+    return ""
 
 
-def _is_value(cell: Any, value: object) -> bool:
-    if not (isinstance(cell, tuple) and len(cell) == 2 and cell[0] in KINDS):
-        return False
-    if cell[0] == RATES:
-        return (
-            isinstance(value, tuple)
-            and len(value) == 2
-            and isinstance(value[0], Symbol)
-            and isinstance(value[1], Expression | tuple)
-        )
-    return cell[0] == DATA or isinstance(value, _TYPES[cell[0]])
+def _are_reads(reads: object) -> bool:
+    return (
+        isinstance(reads, Reads)
+        and isinstance(reads.cells, dict)
+        and isinstance(reads.listings, set)
+        and all(_is_cell(cell) and isinstance(how, Read) for cell, how in reads.cells.items())
+        and reads.listings <= {*KINDS}
+    )
+
+
+def _is_cell(cell: object) -> bool:
+    return isinstance(cell, tuple) and len(cell) == 2 and cell[0] in KINDS and isinstance(cell[1], str)
+
+
+def _is_write(cell: Any, value: Any) -> bool:
+    return (
+        _is_cell(cell)
+        and isinstance(value, _TYPES[cell[0]])
+        and (cell[0] != RATES or (len(value) == 2 and isinstance(value[0], Symbol)))
+    )

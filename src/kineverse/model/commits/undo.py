@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
+from kineverse._checks import as_count
 from kineverse.errors import EditError
 
 if TYPE_CHECKING:
     from kineverse.model.history import CommitRecord, History, TouchedEntry
+    from kineverse.model.operation import Operation
 
 UNDO_LIMIT = 1000
 """Number of commits of a model that can be taken back: those before the last ones are forgotten."""
@@ -40,8 +42,9 @@ def take_back(history: History, version: int) -> None:
                 is_kept = now is after
             else:
                 # What was adopted after it was run again elsewhere may be an equal operation.
-                is_same = now.operation is after.operation or now.operation == after.operation
-                is_kept = is_same and (now.place == after.place or not is_moved)
+                is_kept = _are_equal(now.operation, after.operation) and (
+                    now.place == after.place or not is_moved
+                )
             if not is_kept:
                 raise _later_error(history, version, tag)
             if after is not None and (before is None or is_moved):
@@ -56,10 +59,15 @@ def take_back(history: History, version: int) -> None:
             history.mark_outdated(tag)
 
 
+def _are_equal(one: Operation, other: Operation) -> bool:
+    try:
+        return one is other or bool(one == other)
+    except Exception:  # arrays among the fields of an operation have no truth value
+        return False
+
+
 def _find_commit(history: History, version: int) -> CommitRecord:
-    if isinstance(version, bool) or not isinstance(version, int):
-        raise EditError(f"A version is a number, such as model.version, not {version!r}.")
-    commits = history.commits
+    version, commits = as_count("version", version, 0), history.commits
     if version not in commits:
         kept = f"which are {min(commits)} to {max(commits)}" if commits else "and there are none yet"
         raise EditError(
