@@ -18,14 +18,7 @@ from kineverse._runtime import no_collection
 from kineverse.articulations import Revolute
 from kineverse.articulations.joint import Joint
 from kineverse.expressions import Expression
-from kineverse.formats.document import (
-    from_bytes,
-    operation_from_bytes,
-    operation_to_bytes,
-    read_operations,
-    to_bytes,
-    to_json,
-)
+from kineverse.formats import document
 from kineverse.lie import Array
 from kineverse.model import Diff, Model, Operation, Pose, ReadRecorder, Writes
 from kineverse.model.frame import WORLD
@@ -43,7 +36,6 @@ RELEVANT, RELEVANT_NEW = "constraints_for a pose", "constraints_for a new expres
 READERS = 7  # number of operations that read the writes of the replaced one
 _AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _APPENDED = 100
-_CHAIN = 50
 _QUERIES = 100
 
 
@@ -160,7 +152,7 @@ def make_document_model(nodes: int) -> Model:
 def read_document(text: str) -> Model:
     model = Model()
     with model.edit() as edit, no_collection():
-        for tag, operation in read_operations(text):
+        for tag, operation in document.read_operations(text):
             edit.apply(operation, tag)
     return model
 
@@ -173,20 +165,11 @@ def forget_blobs(model: Model) -> Model:
 
 
 def make_joints(count: int) -> Model:
-    """Return a model of chains of 50 joints with limits."""
+    """Return a model of chains of joints with limits."""
     model = Model()
     with no_collection(), model.edit() as edit:
-        for i in range(count):
-            edit.apply(
-                Revolute(
-                    name=f"joint{i}",
-                    parent=f"link{i - 1}" if i % _CHAIN else WORLD,
-                    child=f"link{i}",
-                    lower=-1.0 - 1e-5 * i,
-                    upper=1.0,
-                    velocity=2.0,
-                )
-            )
+        for k in range(count):
+            edit.apply(_chain_joint(k))
     return model
 
 
@@ -201,10 +184,10 @@ def time_document(nodes: int) -> tuple[int, dict[str, float]]:
         return found
 
     with no_collection():
-        text = timed("written", lambda: to_json(model))
+        text = timed("written", lambda: document.to_json(model))
         timed("read", lambda: read_document(text))
-        data = timed("written as msgpack", lambda: to_bytes(forget_blobs(model)))
-        timed("read from msgpack", lambda: from_bytes(data))
+        data = timed("written as msgpack", lambda: document.to_bytes(forget_blobs(model)))
+        timed("read from msgpack", lambda: document.from_bytes(data))
     return text.count('["'), times
 
 
@@ -294,7 +277,7 @@ def measure_document(settings: BenchmarkSettings) -> BenchmarkResult:
     robot = find_benchmark_robot(settings)
     home = robot.model.copy()
     home.include("kitchen")
-    text = to_json(home)
+    text = document.to_json(home)
     one = Benchmark("document", settings)
     one.time(_home_contenders(robot, home, text))
     size = one.note("robot and kitchen, size", "byte", len(text.encode()))
@@ -307,9 +290,9 @@ def measure_document(settings: BenchmarkSettings) -> BenchmarkResult:
     one.time(_joint_contenders())
     many = make_joints(settings.operations)
     start = perf_counter()
-    data = to_bytes(many)
+    data = document.to_bytes(many)
     middle = perf_counter()
-    from_bytes(data)
+    document.from_bytes(data)
     one.note(f"{len(many.history.tags):,} joints, written", "s", middle - start)
     one.note(f"{len(many.history.tags):,} joints, read", "s", perf_counter() - middle)
     one.bound(0.05, WRITTEN, READ)
@@ -330,30 +313,34 @@ def measure_document(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def _home_contenders(robot: BenchmarkRobot, home: Model, text: str) -> Iterator[Contender]:
-    data = to_bytes(home)
+    data = document.to_bytes(home)
 
     def poses(make: Callable[[], Model]) -> Callable[[], list[Array]]:
         values = dict.fromkeys(home.fk(robot.frame).symbols, 0.1)
         return lambda: [make().fk(robot.frame)(values)]
 
-    yield Contender(WRITTEN, time_calls(lambda: to_json(forget_blobs(home))), poses(lambda: home))
+    yield Contender(WRITTEN, time_calls(lambda: document.to_json(forget_blobs(home))), poses(lambda: home))
     yield Contender(READ, time_calls(partial(read_document, text)), poses(lambda: read_document(text)))
-    yield Contender(PACKED, time_calls(lambda: to_bytes(forget_blobs(home))))
-    yield Contender(AGAIN, time_calls(partial(to_bytes, home)))
-    yield Contender(UNPACKED, time_calls(partial(from_bytes, data)), poses(lambda: from_bytes(data)))
+    yield Contender(PACKED, time_calls(lambda: document.to_bytes(forget_blobs(home))))
+    yield Contender(AGAIN, time_calls(partial(document.to_bytes, home)))
+    yield Contender(
+        UNPACKED, time_calls(partial(document.from_bytes, data)), poses(lambda: document.from_bytes(data))
+    )
 
 
 def _joint_contenders() -> Iterator[Contender]:
     model = make_joints(1)
     (tag,) = model.history.tags
-    blob = operation_to_bytes(model, tag)
-    yield Contender(JOINT_WRITTEN, time_calls(lambda: operation_to_bytes(forget_blobs(model), tag)))
-    yield Contender(JOINT_READ, time_calls(partial(operation_from_bytes, blob)))
+    blob = document.operation_to_bytes(model, tag)
+    yield Contender(JOINT_WRITTEN, time_calls(lambda: document.operation_to_bytes(forget_blobs(model), tag)))
+    yield Contender(JOINT_READ, time_calls(partial(document.operation_from_bytes, blob)))
 
 
 def _robot_contenders(robot: BenchmarkRobot) -> Iterator[Contender]:
-    yield Contender(OURS, time_calls(lambda: read_document(to_json(forget_blobs(robot.model)))))
-    yield Contender(MSGPACK, time_calls(lambda: from_bytes(to_bytes(forget_blobs(robot.model)))))
+    yield Contender(OURS, time_calls(lambda: read_document(document.to_json(forget_blobs(robot.model)))))
+    yield Contender(
+        MSGPACK, time_calls(lambda: document.from_bytes(document.to_bytes(forget_blobs(robot.model))))
+    )
 
 
 JOINT = "kineverse, joint replaced"

@@ -26,19 +26,8 @@ from .lockbox.unlocking_runs import (
     make_thesis_table,
     run_unlocking,
 )
+from .manipulation import trials as trial_runner
 from .manipulation.skills import SettingOptions, find_robots, make_settings
-from .manipulation.trials import (
-    QUALITY,
-    ROW,
-    TIMES,
-    Column,
-    StepTimeStatistics,
-    Trial,
-    make_exception_table,
-    make_failure_table,
-    make_group_table,
-    make_trial_numbers,
-)
 from .registry import Options, Progress
 from .report import Report, ReportTable
 from .table1_push import OBJECT_COLUMNS, OBJECTS, SHIPPED_KITCHEN, PushJob, run_push
@@ -90,15 +79,15 @@ def run_boxes(count: int, seed: int, progress: Progress) -> dict[tuple[Rule, int
 def make_ablation_report(
     thesis: dict[Rule, UnlockingRun],
     boxes: dict[tuple[Rule, int], list[UnlockingRun]],
-    pushes: dict[Rule, list[Trial]],
+    pushes: dict[Rule, list[trial_runner.Trial]],
     seed: int,
 ) -> Report:
     tables = [_thesis_table(thesis), _box_table(boxes)]
     trials = [t for own in pushes.values() for t in own]
     tables += [
-        make_group_table("Objects pushed shut", trials, PUSH_COLUMNS, ("skill",)),
-        make_exception_table(trials),
-        make_failure_table(trials),
+        trial_runner.make_group_table("Objects pushed shut", trials, PUSH_COLUMNS, ("skill",)),
+        trial_runner.make_exception_table(trials),
+        trial_runner.make_failure_table(trials),
     ]
     numbers = {
         "seed": seed,
@@ -107,7 +96,7 @@ def make_ablation_report(
             {"rule": rule, "parts": parts, "opened": sum(r.done for r in own), "of": len(own)}
             for (rule, parts), own in boxes.items()
         ],
-        "pushes": {rule: make_trial_numbers(own) for rule, own in pushes.items()},
+        "pushes": {rule: trial_runner.make_trial_numbers(own) for rule, own in pushes.items()},
     }
     return Report(
         "ablations",
@@ -121,7 +110,7 @@ def make_ablation_report(
 def _thesis_table(runs: dict[Rule, UnlockingRun]) -> ReportTable:
     title = "The lockbox of the thesis: f, e, d, then b and c, then a"
     table = make_thesis_table(title, "order of the bolts", runs)
-    cpu = (f"{1e3 * StepTimeStatistics.from_seconds(one.cpu).mean:.3g}" for one in runs.values())
+    cpu = (f"{1e3 * trial_runner.StepTimeStatistics.from_seconds(one.cpu).mean:.3g}" for one in runs.values())
     rows = tuple((*row, cell) for row, cell in zip(table.rows, cpu, strict=True))
     return ReportTable(title, (*table.head, "CPU of a step [µs]"), rows)
 
@@ -137,15 +126,15 @@ def _box_table(runs: dict[tuple[Rule, int], list[UnlockingRun]]) -> ReportTable:
     )
 
 
-def _median_steps(trials: Sequence[Trial]) -> float:
+def _median_steps(trials: Sequence[trial_runner.Trial]) -> float:
     steps = [t.steps for t in trials if t.done]
     return float(np.median(steps)) if steps else math.nan
 
 
 PUSH_COLUMNS = (
-    *ROW,
+    *trial_runner.ROW,
     *OBJECT_COLUMNS[:3],
-    Column("steps", "steps (median)", _median_steps, 6),
-    *TIMES[1:],
-    *QUALITY,
+    trial_runner.Column("steps", "steps (median)", _median_steps, 6),
+    *trial_runner.TIMES[1:],
+    *trial_runner.QUALITY,
 )

@@ -22,19 +22,12 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .execution import run_jobs
-from .manipulation.skills import (
-    SettingOptions,
-    TrialCase,
-    TrialSetting,
-    find_robots,
-    make_settings,
-    open_then_close,
-)
+from .manipulation import skills
 from .manipulation.trials import Trial, make_success_figure, make_trial_numbers, make_trial_tables
 from .registry import Options, Progress
 from .report import Report
 
-OPTIONS = ("quick", "data", "model", "seed", "count", "robot", "processes", *SettingOptions)
+OPTIONS = ("quick", "data", "model", "seed", "count", "robot", "processes", *skills.SettingOptions)
 COUNT, QUICK_COUNT = 50, 1
 QUICK_OBJECTS = 2
 KITCHEN = "kitchen"
@@ -49,7 +42,7 @@ OPEN_SHARE = 0.98
 class KitchenJob:
     kitchen: str  # name or path of its model, such as ``"kitchens/17"``
     robot: RobotSource
-    setting: TrialSetting = field(default_factory=TrialSetting)  # world, noise and recordings
+    setting: skills.TrialSetting = field(default_factory=skills.TrialSetting)  # world, noise and recordings
     most: int | None = None  # largest number of objects; None for all
     only: str | None = None  # name of the coordinate of the only object; None for all
 
@@ -57,14 +50,14 @@ class KitchenJob:
 def run(progress: Progress, options: Options) -> Report:
     """Open and close everything; the option ``quick`` takes two objects of one kitchen, and one robot."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
-    robots = find_robots(options.robot, options.data)
+    robots = skills.find_robots(options.robot, options.data)
     if options.quick and not options.robot:
         robots = robots[-1:]
     names = [options.model] if options.model else name_kitchens(options.seed, count)
     jobs = [
         KitchenJob(name, robot, setting, QUICK_OBJECTS if options.quick else None)
         for name in names
-        for setting in make_settings(options)
+        for setting in skills.make_settings(options)
         for robot in robots
     ]
     trials = run_jobs(run_kitchen, jobs, progress, "kitchens", "kitchen", options)
@@ -94,7 +87,7 @@ def run_kitchen(job: KitchenJob) -> list[Trial]:
         if one.kind != "knob" and job.only in (None, str(one.coordinate))
     ]
     cases = [
-        TrialCase(
+        skills.TrialCase(
             job.kitchen,
             job.robot,
             str(one.coordinate),
@@ -111,7 +104,7 @@ def run_kitchen(job: KitchenJob) -> list[Trial]:
     trials = []
     for case, one in zip(cases, objects, strict=False):
         targets = (one.shut + OPEN_SHARE * (one.opened - one.shut), one.shut)
-        trials += open_then_close(case, model, world, start, targets)
+        trials += skills.open_then_close(case, model, world, start, targets)
     return trials
 
 

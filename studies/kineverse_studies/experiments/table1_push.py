@@ -29,16 +29,8 @@ from kineverse.view.plots import Figure
 from kineverse.worlds.run_metrics import CONTACT_GAP
 
 from .execution import run_jobs
+from .manipulation import skills
 from .manipulation.film import find_telling_moment, make_film, make_push_picture, make_row
-from .manipulation.skills import (
-    SettingOptions,
-    TrialCase,
-    TrialSetting,
-    check_data,
-    find_robots,
-    make_settings,
-    run_push_trial,
-)
 from .manipulation.trials import (
     PAPER_DOF,
     QUALITY,
@@ -255,7 +247,7 @@ def _draw_commands(canvas: Canvas, trials: Sequence[Trial]) -> None:
     panels[0].set_ylabel("commanded speeds [rad/s], [m/s]")
 
 
-OPTIONS = ("quick", "data", "seed", "robot", "processes", *SettingOptions)
+OPTIONS = ("quick", "data", "seed", "robot", "processes", *skills.SettingOptions)
 PERIODS = {"2022": (0.02, 1200), "2020": (0.1, 500)}  # control period [s] and largest number of steps
 QUICK_OBJECTS = ("fridge door", "sink trash drawer")
 
@@ -267,7 +259,7 @@ class PushJob:
     data: Path | None
     thing: str
     paper: str = "2022"  # paper whose control period and steps count
-    setting: TrialSetting = field(default_factory=TrialSetting)  # world, noise and recordings
+    setting: skills.TrialSetting = field(default_factory=skills.TrialSetting)  # world, noise and recordings
     seed: int = 0  # seed of the base placement
     logic: str | None = "and"  # rule of trends: ``"and"``, ``"product"``, or None for exact gradients alone
     baseline: bool = False  # whether the papers' controller pushes
@@ -275,12 +267,12 @@ class PushJob:
 
 def run(progress: Progress, options: Options) -> Report:
     """Push all objects shut; the option ``quick`` takes two of them, and the period of the 2022 paper."""
-    data = check_data(options.data)
+    data = skills.check_data(options.data)
     jobs = [
         PushJob(robot, kitchen, data, thing, paper, setting, options.seed, baseline=baseline)
-        for setting in make_settings(options)
+        for setting in skills.make_settings(options)
         for kitchen, things in find_kitchens(data).items()
-        for robot in find_robots(options.robot, data)
+        for robot in skills.find_robots(options.robot, data)
         for thing in things
         for baseline in (False, True)
         for paper in PERIODS
@@ -293,7 +285,7 @@ def run(progress: Progress, options: Options) -> Report:
 def run_push(job: PushJob) -> list[Trial]:
     setup: PushSetup = make_push_setup(job.robot, job.kitchen, job.thing, job.data)
     dt, steps = PERIODS[job.paper]
-    case = TrialCase(
+    case = skills.TrialCase(
         setup.kitchen,
         job.robot,
         setup.what,
@@ -304,5 +296,5 @@ def run_push(job: PushJob) -> list[Trial]:
     )
     world = job.setting.make_world(setup.model, job.robot.prefix, setup.start, dt=dt)
     skill = f"{PAPERS if job.baseline else 'push'} ({job.paper})"
-    push = partial(run_push_trial, dt=dt, steps=steps, logic=job.logic, baseline=job.baseline)
+    push = partial(skills.run_push_trial, dt=dt, steps=steps, logic=job.logic, baseline=job.baseline)
     return [push(case, setup.model, world, setup.start, skill)]

@@ -18,15 +18,7 @@ from kineverse.spatial import translation
 from kineverse.worlds import Sensors
 
 from .execution import run_jobs
-from .manipulation.skills import (
-    DT,
-    SettingOptions,
-    TrialCase,
-    TrialSetting,
-    TrialWatch,
-    find_robots,
-    make_settings,
-)
+from .manipulation import skills
 from .manipulation.trials import (
     ROW,
     Column,
@@ -40,7 +32,7 @@ from .manipulation.trials import (
 from .registry import Options, Progress
 from .report import Report
 
-OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *SettingOptions)
+OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *skills.SettingOptions)
 NOISE = "3mm+3mm/m,0.5deg,30Hz,outliers=0.05"  # noise of the sensors unless options name another one
 COUNT, QUICK_COUNT = 10, 1  # number of seeds
 MOST_TURN, MOST_WAY, MOST_SECONDS = math.radians(10.0), 0.08, 15.0
@@ -69,15 +61,15 @@ OBJECTS = {
 class UnknownObjectJob:
     robot: RobotSource
     thing: str
-    setting: TrialSetting
+    setting: skills.TrialSetting
     seed: int
 
 
 def run(progress: Progress, options: Options) -> Report:
     """Open the objects; the option ``quick`` takes one seed and the last robot, ``count`` so many seeds."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
-    settings = make_settings(replace(options, noise=options.noise or NOISE))
-    robots = find_robots(options.robot, options.data)
+    settings = skills.make_settings(replace(options, noise=options.noise or NOISE))
+    robots = skills.find_robots(options.robot, options.data)
     if options.quick and not options.robot:
         robots = robots[-1:]
     jobs = [
@@ -112,11 +104,11 @@ def open_one(job: UnknownObjectJob) -> list[Trial]:
     start = robot.start_state(model)
     world = job.setting.make_world(model, robot.prefix, start, job.seed)
     truth = (("seed", job.seed), ("true_family", thing.family))
-    case = TrialCase(job.thing, robot, thing.part, job.setting, job.seed, measures=truth)
+    case = skills.TrialCase(job.thing, robot, thing.part, job.setting, job.seed, measures=truth)
 
-    def act(watch: TrialWatch) -> Outcome:
+    def act(watch: skills.TrialWatch) -> Outcome:
         return open_unknown(
-            watch.open_session(world, DT),
+            watch.open_session(world, skills.DT),
             thing.handle,
             model=forget_joint(model, thing.part, start),
             part=thing.part,

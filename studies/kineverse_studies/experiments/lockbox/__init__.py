@@ -30,13 +30,7 @@ from kineverse_studies.experiments.manipulation.skills import make_record_folder
 from kineverse_studies.experiments.registry import Options, Progress
 from kineverse_studies.experiments.report import Report, ReportTable, make_table
 
-from .unknown_locks import (
-    UnknownLockResult,
-    can_be_opened,
-    list_unknown_jobs,
-    make_unknown_table,
-    run_unknown,
-)
+from . import unknown_locks
 from .unlocking_runs import (
     FIGURE_SIZE,
     LOCK_RULES,
@@ -132,8 +126,8 @@ def run(progress: Progress, options: Options) -> Report:
     planner_jobs = list_planner_jobs(count, options.seed, options.quick)
     explored = run_jobs(run_explorer, explorer_jobs, progress, "lockbox", "box", options)
     planned = run_jobs(run_planner, planner_jobs, progress, "lockbox", "plan", options)
-    unknown_jobs = list_unknown_jobs(count, options.seed)
-    unknown = run_jobs(run_unknown, unknown_jobs, progress, "lockbox", "exploration", options)
+    unknown_jobs = unknown_locks.list_unknown_jobs(count, options.seed)
+    unknown = run_jobs(unknown_locks.run_unknown, unknown_jobs, progress, "lockbox", "exploration", options)
     return make_lockbox_report(thesis, explored, planned, unknown, options.seed)
 
 
@@ -182,7 +176,7 @@ def run_planner(job: PlannerJob) -> list[PlannerResult]:
     end = process_time()
     wrong = bool(plan_violations(model, plan))
     if job.kind == "tangled":
-        wrong = wrong or (plan.verdict == "found") != can_be_opened(box)
+        wrong = wrong or (plan.verdict == "found") != unknown_locks.can_be_opened(box)
     if job.kind == "rings":
         wrong = wrong or len(plan.steps) != (2 ** (job.parts + 1) - 1) // 3
     return [PlannerResult(job, plan.verdict, len(plan.steps), wrong, read - begin, end - read)]
@@ -200,7 +194,7 @@ def make_lockbox_report(
     thesis: dict[Rule, UnlockingRun],
     explored: Sequence[ExplorerResult],
     planned: Sequence[PlannerResult],
-    unknown: Sequence[UnknownLockResult],
+    unknown: Sequence[unknown_locks.UnknownLockResult],
     seed: int,
 ) -> Report:
     groups: dict[tuple[Rule, bool], list[ExplorerResult]] = {}
@@ -250,7 +244,7 @@ def make_lockbox_report(
             make_thesis_table("The lockbox of the thesis", "order of the parts", thesis),
             make_explorer_table(groups),
             make_planner_table(plans),
-            make_unknown_table(unknown),
+            unknown_locks.make_unknown_table(unknown),
         ),
         numbers,
         Figure(lambda canvas: draw_boxes(canvas, ablated), FIGURE_SIZE),

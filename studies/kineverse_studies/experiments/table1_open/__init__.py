@@ -21,15 +21,8 @@ from kineverse.manipulation.robot_sources import SHIPPED, RobotSource
 from kineverse.model.model import Model
 from kineverse.view.plots import Figure
 from kineverse_studies.experiments.execution import run_jobs
+from kineverse_studies.experiments.manipulation import skills
 from kineverse_studies.experiments.manipulation.film import FilmRow, make_film, make_row
-from kineverse_studies.experiments.manipulation.skills import (
-    SettingOptions,
-    TrialCase,
-    TrialSetting,
-    find_robots,
-    make_settings,
-    open_then_close,
-)
 from kineverse_studies.experiments.manipulation.trials import (
     PAPER_DOF,
     ROW,
@@ -195,7 +188,7 @@ def _draw(canvas: Canvas, groups: Sequence[Sequence[Trial]]) -> None:
     axes.set_xlabel("solver's calls of a control step [ms], 1st to 99th percentile")
 
 
-OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *SettingOptions)
+OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *skills.SettingOptions)
 STARTS, QUICK_STARTS = 10, 1  # number of starts of each robot at each object
 _COMPILED = 30.0  # longest wait for compiled code [s]; times are those of compiled programs
 
@@ -206,14 +199,14 @@ class OpeningJob:
     thing: str
     starts: int
     seed: int
-    settings: tuple[TrialSetting, ...]
+    settings: tuple[skills.TrialSetting, ...]
 
 
 def run(progress: Progress, options: Options) -> Report:
     """Open the objects; the option ``quick`` takes one start of each, ``count`` so many."""
     starts = options.count or (QUICK_STARTS if options.quick else STARTS)
-    settings = make_settings(options)
-    robots = find_robots(options.robot, options.data)
+    settings = skills.make_settings(options)
+    robots = skills.find_robots(options.robot, options.data)
     jobs = [OpeningJob(robot, thing, starts, options.seed, settings) for robot in robots for thing in OBJECTS]
     trials = run_jobs(run_openings, jobs, progress, "table1-open", "object", options)
     return make_opening_report(trials, starts, options.seed)
@@ -225,9 +218,9 @@ def run_openings(job: OpeningJob) -> list[Trial]:
     lower, upper = setup.model.limits(setup.what)
     trials = open_by_programs(setup, job)
     for setting in job.settings:
-        case = TrialCase(job.thing, job.robot, str(setup.what), setting, job.seed, film=True)
+        case = skills.TrialCase(job.thing, job.robot, str(setup.what), setting, job.seed, film=True)
         world = setting.make_world(setup.model, job.robot.prefix, start)
-        trials += open_then_close(case, setup.model, world, start, (DONE * upper, lower))
+        trials += skills.open_then_close(case, setup.model, world, start, (DONE * upper, lower))
     return trials
 
 
