@@ -70,6 +70,7 @@ def test_truncated_document_is_refused():
         (NODE % '["constant", 1], ["elementary", "eval", [0]]', "no elementary function 'eval'"),
         (NODE % '["constant", -1], ["elementary", "sqrt", [0]]', "NaN"),
         (NODE % '["constant", 1], ["elementary", "sin", [0, 0]]', "'sin' has 2 arguments"),
+        (NODE % '["symbol", "a", 0, "dof"], ["elementary", "constpow", [0, 0]]', "is one of 'pow'"),
         (NODE % '["symbol", "a", 0, "king"]', "invalid enum value 'king'"),
         (NODE % '["symbol", "a//b", 0, "dof"]', "parts are not empty"),
         (NODE % '["symbol", "a", -1, "dof"]', "expected a whole number >= 0"),

@@ -101,6 +101,8 @@ def _elementary(graph: NodeGraph, node: Any) -> None:
         raise InvalidDocumentError(f"{function[:60]!r} has {len(refs)} arguments")
     if function in BINARY:
         a, b = refs
+        if function == "constpow" and not sx[b].is_constant():
+            raise InvalidDocumentError("the exponent of 'constpow' is a number; any other is one of 'pow'")
         if function == "pow" and Power.is_needed(sx[a], sx[b]):
             graph.add_alike(Power, node.arguments)
             return
