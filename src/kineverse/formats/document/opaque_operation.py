@@ -8,7 +8,7 @@ from typing import Any
 
 from kineverse.errors import KineverseError, ModelError, UnknownNameError
 from kineverse.model.operation import Cell, FinishedWrites, Operation, Writes
-from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder
+from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, differs
 from kineverse.model.traces import Trace
 from kineverse.model.traces.replay import writes_agree
 from kineverse.model.traces.trace import run_query, substitute_results
@@ -166,10 +166,7 @@ class OpaqueOperation(Operation):
             if tuple(model.list_names(kind)) != names[kind]
         ]
         for cell, how in sorted(self.reads.items()):
-            now, then = model.read(cell, how), values.get(cell, ABSENT)
-            if now is then:
-                continue
-            if then is ABSENT or now is ABSENT or (how & Read.VALUE and now != then):
+            if differs(how, values.get(cell, ABSENT), model.read(cell, how)):
                 changed.append("/".join(cell))
         return changed
 

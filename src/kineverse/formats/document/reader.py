@@ -194,6 +194,7 @@ class _Document:
         place = f", {self._place}{self._part}" if self._place else ""
         if len(reason) > LONGEST_REASON:  # it quotes names, which may be of any length
             reason = f"{reason[:LONGEST_REASON]} ..."
+        reason = " ".join(reason.splitlines())
         raise FormatError(f"{self._source}{place}: {reason.removesuffix('.')}.") from None
 
     def _read(self, content: bytes, is_text: bool) -> list[HistoryEntry]:
@@ -326,8 +327,6 @@ def _refusing(document: _Document) -> Iterator[None]:
     """Turn all errors of a content into one with source and place."""
     try:
         yield
-    except FormatError:
-        raise
     except (InvalidDocumentError, KineverseError) as error:
         document.refuse(str(error))
     except RecursionError:

@@ -38,7 +38,7 @@ PLAIN_BITS = 63
 """Length of the longest integer that is written as a number; other languages and msgpack end there."""
 DATUM_TAGS = ("expression", "float", "integer")
 _QUATERNION = 4  # coordinates that an orientation has at least
-_INTEGER = re.compile("-?[0-9]{1,3011}")
+_INTEGER = re.compile("-?[1-9][0-9]{18,3010}")
 
 
 # -- writing -------------------------------------------------------------------------------------------------
@@ -276,7 +276,7 @@ def decode_datum(value: Any, graph: NodeGraph, depth: int = 0) -> Any:
     if tag == "float" and inner in ("inf", "-inf"):
         return decode_number(inner)
     if tag == "integer" and isinstance(inner, str) and _INTEGER.fullmatch(inner):
-        if int(inner).bit_length() <= MAX_BITS:
+        if PLAIN_BITS < int(inner).bit_length() <= MAX_BITS:
             return int(inner)
     raise InvalidDocumentError(f"{describe_value(inner)} is no {tag} of a datum")
 
