@@ -204,6 +204,17 @@ def test_document_beyond_the_budget_is_refused(name: str) -> None:
         read_operations(text)
 
 
+@pytest.mark.parametrize(
+    "others", [{"parameters": {"x": [1] * 100}}, {"reads": {"value": ["data/x"] * 100}}, {}]
+)
+def test_values_and_reads_are_work(others: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "MAX_WORK", 90)
+    with pytest.raises(kv.errors.FormatError, match="more than 90 steps"):
+        read_operations(
+            document([], [operation("t", {"data": {"x": [] if others else [1] * 100}}, **others)])
+        )
+
+
 def test_refusing_ten_million_nodes_takes_no_memory() -> None:
     text = (
         b'{"format":"kineverse","version":2,"operations":[{"nodes":[["constant",1.0]'

@@ -93,7 +93,9 @@ def fetch_mesh(mesh: Mesh) -> Path | None:
         return None
     sha256, size = mesh.content
     # The suffix says how the file is read; none is longer.
-    path = Path(_folder().name, sha256 + quote_plus(Path(mesh.uri).suffix.lower(), errors="replace")[:_LONGEST_SUFFIX])
+    path = Path(
+        _folder().name, sha256 + quote_plus(Path(mesh.uri).suffix.lower(), errors="replace")[:_LONGEST_SUFFIX]
+    )
     if path.is_file():
         return path
     wrong = ""

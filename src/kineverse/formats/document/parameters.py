@@ -183,6 +183,7 @@ def decode_parameter(
         return decode_parameter(item, graph, names, written, depth + 1)
 
     check_depth(depth)
+    graph.budget.spend(len(value))
     if type(value) is list:
         return tuple([inner(item) for item in value])
     tag, content = tagged(value, TAGS)

@@ -306,6 +306,7 @@ class _Document:
     def _reads(self, given: ReadsValue | None) -> Reads:
         reads = Reads()
         if given is not None:
+            self._budget.spend(COST_OF_NAME * (len(given.existence) + len(given.value)))
             for path in given.existence:
                 reads.add(self._names.path_cell(path), Read.EXISTENCE)
             for path in given.value:

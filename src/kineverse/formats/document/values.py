@@ -257,6 +257,7 @@ def decode_datum(value: Any, graph: NodeGraph, depth: int = 0) -> Any:
     """Decode a datum, nested in ``depth`` lists."""
     if type(value) is list:
         check_depth(depth)
+        graph.budget.spend(len(value))
         return tuple([decode_datum(item, graph, depth + 1) for item in value])
     if type(value) is float:
         if not math.isfinite(value):
