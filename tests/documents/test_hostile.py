@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.formats.document import budget, read_operations, traces
+from kineverse.formats.document import budget, encoding, read_operations, traces
 
 ONE: list[Any] = ["constant", 1.0]
 A: list[Any] = ["symbol", "a", 0, "dof"]
@@ -213,6 +213,13 @@ def test_values_and_reads_are_work(others: dict[str, Any], monkeypatch: pytest.M
         read_operations(
             document([], [operation("t", {"data": {"x": [] if others else [1] * 100}}, **others)])
         )
+
+
+def test_coupled_rates_that_come_alone_are_work() -> None:
+    (rates,) = json.loads(ring_of_rates(1500))["operations"]
+    blob = encoding.make_blob(rates)
+    with pytest.raises(kv.errors.FormatError, match=STEPS):
+        kv.formats.operation_from_bytes(blob)
 
 
 def test_refusing_ten_million_nodes_takes_no_memory() -> None:

@@ -254,7 +254,7 @@ def test_resolvers_are_asked_until_one_has_the_file() -> None:
             with pytest.raises((kv.errors.FormatError, OSError), match=r"(?i)not supported|cannot be read"):
                 read_mesh(Mesh(uri, content=known))
         kv.formats.remove_resolver(good)
-        with pytest.raises(kv.errors.FormatError, match="a resolver failed with TypeError|what was fetched"):
+        with pytest.raises(kv.errors.FormatError, match=r"a resolver failed with TypeError|what was fetched"):
             read_mesh(Mesh("tent.stl", content=known))
     finally:
         for resolver in (good, *wrong):

@@ -183,7 +183,9 @@ class _Document:
             self._check_size(blob)
             check_counts(blob, False)
             operation, _ = read_operation(blob, False)
-            return self._entry(operation, blob, {}, False)
+            entry = self._entry(operation, blob, {}, False)
+            self._spend_rates(entry.writes)
+            return entry
 
     def _check_size(self, content: bytes) -> None:
         if len(content) > MAX_BYTES:
@@ -226,10 +228,12 @@ class _Document:
                 raise InvalidDocumentError(f"the tag {value.tag[:60]!r} is taken by an earlier operation")
             self._place = f"operations[{i}] ({value.tag[:60]!r})"
             entries[value.tag] = self._entry(value, blob, folders.get(value.tag, {}), True)
-        self._place = "the rates"
-        rates = (value for (kind, _), value in self._cells.items() if kind == RATES)
-        spend_rate_coupling(rates, self._budget)
+        self._spend_rates(self._cells)
         return list(entries.values())
+
+    def _spend_rates(self, cells: dict[Cell, Any]) -> None:
+        self._place = "the rates"
+        spend_rate_coupling((value for (kind, _), value in cells.items() if kind == RATES), self._budget)
 
     def _entry(
         self, value: OperationValue, blob: bytes, folders: dict[int, str], is_in_document: bool
