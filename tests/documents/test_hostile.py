@@ -215,6 +215,14 @@ def test_values_and_reads_are_work(others: dict[str, Any], monkeypatch: pytest.M
         )
 
 
+def test_an_expression_of_any_depth_is_compared() -> None:
+    """CasADi's own serialisation recurses, and would end the process."""
+    ((_, deep),) = read_operations(
+        about_last([ONE, A, *(["elementary", "sin", [i]] for i in range(1, 100_000))])
+    )
+    assert hash(deep.recorded["constraints", "c"])
+
+
 def test_coupled_rates_that_come_alone_are_work() -> None:
     (rates,) = json.loads(ring_of_rates(1500))["operations"]
     blob = encoding.make_blob(rates)
