@@ -175,7 +175,13 @@ def _explain(error: Exception) -> str:
     text, _, place = str(error).partition(" - at `")
     text = _QUOTED.sub(_name_type, text)
     text = text if text[1:2].isupper() else text[:1].lower() + text[1:]
-    place = place.removesuffix("`").removeprefix("$").removeprefix(".").replace("[...]", "")
+    place = (
+        place.removeprefix("key` in `")
+        .removesuffix("`")
+        .removeprefix("$")
+        .removeprefix(".")
+        .replace("[...]", "")
+    )
     return f"{place}: {text}" if place else text
 
 
