@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.formats.document import budget, read_operations, traces
+from kineverse.formats.document import budget, encoding, read_operations, traces
 
 ONE: list[Any] = ["constant", 1.0]
 A: list[Any] = ["symbol", "a", 0, "dof"]
@@ -202,6 +202,32 @@ def test_document_beyond_the_budget_is_refused(name: str) -> None:
     assert len(text) < 1_000_000
     with pytest.raises(kv.errors.FormatError, match=reason):
         read_operations(text)
+
+
+@pytest.mark.parametrize(
+    "others", [{"parameters": {"x": [1] * 100}}, {"reads": {"value": ["data/x"] * 100}}, {}]
+)
+def test_values_and_reads_are_work(others: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "MAX_WORK", 90)
+    with pytest.raises(kv.errors.FormatError, match="more than 90 steps"):
+        read_operations(
+            document([], [operation("t", {"data": {"x": [] if others else [1] * 100}}, **others)])
+        )
+
+
+def test_an_expression_of_any_depth_is_compared() -> None:
+    """CasADi's own serialisation recurses, and would end the process."""
+    ((_, deep),) = read_operations(
+        about_last([ONE, A, *(["elementary", "sin", [i]] for i in range(1, 100_000))])
+    )
+    assert hash(deep.recorded["constraints", "c"])
+
+
+def test_coupled_rates_that_come_alone_are_work() -> None:
+    (rates,) = json.loads(ring_of_rates(1500))["operations"]
+    blob = encoding.make_blob(rates)
+    with pytest.raises(kv.errors.FormatError, match=STEPS):
+        kv.formats.operation_from_bytes(blob)
 
 
 def test_refusing_ten_million_nodes_takes_no_memory() -> None:

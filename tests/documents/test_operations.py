@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -230,6 +231,68 @@ def test_mesh_is_fetched_by_its_content(tmp_path: Path) -> None:
         assert read_mesh(mesh).vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     finally:
         kv.formats.remove_resolver(resolver)
+
+
+def test_resolvers_are_asked_until_one_has_the_file() -> None:
+    """One that fails or is wrong hinders no other, and no name of a file is taken from a document."""
+    content = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+    class Resolver:
+        def __init__(self, answer: Any) -> None:
+            self.answer = answer
+
+        def fetch(self, sha256: str, size: int) -> Any:
+            return self.answer[:size]
+
+    known = (hashlib.sha256(content).hexdigest(), len(content))
+    good, wrong = Resolver(content), [Resolver(answer) for answer in ("text", b"x", None, 7)]
+    for resolver in (good, *wrong):
+        kv.formats.add_resolver(resolver)
+    try:
+        assert len(read_mesh(Mesh("tent.obj", content=known)).faces) == 1
+        for uri in ("tent." + "o" * 300, "tent.\0"):
+            with pytest.raises((kv.errors.FormatError, OSError), match=r"(?i)not supported|cannot be read"):
+                read_mesh(Mesh(uri, content=known))
+        kv.formats.remove_resolver(good)
+        with pytest.raises(kv.errors.FormatError, match=r"a resolver failed with TypeError|what was fetched"):
+            read_mesh(Mesh("tent.stl", content=known))
+    finally:
+        for resolver in (good, *wrong):
+            kv.formats.remove_resolver(resolver)
+
+
+def test_no_texture_outside_of_a_root_is_measured(tmp_path: Path) -> None:
+    secret = tmp_path / "secret.png"
+    secret.write_text("secret")
+    model = kv.Model()
+    with model.edit() as edit:
+        shape = Shape(Box((1.0, 1.0, 1.0)), texture=str(secret))
+        edit.add_frame("box", "world", np.eye(4), Body((shape,)))
+    read = kv.formats.from_bytes(kv.formats.to_bytes(model, resources=True))
+    assert b"resources" not in kv.formats.to_bytes(read, resources=True)
+
+
+@pytest.mark.parametrize(("before", "after"), [(1.0, 1), (1, True), (0.0, -0.0), ((1,), (1.0,))])
+def test_equal_numbers_of_other_types_are_other_values(before: Any, after: Any) -> None:
+    """An edit leaves what a model made at once has, bit by bit; a trace takes an integer for a number."""
+
+    def model(value: Any) -> kv.Model:
+        result = kv.Model()
+        with result.edit() as edit:
+            edit.write("number", value)
+            edit.apply(Custom(lambda m: kv.model.Writes(data={"same": m.data["number"]})), "copy")
+        return result
+
+    edited, fresh = model(before), model(after)
+    kv.formats.to_bytes(edited)
+    read = kv.formats.from_bytes(kv.formats.to_bytes(edited))
+    with edited.edit() as edit:
+        edit.replace("data number", kv.model.SetData("number", after))
+    assert kv.formats.to_bytes(edited) == kv.formats.to_bytes(fresh)
+    if before == 1.0 and type(before) is float:
+        with read.edit() as edit:
+            edit.replace("data number", kv.model.SetData("number", after))
+        assert kv.formats.from_bytes(kv.formats.to_bytes(read)).data["same"] == after
 
 
 def test_net_changes_with_operations_from_elsewhere_are_adopted() -> None:

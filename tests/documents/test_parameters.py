@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import sys
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -96,8 +98,6 @@ def test_limits_follow_a_prefix_only_where_they_are_expressions() -> None:
 
 
 def test_record_of_an_unknown_class_stays_opaque() -> None:
-    from dataclasses import dataclass
-
     @dataclass(frozen=True)
     class Limits:
         colour: str
@@ -139,3 +139,36 @@ def test_joint_from_a_document_is_replaced_by_a_rebuilt_one() -> None:
         edit.replace(tag, kind(**recorded.parameters))  # type: ignore[attr-defined]
     assert read.fk(list(read.frames)[-1]) == model.fk(list(model.frames)[-1])
     assert list(read.frames) == list(before.frames)
+
+
+@dataclass(frozen=True, eq=False)
+class Anything(kv.Operation):
+    given: Any
+
+    def apply(self, model: kv.model.ReadRecorder) -> kv.model.Writes:
+        return kv.model.Writes(data={"x": 1})
+
+
+def nested(depth: int) -> tuple[Any, ...]:
+    return (nested(depth - 1),) if depth else ()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        nested(100),
+        nested(130),
+        {frozenset({1}): 1, frozenset({2}): 2},
+        {float("nan"): 1},
+        {2: (-0.0, 1, None)},
+    ],
+)
+def test_parameters_that_cannot_be_written_leave_what_is_read_and_written_again(given: Any) -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(Anything(given), "t")
+    blob = kv.formats.operation_to_bytes(model, "t")
+    again = kv.Model()
+    with again.edit() as edit:
+        edit.apply(kv.formats.operation_from_bytes(blob).operation, "t")
+    assert kv.formats.operation_to_bytes(again, "t") == blob

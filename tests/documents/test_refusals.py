@@ -98,6 +98,11 @@ def test_truncated_document_is_refused():
         (operation(tag='""'), "tag: expected a text of length >= 1"),
         (operation(reads='{"value": ["nowhere"]}'), "'nowhere' is not a kind"),
         (operation(value='{"expression": 7}'), "7 is not the place"),
+        (operation(value='{"integer": "12"}'), "no integer"),
+        (operation(parameters='{"a": {"mapping": [[1, 0], [1.0, 0]]}}'), "two keys that are equal"),
+        (operation(**{"a\\nb": 0}), "unknown field 'a b'"),
+        ('{"format": "kineverse", "version": 2, "operations": [], "folders": {"/\\u0000": {}}}', "folders"),
+        ('{"format": "kineverse", "version": 2, "operations": [], "sha256": "%s\\n"}' % ("0" * 64), "length <= 64"),
         ('{"format": ' + "[" * 1_000_000, "nested too deeply"),
         (operation(value="[" * 900 + "]" * 900), None),
     ],
@@ -109,6 +114,7 @@ def test_invalid_document_error_names_the_place(text, reason):
     assert isinstance(result, str), result
     assert result.startswith("d.kv.json")
     assert reason in result
+    assert len(result.splitlines()) == 1
     assert len(result) < 600
 
 

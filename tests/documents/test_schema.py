@@ -102,7 +102,7 @@ def test_a_parameter_is_no_schema_of_its_own() -> None:
     for text in (
         NODE % '["constant", 1]',
         OPERATION % "",
-        OPERATION % ', "parameters": {"a": [{"integer": "-12"}]}',
+        OPERATION % ', "parameters": {"a": [{"integer": "-9223372036854775808"}]}',
         WRITES % "{}",
     ):
         assert VALID.is_valid(json.loads(text))

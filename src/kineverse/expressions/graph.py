@@ -169,6 +169,7 @@ def _offsets(columns: list[SX]) -> list[int]:
 
 
 _PICKLING_DEPTH = 16
+_DEEP = 5000  # nodes of a graph that may be as deep as it is large
 
 
 def structural_hash(expression: Expression) -> bytes:
@@ -185,7 +186,9 @@ def structural_hash(expression: Expression) -> bytes:
             sx = ca.densify(sx)
         if not sx.is_constant() and not sx.is_symbolic():
             sx = ca.cse(sx)  # sharing of equal parts makes no difference
-        digest.update(sx.serialize().encode())
+        # CasADi serialises a graph by recursion, which ends the process where it is deep.
+        graph = sx if ca.n_nodes(sx) <= _DEEP else _casadi_function(sx, _leaf_graphs(symbols, nodes))
+        digest.update(graph.serialize().encode())
         expression._key = digest.digest()
     return expression._key
 
@@ -193,8 +196,12 @@ def structural_hash(expression: Expression) -> bytes:
 def pack(expression: Expression) -> tuple[Any, ...]:
     """Return the picklable arguments of :func:`unpack`."""
     symbols, nodes = leaves(expression)
-    function = _casadi_function(expression._sx, [*(s._sx for s in symbols), *(n.sx for n in nodes)])
+    function = _casadi_function(expression._sx, _leaf_graphs(symbols, nodes))
     return _pickling_order(nodes), symbols, nodes, expression._shape, function.serialize()
+
+
+def _leaf_graphs(symbols: Iterable[Symbol], nodes: Iterable[Node]) -> list[SX]:
+    return [*(s._sx for s in symbols), *(n.sx for n in nodes)]
 
 
 def _pickling_order(nodes: tuple[Node, ...]) -> tuple[Node, ...]:
@@ -209,7 +216,7 @@ def unpack(
     _: tuple[Any, ...], symbols: tuple[Any, ...], nodes: tuple[Any, ...], shape: ArrayShape, graph: str
 ) -> Expression:
     """Rebuild an expression from :func:`pack`."""
-    leaf = [*(s._sx for s in symbols), *(n.sx for n in nodes)]
+    leaf = _leaf_graphs(symbols, nodes)
     sx = ca.Function.deserialize(graph)(ca.vertcat(*map(ca.vec, leaf)) if leaf else ca.SX(0, 1))
     return from_casadi(sx, tuple(shape), frozenset(nodes))
 

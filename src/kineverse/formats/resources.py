@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Protocol
+from urllib.parse import quote_plus
 
 from kineverse.errors import FormatError
 from kineverse.model.body import Body, Mesh, Shape
 
+from .files import replace_file
 from .resource_paths import locate_mesh
+from .root_folder import NOWHERE
 
 
 class Resolver(Protocol):
@@ -43,6 +46,7 @@ class FolderResolver:
 
 
 _RESOLVERS: list[Resolver] = []
+_LONGEST_SUFFIX = 20
 
 
 def add_resolver(resolver: Resolver) -> None:
@@ -61,10 +65,10 @@ def measure_content(mesh: Mesh) -> tuple[str, int] | None:
     if mesh.content is not None:
         return mesh.content
     try:
-        content = locate_mesh(mesh).read_bytes()
+        with locate_mesh(mesh).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
     except (FormatError, OSError):
         return None
-    return hashlib.sha256(content).hexdigest(), len(content)
 
 
 def files_of(body: Body) -> Iterator[Mesh]:
@@ -78,7 +82,8 @@ def _files_of(shape: Shape) -> Iterator[Mesh]:
     if mesh is not None:
         yield mesh
     if shape.texture:
-        folder, root = ("", None) if mesh is None else (mesh.folder, mesh.root)
+        # A shape knows neither the folder nor the root of its description.
+        folder, root = ("", NOWHERE) if mesh is None else (mesh.folder, mesh.root)
         yield Mesh(shape.texture, folder=folder, root=root)
 
 
@@ -87,25 +92,27 @@ def fetch_mesh(mesh: Mesh) -> Path | None:
     if mesh.content is None:
         return None
     sha256, size = mesh.content
-    path = Path(_folder().name, sha256 + Path(mesh.uri).suffix.lower())
+    # The suffix says how the file is read; none is longer.
+    path = Path(
+        _folder().name, sha256 + quote_plus(Path(mesh.uri).suffix.lower(), errors="replace")[:_LONGEST_SUFFIX]
+    )
     if path.is_file():
         return path
-    for content in _fetched(_RESOLVERS, sha256, size):
-        if len(content) != size or hashlib.sha256(content).hexdigest() != sha256:
-            raise FormatError(
-                f"{mesh.uri!r}: what was fetched is not the file with SHA-256 {sha256} and {size} bytes. "
-                "It was changed or damaged; get another copy."
-            )
-        path.write_bytes(content)
-        return path
-    return None
-
-
-def _fetched(resolvers: Iterable[Resolver], sha256: str, size: int) -> Iterator[bytes]:
-    for resolver in resolvers:
-        content = resolver.fetch(sha256, size)
+    wrong = ""
+    for resolver in _RESOLVERS:
+        try:
+            content = resolver.fetch(sha256, size)
+        except Exception as error:
+            wrong = f"a resolver failed with {type(error).__name__}: {error}"
+            continue
+        if isinstance(content, bytes) and hashlib.sha256(content).hexdigest() == sha256:
+            replace_file(path, content)
+            return path
         if content is not None:
-            yield content
+            wrong = f"what was fetched is not the file with SHA-256 {sha256} and {size} bytes"
+    if wrong:
+        raise FormatError(f"{mesh.uri!r}: {wrong}. Get another copy of the file, or mend the resolver.")
+    return None
 
 
 @cache

@@ -32,7 +32,7 @@ from .commits.checks import (
     refused_error,
 )
 from .operation import DATA, FRAMES, KINDS, Cell, Operation, Writes
-from .read_recorder import ABSENT, Read, ReadRecorder, Reads, unknown_path_error
+from .read_recorder import ABSENT, Read, ReadRecorder, Reads, differs, unknown_path_error
 
 _GAP = 1 << 32
 _PLACE = attrgetter("place")
@@ -362,7 +362,7 @@ class History:
             # Readers then find the value of the previous writer.
             earlier = self.value_at(cell, place)
             old, new = (earlier if value is ABSENT else value for value in (old, new))
-        if old is new or (old is not ABSENT and new is not ABSENT and old == new):
+        if not differs(Read.VALUE, old, new):
             return
         index = bisect_right(writers, place, key=_PLACE)
         following = writers[index].place if index < len(writers) else None
@@ -403,7 +403,7 @@ class History:
             entry = self.entries.get(tag)
             if entry is not None:
                 how = entry.reads.cells.get(cell, Read.EXISTENCE)
-                if _differs(how, before, self.value_at(cell, entry.place)):
+                if differs(how, before, self.value_at(cell, entry.place)):
                     self.mark_outdated(tag)
                     found.append((tag, cell))
         return found
@@ -633,10 +633,3 @@ def check_operation(operation: object) -> None:
     """Check that something is an operation."""
     if not isinstance(operation, Operation):
         raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
-
-
-def _differs(how: Read, before: Any, now: Any) -> bool:
-    """Return whether a read finds something else than before."""
-    if before is now:
-        return False
-    return before is ABSENT or now is ABSENT or bool(how & Read.VALUE and before != now)

@@ -236,6 +236,21 @@ class _RecordedMapping(Mapping[str, V], Generic[V]):
         return len(self._names_at(self._kind))
 
 
+def differs(how: Read, before: Any, now: Any) -> bool:
+    """Return whether a read finds something else than before; 1, 1.0 and True differ, and 0.0 and -0.0."""
+    if before is now:
+        return False
+    return before is ABSENT or now is ABSENT or bool(how & Read.VALUE and not _is_same(before, now))
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    if type(one) is tuple and type(other) is tuple:
+        return len(one) == len(other) and all(map(_is_same, one, other))
+    if isinstance(one, (int, float)) or isinstance(other, (int, float)):
+        return type(one) is type(other) and repr(one) == repr(other)
+    return bool(one == other)
+
+
 def unknown_path_error(path: object) -> UnknownNameError:
     """Return the error for an invalid path into a model."""
     return UnknownNameError(

@@ -97,7 +97,7 @@ def _refuse_envelope(content: bytes, is_text: bool, error: Exception) -> NoRetur
     except msgspec.ValidationError:
         header = Header()
     except (msgspec.MsgspecError, UnicodeError, OverflowError) as problem:
-        what = "JSON" if is_text else "msgpack"
+        what = "JSON in UTF-8" if is_text else "msgpack"
         raise InvalidDocumentError(f"it is not {what}: {_explain(problem)}") from None
     if header.format != FORMAT:
         raise InvalidDocumentError(
@@ -106,15 +106,11 @@ def _refuse_envelope(content: bytes, is_text: bool, error: Exception) -> NoRetur
     version = header.version
     if type(version) is not int or version < 1:
         raise InvalidDocumentError("its version is not a whole number from 1 on") from None
-    if version > VERSION:
-        shown = version if version < 1_000_000 else "a million or more"
+    if version != VERSION:
+        advice = "update Kineverse" if version > VERSION else "save the model again, from what it was made of"
         raise InvalidDocumentError(
-            f"it is of version {shown}, and this Kineverse reads version {VERSION}; update Kineverse"
-        ) from None
-    if version < VERSION:
-        raise InvalidDocumentError(
-            f"it is of version {version}, and this Kineverse reads version {VERSION} alone; save the model "
-            "again, from the description or the code that it was made of"
+            f"it is of version {min(version, 1_000_000)}, and this Kineverse reads version {VERSION} alone; "
+            f"{advice}"
         ) from None
     raise InvalidDocumentError(_explain(error)) from None
 
@@ -179,7 +175,13 @@ def _explain(error: Exception) -> str:
     text, _, place = str(error).partition(" - at `")
     text = _QUOTED.sub(_name_type, text)
     text = text if text[1:2].isupper() else text[:1].lower() + text[1:]
-    place = place.removesuffix("`").removeprefix("$").removeprefix(".").replace("[...]", "")
+    place = (
+        place.removeprefix("key` in `")
+        .removesuffix("`")
+        .removeprefix("$")
+        .removeprefix(".")
+        .replace("[...]", "")
+    )
     return f"{place}: {text}" if place else text
 
 

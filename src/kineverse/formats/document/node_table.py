@@ -1,7 +1,7 @@
 """Node table of an operation, written from expressions.
 
 Every node is a tuple that begins with its type, in the layout of :mod:`.structs`; a reference is the place of
-an earlier node in the table. CasADi lists the instructions of large expressions; small ones are walked.
+an earlier node in the table.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from .node_types import ELEMENTARY_NAMES
 from .structs import VERSION
 
 _PLAIN = (Not, Select, Norm)
-_FEW = 40  # steps of an expression up to which walking it is faster than a function of CasADi
 
 
 class NodeTable:
@@ -98,7 +97,7 @@ class NodeTable:
         """Return the place of an element, after those of its operands."""
         if root.op() == ca.OP_CONST:
             return self._constant(float(root))
-        places, steps = self._elements, 0
+        places = self._elements
         goal = root.element_hash()
         stack: list[tuple[SX, int, list[tuple[SX, int]] | None]] = [(root, goal, None)]
         while stack:
@@ -117,54 +116,10 @@ class NodeTable:
                 operands = [(operand, operand.element_hash()) for operand in found]
                 missing = [(operand, its, None) for operand, its in operands if its not in places]
                 if missing:
-                    steps += 1
-                    if steps > _FEW:
-                        return self._run(root)
                     stack += [(sx, key, operands), *reversed(missing)]
                     continue
             places[key] = self._elementary(code, [places[its] for _, its in operands])
         return places[goal]
-
-    def _run(self, root: SX) -> int:
-        """Return the place of an element by CasADi's program for it, in which memory is used again."""
-        inputs = ca.symvar(root)
-        function = ca.Function("document", [ca.vertcat(*inputs)], [root])
-        operation, arguments = function.instruction_id, function.instruction_input
-        results = function.instruction_output
-        steps: list[Any] = []
-        memory: dict[int, int] = {}
-        wanted = -1
-        for k in range(function.n_instructions()):
-            code = operation(k)
-            if code == ca.OP_OUTPUT:
-                wanted = memory[arguments(k)[0]]
-                continue
-            if code == ca.OP_CONST:
-                steps.append(function.instruction_constant(k))
-            elif code == ca.OP_INPUT:
-                steps.append((None, inputs[arguments(k)[1]].element_hash()))
-            else:
-                steps.append((code, *(memory[a] for a in arguments(k))))
-            memory[results(k)[0]] = len(steps) - 1
-        places = [-1] * len(steps)
-        stack = [wanted]
-        while stack:
-            step = stack[-1]
-            what = steps[step]
-            if places[step] < 0:
-                if isinstance(what, float):
-                    places[step] = self._constant(what)
-                elif what[0] is None:
-                    places[step] = self._leaf(what[1])
-                else:
-                    missing = [a for a in what[1:] if places[a] < 0]
-                    if missing:
-                        stack.extend(reversed(missing))
-                        continue
-                    places[step] = self._elementary(what[0], [places[a] for a in what[1:]])
-            stack.pop()
-        self._elements[root.element_hash()] = places[wanted]
-        return places[wanted]
 
     def _elementary(self, code: int, refs: list[int]) -> int:
         if code not in ELEMENTARY_NAMES:

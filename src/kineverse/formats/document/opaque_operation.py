@@ -8,7 +8,7 @@ from typing import Any
 
 from kineverse.errors import KineverseError, ModelError, UnknownNameError
 from kineverse.model.operation import Cell, FinishedWrites, Operation, Writes
-from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder
+from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, differs
 from kineverse.model.traces import Trace
 from kineverse.model.traces.replay import writes_agree
 from kineverse.model.traces.trace import run_query, substitute_results
@@ -102,10 +102,12 @@ class OpaqueOperation(Operation):
             if again is not None:
                 return again.apply(scope)
         kind = UnknownNameError if isinstance(error, UnknownNameError) else ModelError
+        is_below = self.given and self.scope
+        hint = f" Its parameters say from what, in names that lack '{self.scope}'." if is_below else ""
         raise kind(
             f"{changed[0]} has changed, and this {self.kind} was made from it: {error} It comes from a "
             "document, without its code; in the same edit, remove it, or replace it by "
-            f"a new {self.kind}(...).{self._hint}"
+            f"a new {self.kind}(...).{hint}"
         ) from None
 
     def remember(self, model: ReadRecorder) -> None:
@@ -144,17 +146,9 @@ class OpaqueOperation(Operation):
             return None
         return made.below(self.scope) if self.scope else made
 
-    @property
-    def _hint(self) -> str:
-        if not self.given or not self.scope:
-            return ""
-        return f" Its parameters say from what, in names that lack '{self.scope}'."
-
     def _in_scope(self, model: ReadRecorder) -> ReadRecorder:
         """Return a reader that lists only names below the document's prefix, if it has one."""
-        if not self.scope:
-            return model
-        return model.restricted(self.scope)
+        return model.restricted(self.scope) if self.scope else model
 
     def _changed(self, model: ReadRecorder) -> list[str]:
         """Read what the original read, and return the names of what has changed."""
@@ -166,10 +160,7 @@ class OpaqueOperation(Operation):
             if tuple(model.list_names(kind)) != names[kind]
         ]
         for cell, how in sorted(self.reads.items()):
-            now, then = model.read(cell, how), values.get(cell, ABSENT)
-            if now is then:
-                continue
-            if then is ABSENT or now is ABSENT or (how & Read.VALUE and now != then):
+            if differs(how, values.get(cell, ABSENT), model.read(cell, how)):
                 changed.append("/".join(cell))
         return changed
 

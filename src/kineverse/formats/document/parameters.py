@@ -122,7 +122,11 @@ def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: in
             return encode_datum(value, ref)
         except FormatError:
             return {"unwritten": document_kind(type(value))}
-    if depth > MAX_DEPTH:
+    if isinstance(value, WrittenReference):
+        return {"written": value.path}
+    if isinstance(value, UnsupportedParameter):
+        return {"unwritten": value.kind}
+    if depth >= MAX_DEPTH:  # what is deeper is not read
         return {"unwritten": document_kind(type(value))}
 
     def inner(item: Any) -> Any:
@@ -132,12 +136,12 @@ def encode_parameter(value: Any, written: Mapping[int, str], ref: Ref, depth: in
         return [inner(item) for item in value]
     if isinstance(value, Pose):
         return {"pose": list(value.rows)}
-    if isinstance(value, WrittenReference):
-        return {"written": value.path}
-    if isinstance(value, UnsupportedParameter):
-        return {"unwritten": value.kind}
     if isinstance(value, Mapping):
-        return {"mapping": [[inner(key), inner(item)] for key, item in value.items()]}
+        pairs = [[inner(key), inner(item)] for key, item in value.items()]
+        # What tells keys apart may not be written.
+        if len({repr(key) for key, _ in pairs}) < len(pairs):
+            return {"unwritten": document_kind(type(value))}
+        return {"mapping": pairs}
     # Not so tuples: equal ones are one object in some programs, and several in others.
     if id(value) in written:
         return {"written": written[id(value)]}
@@ -179,6 +183,7 @@ def decode_parameter(
         return decode_parameter(item, graph, names, written, depth + 1)
 
     check_depth(depth)
+    graph.budget.spend(len(value))
     if type(value) is list:
         return tuple([inner(item) for item in value])
     tag, content = tagged(value, TAGS)
@@ -189,7 +194,10 @@ def decode_parameter(
             return msgspec.convert([content], Pose)
         if tag == "mapping":
             pairs = msgspec.convert(content, tuple[tuple[Any, Any], ...])
-            return {inner(key): inner(item) for key, item in pairs}
+            mapping = {inner(key): inner(item) for key, item in pairs}
+            if len(mapping) < len(pairs):
+                raise InvalidDocumentError("a mapping has two keys that are equal")
+            return mapping
         if tag == "record":
             kind, given = msgspec.convert(content, tuple[str, dict[str, Any]])
             return OpaqueRecord(kind, tuple((key, inner(item)) for key, item in given.items()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import Any
 
 from kineverse._runtime import no_collection
 from kineverse.errors import FormatError, KineverseError
@@ -52,29 +52,11 @@ def read_operations(
 ) -> list[tuple[str, OpaqueOperation]]:
     """Return the operations of a document, each with its tag.
 
-    Parameters
-    ----------
-    content
-        Text of the document, or its bytes: in UTF-8, or a packed document.
-    source
-        Name of the document in errors.
-    prefix
-        Prefix of all names, tags included; the world stays the world.
-    root
-        Folder below which its meshes may be opened, see :mod:`kineverse.formats.root_folder`; by default
-        there is none.
-    is_packed
-        True for msgpack.
-
-    Raises
-    ------
-    FormatError
-        With the source, the place in the document and the reason.
+    The content is text, its UTF-8, or msgpack if ``is_packed``. Errors (FormatError) name the source. All
+    names are put below the prefix; meshes below the root may be opened, see :mod:`..root_folder`.
     """
-    try:
-        content = content.encode() if isinstance(content, str) else content
-    except UnicodeError as error:
-        raise FormatError(f"{source}: a document is UTF-8 text, and this is not: {error}.") from None
+    if isinstance(content, str):
+        content = content.encode(errors="surrogatepass")  # refused by its place
     entries = _Document(source, prefix, root).read(content, not is_packed)
     return [(e.tag, e.operation) for e in entries if isinstance(e.operation, OpaqueOperation)]
 
@@ -107,10 +89,7 @@ def operation_from_bytes(
     FormatError
         If they are no valid operation, with the place and the reason.
     """
-    content = _check_bytes(data, "An operation")
-    check_prefix(prefix)
-    document = _Document("the operation", prefix, find_text_root(NOWHERE, root))
-    return document.read_alone(content)
+    return _Document("the operation", prefix, find_text_root(NOWHERE, root)).read_alone(data)
 
 
 def from_bytes(
@@ -132,9 +111,7 @@ def from_bytes(
     FormatError
         If they are no valid document, with the place and the reason.
     """
-    content = _check_bytes(data, "A packed document")
-    check_prefix(prefix)
-    entries = _Document("the document", prefix, find_text_root(NOWHERE, root)).read(content, False)
+    entries = _Document("the document", prefix, find_text_root(NOWHERE, root)).read(data, False)
     model = Model()
     try:
         with no_collection(), model.edit() as edit:
@@ -145,16 +122,11 @@ def from_bytes(
     return model
 
 
-def _check_bytes(data: Any, what: str) -> bytes:
-    if not isinstance(data, (bytes, bytearray, memoryview)):
-        raise FormatError(f"{what} is bytes, not a {type(data).__name__}.")
-    return bytes(data)
-
-
 class _Document:
     """Document that is being read."""
 
     def __init__(self, source: str, prefix: str | None, root: str) -> None:
+        check_prefix(prefix)
         self._source, self._root = source, root
         self._place, self._part = "", ""
         self._names = Names(f"{prefix}/" if prefix else "")
@@ -166,34 +138,43 @@ class _Document:
 
     def read(self, content: bytes, is_text: bool) -> list[HistoryEntry]:
         """Return the operations of a document."""
-        with _refusing(self), no_collection():
-            self._check_size(content)
-            if is_text:
-                try:
-                    content.decode()
-                except UnicodeError as error:
-                    raise InvalidDocumentError(
-                        f"a document is UTF-8 text, and this is not: {error}"
-                    ) from None
-            return self._read(content, is_text)
+        with self._refusing(), no_collection():
+            return self._read(self._check_content(content), is_text)
 
     def read_alone(self, blob: bytes) -> HistoryEntry:
         """Return the operation of a blob, which does not know what it has read."""
-        with _refusing(self), no_collection():
-            self._check_size(blob)
+        with self._refusing(), no_collection():
+            blob = self._check_content(blob)
             check_counts(blob, False)
             operation, _ = read_operation(blob, False)
-            return self._entry(operation, blob, {}, False)
+            entry = self._entry(operation, blob, {}, False)
+            self._spend_rates(entry.writes)
+            return entry
 
-    def _check_size(self, content: bytes) -> None:
+    def _check_content(self, content: Any) -> bytes:
+        if not isinstance(content, (bytes, bytearray, memoryview)):
+            raise InvalidDocumentError(f"it is bytes, not a {type(content).__name__}")
         if len(content) > MAX_BYTES:
             raise InvalidDocumentError(f"larger than {MAX_BYTES} bytes, the most a document has")
+        return bytes(content)
 
-    def refuse(self, reason: str) -> NoReturn:
-        """Raise the error of the document."""
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        """Turn all errors of the content into one with source and place."""
+        try:
+            yield
+        except (InvalidDocumentError, KineverseError) as error:
+            reason = str(error)
+        except RecursionError:
+            reason = "it is nested too deeply"
+        except MemoryError:
+            reason = "there is not enough memory for it"
+        else:
+            return
         place = f", {self._place}{self._part}" if self._place else ""
         if len(reason) > LONGEST_REASON:  # it quotes names, which may be of any length
             reason = f"{reason[:LONGEST_REASON]} ..."
+        reason = " ".join(reason.splitlines())
         raise FormatError(f"{self._source}{place}: {reason.removesuffix('.')}.") from None
 
     def _read(self, content: bytes, is_text: bool) -> list[HistoryEntry]:
@@ -225,10 +206,12 @@ class _Document:
                 raise InvalidDocumentError(f"the tag {value.tag[:60]!r} is taken by an earlier operation")
             self._place = f"operations[{i}] ({value.tag[:60]!r})"
             entries[value.tag] = self._entry(value, blob, folders.get(value.tag, {}), True)
-        self._place = "the rates"
-        rates = (value for (kind, _), value in self._cells.items() if kind == RATES)
-        spend_rate_coupling(rates, self._budget)
+        self._spend_rates(self._cells)
         return list(entries.values())
+
+    def _spend_rates(self, cells: dict[Cell, Any]) -> None:
+        self._place = "the rates"
+        spend_rate_coupling((value for (kind, _), value in cells.items() if kind == RATES), self._budget)
 
     def _entry(
         self, value: OperationValue, blob: bytes, folders: dict[int, str], is_in_document: bool
@@ -242,14 +225,18 @@ class _Document:
         is_as_given = not names.before and (writes is given or writes == given)
         self._part = ", reads"
         reads = self._reads(value.reads)
+        claimed, listed = reads.cells.copy(), reads.listings.copy()
         self._part = ", trace"
         trace = None if value.trace is None else decode_trace(value.trace, graph, names)
         if trace is not None:
             if value.frozen:
                 raise InvalidDocumentError("an operation with a trace is not frozen")
             asked = self._consistency.reads_of(trace, writes) if is_in_document else named_reads(trace)
-            is_as_given &= _merge(reads, asked)
-        is_as_given &= _add_parents(reads, writes)
+            for cell, how in asked.cells.items():
+                reads.add(cell, how)
+            reads.listings |= asked.listings
+        _add_parents(reads, writes)
+        is_as_given &= claimed == reads.cells and listed == reads.listings
         self._part = ", parameters"
         parameters = value.parameters
         for name, parameter in parameters.items():
@@ -305,6 +292,7 @@ class _Document:
     def _reads(self, given: ReadsValue | None) -> Reads:
         reads = Reads()
         if given is not None:
+            self._budget.spend(COST_OF_NAME * (len(given.existence) + len(given.value)))
             for path in given.existence:
                 reads.add(self._names.path_cell(path), Read.EXISTENCE)
             for path in given.value:
@@ -321,21 +309,6 @@ class _Document:
         return {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}, names
 
 
-@contextmanager
-def _refusing(document: _Document) -> Iterator[None]:
-    """Turn all errors of a content into one with source and place."""
-    try:
-        yield
-    except FormatError:
-        raise
-    except (InvalidDocumentError, KineverseError) as error:
-        document.refuse(str(error))
-    except RecursionError:
-        document.refuse("it is nested too deeply")
-    except MemoryError:
-        document.refuse("there is not enough memory for it")
-
-
 def _folders_by_tag(envelope: Envelope) -> dict[str, dict[int, str]]:
     """Return the folders of the meshes of operations, by tag and place of the mesh; -1 is all of them."""
     result: dict[str, dict[int, str]] = {}
@@ -345,19 +318,8 @@ def _folders_by_tag(envelope: Envelope) -> dict[str, dict[int, str]]:
     return result
 
 
-def _merge(reads: Reads, others: Reads) -> bool:
-    """Add other reads, and return whether all of them were there."""
-    known, listed = dict(reads.cells), set(reads.listings)
-    for cell, how in others.cells.items():
-        reads.add(cell, how)
-    reads.listings |= others.listings
-    return known == reads.cells and listed == reads.listings
-
-
-def _add_parents(reads: Reads, writes: dict[Cell, Any]) -> bool:
-    """Add the reads of the parents that written frames need, and return whether all of them were there."""
-    known = len(reads.cells)
+def _add_parents(reads: Reads, writes: dict[Cell, Any]) -> None:
+    """Add the reads of the parents that written frames need."""
     for (kind, _), value in writes.items():
         if kind == FRAMES and value.parent != WORLD and (FRAMES, value.parent) not in writes:
             reads.cells.setdefault((FRAMES, value.parent), Read.EXISTENCE)
-    return len(reads.cells) == known

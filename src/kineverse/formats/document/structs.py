@@ -30,8 +30,9 @@ Order: TypeAlias = Annotated[int, Meta(ge=0, le=MAX_ORDER)]
 Steps: TypeAlias = Annotated[int, Meta(ge=0, le=MAX_STEPS)]
 GradientSteps: TypeAlias = Annotated[tuple[tuple[Ref, bool], ...], Meta(max_length=MAX_PATH)]
 Pairs: TypeAlias = tuple[tuple[Ref, Ref], ...]  # of a symbol and an expression
-Digest: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
-
+# The pattern alone allows a line end after it.
+Digest: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", max_length=64)]
+Folder: TypeAlias = Annotated[str, Meta(pattern="^[^\\x00]*$")]
 
 _NODE_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "constant": {"value": Number},
@@ -154,7 +155,7 @@ class Envelope(_Part, frozen=True, kw_only=True):
     format: Literal["kineverse"]
     version: Literal[2]
     operations: Annotated[list[msgspec.Raw], Meta(max_length=MAX_NODES)]
-    folders: dict[str, dict[str, tuple[Length, ...]]] = field(default_factory=dict)
+    folders: dict[Folder, dict[str, tuple[Length, ...]]] = field(default_factory=dict)
     resources: tuple[Resource, ...] = ()
     sha256: Digest | UnsetType = UNSET
 

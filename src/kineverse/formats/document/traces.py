@@ -134,7 +134,8 @@ class TraceConsistency:
         reads = Reads()
         try:
             replies = self._replies(trace, reads)
-            if replies is None or not self._spend(self._cost_of_writes(trace)):
+            written = (e for (kind, _), value in trace.writes for e in find_expressions(kind, value))
+            if replies is None or not self._spend(sum(map(_nodes, written))):
                 return reads
             again = trace.compute_writes(replies).writes()
         except KineverseError as error:
@@ -201,9 +202,6 @@ class TraceConsistency:
     def _spend(self, work: int) -> bool:
         self._left -= work
         return self._left >= 0
-
-    def _cost_of_writes(self, trace: Trace) -> int:
-        return sum(_nodes(e) for (kind, _), value in trace.writes for e in find_expressions(kind, value))
 
     def _spend_comparison(self, pairs: list[ExpressionPair]) -> bool:
         """Spend the work of comparing values and gradients, which writes out implicit functions."""

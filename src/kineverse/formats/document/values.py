@@ -38,7 +38,7 @@ PLAIN_BITS = 63
 """Length of the longest integer that is written as a number; other languages and msgpack end there."""
 DATUM_TAGS = ("expression", "float", "integer")
 _QUATERNION = 4  # coordinates that an orientation has at least
-_INTEGER = re.compile("-?[0-9]{1,3011}")
+_INTEGER = re.compile("-?[1-9][0-9]{18,3010}")
 
 
 # -- writing -------------------------------------------------------------------------------------------------
@@ -126,15 +126,12 @@ def map_meshes(body: Body, change: Callable[[Mesh], Mesh]) -> Body:
             replace(s, geometry=change(s.geometry)) if type(s.geometry) is Mesh else s for s in given
         )
 
-    visuals = shapes(body.visuals)
-    return replace(body, visuals=visuals, collisions=shapes(body.collisions))
+    return replace(body, visuals=shapes(body.visuals), collisions=shapes(body.collisions))
 
 
 def without_folders(body: Body) -> Body:
     """Return a body whose meshes know nothing of the folders of this machine."""
-    if not any(mesh.folder or mesh.root is not None or mesh.content for mesh in meshes_of(body)):
-        return body
-    return map_meshes(body, lambda mesh: Mesh(mesh.uri, mesh.scale))
+    return map_meshes(body, lambda mesh: Mesh(mesh.uri, mesh.scale)) if meshes_of(body) else body
 
 
 # -- reading -------------------------------------------------------------------------------------------------
@@ -177,8 +174,8 @@ def decode_writes(
             try:
                 cell = names.cell(kind, check_name(name))
                 decoded = decode(cell[1], value, graph, names)
-                if kind == CONSTRAINTS and not is_trace:
-                    _check_bounds(decoded)
+                if kind == CONSTRAINTS and not is_trace and not _has_numbers(decoded):
+                    as_constraint(decoded)  # of a trace, once the values are known
             except (InvalidDocumentError, KineverseError) as error:
                 raise InvalidDocumentError(f"writes {kind}/{name[:60]}: {error}") from None
             yield cell, decoded
@@ -222,14 +219,9 @@ def _decode_articulation(
     return result
 
 
-def _decode_constraint(name: str, given: tuple[int, int, int], graph: NodeGraph, names: Names) -> Constraint:
-    return Constraint(*map(graph.scalar, given))
-
-
-def _check_bounds(constraint: Constraint) -> None:
-    # A trace checks them once the values are known; most bounds are numbers.
-    if not (constraint.lower.sx.is_constant() and constraint.upper.sx.is_constant()):
-        as_constraint(constraint)
+def _has_numbers(constraint: Constraint) -> bool:
+    """Return whether the bounds are numbers, as most are."""
+    return bool(constraint.lower.sx.is_constant() and constraint.upper.sx.is_constant())
 
 
 def _decode_rate(name: str, given: Any, graph: NodeGraph, names: Names) -> tuple[Symbol, RateEntry]:
@@ -246,7 +238,7 @@ _DECODERS: Mapping[str, Callable[[str, Any, NodeGraph, Names], Any]] = MappingPr
         FRAMES: _decode_frame,
         BODIES: _decode_body,
         ARTICULATIONS: _decode_articulation,
-        CONSTRAINTS: _decode_constraint,
+        CONSTRAINTS: lambda name, given, graph, names: Constraint(*map(graph.scalar, given)),
         RATES: _decode_rate,
         DATA: lambda name, given, graph, names: decode_datum(given, graph),
     }
@@ -257,6 +249,7 @@ def decode_datum(value: Any, graph: NodeGraph, depth: int = 0) -> Any:
     """Decode a datum, nested in ``depth`` lists."""
     if type(value) is list:
         check_depth(depth)
+        graph.budget.spend(len(value))
         return tuple([decode_datum(item, graph, depth + 1) for item in value])
     if type(value) is float:
         if not math.isfinite(value):
@@ -276,7 +269,7 @@ def decode_datum(value: Any, graph: NodeGraph, depth: int = 0) -> Any:
     if tag == "float" and inner in ("inf", "-inf"):
         return decode_number(inner)
     if tag == "integer" and isinstance(inner, str) and _INTEGER.fullmatch(inner):
-        if int(inner).bit_length() <= MAX_BITS:
+        if PLAIN_BITS < int(inner).bit_length() <= MAX_BITS:
             return int(inner)
     raise InvalidDocumentError(f"{describe_value(inner)} is no {tag} of a datum")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from kineverse.formats.resources import files_of, measure_content
 from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.model_view import ModelView
-from kineverse.model.operation import BODIES, Cell
+from kineverse.model.operation import BODIES
 from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Reads
 from kineverse.model.traces import Trace, UntraceableError, record_trace
 
@@ -30,9 +30,6 @@ from .values import encode_writes, meshes_of
 # Flags are compared as wholes, because operations on them are slow.
 _WITH_EXISTENCE = (Read.EXISTENCE, Read.EXISTENCE | Read.VALUE)
 _WITH_VALUE = (Read.VALUE, Read.EXISTENCE | Read.VALUE)
-
-# Values before an operation, by cell.
-Before = Callable[[], dict[Cell, Any]]
 
 
 def write_document(model: ModelView, target: Path) -> None:
@@ -137,16 +134,11 @@ def operation_to_bytes(model: ModelView, tag: str) -> bytes:
         entry = model.history.entry(tag)
     else:
         entries = _entries(model)
-        by_tag = {entry.tag: entry for entry in entries}
+        by_tag = {each.tag: each for each in entries}
         if tag not in by_tag:
             raise UnknownNameError(f"There is no operation {tag!r}. {suggest(str(tag), by_tag, 'tag')}")
         entry = by_tag[tag]
-
-    def before() -> dict[Cell, Any]:
-        earlier = takewhile(lambda other: other is not entry, entries)
-        return {cell: value for other in earlier for cell, value in other.writes.items()}
-
-    return entry.blob or _blob(entry, before)
+    return entry.blob or _blob(entry, entries)
 
 
 def operation_digest(model: ModelView, tag: str) -> str:
@@ -163,27 +155,14 @@ def _entries(model: ModelView) -> Sequence[HistoryEntry]:
 
 def _blobs(entries: Sequence[HistoryEntry]) -> list[bytes]:
     """Return the blobs of operations; those that are known are not encoded again."""
-    blobs: list[bytes] = []
-    cells: dict[Cell, Any] = {}
-    done = 0
-
-    def before() -> dict[Cell, Any]:
-        nonlocal done
-        for entry in entries[done : len(blobs)]:
-            cells.update(entry.writes)
-        done = len(blobs)
-        return cells
-
     with no_collection():
-        for entry in entries:
-            blobs.append(entry.blob or _blob(entry, before))  # noqa: PERF401 - before() counts them
-    return blobs
+        return [entry.blob or _blob(entry, entries) for entry in entries]
 
 
-def _blob(entry: HistoryEntry, before: Before) -> bytes:
-    """Return the blob of an operation, and keep it."""
+def _blob(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> bytes:
+    """Return the blob of one of the entries, and keep it."""
     try:
-        entry.blob = encoding.make_blob(_encode_operation(entry, before))
+        entry.blob = encoding.make_blob(_encode_operation(entry, entries))
     except RecursionError:
         raise FormatError("The model contains data or gradients that are nested too deeply.") from None
     except InvalidDocumentError as error:
@@ -193,7 +172,7 @@ def _blob(entry: HistoryEntry, before: Before) -> bytes:
     return entry.blob
 
 
-def _encode_operation(entry: HistoryEntry, before: Before) -> dict[str, Any]:
+def _encode_operation(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> dict[str, Any]:
     operation, writes = entry.operation, entry.writes
     trace: Trace | None = None
     table = NodeTable()
@@ -205,7 +184,7 @@ def _encode_operation(entry: HistoryEntry, before: Before) -> dict[str, Any]:
         kind, parameters = document_kind(type(operation)), operation_parameters(operation)
         if entry.reads.listings or any(how in _WITH_VALUE for how in entry.reads.cells.values()):
             if entry.reads.trace is None:
-                entry.reads.trace = _find_trace(entry, before())
+                entry.reads.trace = _find_trace(entry, entries)
             found = entry.reads.trace
             if isinstance(found, Trace):
                 trace = found
@@ -239,8 +218,10 @@ def _encode_reads(reads: Reads) -> dict[str, list[str]]:
     }
 
 
-def _find_trace(entry: HistoryEntry, cells: dict[Cell, Any]) -> Trace | str:
-    """Return the trace of an operation, or the reason for none."""
+def _find_trace(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> Trace | str:
+    """Return the trace of an operation after those before it, or the reason for none."""
+    earlier = takewhile(lambda other: other is not entry, entries)
+    cells = {cell: value for other in earlier for cell, value in other.writes.items()}
     before = ReadRecorder(
         lambda cell: cells.get(cell, ABSENT),
         lambda kind: sorted(name for k, name in cells if k == kind),

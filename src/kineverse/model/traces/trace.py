@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
@@ -258,7 +259,7 @@ class Trace:
         def fill_datum(expression: Expression) -> Expression | float:
             result = fill(expression)  # raises for an answer that is not there
             # An expression of numbers is converted back to a number.
-            parts = [results[a.query].parts[a.part] for a in find_read_nodes(expression)]
+            parts = [_parts(results[a.query])[a.part] for a in find_read_nodes(expression)]
             of_numbers = bool(parts) and all(isinstance(part, float) for part in parts)
             is_number = of_numbers and not result.shape and result.is_constant
             if not is_number:
@@ -304,8 +305,14 @@ def _reply(answered: QueryResult | KineverseError) -> QueryResult:
 
 def _like(reply: QueryResult, before: QueryResult) -> QueryResult:
     """Return a result with integers as floats, if it had floats at the time of the trace."""
-    is_whole = type(reply.rest) is int and isinstance(before.rest, ResultPart)
-    return QueryResult(before.rest, (float(reply.rest),)) if is_whole else reply
+    is_whole = not reply.parts and isinstance(before.rest, ResultPart)
+    return QueryResult(before.rest, _parts(reply)) if is_whole else reply
+
+
+def _parts(reply: QueryResult) -> tuple[Expression | float, ...]:
+    """Return the parts of a result; an integer, which has none, is a number where the trace had one."""
+    is_whole = type(reply.rest) is int and reply.rest.bit_length() < sys.float_info.max_exp
+    return (float(reply.rest),) if is_whole and not reply.parts else reply.parts
 
 
 def substitute_results(query: Query, results: Sequence[QueryResult]) -> Query:
@@ -318,7 +325,7 @@ def substitute_results(query: Query, results: Sequence[QueryResult]) -> Query:
 
 def _into(results: Sequence[QueryResult]) -> Callable[[Expression], Expression]:
     def place(answer: ReadNode) -> Expression:
-        parts = results[answer.query].parts
+        parts = _parts(results[answer.query])
         part = as_expression(parts[answer.part]) if answer.part < len(parts) else None
         if part is None or part.shape != answer.shape:
             raise UntraceableError("it needs more than there is now.")
