@@ -150,11 +150,7 @@ def make_document_model(nodes: int) -> Model:
 
 
 def read_document(text: str) -> Model:
-    model = Model()
-    with model.edit() as edit, no_collection():
-        for tag, operation in document.read_operations(text):
-            edit.apply(operation, tag)
-    return model
+    return document.from_bytes(text.encode())
 
 
 def forget_blobs(model: Model) -> Model:

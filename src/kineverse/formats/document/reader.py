@@ -100,7 +100,7 @@ def from_bytes(
     Parameters
     ----------
     data
-        The bytes, from any source.
+        The bytes, from any source; also those of a document as text.
     prefix
         Prefix of all names, tags included; the world stays the world.
     root
@@ -111,7 +111,7 @@ def from_bytes(
     FormatError
         If they are no valid document, with the place and the reason.
     """
-    entries = _Document("the document", prefix, find_text_root(NOWHERE, root)).read(data, False)
+    entries = _Document("the document", prefix, find_text_root(NOWHERE, root)).read(data)
     model = Model()
     try:
         with no_collection(), model.edit() as edit:
@@ -136,10 +136,11 @@ class _Document:
         self._listed: dict[str, set[str]] = {kind: set() for kind in KINDS}
         self._consistency = TraceConsistency(self._budget, self._cells, self._listed)
 
-    def read(self, content: bytes, is_text: bool) -> list[HistoryEntry]:
-        """Return the operations of a document."""
+    def read(self, content: bytes, is_text: bool | None = None) -> list[HistoryEntry]:
+        """Return the operations of a document; by default, one that begins with a brace is a text."""
         with self._refusing(), no_collection():
-            return self._read(self._check_content(content), is_text)
+            content = self._check_content(content)
+            return self._read(content, content.lstrip()[:1] == b"{" if is_text is None else is_text)
 
     def read_alone(self, blob: bytes) -> HistoryEntry:
         """Return the operation of a blob, which does not know what it has read."""
