@@ -69,10 +69,10 @@ def _are_equal(one: Operation, other: Operation) -> bool:
 def _find_commit(history: History, version: int) -> CommitRecord:
     version, commits = as_count("version", version, 0), history.commits
     if version not in commits:
-        kept = f"which are {min(commits)} to {max(commits)}" if commits else "and there are none yet"
+        kept = f"those of versions {min(commits)} to {max(commits)}" if commits else "none yet"
         raise EditError(
-            f"Version {version} cannot be taken back: only the last {UNDO_LIMIT} commits of a model can, "
-            f"{kept}."
+            f"Version {version} cannot be taken back. A model keeps the last {UNDO_LIMIT} commits for that, "
+            f"here {kept}."
         )
     return commits[version]
 
