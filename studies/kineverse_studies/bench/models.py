@@ -35,8 +35,7 @@ COPY = "copy a large model, per operation"
 RELEVANT, RELEVANT_NEW = "constraints_for a pose", "constraints_for a new expression"
 READERS = 7  # number of operations that read the writes of the replaced one
 _AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-_APPENDED = 100
-_QUERIES = 100
+_APPENDED = _QUERIES = 100
 
 
 @dataclass(frozen=True)
