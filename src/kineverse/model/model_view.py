@@ -415,12 +415,12 @@ class ModelView(SymbolicView):
         InvalidValueError
             For NaN or an infinite step, or if coordinates diverge.
         """
-        from .integration import StateIntegrator
-
         with self._lock:
             self._settle()
             check_flag("clip", clip)
             if self._integrator is None:
+                from .integration import StateIntegrator
+
                 self._integrator = StateIntegrator(self.degrees_of_freedom, self.rates)
             after = self._integrator.integrate(as_state(state, self._known(state)), speeds, dt)
             if not clip:
