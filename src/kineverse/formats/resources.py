@@ -1,4 +1,4 @@
-"""Files that bodies refer to, by content: their digests in documents, and resolvers that fetch them.
+"""Files that bodies refer to: their folders and digests in documents, and resolvers that fetch them.
 
 A document may state the SHA-256 and the size of each mesh and texture beside its address. Where the file is
 not found, a registered resolver fetches the content by its digest. The content is checked, so a resolver need
@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import quote_plus
 
+from msgspec.structs import replace
+
 from kineverse.errors import FormatError
 from kineverse.model.body import Body, Mesh, Shape
+from kineverse.model.history import HistoryEntry
+from kineverse.model.operation import BODIES
 
 from .files import replace_file
 from .resource_paths import locate_mesh
@@ -71,20 +75,74 @@ def measure_content(mesh: Mesh) -> tuple[str, int] | None:
         return None
 
 
-def files_of(body: Body) -> Iterator[Mesh]:
+def meshes_of(body: Body) -> list[Mesh]:
+    """Return the meshes of a body, in order."""
+    return [s.geometry for s in (*body.visuals, *body.collisions) if type(s.geometry) is Mesh]
+
+
+def map_meshes(body: Body, change: Callable[[Mesh], Mesh]) -> Body:
+    """Return a body with other meshes; they are changed in the order of :func:`meshes_of`."""
+
+    def shapes(given: tuple[Shape, ...]) -> tuple[Shape, ...]:
+        return tuple(
+            replace(s, geometry=change(s.geometry)) if type(s.geometry) is Mesh else s for s in given
+        )
+
+    visuals = shapes(body.visuals)
+    return replace(body, visuals=visuals, collisions=shapes(body.collisions))
+
+
+def without_places(body: Body) -> Body:
+    """Return a body whose meshes know nothing of the folders of this machine."""
+    return map_meshes(body, lambda mesh: Mesh(mesh.uri, mesh.scale)) if meshes_of(body) else body
+
+
+def find_mesh_folders(entries: Iterable[HistoryEntry]) -> dict[str, dict[str, tuple[int, ...]]]:
+    """Return the operations with meshes below a folder, by folder, each with those meshes if not all are."""
+    result: dict[str, dict[str, tuple[int, ...]]] = {}
+    for entry in entries:
+        found = [mesh.folder for body in _bodies_of(entry) for mesh in meshes_of(body)]
+        for folder in dict.fromkeys(found):
+            if folder:
+                places = tuple(i for i, other in enumerate(found) if other == folder)
+                result.setdefault(folder, {})[entry.tag] = () if len(places) == len(found) else places
+    return result
+
+
+def folders_by_tag(folders: Mapping[str, Mapping[str, tuple[int, ...]]]) -> dict[str, dict[int, str]]:
+    """Return the folders of the meshes of operations, by tag and place of the mesh; -1 is all of them."""
+    result: dict[str, dict[int, str]] = {}
+    for folder, tags in folders.items():
+        for tag, places in tags.items():
+            result.setdefault(tag, {}).update(dict.fromkeys(places or (-1,), folder))
+    return result
+
+
+def find_contents(entries: Iterable[HistoryEntry], measured: bool) -> dict[tuple[str, str], tuple[str, int]]:
+    """Return SHA-256 and size of files that are known, or measured, by folder and address."""
+    result: dict[tuple[str, str], tuple[str, int]] = {}
+    for entry in entries:
+        for file in (file for body in _bodies_of(entry) for file in _files_of(body)):
+            known = measure_content(file) if measured else file.content
+            if known is not None:
+                result.setdefault((file.folder, file.uri), known)
+    return result
+
+
+def _bodies_of(entry: HistoryEntry) -> Iterator[Body]:
+    return (value for (kind, _), value in entry.writes.items() if kind == BODIES)
+
+
+def _files_of(body: Body) -> Iterator[Mesh]:
     """Yield the meshes and textures of a body; a texture as a mesh in the folder of its shape."""
     for shape in (*body.visuals, *body.collisions):
-        yield from _files_of(shape)
-
-
-def _files_of(shape: Shape) -> Iterator[Mesh]:
-    mesh = shape.geometry if isinstance(shape.geometry, Mesh) else None
-    if mesh is not None:
-        yield mesh
-    if shape.texture:
-        # A shape knows neither the folder nor the root of its description.
-        folder, root = ("", NOWHERE) if mesh is None else (mesh.folder, mesh.root)
-        yield Mesh(shape.texture, folder=folder, root=root)
+        mesh = shape.geometry if isinstance(shape.geometry, Mesh) else None
+        if mesh is not None:
+            yield mesh
+        if shape.texture:
+            # A shape knows neither the folder nor the root of its description.
+            folder, root = ("", NOWHERE) if mesh is None else (mesh.folder, mesh.root)
+            yield Mesh(shape.texture, folder=folder, root=root)
 
 
 def fetch_mesh(mesh: Mesh) -> Path | None:

@@ -12,6 +12,7 @@ from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.files import MAX_BYTES
 from kineverse.formats.names import check_prefix
 from kineverse.formats.resource_paths import restrict_meshes
+from kineverse.formats.resources import folders_by_tag, map_meshes, meshes_of
 from kineverse.formats.root_folder import NOWHERE, find_text_root
 from kineverse.model.body import Body, Mesh
 from kineverse.model.frame import WORLD
@@ -35,9 +36,9 @@ from .node_graph import NodeGraph
 from .node_types import read_nodes
 from .opaque_operation import OpaqueOperation
 from .parameters import decode_parameter
-from .structs import Envelope, OperationValue, ReadsValue
+from .structs import OperationValue, ReadsValue
 from .traces import TraceConsistency, decode_trace, named_reads
-from .values import Names, decode_writes, map_meshes, meshes_of
+from .values import Names, decode_writes
 
 LONGEST_REASON = 1000
 
@@ -198,7 +199,7 @@ class _Document:
             )
         if sum(len(value.nodes) for value in values) > MAX_NODES:
             raise InvalidDocumentError(f"a document has up to {MAX_NODES:,} nodes")
-        folders = _folders_by_tag(envelope)
+        folders = folders_by_tag(envelope.folders)
         self._contents = {(r.folder, r.uri): (r.sha256, r.size) for r in envelope.resources}
         entries: dict[str, HistoryEntry] = {}
         for i, (value, blob) in enumerate(zip(values, blobs, strict=True)):
@@ -308,15 +309,6 @@ class _Document:
             self._budget.spend(COST_OF_NAME * len(self._listed[kind]))
             names[kind] = tuple(sorted(self._listed[kind]))
         return {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}, names
-
-
-def _folders_by_tag(envelope: Envelope) -> dict[str, dict[int, str]]:
-    """Return the folders of the meshes of operations, by tag and place of the mesh; -1 is all of them."""
-    result: dict[str, dict[int, str]] = {}
-    for folder, tags in envelope.folders.items():
-        for tag, places in tags.items():
-            result.setdefault(tag, {}).update(dict.fromkeys(places or (-1,), folder))
-    return result
 
 
 def _add_parents(reads: Reads, writes: dict[Cell, Any]) -> None:

@@ -13,12 +13,11 @@ from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
-from msgspec.structs import replace
-
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
+from kineverse.formats.resources import meshes_of, without_places
 from kineverse.model.articulation import Articulation, check_home
-from kineverse.model.body import Body, Mesh, Pose, Shape
+from kineverse.model.body import Body, Mesh, Pose
 from kineverse.model.constraint import Constraint, as_constraint
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, KINDS, RATES, Cell
@@ -72,7 +71,7 @@ def _encode_value(kind: str, value: Any, ref: Ref) -> Any:
             return ref(coordinate), ref(row)
         return ref(coordinate), [(ref(speed), ref(entry)) for speed, entry in row]
     if kind == BODIES:
-        return without_folders(value)
+        return without_places(value)
     if kind == ARTICULATIONS:
         return {
             "kind": value.kind,
@@ -108,30 +107,6 @@ def encode_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
         f"a {type(value).__name__} cannot be saved; write texts, numbers, true or false, None, expressions "
         "and tuples of these"
     )
-
-
-# -- meshes --------------------------------------------------------------------------------------------------
-
-
-def meshes_of(body: Body) -> list[Mesh]:
-    """Return the meshes of a body, in order."""
-    return [s.geometry for s in (*body.visuals, *body.collisions) if type(s.geometry) is Mesh]
-
-
-def map_meshes(body: Body, change: Callable[[Mesh], Mesh]) -> Body:
-    """Return a body with other meshes; they are changed in the order of :func:`meshes_of`."""
-
-    def shapes(given: tuple[Shape, ...]) -> tuple[Shape, ...]:
-        return tuple(
-            replace(s, geometry=change(s.geometry)) if type(s.geometry) is Mesh else s for s in given
-        )
-
-    return replace(body, visuals=shapes(body.visuals), collisions=shapes(body.collisions))
-
-
-def without_folders(body: Body) -> Body:
-    """Return a body whose meshes know nothing of the folders of this machine."""
-    return map_meshes(body, lambda mesh: Mesh(mesh.uri, mesh.scale)) if meshes_of(body) else body
 
 
 # -- reading -------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,10 @@ from typing import Any
 from kineverse._runtime import no_collection
 from kineverse.errors import FormatError, UnknownNameError, suggest
 from kineverse.formats.files import replace_file
-from kineverse.formats.resources import files_of, measure_content
+from kineverse.formats.resources import find_contents, find_mesh_folders
 from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.model_view import ModelView
-from kineverse.model.operation import BODIES
 from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Reads
 from kineverse.model.traces import Trace, UntraceableError, record_trace
 
@@ -25,7 +24,7 @@ from .opaque_operation import OpaqueOperation
 from .parameters import document_kind, encode_parameter, operation_parameters
 from .structs import Resource
 from .traces import encode_queries
-from .values import encode_writes, meshes_of
+from .values import encode_writes
 
 # Flags are compared as wholes, because operations on them are slow.
 _WITH_EXISTENCE = (Read.EXISTENCE, Read.EXISTENCE | Read.VALUE)
@@ -235,36 +234,6 @@ def _find_trace(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> Trace |
 
 def _beside(entries: Sequence[HistoryEntry], resources: bool) -> dict[str, Any]:
     """Return the members of a document that are no part of its content."""
-    return {"folders": _folders(entries), "resources": _resources(entries, resources)}
-
-
-def _resources(entries: Sequence[HistoryEntry], measured: bool) -> tuple[Resource, ...]:
-    """Return the contents of files that are known, or measured, each address once."""
-    result: dict[tuple[str, str], Resource] = {}
-    for entry in entries:
-        for (kind, _), body in entry.writes.items():
-            for file in files_of(body) if kind == BODIES else ():
-                known = measure_content(file) if measured else file.content
-                if known is not None:
-                    resource = Resource(file.uri, known[0], known[1], file.folder)
-                    result.setdefault((file.folder, file.uri), resource)
-    return tuple(result.values())
-
-
-def _folders(entries: Sequence[HistoryEntry]) -> dict[str, dict[str, tuple[int, ...]]]:
-    """Return the operations with meshes below a folder, by folder, each with those meshes if not all are."""
-    result: dict[str, dict[str, tuple[int, ...]]] = {}
-    for entry in entries:
-        found = list(_mesh_folders(entry))
-        for folder in dict.fromkeys(found):
-            if folder:
-                places = tuple(i for i, other in enumerate(found) if other == folder)
-                result.setdefault(folder, {})[entry.tag] = () if len(places) == len(found) else places
-    return result
-
-
-def _mesh_folders(entry: HistoryEntry) -> Iterator[str]:
-    for (kind, _), body in entry.writes.items():
-        if kind == BODIES:
-            for mesh in meshes_of(body):
-                yield mesh.folder
+    contents = find_contents(entries, resources).items()
+    files = tuple(Resource(uri, sha256, size, folder) for (folder, uri), (sha256, size) in contents)
+    return {"folders": find_mesh_folders(entries), "resources": files}
