@@ -65,9 +65,10 @@ class Changes(_Message, frozen=True):
 
 
 class FileContent(_Message, frozen=True):
-    """Digest and size of a file that bodies refer to, by its address in them."""
+    """Digest and size of the file of a mesh, by the operation and the place among its meshes."""
 
-    uri: Name
+    tag: Name
+    index: Number
     sha256: Sha256
     size: Number
 
@@ -113,6 +114,7 @@ class Edit(_Message, frozen=True, tag="edit"):
     chain: Chain
     changes: Changes
     strict: bool = False
+    files: tuple[FileContent, ...] = ()
 
 
 class Undo(_Message, frozen=True, tag="undo"):
@@ -217,6 +219,7 @@ class Joined(_Message, frozen=True, tag="joined"):
     chain: Chain
     view: str
     document: bytes
+    files: tuple[FileContent, ...] = ()
 
 
 class Missed(_Message, frozen=True, tag="missed"):
@@ -323,6 +326,13 @@ Answer: TypeAlias = Committed | Refused | Joined | Missed | Status | History | F
 # -- signals -------------------------------------------------------------------------------------------------
 
 
+class Seen(_Message, frozen=True):
+    """Revision that a client has got, told from time to time."""
+
+    client: Id
+    revision: Revision
+
+
 class Beat(_Message, frozen=True):
     """Sign of life with the present revision and, by view, the last one that concerns it."""
 
@@ -373,6 +383,7 @@ decode_answer = Decoder(Answer, "An answer")
 decode_commit = Decoder(Commit, "A commit")
 decode_published = Decoder(Published, "A commit")
 decode_beat = Decoder(Beat, "A sign of life")
+decode_seen = Decoder(Seen, "A sign of life")
 
 
 def chain(previous: bytes, commit: bytes) -> bytes:
