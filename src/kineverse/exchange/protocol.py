@@ -127,7 +127,7 @@ class Undo(_Message, frozen=True, tag="undo"):
 
 
 class Join(_Message, frozen=True, tag="join"):
-    """Ask for the model, or for the part that frames and symbols need."""
+    """Ask for the model, or for the part of it that frames and symbols need."""
 
     protocol: int
     library: Text  # version of Kineverse
@@ -136,13 +136,14 @@ class Join(_Message, frozen=True, tag="join"):
     frames: Tags = ()
     symbols: Tags = ()
     bodies: bool = True
-    whole: bool = True
+    is_part: bool = False
 
 
 class Since(_Message, frozen=True, tag="since"):
     """Ask for the commits after a revision, to close a gap; ``view`` is empty for the whole model."""
 
     client: Id
+    who: Text
     view: str
     revision: Revision
     chain: Chain
