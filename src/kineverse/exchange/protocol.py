@@ -387,6 +387,18 @@ decode_beat = Decoder(Beat, "A sign of life")
 decode_seen = Decoder(Seen, "A sign of life")
 
 
+class _Tagged(Struct, frozen=True):
+    tag: str
+
+
+_decode_tag = msgspec.msgpack.Decoder(_Tagged).decode
+
+
+def tag_of(placed: Placed) -> str:
+    """Return the tag of an operation from a blob that was checked."""
+    return _decode_tag(placed.blob).tag
+
+
 def chain(previous: bytes, commit: bytes) -> bytes:
     """Return the digest of a sequence of commits with one more: equal only for equal sequences."""
     return hashlib.sha256(previous + commit).digest()
