@@ -19,7 +19,7 @@ from kineverse.model.frame import WORLD
 from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model
 from kineverse.model.operation import BODIES, FRAMES, KINDS, RATES, Cell, Writes, find_expressions
-from kineverse.model.read_recorder import ABSENT, Read, Reads
+from kineverse.model.read_recorder import ABSENT, Read, Reads, Seen
 from kineverse.model.registry import FileContent
 from kineverse.model.traces.trace import find_read_nodes
 
@@ -244,11 +244,9 @@ class _Document:
         for name, parameter in parameters.items():
             parameters[name] = decode_parameter(parameter, graph, names, writes)
         self._part = ""
-        seen, overrides = None, False
         if is_in_document:
-            seen = self._seen(reads)
+            reads.seen = self._seen(reads, writes)
             for cell, written in writes.items():
-                overrides = overrides or cell in self._cells
                 self._cells[cell] = written
                 self._listed[cell[0]].add(cell[1])
         operation = OpaqueOperation(
@@ -260,8 +258,6 @@ class _Document:
             trace,
             value.frozen,
             names.before + value.below,
-            seen,
-            overrides,
         )
         tag = names.before + value.tag
         return HistoryEntry(tag, operation, 0, reads, writes, blob if is_as_given else None)
@@ -303,12 +299,13 @@ class _Document:
                 reads.listings.add(self._names.cell(kind, "x")[0])
         return reads
 
-    def _seen(self, reads: Reads) -> tuple[dict[Cell, Any], dict[str, tuple[str, ...]]]:
+    def _seen(self, reads: Reads, writes: dict[Cell, Any]) -> Seen:
         names = {}
         for kind in reads.listings:
             self._budget.spend(COST_OF_NAME * len(self._listed[kind]))
             names[kind] = tuple(sorted(self._listed[kind]))
-        return {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}, names
+        values = {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}
+        return Seen(values, names, not self._cells.keys().isdisjoint(writes))
 
 
 def _add_parents(reads: Reads, writes: dict[Cell, Any]) -> None:

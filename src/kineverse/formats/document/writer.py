@@ -224,7 +224,7 @@ def _find_trace(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> Trace |
     before = ReadRecorder(
         lambda cell: cells.get(cell, ABSENT),
         lambda kind: sorted(name for k, name in cells if k == kind),
-        Reads(),
+        Reads(entry.reads.seen),
     )
     try:
         return record_trace(entry.operation, before, entry.writes)
