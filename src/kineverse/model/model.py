@@ -194,6 +194,13 @@ class Model(ModelView):
         except KineverseError as error:
             raise EditError(f"The changes cannot be adopted: {error}") from error
 
+    def _restore(self, entries: Iterable[HistoryEntry], version: int) -> None:
+        """Fill an empty model with entries of a document, checked, as of a version; that cannot be undone."""
+        with no_collection(), self._transaction(lambda _: self._commit(version)) as edit:
+            for entry in entries:
+                edit.link(entry)
+        self._history.commits.clear()
+
     def include(
         self,
         source: Any,

@@ -43,19 +43,11 @@ class Read(IntFlag):
 
 
 class Seen(NamedTuple):
-    """What an operation of a document found where it was written: its writes in the document follow from it.
+    """Values that an operation of a document has read there; its writes in the document follow from them."""
 
-    Attributes
-    ----------
-    values, names
-        Values of the cells that it read, and names of the kinds that it listed.
-    overrides
-        True if it overwrote writes of operations before it.
-    """
-
-    values: Mapping[Cell, Any]
-    names: Mapping[str, tuple[str, ...]]
-    overrides: bool
+    values: Mapping[Cell, Any]  # of the cells that it read
+    names: Mapping[str, tuple[str, ...]]  # of the kinds that it listed
+    overrides: bool  # True if it overwrote writes of operations before it
 
 
 class Reads:
@@ -100,11 +92,11 @@ class ReadRecorder:
 
     @property
     def seen(self) -> Seen | None:
-        """What the operation has read in the document that it comes from; None until it is known."""
+        """Values that the operation has read in the document that it comes from; None until they are known."""
         return self._reads.seen
 
     def remember(self, seen: Seen) -> None:
-        """Keep what counts as what the operation has read."""
+        """Keep values as those that the operation has read."""
         self._reads.seen = seen
 
     def read(self, cell: Cell, how: Read) -> Any:

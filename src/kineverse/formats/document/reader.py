@@ -55,6 +55,8 @@ def read_operations(
 
     The content is text, its UTF-8, or msgpack if ``is_packed``. Errors (FormatError) name the source. All
     names are put below the prefix; meshes below the root may be opened, see :mod:`..root_folder`.
+
+    An operation alone does not know what it has read. A whole model is made of :func:`entries_from_bytes`.
     """
     if isinstance(content, str):
         content = content.encode(errors="surrogatepass")  # refused by its place
@@ -93,10 +95,16 @@ def operation_from_bytes(
     return _Document("the operation", prefix, find_text_root(NOWHERE, root)).read_alone(data)
 
 
-def from_bytes(
-    data: bytes, prefix: str | None = None, *, root: str | os.PathLike[str] | None = None
-) -> Model:
-    """Return the model in the result of :func:`.writer.to_bytes`. Runs no code and imports no name.
+def entries_from_bytes(
+    data: bytes,
+    prefix: str | None = None,
+    *,
+    root: str | os.PathLike[str] | None = None,
+    source: str = "the document",
+) -> list[HistoryEntry]:
+    """Return the operations in the result of :func:`.writer.to_bytes`, with what they read and wrote.
+
+    ``edit.link(entry)`` of each in turn makes the model. Runs no code and imports no name.
 
     Parameters
     ----------
@@ -106,13 +114,25 @@ def from_bytes(
         Prefix of all names, tags included; the world stays the world.
     root
         Folder below which meshes given by path may be opened. By default only meshes of packages are.
+    source
+        Name of the document in errors.
 
     Raises
     ------
     FormatError
         If they are no valid document, with the place and the reason.
     """
-    entries = _Document("the document", prefix, find_text_root(NOWHERE, root)).read(data)
+    return _Document(source, prefix, find_text_root(NOWHERE, root)).read(data)
+
+
+def from_bytes(
+    data: bytes, prefix: str | None = None, *, root: str | os.PathLike[str] | None = None
+) -> Model:
+    """Return the model in the result of :func:`.writer.to_bytes`. Runs no code and imports no name.
+
+    Parameters and errors are those of :func:`entries_from_bytes`.
+    """
+    entries = entries_from_bytes(data, prefix, root=root)
     model = Model()
     try:
         with no_collection(), model.edit() as edit:

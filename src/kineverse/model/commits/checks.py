@@ -90,7 +90,7 @@ def know_reads(history: History, entry: HistoryEntry) -> HistoryEntry:
 
 
 def finds_what_it_read(history: History, entry: HistoryEntry) -> bool:
-    """Return whether all values that an operation has read elsewhere are the same objects before its place."""
+    """Return whether all values that an operation has read elsewhere are the same objects here."""
     seen, place = entry.reads.seen, entry.place
     return (
         seen is not None
