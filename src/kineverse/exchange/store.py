@@ -300,7 +300,10 @@ def _encode_total(total: int) -> bytes:
 
 
 def _connect(address: str, **options: Any) -> sqlite3.Connection:
-    return sqlite3.connect(address, timeout=0, isolation_level=None, check_same_thread=False, **options)
+    db: sqlite3.Connection = sqlite3.connect(
+        address, timeout=0, isolation_level=None, check_same_thread=False, **options
+    )
+    return db
 
 
 def _check_path(path: Path) -> None:
@@ -308,6 +311,11 @@ def _check_path(path: Path) -> None:
         raise StoreError(f"{path} cannot be opened: there is no folder {path.parent}. Make it first.")
     if path.exists() and not path.is_file():
         raise StoreError(f"{path} is no file. Name a file for the store.")
+    if not path.exists() and os.path.lexists(f"{path}-wal"):  # SQLite would remove it
+        raise StoreError(
+            f"{path} is missing, but {path}-wal is there, which has its newest commits. Restore the former, "
+            "or remove the latter to start a new store."
+        )
 
 
 def _check_unclosed(path: Path) -> None:
