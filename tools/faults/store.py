@@ -261,7 +261,7 @@ def commit_for_ever(path: Path, seed: int) -> None:
 
 
 def try_kills(rounds: int, seed: int, folder: Path) -> list[int]:
-    """Kill processes that commit, and return the revisions then; raise if a commit is missing, or a part of it."""
+    """Kill processes that commit, and return the revisions then; raise for a commit that is not complete."""
     path, expected, random = folder / "killed.db", Expected(seed), Random(seed)
     revisions = []
     for number in range(rounds):

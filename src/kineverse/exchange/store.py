@@ -85,25 +85,25 @@ class Store:
     """
 
     def __init__(self, path: Path | None, *, durable: bool = False) -> None:
-        self._path = "The store" if path is None else str(path)
+        self._path = "The store" if path is None else os.path.realpath(path)
         self._lock = threading.RLock()
-        may_create = path is None or not path.exists()
-        if path is not None:
-            _check_path(path)
-            if not may_create and os.path.exists(f"{path}-wal"):
-                _check_unclosed(path)
+        is_there = path is not None and _check_path(Path(self._path))
+        if is_there and os.path.exists(f"{self._path}-wal"):
+            _check_unclosed(self._path)
         with _reporting(self._path):
-            self._db = _connect(":memory:" if path is None else os.path.abspath(path))
+            self._db = _connect(":memory:" if path is None else self._path)
         try:
             with _reporting(self._path):
                 self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
-                if may_create:
+                if not is_there:
                     _create(self._db)
                 self._contents = _load(self._db, self._path)
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
                 self._db.execute("BEGIN IMMEDIATE")  # an error if the file cannot be written
                 self._db.execute("ROLLBACK")
+            if path is not None:
+                Path(f"{self._path}-shm").unlink(missing_ok=True)  # of readers; nobody else has the file open
         except BaseException:
             self._db.close()
             raise
@@ -195,9 +195,8 @@ class Store:
 
     def backup(self, path: Path) -> None:
         """Write a copy of the store into a new file; it is complete, or there is none."""
-        if os.path.lexists(path):
+        if _check_path(path):
             raise StoreError(f"{path} exists already. Name a new file for the backup.")
-        _check_path(path)
         part = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex}")
         try:
             with self._lock, _reporting(str(path)):
@@ -306,27 +305,38 @@ def _connect(address: str, **options: Any) -> sqlite3.Connection:
     return db
 
 
-def _check_path(path: Path) -> None:
+def _check_path(path: Path) -> bool:
+    """Return True if there is a file at a path, False if one can be made there."""
+    try:
+        size = path.stat().st_size if path.exists() else None
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path} cannot be opened: {getattr(error, 'strerror', error)}.") from None
     if not path.parent.is_dir():
         raise StoreError(f"{path} cannot be opened: there is no folder {path.parent}. Make it first.")
-    if path.exists() and not path.is_file():
+    if size is not None and not path.is_file():
         raise StoreError(f"{path} is no file. Name a file for the store.")
-    if not path.exists() and os.path.lexists(f"{path}-wal"):  # SQLite would remove it
+    for place in (path.parent, path):
+        if place.exists() and not os.access(place, os.R_OK | os.W_OK):
+            raise StoreError(f"{path} cannot be written: this user has no access to {place}.")
+    if size == 0:
+        raise StoreError(f"{path} is empty. Restore a backup of it, or remove it to start a new store.")
+    if size is None and os.path.lexists(f"{path}-wal"):  # SQLite would remove it
         raise StoreError(
             f"{path} is missing, but {path}-wal is there, which has its newest commits. Restore the former, "
             "or remove the latter to start a new store."
         )
+    return size is not None
 
 
-def _check_unclosed(path: Path) -> None:
+def _check_unclosed(path: str) -> None:
     """Check a store whose server was killed, without a change.
 
     To close a file that may be written merges its log of writes (``-wal``) into it, a damaged one as well.
     """
-    with _reporting(str(path)):
-        reader = _connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+    with _reporting(path):
+        reader = _connect(f"{Path(path).as_uri()}?mode=ro", uri=True)
     try:
-        _load(reader, str(path))
+        _load(reader, path)
     finally:
         reader.close()
 
@@ -355,13 +365,11 @@ def _load(db: sqlite3.Connection, path: str) -> _Contents:
 
 
 def _read(db: sqlite3.Connection, path: str) -> _Contents:
-    ((pages,), (application,), (version,)) = (
-        db.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "application_id", "user_version")
+    (application,), (version,) = (
+        db.execute(f"PRAGMA {name}").fetchone() for name in ("application_id", "user_version")
     )
-    if not pages:
-        raise StoreError(f"{path} is empty, and no store. Remove it to start a new one there.")
     if application != _APPLICATION:
-        raise StoreError(f"{path} is no store of a model server, but a database of another program.")
+        raise StoreError(f"{path} is no store of a model server.")
     if version != VERSION:
         raise StoreError(
             f"{path} is a store of version {version}; Kineverse {__version__} reads version {VERSION}. "
@@ -403,7 +411,7 @@ def _damaged(path: str, what: str) -> StoreError:
 
 _REASONS = {
     sqlite3.SQLITE_BUSY: "{path} is served by another process. Connect to that one, or name another file.",
-    sqlite3.SQLITE_NOTADB: "{path} is no store of a model server, or its beginning is damaged.",
+    sqlite3.SQLITE_NOTADB: "{path} is no store of a model server, or damaged.",
     sqlite3.SQLITE_CONSTRAINT: "{path} has a row of the commit already: its place, or its client and number.",
     sqlite3.SQLITE_FULL: "{path} cannot be written: the disk is full.",
     sqlite3.SQLITE_READONLY: "{path} cannot be written: this user may only read it.",
