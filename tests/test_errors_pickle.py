@@ -42,6 +42,7 @@ ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "ArmEndError": ("reach", "the arm ends"),
     "BlockedError": (Obstacle(position("door"), 1.0, "door", "wall", 0.5, 0.1, 0.4),),
     "UnsupportedError": ("A loop cannot be written.", True, True),
+    "ConflictError": ("it met another", ("joint door",), ("frames/door",), 7, "robot"),
     "EditError": ("two failures", {"tag": KineverseError("inner")}),
     "InfeasibleError": ("none", ("row", "other"), (1.0, 2.0)),
     "ElementError": ("the element", "it is wrong"),

@@ -1,0 +1,330 @@
+"""Requests, messages and signs of life between processes: the one module that uses Zenoh.
+
+A server listens, clients connect to it, and everything goes through it. There is no discovery, and no port is
+open unless one is asked for. What arrives waits in channels, from which threads of the library take it: Zenoh
+calls nothing here, so that a script ends although it has closed nothing.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import os
+import re
+import tempfile
+import time
+import weakref
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+from kineverse._extras import install_command
+from kineverse.errors import InvalidValueError, MissingDependencyError
+
+from .address import check_endpoint
+
+LEASE: Final = 1.0
+"""Time after which a process that says nothing counts as gone [s]."""
+
+_USER: Final = "kineverse"
+_MOST_REQUESTS: Final = 10_000
+_END_SECONDS: Final = 0.2
+
+
+class NoAnswerError(Exception):
+    """Nobody is there, or has answered in time; or the transport is closed."""
+
+
+class _Entrances:
+    """Calls of Zenoh that are under way in this process.
+
+    A thread that comes back from one while the interpreter ends would abort the process: Zenoh's frames
+    cannot be unwound. So when the process ends all transports are closed first, and no call begins after.
+    """
+
+    def __init__(self) -> None:
+        self._inside: list[None] = []  # append and pop are atomic
+        self._ended = False
+        self.transports: weakref.WeakSet[Transport] = weakref.WeakSet()
+        atexit.register(self._end)
+
+    def __enter__(self) -> None:
+        self._inside.append(None)
+        if self._ended:
+            self._inside.pop()
+            raise NoAnswerError("The process ends.")
+
+    def __exit__(self, *_: object) -> None:
+        self._inside.pop()
+
+    def _end(self) -> None:
+        for transport in list(self.transports):
+            transport.close()
+        self._ended = True
+        late = time.monotonic() + _END_SECONDS
+        while self._inside and time.monotonic() < late:
+            time.sleep(0.001)
+
+
+_call = _Entrances()
+
+
+class Channel:
+    """What has arrived for a subscription, oldest first.
+
+    The oldest is dropped where too much waits, so a slow reader holds up nobody.
+    """
+
+    def __init__(self, declared: Any) -> None:
+        self._declared, self._handler = declared, declared.handler
+
+    def _wait(self) -> Any:
+        """Return the next thing that arrives, None after the end."""
+        try:
+            with _call:
+                return self._handler.recv()
+        except (NoAnswerError, _zenoh().ZError):
+            return None
+
+    def close(self) -> None:
+        """End the subscription: those who wait go on, and get nothing more."""
+        with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
+            self._declared.undeclare()
+
+
+class Messages(Channel):
+    """Payloads of messages, as bytes; iterating waits for the next."""
+
+    def __iter__(self) -> Iterator[bytes]:
+        while (sample := self._wait()) is not None:
+            yield sample.payload.to_bytes()
+
+
+class LifeSigns(Channel):
+    """Keys of tokens that come, with True, and go, with False; those that are there come first."""
+
+    def __iter__(self) -> Iterator[tuple[str, bool]]:
+        put = _zenoh().SampleKind.PUT
+        while (sample := self._wait()) is not None:
+            yield str(sample.key_expr), sample.kind == put
+
+
+class Request:
+    """A request, to be answered once; one that is dropped gets no answer, which the asker hears at once."""
+
+    def __init__(self, query: Any) -> None:
+        self._query = query
+        payload = query.payload
+        self.payload = b"" if payload is None else payload.to_bytes()
+
+    def answer(self, payload: bytes) -> None:
+        """Send the answer; an asker who is gone gets none."""
+        with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
+            self._query.reply(self._query.key_expr, payload)
+            self._query.drop()  # else the asker waits for more
+
+
+class Requests(Channel):
+    """Requests that have come in; iterating waits for the next."""
+
+    def __iter__(self) -> Iterator[Request]:
+        while (query := self._wait()) is not None:
+            yield Request(query)
+
+    def take(self, most: int, seconds: float) -> list[Request]:
+        """Wait for a request and return it with those that wait behind it; none after the end.
+
+        Taking stops at the number ``most``, and after so many seconds.
+        """
+        first = self._wait()
+        if first is None:
+            return []
+        result, late = [Request(first)], time.monotonic() + seconds
+        with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
+            while len(result) < most and (query := self._handler.try_recv()) is not None:
+                result.append(Request(query))
+                if time.monotonic() > late:
+                    break
+        return result
+
+
+class Token:
+    """Sign of life, which others see until it is closed, this process ends, or its connection is cut."""
+
+    def __init__(self, declared: Any) -> None:
+        self._declared = declared
+
+    def close(self) -> None:
+        """Take the sign back."""
+        with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
+            self._declared.undeclare()
+
+
+class Transport:
+    """Connection of this process to others, made by :meth:`serve` or :meth:`connect`.
+
+    Endpoints are ``unixsock-stream/PATH`` or ``tcp/HOST:PORT``. All methods may be called in any thread.
+    After :meth:`close` they raise :class:`NoAnswerError`, and publishing does nothing.
+    """
+
+    def __init__(self, settings: dict[str, object]) -> None:
+        zenoh = _zenoh()
+        config = zenoh.Config()
+        for path, value in {**_SETTINGS, **settings}.items():
+            config.insert_json5(path, json.dumps(value))
+        with _call:
+            self._session = zenoh.open(config)
+        self._drop, self._block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
+        self._all, self._error = zenoh.ConsolidationMode.NONE, zenoh.ZError
+        _call.transports.add(self)
+
+    @classmethod
+    def serve(cls, endpoints: Sequence[str], secret: str = "") -> Transport:
+        """Listen at endpoints, for clients that know the secret if there is one.
+
+        Raises
+        ------
+        InvalidValueError
+            If an endpoint is taken, or none to listen at.
+        """
+        for endpoint in endpoints:
+            check_endpoint(endpoint)
+        settings = {"mode": "router", "listen/endpoints": list(endpoints), "listen/exit_on_failure": True}
+        with contextlib.ExitStack() as stack:
+            if secret:
+                folder = stack.enter_context(tempfile.TemporaryDirectory())
+                passwords = os.path.join(folder, "users")
+                with open(os.open(passwords, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
+                    file.write(f"{_USER}:{secret}\n")
+                settings |= {**_credentials(secret), "transport/auth/usrpwd/dictionary_file": passwords}
+            try:
+                return cls(settings)
+            except _zenoh().ZError as error:
+                reason = re.sub(r"\s+at /\S+?\.rs:\d+\.?", "", str(error)).strip().rstrip(".")  # no places
+                raise InvalidValueError(f"Cannot listen at {' and '.join(endpoints)}: {reason}.") from None
+
+    @classmethod
+    def connect(cls, endpoint: str, secret: str = "", timeout: float = 0.0) -> Transport:
+        """Connect to a server; a connection that is cut is made again as soon as there is a server.
+
+        Parameters
+        ----------
+        timeout
+            How long to wait for a server [s]; with 0 it has to be there.
+
+        Raises
+        ------
+        NoAnswerError
+            If no server listens there, or it wants another secret.
+        """
+        settings = {
+            "mode": "client",
+            "connect/endpoints": [endpoint],
+            "connect/exit_on_failure": True,
+            "connect/timeout_ms": round(1e3 * timeout),
+            "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 2},
+        }
+        try:
+            return cls(settings | _credentials(secret))
+        except _zenoh().ZError:
+            raise NoAnswerError(f"No server answers at {endpoint}.") from None
+
+    def ask(self, key: str, payload: bytes, timeout: float) -> bytes:
+        """Return the answer to a request.
+
+        Raises
+        ------
+        NoAnswerError
+            At once if nobody is there who answers; else after the timeout [s].
+        """
+        channel: Any = _zenoh().handlers.RingChannel(1)
+        try:
+            with _call:
+                replies = self._session.get(
+                    key,
+                    channel,
+                    payload=payload,
+                    timeout=timeout,
+                    consolidation=self._all,  # an answer is handed over when it comes, not when all have come
+                    congestion_control=self._block,
+                )
+                reply = replies.recv()
+        except self._error:
+            raise NoAnswerError(f"Nobody answers {key}.") from None
+        if reply.ok is None:
+            raise NoAnswerError(f"No answer from {key} within {timeout:g} s.")
+        return bytes(reply.ok.payload)
+
+    def answers(self, key: str) -> Requests:
+        """Return the requests for a key, which is all of this process's to answer."""
+        with self._declaring():
+            return Requests(self._session.declare_queryable(key, _ring(_MOST_REQUESTS), complete=True))
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send a message to the subscribers of a key.
+
+        It waits for nobody: one who does not keep up loses messages. The others get them in order.
+        """
+        with contextlib.suppress(NoAnswerError, self._error), _call:
+            self._session.put(key, payload, congestion_control=self._drop)
+
+    def subscribe(self, key: str, most: int = 10_000) -> Messages:
+        """Return the messages of a key; of those that wait, the newest ``most`` are kept."""
+        with self._declaring():
+            return Messages(self._session.declare_subscriber(key, _ring(most)))
+
+    def alive(self, key: str) -> Token:
+        """Show that this process is there, until the token is closed."""
+        with self._declaring():
+            return Token(self._session.liveliness().declare_token(key))
+
+    def watch_alive(self, key: str) -> LifeSigns:
+        """Return the signs of life of a key, in which ``*`` stands for any part between slashes."""
+        with self._declaring():
+            return LifeSigns(
+                self._session.liveliness().declare_subscriber(key, _ring(_MOST_REQUESTS), history=True)
+            )
+
+    def close(self) -> None:
+        """Close the connection and all that was made with it."""
+        with contextlib.suppress(NoAnswerError, self._error), _call:
+            self._session.close()
+
+    @contextlib.contextmanager
+    def _declaring(self) -> Iterator[None]:
+        try:
+            with _call:
+                yield
+        except self._error:
+            raise NoAnswerError("The transport is closed.") from None
+
+
+_SETTINGS: Final[dict[str, object]] = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "scouting/delay": 0,  # a server would wait for others to find, half a second
+    "transport/shared_memory/enabled": False,  # files of it outlive a process that is killed
+    "transport/link/tx/lease": round(1e3 * LEASE),
+    # An answer to one who reads nothing holds up the others no longer than he counts as there.
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * LEASE),
+}
+
+
+def _credentials(secret: str) -> dict[str, object]:
+    if not secret:
+        return {}
+    return {"transport/auth/usrpwd/user": _USER, "transport/auth/usrpwd/password": secret}
+
+
+def _ring(most: int) -> Any:
+    return _zenoh().handlers.RingChannel(most)
+
+
+def _zenoh() -> Any:
+    try:
+        import zenoh
+    except ImportError:
+        raise MissingDependencyError(
+            f"Model servers need the package eclipse-zenoh: {install_command('exchange')}"
+        ) from None
+    return zenoh
