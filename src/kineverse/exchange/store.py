@@ -30,10 +30,12 @@ _APPLICATION: Final = 0x4B764D53
 _SCHEMA: Final = (
     "CREATE TABLE meta (name TEXT NOT NULL, revision INTEGER NOT NULL, chain BLOB NOT NULL,"
     " total BLOB NOT NULL)",
-    "CREATE TABLE operations (place INTEGER PRIMARY KEY, tag TEXT NOT NULL, blob BLOB NOT NULL)",
+    "CREATE TABLE operations (place INTEGER PRIMARY KEY, tag TEXT NOT NULL, blob BLOB NOT NULL,"
+    " files BLOB NOT NULL)",
     "CREATE TABLE log (revision INTEGER PRIMARY KEY, chain BLOB NOT NULL, client TEXT NOT NULL,"
     " number INTEGER NOT NULL, data BLOB NOT NULL, replaced BLOB NOT NULL)",
     "CREATE UNIQUE INDEX answers ON log (client, number)",
+    "CREATE TABLE paths (sha256 TEXT PRIMARY KEY, path TEXT NOT NULL)",
 )
 _MODULUS: Final = 1 << 256
 _ENCODE: Final = msgspec.msgpack.Encoder().encode
@@ -55,6 +57,8 @@ class Replaced(msgspec.Struct, frozen=True, array_like=True):
     place: int
 
 
+_NO_FILES: Final = _ENCODE(())
+_decode_files = msgspec.msgpack.Decoder(tuple[protocol.FileContent, ...]).decode
 _decode_replaced = msgspec.msgpack.Decoder(tuple[Replaced, ...]).decode
 
 
@@ -62,8 +66,8 @@ _decode_replaced = msgspec.msgpack.Decoder(tuple[Replaced, ...]).decode
 class StoredCommit:
     """Commit to be stored: its message, its rows, and what its edit replaced.
 
-    ``put`` has tags, places and blobs. ``places`` has the tags and places of all operations after the commit
-    if it gave them new places.
+    ``put`` has tags, places and blobs, and ``files`` the digests of their meshes. ``places`` has the tags and
+    places of all operations after the commit if it gave them new places.
     """
 
     revision: int
@@ -75,6 +79,7 @@ class StoredCommit:
     removed: Sequence[str] = ()
     places: Sequence[tuple[str, int]] | None = None
     replaced: tuple[Replaced, ...] = ()
+    files: Sequence[protocol.FileContent] = ()
 
 
 class Store:
@@ -136,9 +141,19 @@ class Store:
         """The digest of all commits."""
         return self._contents.chain
 
-    def operations(self) -> list[tuple[int, bytes]]:
-        """Return the places and blobs of all operations, in order."""
-        return self._rows("SELECT place, blob FROM operations ORDER BY place")
+    def operations(self) -> list[tuple[int, bytes, tuple[protocol.FileContent, ...]]]:
+        """Return the places, blobs and files of all operations, in order."""
+        rows = self._rows("SELECT place, blob, files FROM operations ORDER BY place")
+        return [(place, blob, _decode_files(files)) for place, blob, files in rows]
+
+    def paths(self) -> dict[str, str]:
+        """Return the paths of files by SHA-256; what is there now may be something else."""
+        return dict(self._rows("SELECT sha256, path FROM paths"))
+
+    def add_path(self, sha256: str, path: str) -> None:
+        """Note where a file is; it is no part of the model."""
+        with self._lock, self._transaction():
+            self._db.execute("INSERT OR REPLACE INTO paths VALUES (?, ?)", (sha256, path))
 
     def commit(self, batch: Sequence[StoredCommit]) -> None:
         """Store commits in one transaction.
@@ -240,9 +255,12 @@ class Store:
         """Write a commit after the new contents, and bring these up to date."""
         if (one.revision, one.chain) != (new.revision + 1, protocol.chain(new.chain, one.commit)):
             raise InvalidValueError(f"The commit {one.revision} does not follow revision {new.revision}.")
+        files = _files_by_tag(one)
         put, gone = one.put, {*one.removed, *(tag for tag, *_ in one.put if self._find(new, tag))}
         if one.places is not None:  # rare, and then all rows are written
-            blobs = dict(self._db.execute("SELECT tag, blob FROM operations").fetchall())
+            rows = self._db.execute("SELECT tag, blob, files FROM operations").fetchall()
+            blobs = {tag: blob for tag, blob, _ in rows}
+            files = {tag: known for tag, _, known in rows} | files
             gone |= blobs.keys()
             blobs.update({tag: blob for tag, _, blob in put})
             if {tag for tag, _ in one.places} != blobs.keys() - {*one.removed}:
@@ -251,15 +269,16 @@ class Store:
                 )
             put = [(tag, place, blobs[tag]) for tag, place in one.places]
         for tag in gone:
-            row = self._find(new, tag)
-            if row is None:
+            known = self._find(new, tag)
+            if known is None:
                 raise InvalidValueError(f"The commit {one.revision} removes {tag!r}, which is not there.")
-            self._db.execute("DELETE FROM operations WHERE place = ?", (row[0],))
-            new.total -= row[1]
+            self._db.execute("DELETE FROM operations WHERE place = ?", (known[0],))
+            new.total -= known[1]
             new.rows[tag] = None
         for tag, place, blob in put:
-            self._db.execute("INSERT INTO operations VALUES (?, ?, ?)", (place, tag, blob))
-            digest = _digest(place, tag, blob)
+            row = place, tag, blob, files.get(tag, _NO_FILES)
+            self._db.execute("INSERT INTO operations VALUES (?, ?, ?, ?)", row)
+            digest = _digest(*row)
             new.total += digest
             new.rows[tag] = place, digest
         logged = (one.revision, one.chain, one.client, one.number, one.commit, _ENCODE(one.replaced))
@@ -287,6 +306,13 @@ class _Contents:
     chain: bytes
     total: int
     rows: dict[str, tuple[int, int] | None]
+
+
+def _files_by_tag(commit: StoredCommit) -> dict[str, bytes]:
+    found: dict[str, list[protocol.FileContent]] = {}
+    for file in commit.files:
+        found.setdefault(file.tag, []).append(file)
+    return {tag: _ENCODE(files) for tag, files in found.items()}
 
 
 def _digest(*row: object) -> int:
@@ -375,7 +401,9 @@ def _read(db: sqlite3.Connection, path: str) -> _Contents:
             f"{path} is a store of version {version}; Kineverse {__version__} reads version {VERSION}. "
             "Serve it with the Kineverse that wrote it, and dump the model to a document."
         )
-    schema = tuple(sql for (sql,) in db.execute("SELECT sql FROM sqlite_master ORDER BY rowid"))
+    schema = tuple(
+        sql for (sql,) in db.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL ORDER BY rowid")
+    )
     if schema != _SCHEMA:
         raise _damaged(path, "other tables")
     fault = db.execute("PRAGMA integrity_check(1)").fetchone()[0]
@@ -396,8 +424,8 @@ def _read(db: sqlite3.Connection, path: str) -> _Contents:
     if (last, link) != (revision, chain):
         raise _damaged(path, f"it is at revision {revision}, but the log ends at {last}")
     rows: dict[str, tuple[int, int] | None] = {}
-    for place, tag, blob in db.execute("SELECT place, tag, blob FROM operations"):
-        digest = _digest(place, tag, blob)
+    for place, tag, *rest in db.execute("SELECT place, tag, blob, files FROM operations"):
+        digest = _digest(place, tag, *rest)
         rows[tag] = place, digest
         total += digest
     if _encode_total(total) != stored:

@@ -307,7 +307,9 @@ def _part_entry(
     kind = operation.kind if isinstance(operation, OpaqueOperation) else document_kind(type(operation))
     if known is not None and _is_same(known, kind, reads, writes):
         return known
-    made = HistoryEntry(entry.tag, OpaqueOperation(kind, reads=reads.cells, recorded=writes), 0, reads, writes)
+    made = HistoryEntry(
+        entry.tag, OpaqueOperation(kind, reads=reads.cells, recorded=writes), 0, reads, writes
+    )
     blob = entry_to_bytes(made, ())
     return known if known is not None and known.blob == blob else made
 
@@ -477,4 +479,3 @@ class Views:
             elif change.kind == FRAMES and change.before is None:
                 keys.update((_BELOW, change.name[: i + 1]) for i, c in enumerate(change.name) if c == "/")
         return keys
-
