@@ -164,9 +164,7 @@ def test_a_frame_that_was_attached_elsewhere_has_its_last_value() -> None:
     part = make_replica(Views(model).add(Wish(("knob",))))
     assert "cabinet/door" not in part.frames
     check_agreement(model, part, ["knob", "cabinet/door/handle"])
-    assert part.history.tags == [
-        tag for tag in model.history.tags if tag in {*part.history.tags}
-    ]
+    assert part.history.tags == [tag for tag in model.history.tags if tag in {*part.history.tags}]
 
 
 # -- commits -------------------------------------------------------------------------------------------------
@@ -257,9 +255,7 @@ class Record(kv.Operation):
     home: float
 
     def apply(self, model: Any) -> kv.model.Writes:
-        record = kv.model.Articulation(
-            "hinge", self.parent, self.child, (self.coordinate,), (self.home,)
-        )
+        record = kv.model.Articulation("hinge", self.parent, self.child, (self.coordinate,), (self.home,))
         return kv.model.Writes(articulations={self.name: record})
 
 
@@ -371,7 +367,9 @@ def do(edit: Edit, kind: str, *what: Any) -> None:
             edit.insert(operation, tag, before=edit.model.history.tags[what[1] % (len(tags) - 1)])
         else:
             name = next((n for k, n in edit.model.history.entry(tag).writes if k == FRAMES), "a")
-            edit.replace(tag, kv.model.AddFrame(name, kv.model.Frame.from_transform(what[1], kv.rotation_x(what[2]))))
+            edit.replace(
+                tag, kv.model.AddFrame(name, kv.model.Frame.from_transform(what[1], kv.rotation_x(what[2])))
+            )
 
 
 @dataclass(frozen=True)
