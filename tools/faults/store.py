@@ -100,7 +100,7 @@ class Expected:
             return "chain"
         if store.commits_after(0, protocol.NO_CHAIN, 10**9) != [(one.commit, one.chain) for one in log]:
             return "log"
-        for one in log:
+        for one in [*log[::10], *log[-10:]]:  # each takes two queries
             if store.commit_of(one.revision) != (one.commit, one.replaced):
                 return "replaced"
             if store.find_answer(one.client, one.number) != (one.revision, one.chain):
@@ -273,12 +273,18 @@ def try_kills(rounds: int, seed: int, folder: Path) -> list[int]:
             assert process.stdout is not None
             first = process.stdout.readline()
             time.sleep(random.uniform(0, 0.2))
+            try:
+                Store(path).close()
+            except StoreError as error:
+                wrong = "" if "served by another process" in str(error) else str(error)
+            else:
+                wrong = "two processes have opened the store"
             process.kill()
             told = [first, *process.stdout.read().splitlines(keepends=True)]
         acknowledged = int([line for line in told if line.endswith(b"\n")][-1])
         store = Store(path)
         try:
-            wrong = expected.find_difference(store)
+            wrong = wrong or expected.find_difference(store)
             if store.revision < acknowledged:
                 wrong = f"{acknowledged} was acknowledged, and the store is at {store.revision}"
         finally:

@@ -187,7 +187,7 @@ class Store:
         None if the chain is not the one of that revision here, or if there are more than ``most``.
         """
         with self._lock:
-            if not 0 <= self.revision - revision <= most or self._chain_at(revision) != chain:
+            if not 0 <= revision <= self.revision <= revision + most or self._chain_at(revision) != chain:
                 return None
             return self._rows("SELECT data, chain FROM log WHERE revision > ? ORDER BY revision", revision)
 
