@@ -88,12 +88,20 @@ def test_the_log_is_read_backwards() -> None:
             store.commit_of(31)
 
 
-def test_a_name_is_given_once(filled: Path) -> None:
-    with opened(filled) as store:
+def test_names_digests_and_places_of_files_are_kept(path: Path) -> None:
+    one = Expected(1).up_to(1)[0]
+    (tag, *_), sha256 = one.put[0], "ab" * 32
+    files = (protocol.FileContent(tag, 0, sha256, 5),)
+    with opened(path) as store:
         store.name = "home"
-        with pytest.raises(StoreError, match="is the store of the model 'home', not of 'lab'"):
-            store.name = "lab"
+        store.commit([replace(one, files=files)])
+        store.add_path(sha256, "/meshes/cup.stl")
+    with opened(path) as store:
         assert store.name == "home"
+        assert store.operations()[0][2] == files
+        assert store.paths() == {sha256: "/meshes/cup.stl"}
+        store.name = "lab"
+        assert store.name == "lab"
 
 
 BAD = {

@@ -94,7 +94,7 @@ class Expected:
     def find_difference(self, store: Store) -> str:
         """Return what a store has wrong for the revision that it says it has, else an empty text."""
         log = self.up_to(store.revision)
-        if store.operations() != self._operations[store.revision]:
+        if [row[:2] for row in store.operations()] != self._operations[store.revision]:
             return "operations"
         if store.chain != (log[-1].chain if log else protocol.NO_CHAIN):
             return "chain"
@@ -249,7 +249,7 @@ def try_damages(count: int, seed: int, folder: Path) -> dict[str, int]:
 def commit_for_ever(path: Path, seed: int) -> None:
     """Commit in batches, and write each revision to standard output when it is stored."""
     store = Store(path)
-    operations = {msgspec.msgpack.decode(blob)[0]: (place, blob) for place, blob in store.operations()}
+    operations = {msgspec.msgpack.decode(blob)[0]: (place, blob) for place, blob, _ in store.operations()}
     random, following = Random(), commits(seed, store.revision, store.chain, operations)
     sys.stdout.write(f"{store.revision}\n")
     sys.stdout.flush()

@@ -90,6 +90,7 @@ class Store:
     """
 
     def __init__(self, path: Path | None, *, durable: bool = False) -> None:
+        self.path, self.is_durable = path, durable
         self._path = "The store" if path is None else os.path.realpath(path)
         self._lock = threading.RLock()
         is_there = path is not None and _check_path(Path(self._path))
@@ -115,7 +116,7 @@ class Store:
 
     @property
     def name(self) -> str:
-        """The name of the model, empty if it has none yet; it is set once."""
+        """The name of the model, empty if it has none yet."""
         return self._contents.name
 
     @name.setter
@@ -124,8 +125,6 @@ class Store:
             old = self._contents
             if old.name == name:
                 return
-            if old.name:
-                raise StoreError(f"{self._path} is the store of the model {old.name!r}, not of {name!r}.")
             new = replace(old, name=name)
             with self._transaction():
                 self._write_meta(new)
