@@ -89,12 +89,11 @@ def test_the_log_is_read_backwards() -> None:
 
 
 def test_names_digests_and_places_of_files_are_kept(path: Path) -> None:
-    one = Expected(1).up_to(1)[0]
-    (tag, *_), sha256 = one.put[0], "ab" * 32
-    files = (protocol.FileContent(tag, 0, sha256, 5),)
+    one, sha256 = Expected(1).up_to(1)[0], "ab" * 32
+    files = (protocol.FileContent("cup", 0, sha256, 5),)
     with opened(path) as store:
         store.name = "home"
-        store.commit([replace(one, files=files)])
+        store.commit([replace(one, put=[("cup", 0, b"blob")], removed=(), files=files)])
         store.add_path(sha256, "/meshes/cup.stl")
     with opened(path) as store:
         assert store.name == "home"

@@ -34,8 +34,8 @@ _SCHEMA: Final = (
     " files BLOB NOT NULL)",
     "CREATE TABLE log (revision INTEGER PRIMARY KEY, chain BLOB NOT NULL, client TEXT NOT NULL,"
     " number INTEGER NOT NULL, data BLOB NOT NULL, replaced BLOB NOT NULL)",
-    "CREATE UNIQUE INDEX answers ON log (client, number)",
     "CREATE TABLE paths (sha256 TEXT PRIMARY KEY, path TEXT NOT NULL)",
+    "CREATE UNIQUE INDEX answers ON log (client, number)",
 )
 _MODULUS: Final = 1 << 256
 _ENCODE: Final = msgspec.msgpack.Encoder().encode
