@@ -526,7 +526,7 @@ def _find_own(changes: NetChanges) -> list[str]:
 
 
 def _as_answer(conflict: Conflict) -> Refused:
-    message = _one_line(f"{conflict.message} Try again.")
+    message = _one_line(conflict.message)
     return Refused("conflict", message, conflict.tag, conflict.path, conflict.revision, conflict.who)
 
 

@@ -181,12 +181,16 @@ class Revisions:
         revision = self._tags[other]
         who = self.who_made(revision)
         return Conflict(
-            f"Revision {revision}, by {who}, {what} the operation {other!r}.", tag, "", revision, who
+            f"Revision {revision}, by {who}, {what} the operation {other!r}. Try again.",
+            tag,
+            "",
+            revision,
+            who,
         )
 
     def _conflict(self, revision: int, tag: str, what: str, cell: Cell, how: str) -> Conflict:
         path, who = "/".join(cell).rstrip("/"), self.who_made(revision)
-        message = f"Revision {revision}, by {who}, {what} {path}, which {tag!r} {how}."
+        message = f"Revision {revision}, by {who}, {what} {path}, which {tag!r} {how}. Try again."
         return Conflict(message, tag, path, revision, who)
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from operator import attrgetter
+from typing import Any, Final
 
 from kineverse.formats import operation_from_bytes
 from kineverse.formats.document import OpaqueOperation
 from kineverse.model import NetChanges, PlacedEntry
 from kineverse.model.history import History, HistoryEntry
-from kineverse.model.read_recorder import Read
+from kineverse.model.operation import Cell
+from kineverse.model.read_recorder import ABSENT, Read, differs
 
 from . import protocol
 from .conflicts import Conflict, ConflictFoundError
@@ -18,6 +20,7 @@ from .protocol import Commit
 from .store import Replaced, Store
 
 _PLACE = attrgetter("place")
+_UNKNOWN: Final = object()
 
 
 def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
@@ -50,7 +53,7 @@ def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
         if old.blob is not None:
             entry = operation_from_bytes(old.blob)
             if computes(entry) and is_frozen(entry):
-                _check_unread(store, revision, entry, later)
+                _check_unread(store, history, entry, later)
             put.append(PlacedEntry(entry, _find_anchor(history, old, put, gone)))
     again = tuple(placed.entry.tag for placed in put if placed.entry.tag in history.entries)
     moved = tuple(tag for tag in changes.moved if tag in again)
@@ -58,9 +61,10 @@ def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
 
 
 def computes(entry: HistoryEntry) -> bool:
-    """Return whether an operation depends on values that it reads, and not only on their being there."""
+    """Return whether an operation depends on more of what it reads than on its being there."""
     reads = entry.reads
-    return bool(reads.listings) or any(how is not Read.EXISTENCE for how in reads.cells.values())
+    has_trace = isinstance(entry.operation, OpaqueOperation) and entry.operation.trace is not None
+    return has_trace or bool(reads.listings) or any(how != Read.EXISTENCE for how in reads.cells.values())
 
 
 def is_frozen(entry: HistoryEntry) -> bool:
@@ -79,16 +83,26 @@ def _check_unchanged(
         raise _conflict(later[0], tag, "", f"is after another {tag!r} than that of revision {revision}")
 
 
-def _check_unread(store: Store, revision: int, entry: HistoryEntry, later: Sequence[Commit]) -> None:
+def _check_unread(store: Store, history: History, entry: HistoryEntry, later: Sequence[Commit]) -> None:
     """Check that a frozen operation finds what it has read; it does not know that itself."""
-    for one in later:
-        blobs = [placed.blob for placed in one.changes.put]
-        blobs += [old.blob for old in store.commit_of(one.revision)[1] if old.blob is not None]
-        for cell in (cell for blob in blobs for cell in operation_from_bytes(blob).writes):
-            if cell in entry.reads.cells or cell[0] in entry.reads.listings:
-                path = "/".join(cell)
-                what = f"has changed {path} after revision {revision}, and {entry.tag!r} was made from it"
-                raise _conflict(one, entry.tag, path, what)
+    then: dict[Cell, tuple[Any, Commit]] = {}  # value before the first commit that touched it, and that
+    for one in later[::-1]:
+        _, replaced = store.commit_of(one.revision)
+        old: dict[Cell, Any] = {}
+        for blob in (was.blob for was in replaced if was.blob is not None):
+            old.update(operation_from_bytes(blob).writes)
+        for now in (operation_from_bytes(placed.blob) for placed in one.changes.put):
+            # What an operation wrote before it was run again is not kept.
+            unknown = _UNKNOWN if now.tag in one.changes.rerun else ABSENT
+            old.update({cell: unknown for cell in now.writes if cell not in old})
+        then.update({cell: (value, one) for cell, value in old.items() if cell not in then})
+    for cell, (value, one) in then.items():
+        how = entry.reads.cells.get(cell)
+        now = history.head[cell[0]].get(cell[1], ABSENT)
+        is_changed = how is not None and (value is _UNKNOWN or differs(how, value, now))
+        if is_changed or cell[0] in entry.reads.listings:
+            path = "/".join(cell)
+            raise _conflict(one, entry.tag, path, f"has changed {path}, from which {entry.tag!r} was made")
 
 
 def _conflict(later: Commit, tag: str, path: str, what: str) -> ConflictFoundError:
