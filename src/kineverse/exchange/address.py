@@ -90,10 +90,9 @@ class Address:
             return self.endpoint, ""
         folder = runtime_folder()
         if not _is_served(folder, self.name):
-            raise UnknownNameError(
-                f"There is no model server {self.name!r} of this user. "
-                f"{suggest(self.name, list_servers(), 'model server')}"
-            )
+            others = list_servers()
+            hint = suggest(self.name, others) if others else "None is running; 'kineverse serve' starts one."
+            raise UnknownNameError(f"There is no model server {self.name!r} of this user. {hint}")
         return _read_place(folder, self.name) or (_socket_endpoint(folder, self.name), "")
 
 
