@@ -282,7 +282,8 @@ def _run_undo(arguments: argparse.Namespace) -> int:
     with _join(arguments) as model:
         model.undo(arguments.revision)
         row = _find_row(model.exchange, arguments.revision)
-        print(f"revision {model.version}: taken back is {_format_operations(row)}" if row else "taken back")
+        what = f" ({_format_operations(row)})" if row else ""
+        print(f"revision {arguments.revision} is taken back{what}; now at revision {model.version}")
     return 0
 
 
@@ -351,7 +352,13 @@ def _run_apply(arguments: argparse.Namespace) -> int:
     options = {"root": arguments.root, "strict": arguments.strict, "loops": arguments.loops}
     with _join(arguments) as model:
         with collect_warnings() as remarks, show_activity(f"reading {arguments.file}"):
-            tags = model.transact(lambda edit: edit.include(arguments.file, arguments.prefix, **options))
+            try:
+                tags = model.transact(lambda edit: edit.include(arguments.file, arguments.prefix, **options))
+            except DuplicateNameError as error:
+                taken = str(error).partition(";")[0].rstrip(".")
+                raise DuplicateNameError(
+                    f"{taken}. Put a prefix in front of all names with --prefix."
+                ) from None
         print_notes(truncate_lines([*dict.fromkeys(remarks)], REMARKS, ""))
         added = format_count(len(tags), "operation")
         print(f"{model.exchange.address}: {added} added, revision {model.version}")

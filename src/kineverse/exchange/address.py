@@ -127,7 +127,7 @@ class Claim:
         self._lock = _lock(folder, self._stem)
         if self._lock is None:
             what = f"A source {source!r} of the model server" if source else "A model server"
-            raise DuplicateNameError(f"{what} {name!r} is running already.")
+            raise DuplicateNameError(f"{what} {name!r} is running already. Use that one, or another name.")
         self.secret = ""
         if UNIX_SOCKETS:
             _discard(folder, self._stem)

@@ -257,7 +257,9 @@ class Connection:
             except NoAnswerError:
                 # For moments after a connection was made it is not known who answers.
                 if not self.is_online or time.monotonic() >= end:
-                    raise OfflineError(f"The server {self.address.name!r} does not answer.") from None
+                    raise OfflineError(
+                        f"The server {self.address.name!r} does not answer. Look if it runs, by that name."
+                    ) from None
                 time.sleep(_PAUSE)
 
 
