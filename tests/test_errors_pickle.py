@@ -42,6 +42,7 @@ ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "ArmEndError": ("reach", "the arm ends"),
     "BlockedError": (Obstacle(position("door"), 1.0, "door", "wall", 0.5, 0.1, 0.4),),
     "UnsupportedError": ("A loop cannot be written.", True, True),
+    "ConflictError": ("it met another", ("joint door",), ("frames/door",), 7, "robot"),
     "EditError": ("two failures", {"tag": KineverseError("inner")}),
     "InfeasibleError": ("none", ("row", "other"), (1.0, 2.0)),
     "ElementError": ("the element", "it is wrong"),
@@ -59,6 +60,15 @@ def test_error_survives_a_pickle(kind: type[Exception]) -> None:
     assert str(after) == str(error)
     assert after.args == error.args
     assert {k: str(v) for k, v in vars(after).items()} == {k: str(v) for k, v in vars(error).items()}
+
+
+def test_errors_of_live_models_are_those_that_local_code_expects() -> None:
+    conflict = kineverse.ConflictError("it met another", ["joint door"], ["frames/door"], 7, "robot")
+    assert (conflict.tags, conflict.paths) == (("joint door",), ("frames/door",))
+    assert (conflict.revision, conflict.who, conflict.failures) == (7, "robot", {})
+    assert isinstance(conflict, kineverse.errors.EditError)
+    assert issubclass(kineverse.OfflineError, ConnectionError)
+    assert str(kineverse.OfflineError("nobody answers")) == "nobody answers"
 
 
 def test_all_error_classes_are_found() -> None:

@@ -42,7 +42,11 @@ if TYPE_CHECKING:
         Revolute as Revolute,
     )
     from kineverse.compilation import CompiledFunction as CompiledFunction, compile as compile
-    from kineverse.errors import KineverseError as KineverseError
+    from kineverse.errors import (
+        ConflictError as ConflictError,
+        KineverseError as KineverseError,
+        OfflineError as OfflineError,
+    )
     from kineverse.expressions import Expression as Expression, array as array
     from kineverse.expressions.functions import (
         clip as clip,

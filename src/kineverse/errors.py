@@ -12,6 +12,7 @@ from typing import Any
 
 __all__ = [
     "CompileError",
+    "ConflictError",
     "DuplicateNameError",
     "EditError",
     "ExpressionError",
@@ -23,6 +24,7 @@ __all__ = [
     "ModelError",
     "NoSolutionError",
     "NotFiniteError",
+    "OfflineError",
     "ShapeError",
     "SimulationError",
     "UnknownAttributeError",
@@ -98,6 +100,34 @@ class EditError(KineverseError, RuntimeError):
     def __init__(self, message: str, failures: Mapping[str, KineverseError] | None = None) -> None:
         super().__init__(message)
         self.failures: dict[str, KineverseError] = dict(failures or {})
+
+
+class ConflictError(EditError):
+    """An edit of a live model met one that others have made meanwhile, and nothing was done.
+
+    Attributes
+    ----------
+    tags, paths
+        Operations and values in which the two meet.
+    revision, who
+        Version of the other edit, and who has made it.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        tags: Iterable[str] = (),
+        paths: Iterable[str] = (),
+        revision: int = 0,
+        who: str = "",
+    ) -> None:
+        super().__init__(message)
+        self.tags, self.paths = tuple(tags), tuple(paths)
+        self.revision, self.who = revision, who
+
+
+class OfflineError(KineverseError, ConnectionError):
+    """The server of a live model does not answer; the model can be read on, and edits are not possible."""
 
 
 class UnknownAttributeError(KineverseError, AttributeError):

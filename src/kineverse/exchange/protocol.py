@@ -65,9 +65,10 @@ class Changes(_Message, frozen=True):
 
 
 class FileContent(_Message, frozen=True):
-    """Digest and size of a file that bodies refer to, by its address in them."""
+    """Digest and size of the file of a mesh, by the operation and the place among its meshes."""
 
-    uri: Name
+    tag: Name
+    index: Number
     sha256: Sha256
     size: Number
 
@@ -113,6 +114,7 @@ class Edit(_Message, frozen=True, tag="edit"):
     chain: Chain
     changes: Changes
     strict: bool = False
+    files: tuple[FileContent, ...] = ()
 
 
 class Undo(_Message, frozen=True, tag="undo"):
@@ -125,7 +127,7 @@ class Undo(_Message, frozen=True, tag="undo"):
 
 
 class Join(_Message, frozen=True, tag="join"):
-    """Ask for the model, or for the part that frames and symbols need."""
+    """Ask for the model, or for the part of it that frames and symbols need."""
 
     protocol: int
     library: Text  # version of Kineverse
@@ -134,13 +136,14 @@ class Join(_Message, frozen=True, tag="join"):
     frames: Tags = ()
     symbols: Tags = ()
     bodies: bool = True
-    whole: bool = True
+    is_part: bool = False
 
 
 class Since(_Message, frozen=True, tag="since"):
     """Ask for the commits after a revision, to close a gap; ``view`` is empty for the whole model."""
 
     client: Id
+    who: Text
     view: str
     revision: Revision
     chain: Chain
@@ -217,6 +220,7 @@ class Joined(_Message, frozen=True, tag="joined"):
     chain: Chain
     view: str
     document: bytes
+    files: tuple[FileContent, ...] = ()
 
 
 class Missed(_Message, frozen=True, tag="missed"):
@@ -323,6 +327,13 @@ Answer: TypeAlias = Committed | Refused | Joined | Missed | Status | History | F
 # -- signals -------------------------------------------------------------------------------------------------
 
 
+class Seen(_Message, frozen=True):
+    """Revision that a client has got, told from time to time."""
+
+    client: Id
+    revision: Revision
+
+
 class Beat(_Message, frozen=True):
     """Sign of life with the present revision and, by view, the last one that concerns it."""
 
@@ -373,6 +384,19 @@ decode_answer = Decoder(Answer, "An answer")
 decode_commit = Decoder(Commit, "A commit")
 decode_published = Decoder(Published, "A commit")
 decode_beat = Decoder(Beat, "A sign of life")
+decode_seen = Decoder(Seen, "A sign of life")
+
+
+class _Tagged(Struct, frozen=True):
+    tag: str
+
+
+_decode_tag = msgspec.msgpack.Decoder(_Tagged).decode
+
+
+def tag_of(placed: Placed) -> str:
+    """Return the tag of an operation from a blob that was checked."""
+    return _decode_tag(placed.blob).tag
 
 
 def chain(previous: bytes, commit: bytes) -> bytes:

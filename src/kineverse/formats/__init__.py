@@ -9,6 +9,8 @@ if TYPE_CHECKING:
 
     from .document import (
         document_hash as document_hash,
+        entries_from_bytes as entries_from_bytes,
+        entry_to_bytes as entry_to_bytes,
         from_bytes as from_bytes,
         operation_digest as operation_digest,
         operation_from_bytes as operation_from_bytes,

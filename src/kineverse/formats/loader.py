@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
@@ -17,6 +17,7 @@ from kineverse.model.edit import Edit
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.operation import Operation
 from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, check_loops
+from kineverse.symbols import Symbol
 
 from .file_formats import DOCUMENT_SUFFIXES
 from .files import read_file
@@ -88,15 +89,19 @@ def load(
     strict: bool = False,
     loops: LoopTreatment = "solve",
     arguments: Mapping[str, object] | None = None,
+    frames: Iterable[str] | None = None,
+    symbols: Iterable[Symbol | str] | None = None,
+    bodies: bool | None = None,
 ) -> Model:
-    """Load a model from a file or by name.
+    """Load a model from a file or by name, or join a live one.
 
     Parameters
     ----------
     source
         Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.xacro``, ``.kv.json`` or ``.kv.msgpack``
         file, or a name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
-        :func:`kineverse.formats.locate.locate_model`.
+        :func:`kineverse.formats.locate.locate_model`. ``live:NAME`` is a model that other processes edit as
+        well: the result follows it, and edits of the result are theirs.
     prefix
         Prefix of the names of all frames and degrees of freedom, without the slash. A shipped model has its
         own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means none.
@@ -115,20 +120,35 @@ def load(
         constraints. ``"refuse"``: a loop that cannot be solved is an error.
     arguments
         Arguments of a ``.xacro`` template by name. They may also follow the path, ``"arm.xacro side:=left"``.
+    frames, symbols, bodies
+        Part of a live model: what the poses of these frames and the constraints and rates of these symbols
+        depend on, and whether with bodies. By default all of it.
 
     Raises
     ------
     FormatError
         If the file is invalid, with file, line, element and reason; or for an invalid prefix or root.
     InvalidValueError
-        If ``loops`` is none of these.
+        If ``loops`` is none of these; or for a part of a file, or options of a file for a live model.
     """
     check_prefix(prefix)
     check_loops(loops)
-    if registry.find_scheme(source) is not None:
-        model = Model()
-        model.include(source, prefix, root=root, strict=strict, loops=loops)
-        return model
+    scheme = registry.find_scheme(source)
+    if scheme is not None:
+        registry.check_no_file_options(root=root, strict=strict, loops=loops, arguments=arguments)
+        if prefix is not None:
+            raise InvalidValueError(
+                f"A live model keeps its names. For a copy of it below a prefix: model.include({source!r}, "
+                f"prefix={prefix!r})."
+            )
+        join = registry.import_entry(scheme.load)
+        live: Model = join(source, frames=frames, symbols=symbols, bodies=bodies)
+        return live
+    if not (frames is None and symbols is None and bodies is None):
+        raise InvalidValueError(
+            "frames=, symbols= and bodies= choose a part of a live model, live:NAME; "
+            f"{os.fspath(source)} is loaded as a whole."
+        )
     source, given = _arguments(source, arguments)
     found = locate_model(source)
     content = _content(found)

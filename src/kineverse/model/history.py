@@ -28,11 +28,15 @@ from .commits.checks import (
     check_frames,
     check_names,
     check_overwrite,
+    check_parent,
     check_writes,
+    finds_what_it_read,
+    know_parents,
+    know_reads,
     refused_error,
 )
 from .operation import DATA, FRAMES, KINDS, Cell, Operation, Writes
-from .read_recorder import ABSENT, Read, ReadRecorder, Reads, differs, unknown_path_error
+from .read_recorder import ABSENT, Read, ReadRecorder, Reads, Seen, differs, unknown_path_error
 
 _GAP = 1 << 32
 _PLACE = attrgetter("place")
@@ -66,6 +70,10 @@ class HistoryEntry:
         """Return the entry at another place."""
         return HistoryEntry(self.tag, self.operation, place, self.reads, self.writes, self.blob)
 
+    def reading(self, reads: Reads) -> HistoryEntry:
+        """Return the entry with other reads; its blob is not known then."""
+        return HistoryEntry(self.tag, self.operation, self.place, reads, self.writes)
+
 
 TouchedEntry: TypeAlias = tuple[HistoryEntry | None, HistoryEntry | None, bool]
 """Entry of a tag before and after an edit; False if its operation was only run again."""
@@ -84,7 +92,7 @@ class History:
         self.head: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
         self.reading: dict[Cell, dict[str, Read]] = {}
         self.listing: dict[str, set[str]] = {kind: set() for kind in KINDS}
-        self.runs = 0
+        self.runs = self.runs_before = 0
         self._undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         self._before: dict[Cell, Any] = {}
         self._events: list[tuple[Cell, Any, Any]] = []
@@ -102,7 +110,7 @@ class History:
         cells, reading, head = self.cells, self.reading, self.head
         for i, given in enumerate(entries):
             # New places, because the entries may come from several models.
-            entry = given.at(i * _GAP)
+            entry = know_reads(self, given.at(i * _GAP))
             self.entries[entry.tag] = entry
             self.sequence.append(entry)
             for cell, value in entry.writes.items():
@@ -163,12 +171,17 @@ class History:
 
     # -- changes of the sequence ---------------------------------------------------------------------------
 
-    def insert(self, tag: str, operation: Operation, index: int | None = None) -> None:
-        """Run an operation and insert it before the one at ``index``, by default last."""
+    def insert(
+        self, tag: str, operation: Operation, index: int | None = None, seen: Seen | None = None
+    ) -> None:
+        """Run an operation and insert it before the one at ``index``, by default last.
+
+        ``seen`` is what it has read in its document, if that is known.
+        """
         self._check_new(tag, operation)
         with self.step():
             self.note_given(tag)
-            entry = HistoryEntry(tag, operation, self.place_at(index), Reads(), {})
+            entry = HistoryEntry(tag, operation, self.place_at(index), Reads(seen), {})
             if self._dirty:
                 self._link(entry)
                 self.mark_outdated(tag)
@@ -180,10 +193,12 @@ class History:
     def link(self, given: HistoryEntry) -> None:
         """Append an operation with its writes elsewhere; it is run only if it finds other values here."""
         entry = given.at(self.place_at())
-        if self._dirty or given.tag in self.entries or not self._finds_what_it_read(entry):
-            self.insert(given.tag, given.operation)
+        if self._dirty or given.tag in self.entries or not finds_what_it_read(self, entry):
+            self.insert(given.tag, given.operation, seen=given.reads.seen)
             return
-        check_writes(self, entry)
+        entry, parents = know_parents(entry)
+        for name, parent in parents:
+            check_parent(self, name, parent, entry.place)
         check_overwrite(self, entry)
         self.note_given(entry.tag)
         if any(c in self.cells or c in self.reading or self.listing[c[0]] for c in entry.writes):
@@ -203,15 +218,6 @@ class History:
             self._put_head(cell, value, ABSENT)
         self._forget(entry)
 
-    def _finds_what_it_read(self, entry: HistoryEntry) -> bool:
-        """Return whether all values that an operation read elsewhere are the same objects here."""
-        if entry.operation.seen is None:
-            return False
-        values, names = entry.operation.seen
-        return all(self.value_at(cell, entry.place) is value for cell, value in values.items()) and all(
-            tuple(self.names_at(kind, entry.place)) == listed for kind, listed in names.items()
-        )
-
     def index(self, tag: str) -> int:
         """Return the position of a tag in the sequence."""
         return bisect_left(self.sequence, self.entry(tag).place, key=_PLACE)
@@ -222,7 +228,9 @@ class History:
         check_operation(operation)
         with self.step():
             self.note_given(tag)
-            self._exchange(HistoryEntry(tag, operation, old.place, old.reads, old.writes))
+            reads = old.reads.copy()
+            reads.seen = None
+            self._exchange(HistoryEntry(tag, operation, old.place, reads, old.writes))
             if self._dirty:
                 self.mark_outdated(tag)
             else:
@@ -330,9 +338,9 @@ class History:
     def _apply(self, entry: HistoryEntry) -> HistoryEntry:
         self.runs += 1
         tag = entry.tag
-        reads = Reads()
+        reads = Reads(entry.reads.seen)
         try:
-            effects = entry.operation.apply(self._reader(entry.place, reads))
+            effects = entry.operation.apply(self.reader_at(entry.place, reads))
             if not isinstance(effects, Writes):
                 raise EditError(f"apply() returns kv.model.Writes, not {type(effects).__name__}.")
             writes = effects.writes()
@@ -344,7 +352,7 @@ class History:
         check_writes(self, new)
         return new
 
-    def _reader(self, place: int, reads: Reads) -> ReadRecorder:
+    def reader_at(self, place: int, reads: Reads) -> ReadRecorder:
         """Return the model before a place, which records what is read."""
         return ReadRecorder(
             lambda cell: self.value_at(cell, place), lambda kind: self.names_at(kind, place), reads
@@ -450,6 +458,7 @@ class History:
         self._contested.clear()
         self._given.clear()
         self._touched = {}
+        self.runs_before = self.runs
 
     def touched(self) -> Iterator[TouchedEntry]:
         """Yield what the transaction has changed, first what the edit itself did, in its order."""
@@ -518,8 +527,6 @@ class History:
         self._events.append((cell, old, value))
 
     def _link(self, entry: HistoryEntry) -> None:
-        if entry.operation.recorded is entry.writes:  # linked without a run
-            entry.operation.remember(self._reader(entry.place, Reads()))
         self._index(entry)
         for cell in entry.writes:
             writers = self.cells.get(cell)

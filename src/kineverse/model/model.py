@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
+from kineverse._checks import check_flag
 from kineverse._runtime import no_collection
 from kineverse.errors import EditError, ExpressionError, KineverseError, UnknownAttributeError
 from kineverse.symbols import Symbol
@@ -16,7 +17,7 @@ from .commits.listeners import Commit, CommitFilter, Listener, Listeners
 from .commits.net_changes import NetChanges, adopt, group_tags
 from .commits.undo import keep_commit
 from .edit import Edit
-from .history import History, HistoryEntry, TouchedEntry
+from .history import History, HistoryEntry
 from .model_view import ModelView
 from .read_recorder import ABSENT
 from .registry import LoopTreatment
@@ -86,8 +87,14 @@ class Model(ModelView):
 
     # -- editing -------------------------------------------------------------------------------------------
 
-    def edit(self) -> AbstractContextManager[Edit]:
+    def edit(self, *, strict: bool = False) -> AbstractContextManager[Edit]:
         """Open a transaction, committed as a whole at the end of its ``with`` block.
+
+        Parameters
+        ----------
+        strict
+            True to refuse the edit of a live model if anything in it has changed since the edit began. It has
+            no effect here, where nobody else edits meanwhile.
 
         Raises
         ------
@@ -95,31 +102,32 @@ class Model(ModelView):
             At the end of the block, if operations fail after the edit. The message lists the first ones, and
             the attribute ``failures`` has all.
         """
-        return EditContext(self._transaction)
+        check_flag("strict", strict)
+        return EditContext(lambda: self._transaction(lambda _: self._commit()))
 
     @contextmanager
-    def _transaction(self) -> Iterator[Edit]:
+    def _transaction(self, finish: Callable[[Edit], None]) -> Iterator[Edit]:
+        """Open an edit, and call ``finish`` with it at its end; what that does not commit is rolled back.
+
+        Other threads wait until it is over. What was posted to listeners is delivered after that.
+        """
         with self._lock:
             if self._edit is not None:
                 raise EditError("The model is being edited already; use that edit.")
             self._history.begin()
-            runs = self._history.runs
             self._edit = edit = Edit(self._history, self)
             try:
                 yield edit
-                self._history.settle()
-                self.rates  # noqa: B018 - cyclic rates are an error of the edit, not of a later query
-                touched = list(self._history.touched())
-            except BaseException:
-                self._history.roll_back()
-                raise
-            else:
-                if touched:
-                    self._listeners.post(self._commit(touched, self._history.runs - runs))
+                finish(edit)
             finally:
+                self._history.roll_back()  # nothing is left of a commit to be undone
                 edit._open = False
                 self._edit = None
                 self._settle()
+        self._deliver()
+
+    def _deliver(self) -> None:
+        """Call the listeners with what was posted to them; called by the thread that committed."""
         self._listeners.deliver()
 
     def _settle(self) -> None:
@@ -135,18 +143,27 @@ class Model(ModelView):
     def _ordered(self, kind: str) -> dict[str, Any]:
         return self._history.ordered(kind)
 
-    def _commit(self, touched: list[TouchedEntry], reruns: int) -> Commit:
-        history, version = self._history, self._version + 1
+    def _commit(self, version: int | None = None) -> None:
+        """Commit the open edit as the next version, unless it has changed nothing; or as a given version."""
+        history = self._history
+        history.settle()
+        self.rates  # noqa: B018 - cyclic rates are an error of the edit, not of a later query
+        touched = list(history.touched())
+        if version is None:
+            if not touched:
+                return
+            version = self._version + 1
         changes = [
             Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
             for (kind, name), before, after in history.changes()
         ]
+        reruns = history.runs - history.runs_before
         diff = Diff(version, tuple(changes), reruns=reruns, **group_tags(history, touched))
         keep_commit(history, version, touched)
         history.begin()
         self._version = version
         self._derived = {}
-        return Commit(diff, history.head)
+        self._listeners.post(Commit(diff, history.head))
 
     def adopt(self, changes: NetChanges) -> None:
         """Make the net changes of an edit of an equal model, in one commit, without running an operation.
@@ -165,13 +182,24 @@ class Model(ModelView):
             If the changes do not belong to this model: a tag is taken, an anchor or a parent is missing,
             frames or rates are cyclic, or another operation reads what they change. The model is unchanged.
         """
+        self._adopt(changes)
+
+    def _adopt(self, changes: NetChanges, version: int | None = None) -> None:
+        """Make net changes in one commit, here and nowhere else, as the next or as a given version."""
         try:
-            with self.edit() as edit:
+            with self._transaction(lambda _: self._commit(version)) as edit:
                 adopt(edit._check_open(), changes, complete=True)
         except EditError:
             raise
         except KineverseError as error:
             raise EditError(f"The changes cannot be adopted: {error}") from error
+
+    def _restore(self, entries: Iterable[HistoryEntry], version: int) -> None:
+        """Fill an empty model with entries of a document, checked, as of a version; that cannot be undone."""
+        with no_collection(), self._transaction(lambda _: self._commit(version)) as edit:
+            for entry in entries:
+                edit.link(entry)
+        self._history.commits.clear()
 
     def include(
         self,

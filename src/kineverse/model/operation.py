@@ -25,7 +25,7 @@ from .rates import as_entry, to_plain
 
 if TYPE_CHECKING:
     from .history import HistoryEntry
-    from .read_recorder import ReadRecorder
+    from .read_recorder import ReadRecorder, Seen
 
 FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS = (
     "frames",
@@ -187,9 +187,6 @@ class Operation(ABC):
     recorded: ClassVar[Mapping[tuple[str, str], Any]] = MappingProxyType({})
     """Writes of the operation in the document that it comes from; empty if it has its code."""
 
-    seen: ClassVar[tuple[Mapping[tuple[str, str], Any], Mapping[str, tuple[str, ...]]] | None] = None
-    """Values of the cells and names of the kinds that it read there; None if they are not known."""
-
     document_kind: ClassVar[str]
     """Frozen name of the class in documents, in kinds of articulations and in tags."""
 
@@ -212,8 +209,9 @@ class Operation(ABC):
         The result must be a pure function of the fields and of the values read from ``model``.
         """
 
-    def remember(self, model: ReadRecorder) -> None:  # noqa: B027 - only operations from elsewhere do
-        """Take what a model contains now as what the operation has read."""
+    def see(self, model: ReadRecorder) -> Seen | None:
+        """Return what an operation of a document finds in a model; None if it has its code."""
+        return None
 
     def below(self, prefix: str) -> Operation | None:
         """Return the operation with its names below a prefix that ends with a slash.
@@ -330,7 +328,9 @@ def may_override(entry: HistoryEntry, cell: Cell) -> bool:
     kind = cell[0]
     if kind == CONSTRAINTS:
         return False
-    return kind == DATA or cell in entry.reads.cells or entry.operation.overrides
+    if kind == DATA or cell in entry.reads.cells or entry.operation.overrides:
+        return True
+    return entry.reads.seen is not None and entry.reads.seen.overrides
 
 
 def overwrite_error(cell: Cell, entry: HistoryEntry, maker: str) -> DuplicateNameError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntFlag
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from kineverse.errors import KineverseError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
@@ -42,18 +42,34 @@ class Read(IntFlag):
     VALUE = 2
 
 
+class Seen(NamedTuple):
+    """Values that an operation of a document has read there; its writes in the document follow from them."""
+
+    values: Mapping[Cell, Any]  # of the cells that it read
+    names: Mapping[str, tuple[str, ...]]  # of the kinds that it listed
+    overrides: bool  # True if it overwrote writes of operations before it
+
+
 class Reads:
     """Recorded reads of one run: cells with the strength of the read, and listed kinds.
 
+    ``seen`` is what an operation of a document has read there, once it is known; all later runs refer to it.
     The trace of the run, once it is made, is stored here as well.
     """
 
-    __slots__ = ("cells", "listings", "trace")
+    __slots__ = ("cells", "listings", "seen", "trace")
 
-    def __init__(self) -> None:
+    def __init__(self, seen: Seen | None = None) -> None:
         self.cells: dict[Cell, Read] = {}
         self.listings: set[str] = set()
+        self.seen = seen
         self.trace: object = None
+
+    def copy(self) -> Reads:
+        """Return an independent copy."""
+        other = Reads(self.seen)
+        other.cells, other.listings, other.trace = self.cells.copy(), self.listings.copy(), self.trace
+        return other
 
     def add(self, cell: Cell, how: Read) -> None:
         """Record a read of a cell."""
@@ -73,6 +89,15 @@ class ReadRecorder:
         self._value_at = value_at
         self._names_at = names_at
         self._reads = reads
+
+    @property
+    def seen(self) -> Seen | None:
+        """Values that the operation has read in the document that it comes from; None until they are known."""
+        return self._reads.seen
+
+    def remember(self, seen: Seen) -> None:
+        """Keep values as those that the operation has read."""
+        self._reads.seen = seen
 
     def read(self, cell: Cell, how: Read) -> Any:
         """Record a read of a cell, and return its value; :data:`ABSENT` if it has none."""

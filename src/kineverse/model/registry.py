@@ -109,6 +109,13 @@ class ModelCollection(Struct, frozen=True):
         yield from import_entry(self.build)(name, prefix)
 
 
+class Scheme(Struct, frozen=True):
+    """Addresses of live models, ``scheme:...``."""
+
+    load: str  # function of (source, frames=, symbols=, bodies=) to a model, of the part that is asked for
+    include: str  # function of (edit, source, prefix) that appends what the model contains now; returns tags
+
+
 class FrameDeviation(Struct, frozen=True):
     """Upper bound on the error of a frame while all coordinates are within their limits.
 
@@ -178,14 +185,14 @@ _SERVICES = {
 }
 """Readers and writers of files, and the reader of meshes."""
 
-_SCHEMES: dict[str, str] = {}  # readers of addresses scheme:…, with the signature of include_source
+_SCHEMES: Mapping[str, Scheme] = {
+    "live": Scheme(
+        load="kineverse.exchange.client:load_live", include="kineverse.exchange.client:include_live"
+    ),
+}
+"""Addresses of models that are served, by what stands before their colon."""
 
 Service: TypeAlias = Literal["include", "save", "read_mesh"]
-
-
-def register_scheme(scheme: str, include: str) -> None:
-    """Register the reader of addresses ``scheme:…``, with the signature of :func:`include_source`."""
-    _SCHEMES[scheme] = include
 
 
 @cache
@@ -208,11 +215,34 @@ def include_source(
 ) -> list[str]:
     """Append the operations of a source to an edit, and return their tags.
 
-    A text ``scheme:…`` with a registered scheme is an address; any other source is a file or a name.
+    A text ``scheme:…`` with a registered scheme is an address; any other source is a file or a name. Options
+    of files are refused for an address.
     """
-    reader = find_scheme(source) or _SERVICES["include"]
-    tags: list[str] = import_entry(reader)(edit, source, prefix, root=root, strict=strict, loops=loops)
+    scheme = find_scheme(source)
+    if scheme is not None:
+        check_no_file_options(root=root, strict=strict, loops=loops)
+        added: list[str] = import_entry(scheme.include)(edit, source, prefix)
+        return added
+    include = find_service("include")
+    tags: list[str] = include(edit, source, prefix, root=root, strict=strict, loops=loops)
     return tags
+
+
+def check_no_file_options(
+    *, root: object = None, strict: object = False, loops: object = "solve", arguments: object = None
+) -> None:
+    """Check that no option is given that is about a file, as a live model is none."""
+    given = {
+        "root=": root is not None,
+        "strict=": strict is not False,
+        "loops=": loops != "solve",
+        "arguments=": bool(arguments),
+    }
+    for name, is_given in given.items():
+        if is_given:
+            raise InvalidValueError(
+                f"{name} is about reading a file, and a live model is none. Leave it out."
+            )
 
 
 def save_model(
@@ -229,8 +259,8 @@ def save_model(
     return result
 
 
-def find_scheme(source: object) -> str | None:
-    """Return the reader of an address; None if the source is no address with a registered scheme."""
+def find_scheme(source: object) -> Scheme | None:
+    """Return the scheme of an address; None if the source is no address with a registered one."""
     if not isinstance(source, str):
         return None
     scheme, colon, _ = source.partition(":")

@@ -24,7 +24,7 @@ from kineverse.errors import (
     UnknownNameError,
     suggest,
 )
-from kineverse.formats.document.reader import read_operations
+from kineverse.formats.document.reader import entries_from_bytes
 from kineverse.formats.files import read_file
 from kineverse.formats.root_folder import find_root
 from kineverse.lie import Array
@@ -341,11 +341,11 @@ def read_run_recording(
 
 def _read_model(data: bytes, path: Path, root: str | os.PathLike[str] | None) -> Snapshot:
     model = Model()
-    operations = read_operations(data, f"{path.name}, /model", root=find_root(path.parent, root))
+    entries = entries_from_bytes(data, root=find_root(path.parent, root), source=f"{path.name}, /model")
     try:
         with model.edit() as edit:
-            for tag, operation in operations:
-                edit.apply(operation, tag)
+            for entry in entries:
+                edit.link(entry)
     except KineverseError as error:
         raise FormatError(f"{path.name}: the model cannot be built: {error}") from error
     return model.snapshot()

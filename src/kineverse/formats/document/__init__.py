@@ -16,6 +16,7 @@ from kineverse._lazy import lazy_face
 if TYPE_CHECKING:
     from .opaque_operation import OpaqueOperation as OpaqueOperation
     from .reader import (
+        entries_from_bytes as entries_from_bytes,
         from_bytes as from_bytes,
         operation_from_bytes as operation_from_bytes,
         read_operations as read_operations,
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from .structs import schema as schema
     from .writer import (
         document_hash as document_hash,
+        entry_to_bytes as entry_to_bytes,
         operation_digest as operation_digest,
         operation_to_bytes as operation_to_bytes,
         to_bytes as to_bytes,

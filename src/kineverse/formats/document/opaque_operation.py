@@ -8,7 +8,7 @@ from typing import Any
 
 from kineverse.errors import KineverseError, ModelError, UnknownNameError
 from kineverse.model.operation import Cell, FinishedWrites, Operation, Writes
-from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, differs
+from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Seen, differs
 from kineverse.model.traces import Trace
 from kineverse.model.traces.replay import writes_agree
 from kineverse.model.traces.trace import run_query, substitute_results
@@ -44,11 +44,6 @@ class OpaqueOperation(Operation):
         Reason for a missing trace of an operation that read values, else empty.
     scope
         Prefix that the names in its parameters lack, with its slash.
-    seen
-        Values of the cells that were read, and names of the kinds that were listed; None until it is linked
-        or run for the first time, if it comes without its document.
-    overrides
-        True if it overwrites writes of operations before it in the document.
     """
 
     kind: str
@@ -61,10 +56,6 @@ class OpaqueOperation(Operation):
     trace: Trace | None = field(default=None, repr=False)
     frozen: str = ""
     scope: str = ""
-    seen: tuple[Mapping[Cell, Any], Mapping[str, tuple[str, ...]]] | None = field(  # type: ignore[misc]
-        default=None, repr=False, compare=False
-    )
-    overrides: bool = field(default=False, repr=False, compare=False)  # type: ignore[misc]
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -85,16 +76,17 @@ class OpaqueOperation(Operation):
         ModelError
             If a read has changed in a way that the trace cannot follow.
         """
-        scope = self._in_scope(model)
-        if self.seen is None:
+        scope, seen = self._in_scope(model), model.seen
+        if seen is None:
+            model.remember(self.see(model))
             return self._run_first(scope)
-        changed = self._changed(scope)
+        changed = self._changed(scope, seen)
         if not changed:
             return FinishedWrites(self.recorded)
         error: KineverseError = ModelError(f"{self.frozen or 'it looked whether it is there'}.")
         if self.trace is not None:
             try:
-                return self.trace.run(scope, scope.replaced(*self.seen))
+                return self.trace.run(scope, scope.replaced(seen.values, seen.names))
             except KineverseError as problem:
                 error = problem
         else:
@@ -110,20 +102,17 @@ class OpaqueOperation(Operation):
             f"a new {self.kind}(...).{hint}"
         ) from None
 
-    def remember(self, model: ReadRecorder) -> None:
-        """Take what a model contains now as what the original has read."""
-        if self.seen is None:
-            model = self._in_scope(model)
-            values = {cell: model.read(cell, how) for cell, how in self.reads.items()}
-            names = {kind: tuple(model.list_names(kind)) for kind in self.listings}
-            silent = model.replaced({}, {})
-            overrides = any(silent.read(cell, Read.EXISTENCE) is not ABSENT for cell in self.recorded)
-            object.__setattr__(self, "seen", (values, names))
-            object.__setattr__(self, "overrides", self.overrides or overrides)
+    def see(self, model: ReadRecorder) -> Seen:
+        """Return what a model has of what the original read."""
+        model = self._in_scope(model)
+        values = {cell: model.read(cell, how) for cell, how in self.reads.items()}
+        names = {kind: tuple(model.list_names(kind)) for kind in self.listings}
+        silent = model.replaced({}, {})
+        overrides = any(silent.read(cell, Read.EXISTENCE) is not ABSENT for cell in self.recorded)
+        return Seen(values, names, overrides)
 
     def _run_first(self, model: ReadRecorder) -> Writes:
         """Write what the original wrote, unless the trace shows that it has read other values."""
-        self.remember(model)
         if self.trace is None:
             return FinishedWrites(self.recorded)
         results: list[QueryResult] = []
@@ -150,17 +139,15 @@ class OpaqueOperation(Operation):
         """Return a reader that lists only names below the document's prefix, if it has one."""
         return model.restricted(self.scope) if self.scope else model
 
-    def _changed(self, model: ReadRecorder) -> list[str]:
+    def _changed(self, model: ReadRecorder, seen: Seen) -> list[str]:
         """Read what the original read, and return the names of what has changed."""
-        assert self.seen is not None
-        values, names = self.seen
         changed = [
             f"the list of all {kind}"
             for kind in sorted(self.listings)
-            if tuple(model.list_names(kind)) != names[kind]
+            if tuple(model.list_names(kind)) != seen.names[kind]
         ]
         for cell, how in sorted(self.reads.items()):
-            if differs(how, values.get(cell, ABSENT), model.read(cell, how)):
+            if differs(how, seen.values.get(cell, ABSENT), model.read(cell, how)):
                 changed.append("/".join(cell))
         return changed
 

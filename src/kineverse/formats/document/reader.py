@@ -19,7 +19,7 @@ from kineverse.model.frame import WORLD
 from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model
 from kineverse.model.operation import BODIES, FRAMES, KINDS, RATES, Cell, Writes, find_expressions
-from kineverse.model.read_recorder import ABSENT, Read, Reads
+from kineverse.model.read_recorder import ABSENT, Read, Reads, Seen
 from kineverse.model.registry import FileContent
 from kineverse.model.traces.trace import find_read_nodes
 
@@ -55,6 +55,8 @@ def read_operations(
 
     The content is text, its UTF-8, or msgpack if ``is_packed``. Errors (FormatError) name the source. All
     names are put below the prefix; meshes below the root may be opened, see :mod:`..root_folder`.
+
+    An operation alone does not know what it has read. A whole model is made of :func:`entries_from_bytes`.
     """
     if isinstance(content, str):
         content = content.encode(errors="surrogatepass")  # refused by its place
@@ -93,10 +95,16 @@ def operation_from_bytes(
     return _Document("the operation", prefix, find_text_root(NOWHERE, root)).read_alone(data)
 
 
-def from_bytes(
-    data: bytes, prefix: str | None = None, *, root: str | os.PathLike[str] | None = None
-) -> Model:
-    """Return the model in the result of :func:`.writer.to_bytes`. Runs no code and imports no name.
+def entries_from_bytes(
+    data: bytes,
+    prefix: str | None = None,
+    *,
+    root: str | os.PathLike[str] | None = None,
+    source: str = "the document",
+) -> list[HistoryEntry]:
+    """Return the operations in the result of :func:`.writer.to_bytes`, with what they read and wrote.
+
+    ``edit.link(entry)`` of each in turn makes the model. Runs no code and imports no name.
 
     Parameters
     ----------
@@ -106,13 +114,25 @@ def from_bytes(
         Prefix of all names, tags included; the world stays the world.
     root
         Folder below which meshes given by path may be opened. By default only meshes of packages are.
+    source
+        Name of the document in errors.
 
     Raises
     ------
     FormatError
         If they are no valid document, with the place and the reason.
     """
-    entries = _Document("the document", prefix, find_text_root(NOWHERE, root)).read(data)
+    return _Document(source, prefix, find_text_root(NOWHERE, root)).read(data)
+
+
+def from_bytes(
+    data: bytes, prefix: str | None = None, *, root: str | os.PathLike[str] | None = None
+) -> Model:
+    """Return the model in the result of :func:`.writer.to_bytes`. Runs no code and imports no name.
+
+    Parameters and errors are those of :func:`entries_from_bytes`.
+    """
+    entries = entries_from_bytes(data, prefix, root=root)
     model = Model()
     try:
         with no_collection(), model.edit() as edit:
@@ -244,11 +264,9 @@ class _Document:
         for name, parameter in parameters.items():
             parameters[name] = decode_parameter(parameter, graph, names, writes)
         self._part = ""
-        seen, overrides = None, False
         if is_in_document:
-            seen = self._seen(reads)
+            reads.seen = self._seen(reads, writes)
             for cell, written in writes.items():
-                overrides = overrides or cell in self._cells
                 self._cells[cell] = written
                 self._listed[cell[0]].add(cell[1])
         operation = OpaqueOperation(
@@ -260,8 +278,6 @@ class _Document:
             trace,
             value.frozen,
             names.before + value.below,
-            seen,
-            overrides,
         )
         tag = names.before + value.tag
         return HistoryEntry(tag, operation, 0, reads, writes, blob if is_as_given else None)
@@ -303,12 +319,13 @@ class _Document:
                 reads.listings.add(self._names.cell(kind, "x")[0])
         return reads
 
-    def _seen(self, reads: Reads) -> tuple[dict[Cell, Any], dict[str, tuple[str, ...]]]:
+    def _seen(self, reads: Reads, writes: dict[Cell, Any]) -> Seen:
         names = {}
         for kind in reads.listings:
             self._budget.spend(COST_OF_NAME * len(self._listed[kind]))
             names[kind] = tuple(sorted(self._listed[kind]))
-        return {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}, names
+        values = {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}
+        return Seen(values, names, not self._cells.keys().isdisjoint(writes))
 
 
 def _add_parents(reads: Reads, writes: dict[Cell, Any]) -> None:

@@ -137,6 +137,25 @@ def operation_to_bytes(model: ModelView, tag: str) -> bytes:
         if tag not in by_tag:
             raise UnknownNameError(f"There is no operation {tag!r}. {suggest(str(tag), by_tag, 'tag')}")
         entry = by_tag[tag]
+    return entry_to_bytes(entry, entries)
+
+
+def entry_to_bytes(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> bytes:
+    """Return an entry of a history as bytes, its *blob*, and keep it with the entry.
+
+    The entry may be one of an edit that is still open. Others are only looked at if it computes with values
+    that it read, and its trace is not known yet.
+
+    Parameters
+    ----------
+    entry, entries
+        Entry, and those of all operations in order, ``model.history.sequence``.
+
+    Raises
+    ------
+    FormatError
+        For content that a document cannot carry.
+    """
     return entry.blob or _blob(entry, entries)
 
 
@@ -155,7 +174,7 @@ def _entries(model: ModelView) -> Sequence[HistoryEntry]:
 def _blobs(entries: Sequence[HistoryEntry]) -> list[bytes]:
     """Return the blobs of operations; those that are known are not encoded again."""
     with no_collection():
-        return [entry.blob or _blob(entry, entries) for entry in entries]
+        return [entry_to_bytes(entry, entries) for entry in entries]
 
 
 def _blob(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> bytes:
@@ -224,7 +243,7 @@ def _find_trace(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> Trace |
     before = ReadRecorder(
         lambda cell: cells.get(cell, ABSENT),
         lambda kind: sorted(name for k, name in cells if k == kind),
-        Reads(),
+        Reads(entry.reads.seen),
     )
     try:
         return record_trace(entry.operation, before, entry.writes)

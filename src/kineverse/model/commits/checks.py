@@ -1,4 +1,7 @@
-"""Checks of a sequence of operations: names, parents of frames, cycles, values written twice."""
+"""Checks of a sequence of operations: names, parents of frames, cycles, values written twice.
+
+Entries that come from elsewhere are also completed here by what they have read.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import TYPE_CHECKING
 from kineverse.errors import EditError, KineverseError, ModelError, UnknownNameError
 from kineverse.model.frame import WORLD
 from kineverse.model.operation import FRAMES, Cell, may_override, overwrite_error
-from kineverse.model.read_recorder import ABSENT, Read, unknown_name_error
+from kineverse.model.read_recorder import ABSENT, Read, Reads, unknown_name_error
 
 if TYPE_CHECKING:
     from kineverse.model.history import History, HistoryEntry
@@ -24,7 +27,7 @@ _FEW = 4
 
 
 def check_writes(history: History, entry: HistoryEntry) -> None:
-    """Check the names that an entry writes, and the parents of its frames, which count as read."""
+    """Check the names that a run has written, and the parents of its frames, which are added to its reads."""
     for name, parent in find_parents(entry):
         entry.reads.add((FRAMES, parent), Read.EXISTENCE)
         check_parent(history, name, parent, entry.place)
@@ -57,6 +60,43 @@ def find_parents(entry: HistoryEntry) -> Iterator[tuple[str, str]]:
             raise ModelError(f"Cyclic frames: '{name}' would be its own parent.")
         if value.parent not in chain:
             yield name, value.parent
+
+
+def know_parents(entry: HistoryEntry) -> tuple[HistoryEntry, list[tuple[str, str]]]:
+    """Return an entry that has read the parents of its frames, and these as :func:`find_parents` does.
+
+    It is the given one, or has a copy of its reads, which belong to others as well.
+    """
+    parents = list(find_parents(entry))
+    missing = [parent for _, parent in parents if (FRAMES, parent) not in entry.reads.cells]
+    if missing:
+        entry = entry.reading(entry.reads.copy())
+        for parent in missing:
+            entry.reads.add((FRAMES, parent), Read.EXISTENCE)
+    return entry, parents
+
+
+def know_reads(history: History, entry: HistoryEntry) -> HistoryEntry:
+    """Return an entry that takes what there is before its place as what it has read, if that is not known.
+
+    Only that of an operation from a document that was never run does not know it.
+    """
+    if entry.reads.seen is not None or entry.operation.recorded is not entry.writes:
+        return entry
+    known = entry.reading(entry.reads.copy())
+    known.reads.seen = entry.operation.see(history.reader_at(entry.place, Reads()))
+    known.blob = entry.blob
+    return known
+
+
+def finds_what_it_read(history: History, entry: HistoryEntry) -> bool:
+    """Return whether all values that an operation has read elsewhere are the same objects here."""
+    seen, place = entry.reads.seen, entry.place
+    return (
+        seen is not None
+        and all(history.value_at(cell, place) is value for cell, value in seen.values.items())
+        and all(tuple(history.names_at(kind, place)) == names for kind, names in seen.names.items())
+    )
 
 
 def check_overwrite(history: History, entry: HistoryEntry) -> None:

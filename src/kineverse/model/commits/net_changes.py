@@ -15,11 +15,11 @@ from kineverse.model.changes import find_moved_tags
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
 from kineverse.model.history import History, HistoryEntry, TouchedEntry
-from kineverse.model.operation import FRAMES, KINDS, RATES, Operation
-from kineverse.model.read_recorder import Read, Reads
+from kineverse.model.operation import KINDS, RATES, Operation
+from kineverse.model.read_recorder import Read, Reads, Seen
 from kineverse.symbols import Symbol
 
-from .checks import check_parent, find_parents
+from .checks import check_parent, know_parents, know_reads
 
 _PLACE = attrgetter("place")
 _TYPES: dict[str, Any] = dict(
@@ -160,20 +160,19 @@ def adopt(history: History, changes: NetChanges, *, complete: bool) -> None:
     history.settle()
     before = [known[tag] for tag in (*changes.removed, *put) if tag in known]
     cells = dict.fromkeys(cell for entry in (*before, *put.values()) for cell in entry.writes)
+    parents: dict[str, list[tuple[str, str]]] = {}
     with history.step():
         seen = history.list_reads(cells, without=put)
         for tag in (*changes.removed, *changes.moved):
             history.remove(tag)
         for placed in changes.put:
-            entry = placed.entry
-            for _, parent in find_parents(entry):
-                entry.reads.add((FRAMES, parent), Read.EXISTENCE)
+            entry, parents[placed.entry.tag] = know_parents(placed.entry)
             if entry.tag not in changes.rerun:
                 history.note_given(entry.tag)
-            history.put(entry.at(_find_place(history, placed)))
-        for tag, entry in put.items():
+            history.put(know_reads(history, entry.at(_find_place(history, placed))))
+        for tag in put:
             # Parents are looked for when all are there, as frames may be replaced before them.
-            for name, parent in find_parents(entry):
+            for name, parent in parents[tag]:
                 check_parent(history, name, parent, history.entries[tag].place)
         for tag, cell in history.find_outdated(seen):
             if complete:
@@ -230,6 +229,7 @@ def _are_reads(reads: object) -> bool:
         and isinstance(reads.listings, set)
         and all(_is_cell(cell) and isinstance(how, Read) for cell, how in reads.cells.items())
         and reads.listings <= {*KINDS}
+        and (reads.seen is None or isinstance(reads.seen, Seen))
     )
 
 

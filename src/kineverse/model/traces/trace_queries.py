@@ -221,7 +221,7 @@ class TracingReader(ReadRecorder, ABC):
     """Model before an operation that turns every read into a query."""
 
     def __init__(self, model: ReadRecorder) -> None:
-        super().__init__(model._value_at, model._names_at, Reads())
+        super().__init__(model._value_at, model._names_at, Reads(model.seen))
         self.model = model
         self.done = False
 

@@ -1,0 +1,453 @@
+"""Live models: a server keeps them, their edits are asked of it, and they follow all commits.
+
+A client runs an edit on its replica, takes the net changes, rolls back and asks the server. The replica
+adopts only what the server publishes, its own edits included, so a refused edit needs no repair.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from queue import SimpleQueue
+from typing import Any, TypeVar
+
+from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
+from kineverse._version import __version__
+from kineverse.errors import ConflictError, EditError, KineverseError, OfflineError
+from kineverse.formats import entries_from_bytes, entry_to_bytes, operation_from_bytes
+from kineverse.formats.resources import add_resolver, remove_resolver
+from kineverse.model.changes import find_moved_tags
+from kineverse.model.commits.net_changes import NetChanges, PlacedEntry
+from kineverse.model.edit import Edit
+from kineverse.model.history import History, HistoryEntry
+from kineverse.model.model import EditContext, Model
+from kineverse.model.read_recorder import ABSENT
+from kineverse.symbols import Symbol
+
+from . import protocol
+from .address import Address
+from .connection import Connection
+from .meshes import FetchedFiles, find_known_files, put_contents
+from .transport import Channel
+
+_LOG = logging.getLogger(__name__)
+
+_OWN_COMMIT = 0.05
+"""Time in which the publication of an own edit is waited for before the server is asked for it [s]."""
+
+R = TypeVar("R")
+
+
+def load_live(
+    source: str,
+    *,
+    frames: Iterable[str] | None = None,
+    symbols: Iterable[Symbol | str] | None = None,
+    bodies: bool | None = None,
+) -> LiveModel:
+    """Connect to a model server and return its model, or a part of it.
+
+    Parameters
+    ----------
+    source
+        Address ``live:NAME``, or ``live:tcp/host:port/NAME``.
+    frames, symbols
+        Names of frames and of coordinates of a part, which is closed: their forward kinematics, Jacobians,
+        constraints and rates are those of the whole. By default the model is whole.
+    bodies
+        Whether bodies are wanted: by default in the whole, and not in a part.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such server, or its model has no such frame or coordinate; the message lists
+        similar ones.
+    OfflineError
+        If nobody answers at a given endpoint.
+    FormatError
+        If the server is of another version.
+    MissingDependencyError
+        Without the extra ``exchange``.
+    """
+    is_part = frames is not None or symbols is not None
+    wish = protocol.Join(
+        protocol.PROTOCOL,
+        __version__,
+        "",
+        "",
+        as_entries("frames=", frames or (), str, "names of frames"),
+        tuple(map(str, symbols or ())),
+        not is_part if bodies is None else check_flag("bodies", bodies),
+        is_part or bodies is False,
+    )
+    return LiveModel(Connection(Address.parse(source)), wish)
+
+
+def include_live(edit: Edit, source: str, prefix: str | None = None, **others: Any) -> list[str]:
+    """Append the present operations of a server's model to an edit of another one, and return their tags."""
+    connection = Connection(Address.parse(source))
+    try:
+        joined = connection.join(protocol.Join(protocol.PROTOCOL, __version__, "", ""))
+    finally:
+        connection.close()
+    return [edit.link(entry) for entry in entries_from_bytes(joined.document, prefix)]
+
+
+class LiveModel(Model):
+    """Model that a server keeps, from ``kv.load("live:NAME")``.
+
+    It reads like any model and is edited like any: ``with model.edit() as edit:`` ends when the edit is
+    stored, or raises and nothing has happened. Commits of others arrive in the background. Listeners are
+    called in a thread of their own, in order, and may edit. The version is the server's revision. While the
+    server is away, reading goes on and edits raise; afterwards the model catches up.
+    """
+
+    def __init__(self, connection: Connection, wish: protocol.Join) -> None:
+        self.exchange = connection
+        self._wish = wish
+        self._following = threading.RLock()
+        self._deliveries: SimpleQueue[bool] = SimpleQueue()
+        self._announced = 0  # last revision that concerns this model, as the last sign of life had it
+        log = None if wish.is_part else connection.transport.subscribe(connection.key("log"))
+        try:
+            joined = connection.join(wish)
+            super().__init__()
+            self._restore(_entries(joined), joined.revision)
+        except BaseException:
+            connection.close()
+            raise
+        self._start(log, joined)
+
+    # -- edits ---------------------------------------------------------------------------------------------
+
+    def edit(self, *, strict: bool = False) -> AbstractContextManager[Edit]:
+        """Open a transaction, which the server is asked for at the end of its ``with`` block.
+
+        Parameters
+        ----------
+        strict
+            True to be refused if anything has been changed meanwhile: for edits whose code has read values of
+            the model by hand. Otherwise edits of others are merged if neither's operations read or write what
+            the other's write.
+
+        Raises
+        ------
+        ConflictError
+            If another edit was first: the error names tags, paths, revision and who. Nothing has happened;
+            :meth:`transact` tries again.
+        EditError
+            If the model refuses the edit, as for any model, or the part does not have what the edit needs.
+        OfflineError
+            If the server is away.
+        """
+        check_flag("strict", strict)
+        return EditContext(lambda: self._ask_for_edit(strict))
+
+    def transact(self, change: Callable[[Edit], R], *, attempts: int = 5, strict: bool = False) -> R:
+        """Edit the model by a function, which is called again on the newest model after a conflict.
+
+        Parameters
+        ----------
+        change
+            Function of an edit; it must depend on nothing else that it changes.
+        attempts
+            Most calls.
+        strict
+            As for :meth:`edit`.
+
+        Returns
+        -------
+        object
+            What the function has returned.
+
+        Raises
+        ------
+        ConflictError
+            If the last attempt was in conflict as well.
+        """
+        for left in reversed(range(as_count("attempts", attempts, 1))):
+            try:
+                with self.edit(strict=strict) as edit:
+                    return change(edit)
+            except ConflictError as error:
+                if not left:
+                    raise
+                self.wait(error.revision)
+        raise AssertionError
+
+    def undo(self, revision: int) -> None:
+        """Take back the commit of a revision, also one from before this process has joined.
+
+        Raises
+        ------
+        ConflictError
+            If a later commit has changed what it would change.
+        """
+        connection = self.exchange
+        number = connection.next_number()
+        wanted = as_count("revision", revision, 1)
+        self._finish_edit(
+            connection.ask_edit(protocol.Undo(connection.client, number, connection.who, wanted))
+        )
+
+    def wait(self, version: int, timeout: float | None = None) -> bool:
+        """Wait until the model is at a version or a later one; False if it is not after a time [s].
+
+        A listener is called after the model has its version, so hooks of that version may still run.
+        """
+        wanted = as_count("version", version, 0)
+        return self.exchange.wait_for(
+            lambda: self.exchange.revision >= wanted,
+            None if timeout is None else as_tolerance(timeout, "A timeout"),
+        )
+
+    def close(self) -> None:
+        """End the connection; reading goes on. A second call has no effect, and a script need not call it."""
+        self._finish()
+
+    def __enter__(self) -> LiveModel:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _ask_for_edit(self, strict: bool) -> Iterator[Edit]:
+        connection = self.exchange
+        connection.check_online()
+        proposed: list[protocol.Edit] = []
+        with self._transaction(lambda edit: proposed.extend(self._propose(edit, strict))) as edit:
+            yield edit
+        for request in proposed:
+            self._finish_edit(connection.ask_edit(request))
+
+    def _propose(self, edit: Edit, strict: bool) -> list[protocol.Edit]:
+        """Return an open edit as a request; none if it does nothing."""
+        changes, connection = edit.net(), self.exchange
+        if changes.is_empty:
+            return []
+        if self._wish.is_part:
+            _check_part(self._history, changes, connection)
+        sequence = self._history.sequence
+        put = tuple(
+            protocol.Placed(entry_to_bytes(placed.entry, sequence), placed.after or "", placed.at_end)
+            for placed in changes.put
+        )
+        return [
+            protocol.Edit(
+                connection.client,
+                connection.next_number(),
+                connection.who,
+                *connection.position,
+                protocol.Changes(put, changes.replaced, changes.rerun, changes.moved, changes.removed),
+                strict,
+                find_known_files(placed.entry for placed in changes.put),
+            )
+        ]
+
+    def _finish_edit(self, answer: protocol.Committed | protocol.Refused) -> None:
+        """Wait until the replica has an edit that was committed, or raise the error of one that was not."""
+        if isinstance(answer, protocol.Refused):
+            if answer.reason == "stale":
+                self._catch_up()
+            if answer.reason in ("conflict", "stale"):
+                named = {
+                    "tags": (answer.tag,) if answer.tag else (),
+                    "paths": (answer.path,) if answer.path else (),
+                }
+                raise ConflictError(answer.message, revision=answer.revision, who=answer.who, **named)
+            raise EditError(answer.message)
+        connection = self.exchange
+        first = 0.0 if self._wish.is_part else _OWN_COMMIT  # a part may have nothing of it
+        while not connection.wait_for(lambda: connection.revision >= answer.revision, first):
+            if not connection.is_online:
+                return  # it is stored, and comes when the server is back
+            self._catch_up()
+            first = _OWN_COMMIT
+
+    # -- following -----------------------------------------------------------------------------------------
+
+    def _start(self, log: Channel | None, joined: protocol.Joined) -> None:
+        connection, model = self.exchange, weakref.ref(self)
+        connection.accept(joined)
+        self._view = joined.view
+        transport = connection.transport
+        self._pump(log or transport.subscribe(connection.key(f"view/{joined.view}")), LiveModel._receive)
+        self._pump(transport.subscribe(connection.key("beat"), most=2), LiveModel._hear)
+        self._pump(transport.watch_alive(connection.key("alive/*")), LiveModel._notice)
+        threading.Thread(
+            target=_call_hooks, args=(self._deliveries, model), name="kineverse-hooks", daemon=True
+        ).start()
+        fetched = FetchedFiles(connection.fetch_part)
+        add_resolver(fetched)
+        self._finish = weakref.finalize(self, _finish, connection, self._deliveries, fetched)
+        if log is None:
+            self._catch_up()  # what came before the subscription
+
+    def _pump(self, channel: Channel, method: Callable[[LiveModel, Any], None]) -> None:
+        threading.Thread(
+            target=_pump, args=(channel, weakref.ref(self), method), name="kineverse-follow", daemon=True
+        ).start()
+
+    def _receive(self, data: bytes) -> None:
+        """Adopt a commit that was published."""
+        published = protocol.decode_published(data)
+        commit = protocol.decode_commit(published.commit)
+        with self._following:
+            connection = self.exchange
+            if published.epoch != connection.epoch or commit.previous > connection.revision:
+                self._catch_up()
+            elif commit.revision > connection.revision:
+                self._adopt_commit(published, commit)
+
+    def _adopt_commit(self, published: protocol.Published, commit: protocol.Commit) -> None:
+        connection = self.exchange
+        is_whole = not self._wish.is_part
+        if is_whole and protocol.chain(connection.chain, published.commit) != published.chain:
+            self._join_again()
+            return
+        try:
+            self._adopt(_decode_changes(commit), commit.revision)
+        except KineverseError:
+            _LOG.exception("A commit of %s cannot be adopted; its model is joined again.", connection.address)
+            self._join_again()
+            return
+        connection.advance(commit.revision, published.chain)
+
+    def _catch_up(self) -> None:
+        """Ask for what was missed, and adopt it."""
+        connection = self.exchange
+        with self._following:
+            is_behind = True
+            while is_behind:
+                try:
+                    answer = connection.ask_missed(self._view)
+                except OfflineError:
+                    return  # when the server is back, it says so
+                if isinstance(answer, protocol.Refused):
+                    self._join_again()
+                    return
+                connection.epoch = answer.epoch
+                for published in answer.commits:
+                    commit = protocol.decode_commit(published.commit)
+                    if commit.revision > connection.revision:
+                        self._adopt_commit(published, commit)
+                is_behind = bool(answer.commits) and connection.revision < answer.revision
+            if connection.revision < answer.revision:  # nothing of a part has changed
+                connection.advance(answer.revision, answer.chain)
+            connection.note_presence(True)
+
+    def _join_again(self) -> None:
+        """Take the model anew, as one commit, if the server does not know the state that this one is in."""
+        connection = self.exchange
+        joined = connection.join(self._wish)
+        self._adopt(_find_changes(self._history.sequence, _entries(joined)), joined.revision)
+        if joined.view != self._view:
+            self._view = joined.view
+            self._pump(
+                connection.transport.subscribe(connection.key(f"view/{joined.view}")), LiveModel._receive
+            )
+        connection.accept(joined)
+
+    def _hear(self, data: bytes) -> None:
+        """Note a sign of life: what it tells of and has not come until the next one was lost."""
+        beat = protocol.decode_beat(data)
+        connection = self.exchange
+        with self._following:
+            last = beat.views.get(self._view, 0) if self._wish.is_part else beat.revision
+            if beat.epoch != connection.epoch or connection.revision < self._announced:
+                self._catch_up()
+            elif self._wish.is_part and last <= connection.revision < beat.revision:
+                connection.advance(beat.revision, beat.chain)
+            self._announced = last
+        connection.hear(beat)
+
+    def _notice(self, sign: tuple[str, bool]) -> None:
+        """Note that a server has come or gone."""
+        key, is_there = sign
+        connection = self.exchange
+        if is_there:
+            self._catch_up()
+        elif key.endswith(connection.epoch):
+            connection.note_presence(False)
+
+    def _deliver(self) -> None:
+        self._deliveries.put(True)
+
+
+def _entries(joined: protocol.Joined) -> list[HistoryEntry]:
+    entries = entries_from_bytes(joined.document)
+    put_contents(entries, joined.files)
+    return entries
+
+
+def _find_changes(old: Sequence[HistoryEntry], new: Sequence[HistoryEntry]) -> NetChanges:
+    """Return the changes between two sequences; operations that may read what changes are put as well."""
+    known = {entry.tag: entry for entry in old}
+    tags = {entry.tag for entry in new}
+    before, after = [tag for tag in known if tag in tags], [entry.tag for entry in new if entry.tag in known]
+    moved = find_moved_tags(before, after)
+    put, last = [], None
+    for entry in new:
+        is_equal = entry.tag in known and known[entry.tag].blob == entry.blob and entry.tag not in moved
+        if not is_equal or entry.reads.cells or entry.reads.listings:
+            put.append(PlacedEntry(entry, last))
+        last = entry.tag
+    replaced = tuple(placed.entry.tag for placed in put if placed.entry.tag in known)
+    removed = tuple(tag for tag in known if tag not in tags)
+    return NetChanges(tuple(put), replaced, (), moved, removed)
+
+
+def _check_part(history: History, changes: NetChanges, connection: Connection) -> None:
+    """Refuse an edit that would depend on what is not in a part of the model."""
+    for entry in (placed.entry for placed in changes.put):
+        missing = sorted(f"all {kind}" for kind in entry.reads.listings)
+        missing += [
+            "/".join(cell) for cell in entry.reads.cells if history.value_at(cell, entry.place) is ABSENT
+        ]
+        if missing:
+            raise EditError(
+                f"The edit needs more than this part of the model: {entry.tag!r} reads {missing[0]}. Name it "
+                f"when the part is loaded, or load the whole, {str(connection.address)!r}."
+            )
+
+
+def _decode_changes(commit: protocol.Commit) -> NetChanges:
+    changes = commit.changes
+    put = []
+    for placed in changes.put:
+        entry = operation_from_bytes(placed.blob)
+        put.append(PlacedEntry(entry, placed.after or None, placed.at_end))
+    put_contents([placed.entry for placed in put], commit.files)
+    return NetChanges(tuple(put), changes.replaced, changes.rerun, changes.moved, changes.removed)
+
+
+def _pump(channel: Any, model: weakref.ref[LiveModel], method: Callable[[LiveModel, Any], None]) -> None:
+    """Hand over what arrives to a method of a model, as long as both are there."""
+    for item in channel:
+        target = model()
+        if target is None or target.exchange.is_closed:
+            return
+        try:
+            method(target, item)
+        except KineverseError:
+            _LOG.exception("A message of %s is left out.", target.exchange.address)
+        del target
+
+
+def _call_hooks(deliveries: SimpleQueue[bool], model: weakref.ref[LiveModel]) -> None:
+    while deliveries.get():
+        target = model()
+        if target is None:
+            return
+        target._listeners.deliver()
+        del target
+
+
+def _finish(connection: Connection, deliveries: SimpleQueue[bool], fetched: FetchedFiles) -> None:
+    connection.close()
+    deliveries.put(False)
+    remove_resolver(fetched)

@@ -1,0 +1,246 @@
+"""Connection of a client to a model server: requests, their answers, and signs of life."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import socket
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import TypeVar
+
+from msgspec.structs import replace
+
+from kineverse._checks import as_count
+from kineverse.errors import FormatError, OfflineError, UnknownNameError
+
+from . import protocol
+from .address import Address
+from .transport import NoAnswerError, Transport
+
+PATIENCE = 10.0
+"""Time that an edit waits for a server that went away, before it is given up [s]."""
+_ASK_TIMEOUT = 5.0
+_PAUSE = 0.005
+_ROUTING = 0.5
+
+A = TypeVar("A")
+
+
+class Connection:
+    """Connection of a live model to its server, under the identity of one client: ``model.exchange``.
+
+    Attributes
+    ----------
+    address
+        Address of the server.
+    client
+        Identity of this client, 32 hexadecimal digits.
+    who
+        Name of this client for people: user, computer, program and process.
+    epoch
+        Identity of the present run of the server.
+    revision, chain
+        Revision up to which the model has everything, and the digest of all commits up to it.
+    is_online
+        False while the server is away.
+    sources
+        Sources of state that the server has announced.
+    """
+
+    def __init__(self, address: Address) -> None:
+        self.address = address
+        self.client = uuid.uuid4().hex
+        self.who = describe_client()
+        self.epoch, self.revision, self.chain = "", 0, protocol.NO_CHAIN
+        self.is_online, self.is_closed = True, False
+        self.sources: tuple[protocol.SourceStatus, ...] = ()
+        self._numbers = count(1)
+        self._told = -1
+        self._changed = threading.Condition()
+        endpoint, secret = address.find()
+        try:
+            self.transport = Transport.connect(endpoint, secret)
+        except NoAnswerError:
+            raise OfflineError(
+                f"No model server answers at {endpoint}. Start it, or mend the address {str(address)!r}."
+            ) from None
+        self._presence = self.transport.alive(self.key(f"client/{self.client}"))
+
+    def close(self) -> None:
+        """End the connection; the model can still be read. A second call has no effect."""
+        self.is_closed = True
+        self.note_presence(False)
+        self.transport.close()
+
+    # -- questions to the server ---------------------------------------------------------------------------
+
+    def status(self) -> protocol.Status:
+        """Return how the server is: rates, times, clients, sources and the last refusals."""
+        return self.ask(protocol.GetStatus(), protocol.Status)
+
+    def history(self, most: int = 20, before: int | None = None) -> tuple[protocol.HistoryRow, ...]:
+        """Return the last commits, newest first, from before a revision if one is given."""
+        most = as_count("most", most, 1)
+        asked = protocol.GetHistory(most) if before is None else protocol.GetHistory(most, before)
+        return self.ask(asked, protocol.History).rows
+
+    # -- for the live model --------------------------------------------------------------------------------
+
+    @property
+    def position(self) -> tuple[int, bytes]:
+        """Revision and digest, together."""
+        with self._changed:
+            return self.revision, self.chain
+
+    def key(self, end: str) -> str:
+        """Return a key of the server."""
+        return f"kineverse/{self.address.name}/{end}"
+
+    def next_number(self) -> int:
+        """Return the number of a new edit of this client."""
+        return next(self._numbers)
+
+    def check_online(self) -> None:
+        """Raise an OfflineError if the server is away."""
+        if self.is_closed:
+            raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+        if not self.is_online:
+            raise OfflineError(
+                f"The server of {self.address} is away. The model can be read, and edited when it is back."
+            )
+
+    def join(self, wish: protocol.Join) -> protocol.Joined:
+        """Join and return the model, or the part that is wished for."""
+        return self.ask(replace(wish, client=self.client, who=self.who), protocol.Joined)
+
+    def ask_missed(self, view: str) -> protocol.Missed | protocol.Refused:
+        """Ask for the commits after the present revision."""
+        answer = self._ask(protocol.Since(self.client, self.who, view, *self.position), _ASK_TIMEOUT)
+        if isinstance(answer, (protocol.Missed, protocol.Refused)):
+            return answer
+        raise refusal_error(answer, self.address)
+
+    def fetch_part(self, sha256: str, offset: int) -> bytes | None:
+        """Return a part of a file; None if the server does not have it."""
+        try:
+            return self.ask(protocol.GetFile(sha256, offset), protocol.FilePart).data
+        except UnknownNameError:
+            return None
+
+    def accept(self, joined: protocol.Joined) -> None:
+        """Take over where the model is that the server has sent."""
+        self.epoch = joined.epoch
+        self.advance(joined.revision, joined.chain)
+        self.note_presence(True)
+
+    def advance(self, revision: int, chain: bytes) -> None:
+        """Note the revision that the model has."""
+        with self._changed:
+            self.revision, self.chain = revision, chain
+            self._changed.notify_all()
+
+    def note_presence(self, is_online: bool) -> None:
+        """Note whether the server is there."""
+        with self._changed:
+            self.is_online = is_online and not self.is_closed
+            self._changed.notify_all()
+
+    def hear(self, beat: protocol.Beat) -> None:
+        """Take the sources of state from a sign of life, and tell the server what this client has."""
+        self.sources = beat.sources
+        seen = protocol.Seen(self.client, self.revision)
+        if self.revision != self._told:
+            self._told = self.revision
+            self.transport.publish(self.key("seen"), protocol.encode(seen))
+
+    def wait_for(self, is_done: Callable[[], bool], timeout: float | None) -> bool:
+        """Wait until something is so, which is looked at when the model or the connection changes."""
+        with self._changed:
+            return self._changed.wait_for(is_done, timeout)
+
+    def ask(self, request: protocol.Request, kind: type[A], timeout: float = _ASK_TIMEOUT) -> A:
+        """Ask once and return the answer, which is of a kind.
+
+        Raises
+        ------
+        OfflineError
+            Without an answer in time.
+        UnknownNameError
+            For a name that the server does not know.
+        FormatError
+            For any other refusal, or an answer that is none.
+        """
+        answer = self._ask(request, timeout)
+        if isinstance(answer, kind):
+            return answer
+        raise refusal_error(answer, self.address)
+
+    def ask_edit(self, edit: protocol.Edit | protocol.Undo) -> protocol.Committed | protocol.Refused:
+        """Ask for an edit until it is answered: under its number it is done once.
+
+        Raises
+        ------
+        OfflineError
+            If the server stays away: the edit may be stored, or not.
+        """
+        end = time.monotonic() + PATIENCE
+        while True:
+            try:
+                answer = self._ask(edit, min(_ASK_TIMEOUT, max(end - time.monotonic(), _PAUSE)))
+            except OfflineError:
+                if self.is_closed or time.monotonic() >= end:
+                    raise OfflineError(
+                        f"The server {self.address.name!r} has not answered for {PATIENCE:g} s. Whether the "
+                        "edit is stored is not known: look at the model when the server is back."
+                    ) from None
+                time.sleep(_PAUSE)
+                continue
+            if isinstance(answer, (protocol.Committed, protocol.Refused)):
+                return answer
+            raise refusal_error(answer, self.address)
+
+    def _ask(self, request: protocol.Request, timeout: float) -> protocol.Answer:
+        if self.is_closed:
+            raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+        changes_model = isinstance(request, (protocol.Edit, protocol.Undo))
+        data = protocol.encode(request)
+        if len(data) > protocol.MAX_BYTES:
+            raise FormatError(
+                f"This takes a message of {len(data) / 1e6:.0f} MB, and the most is "
+                f"{protocol.MAX_BYTES / 1e6:.0f} MB. Split it into several edits."
+            )
+        key, end = self.key("edit" if changes_model else "ask"), time.monotonic() + min(timeout, _ROUTING)
+        while True:
+            try:
+                return protocol.decode_answer(self.transport.ask(key, data, timeout))  # type: ignore[no-any-return]
+            except NoAnswerError:
+                # For moments after a connection was made it is not known who answers.
+                if not self.is_online or time.monotonic() >= end:
+                    raise OfflineError(f"The server {self.address.name!r} does not answer.") from None
+                time.sleep(_PAUSE)
+
+
+def refusal_error(answer: object, address: Address) -> Exception:
+    """Return the error for an answer that is a refusal, or of another kind than was asked for."""
+    if not isinstance(answer, protocol.Refused):
+        return FormatError(f"{address} answered with a {type(answer).__name__}, which was not asked for.")
+    kind = UnknownNameError if answer.reason == "unknown" else FormatError
+    return kind(answer.message)
+
+
+@cache
+def describe_client() -> str:
+    """Return the name of this process for people: user, computer, program and number."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):
+        user = str(os.getuid()) if hasattr(os, "getuid") else "somebody"
+    program = Path(sys.argv[0]).name if sys.argv and sys.argv[0] not in ("", "-c") else "python"
+    return f"{user}@{socket.gethostname()} {program} {os.getpid()}"

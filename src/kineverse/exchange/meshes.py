@@ -1,0 +1,131 @@
+"""Files of meshes for other processes: a server reads those that its root allows, by their digests.
+
+A client asks for a file when its triangles are needed, and keeps it on disk.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from kineverse.compilation.cache import private_subfolder
+from kineverse.errors import FormatError
+from kineverse.formats.files import replace_file
+from kineverse.formats.resource_paths import locate_mesh
+from kineverse.formats.resources import FolderResolver, map_meshes, measure_content, meshes_of
+from kineverse.model.body import Body, Mesh
+from kineverse.model.history import HistoryEntry
+from kineverse.model.operation import BODIES
+
+from .protocol import FileContent
+from .store import Store
+
+MAX_PART = 1 << 24
+"""Largest part of a file in one message [byte]."""
+
+
+class ServedFiles:
+    """Files of the meshes of a server's model, by the digest of their content, as its store knows them."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._paths = store.paths()
+
+    def find(
+        self, entries: Iterable[HistoryEntry], named: Iterable[FileContent] = ()
+    ) -> tuple[FileContent, ...]:
+        """Return the digests of meshes whose files are here: found on disk, or named and known already."""
+        by_place = {(file.tag, file.index): (file.sha256, file.size) for file in named}
+        result = []
+        for entry in entries:
+            for index, mesh in enumerate(_meshes(entry.writes)):
+                known = by_place.get((entry.tag, index)) or mesh.content
+                if known is None:
+                    known = measure_content(mesh)
+                    if known is not None and known[0] not in self._paths:
+                        self._paths[known[0]] = os.fspath(locate_mesh(mesh))
+                        self._store.add_path(known[0], self._paths[known[0]])
+                if known is not None and known[0] in self._paths:
+                    result.append(FileContent(entry.tag, index, *known))
+        return tuple(result)
+
+    def read(self, sha256: str, offset: int) -> bytes | None:
+        """Return a part of a file; None if there is none with this digest any more."""
+        path = self._paths.get(sha256)
+        if path is None:
+            return None
+        try:
+            with open(path, "rb") as file:
+                if not offset and hashlib.file_digest(file, "sha256").hexdigest() != sha256:
+                    return None
+                file.seek(offset)
+                return file.read(MAX_PART)
+        except (OSError, OverflowError):
+            return None
+
+
+class FetchedFiles:
+    """Resolver that asks a server for files, and keeps them in the cache of this user."""
+
+    def __init__(self, fetch_part: Callable[[str, int], bytes | None]) -> None:
+        self._fetch_part = fetch_part
+
+    def fetch(self, sha256: str, size: int) -> bytes | None:
+        """Return the content with this SHA-256 and size [byte]; None if the server does not have it."""
+        folder = private_subfolder("files").path
+        content = FolderResolver(folder).fetch(sha256, size)
+        if content is not None and hashlib.sha256(content).hexdigest() == sha256:
+            return content
+        parts = bytearray()
+        while len(parts) < size or not parts:
+            part = self._fetch_part(sha256, len(parts))
+            if part is None:
+                return None
+            if not part:
+                break
+            parts += part
+        content = bytes(parts)
+        if hashlib.sha256(content).hexdigest() != sha256:
+            raise FormatError(f"the server sent another file than that with SHA-256 {sha256}")
+        replace_file(Path(folder, sha256), content)
+        return content
+
+
+def find_known_files(entries: Iterable[HistoryEntry]) -> tuple[FileContent, ...]:
+    """Return the digests of meshes that are known in some operations."""
+    return tuple(
+        FileContent(entry.tag, index, *mesh.content)
+        for entry in entries
+        for index, mesh in enumerate(_meshes(entry.writes))
+        if mesh.content is not None
+    )
+
+
+def put_contents(entries: Iterable[HistoryEntry], files: Iterable[FileContent]) -> None:
+    """Put the digests of meshes into the operations that they belong to."""
+    by_tag: dict[str, dict[int, tuple[str, int]]] = {}
+    for file in files:
+        by_tag.setdefault(file.tag, {})[file.index] = file.sha256, file.size
+    for entry in entries:
+        contents = by_tag.get(entry.tag)
+        if not contents:
+            continue
+        count = 0
+
+        def place(mesh: Mesh, contents: dict[int, tuple[str, int]] = contents) -> Mesh:
+            nonlocal count
+            count += 1
+            return replace(mesh, content=contents.get(count - 1, mesh.content))
+
+        for cell, value in entry.writes.items():
+            if cell[0] == BODIES and meshes_of(value):
+                entry.writes[cell] = map_meshes(value, place)
+
+
+def _meshes(writes: Mapping[tuple[str, str], object]) -> list[Mesh]:
+    bodies = [value for (kind, _), value in writes.items() if kind == BODIES and isinstance(value, Body)]
+    return [mesh for body in bodies for mesh in meshes_of(body)]

@@ -1,0 +1,525 @@
+"""Model server: serves a model, takes edits in turn, keeps them, and publishes what changed."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack, closing, suppress
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from kineverse._checks import as_tolerance, check_flag
+from kineverse._version import __version__
+from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
+from kineverse.formats import entry_to_bytes
+from kineverse.formats.document.encoding import pack_document
+from kineverse.model.edit import Edit
+from kineverse.model.model import Model, Snapshot
+
+from . import protocol
+from .address import Claim, check_endpoint
+from .authority import Authority, Result
+from .connection import describe_client
+from .meshes import ServedFiles
+from .store import Store
+from .transport import Request, Requests, Transport
+from .views import View, Views, Wish
+
+_LOG = logging.getLogger(__name__)
+
+Source: TypeAlias = str | os.PathLike[str] | Model
+
+MOST_TOGETHER, LONGEST_WAIT = 200, 0.002
+"""Most edits that are stored together, and the time in which they have to arrive [s]."""
+BEAT = 0.5
+"""Time between two signs of life [s]."""
+_KEPT_REFUSALS = 20
+_KEPT_TIMES = 1000
+_MOST_MISSED = 1000
+_LONGEST_MESSAGE = 10_000
+_MINUTE = 60.0
+
+
+def serve(
+    models: Source | Iterable[Source] = (),
+    *,
+    name: str | None = None,
+    store: str | os.PathLike[str] | None = None,
+    listen: Iterable[str] = (),
+    durable: bool = False,
+) -> Server:
+    """Serve a model to other processes, in threads of this one.
+
+    Parameters
+    ----------
+    models
+        Models, or their files and names, that an empty store begins with. A store that has a model keeps it.
+    name
+        Name of the server: by default that in the store, of the store's file, or of the first model.
+    store
+        SQLite file that keeps the model and all edits. Without one, they end with the server.
+    listen
+        Further endpoints such as ``tcp/127.0.0.1:7410``. By default only processes of this user on this
+        computer are served.
+    durable
+        True to acknowledge an edit only when it survives a loss of power; otherwise it survives the end of
+        the process at any time.
+
+    Returns
+    -------
+    Server
+        The server, which runs until it is closed.
+
+    Raises
+    ------
+    InvalidValueError
+        For an invalid name, or one that another server has.
+    FormatError
+        For a model that cannot be loaded, or a store that is damaged, in use or of another version.
+    MissingDependencyError
+        Without the extra ``exchange``.
+    """
+    check_flag("durable", durable)
+    given = [models] if isinstance(models, (str, os.PathLike, Model)) else list(models)
+    endpoints = [check_endpoint(endpoint) for endpoint in listen]
+    path = None if store is None else Path(store)
+    with ExitStack() as opened:
+        kept = opened.enter_context(closing(Store(path, durable=durable)))
+        chosen = name or kept.name or (path.stem if path else "") or _name_of(given)
+        claim = Claim(chosen)
+        opened.callback(claim.release)
+        files = ServedFiles(kept)
+        authority = Authority(kept, find_files=files.find, watch=lambda _, diff, commit: (diff, commit))
+        if not authority.revision and given:
+            authority.fill(lambda edit: _include(edit, given), describe_client())
+        kept.name = chosen
+        transport = Transport.serve([claim.endpoint, *endpoints], claim.secret)
+        opened.callback(transport.close)
+        return Server(chosen, authority, kept, files, transport, opened.pop_all())
+
+
+def _name_of(given: Sequence[Source]) -> str:
+    first = given[0] if given else None
+    if first is None or isinstance(first, Model):
+        raise InvalidValueError("A server has a name: give one with name= (on the command line, --name).")
+    stem = Path(first).name
+    return stem.partition(".")[0] or stem
+
+
+def _include(edit: Edit, given: Sequence[Source]) -> None:
+    for source in given:
+        if isinstance(source, Model):
+            for entry in source.snapshot().entries:
+                edit.apply(entry.operation, entry.tag)
+        else:
+            edit.include(source)
+
+
+class Server:
+    """Running model server, from :func:`serve`.
+
+    Attributes
+    ----------
+    name
+        Name; clients load ``live:NAME``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        authority: Authority,
+        store: Store,
+        files: ServedFiles,
+        transport: Transport,
+        opened: ExitStack,
+    ) -> None:
+        self.name = name
+        self._authority, self._store, self._files, self._transport = authority, store, files, transport
+        self._opened = opened
+        self._since = time.time()
+        self._views = Views(authority.model)
+        self._logs: dict[str, _ViewLog] = {}
+        self._sources: dict[str, protocol.SourceStatus] = {}
+        self._clients: dict[str, _Client] = {}
+        self._refusals: deque[protocol.Refusal] = deque(maxlen=_KEPT_REFUSALS)
+        self._times: dict[str, deque[float]] = {}
+        self._accepted: deque[float] = deque(maxlen=100_000)
+        self._edits = 0
+        self._lock = threading.RLock()  # of the model, the views and the lists above
+        self._closed = threading.Event()
+        edits, questions = transport.answers(self._key("edit")), transport.answers(self._key("ask"))
+        presence = transport.watch_alive(self._key("client/*"))
+        seen = transport.subscribe(self._key("seen"))
+        # Last, for those who wait for a server to ask it.
+        self._token = transport.alive(self._key(f"alive/{authority.epoch}"))
+        for task, work in (
+            ("edits", lambda: self._take_edits(edits)),
+            ("questions", lambda: self._answer_questions(questions)),
+            ("presence", lambda: self._watch_clients(presence)),
+            ("seen", lambda: self._note_seen(seen)),
+            ("beat", self._beat),
+        ):
+            threading.Thread(target=work, name=f"kineverse-server-{task}", daemon=True).start()
+
+    # -- for users -----------------------------------------------------------------------------------------
+
+    @property
+    def address(self) -> str:
+        """Address for :func:`kineverse.load`."""
+        return f"live:{self.name}"
+
+    @property
+    def revision(self) -> int:
+        """Number of commits of the model."""
+        return self._authority.revision
+
+    def snapshot(self) -> Snapshot:
+        """Return the present model."""
+        with self._lock:
+            return self._authority.model.snapshot()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until the server is closed; False if it is not after a time [s]."""
+        return self._closed.wait(None if timeout is None else as_tolerance(timeout, "A timeout"))
+
+    def close(self) -> None:
+        """Stop serving; what was acknowledged is kept. A second call has no effect."""
+        if not self._closed.is_set():
+            self._closed.set()
+            with self._lock:
+                self._opened.close()
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- edits ---------------------------------------------------------------------------------------------
+
+    def _take_edits(self, requests: Requests) -> None:
+        while not self._closed.is_set():
+            waiting = requests.take(MOST_TOGETHER, LONGEST_WAIT)
+            if not waiting:
+                return  # the transport is closed
+            begin = time.perf_counter()
+            edits, given = [], []
+            for request in waiting:
+                try:
+                    decoded = protocol.decode_request(request.payload)
+                    if not isinstance(decoded, (protocol.Edit, protocol.Undo)):
+                        raise FormatError("This is no edit, and is asked under another key.")
+                except FormatError as error:
+                    self._refuse(request, "malformed", error)
+                    continue
+                edits.append(decoded)
+                given.append(request)
+            self._note_time("decode", begin)
+            if edits:
+                self._process(edits, given)
+
+    def _process(self, edits: Sequence[protocol.Edit | protocol.Undo], requests: Sequence[Request]) -> None:
+        epoch = self._authority.epoch
+        try:
+            with self._lock:
+                results = self._authority.process(edits)
+                published = [result.published for result in results if result.published is not None]
+                if self._authority.epoch != epoch:
+                    self._begin_again()
+                for_parts = self._commit_views(results)
+        except Exception as error:  # a defect of this package must not end the server
+            _LOG.exception("Edits could not be processed.")
+            for request in requests:
+                self._refuse(request, "failed", error)
+            return
+        begin = time.perf_counter()
+        for commit in published:
+            self._transport.publish(self._key("log"), protocol.encode(commit))
+        for view, commit in for_parts:
+            self._transport.publish(self._key(f"view/{view}"), protocol.encode(commit))
+        self._note_time("publish", begin)
+        begin = time.perf_counter()
+        for request, edit, result in zip(requests, edits, results, strict=True):
+            request.answer(protocol.encode(result.answer))
+            self._note(edit, result)
+        self._note_time("answer", begin)
+
+    def _begin_again(self) -> None:
+        """Follow a model that was loaded again from its store: parts are asked for anew."""
+        self._views, self._logs = Views(self._authority.model), {}
+        self._token.close()
+        self._token = self._transport.alive(self._key(f"alive/{self._authority.epoch}"))
+
+    def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
+        """Return the commits of parts, by the ids of their views."""
+        made = [result.watched for result in results if result.watched is not None]
+        if not made:
+            return []
+        authority, last = self._authority, made[-1][1]
+        commits = []
+        for view, changes in self._views.commit(*(diff for diff, _ in made)):
+            log = self._logs[view.id]
+            put = {*map(protocol.tag_of, changes.put)}
+            files = self._files.find([entry for entry in view.entries if entry.tag in put])
+            commit = protocol.Commit(
+                last.revision, log.last, last.client, last.number, last.who, last.time, changes, files
+            )
+            published = protocol.Published(authority.epoch, authority.chain, protocol.encode(commit))
+            log.add(last.revision, published)
+            commits.append((view.id, published))
+        return commits
+
+    def _note(self, edit: protocol.Edit | protocol.Undo, result: Result) -> None:
+        now = time.time()
+        with self._lock:
+            for stage, seconds in result.seconds.items():
+                self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(seconds)
+            if isinstance(result.answer, protocol.Refused):
+                self._refusals.append(protocol.Refusal(now, edit.who, result.answer.message))
+                _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
+            elif result.published is not None:
+                self._edits += 1
+                self._accepted.append(now)
+
+    def _note_time(self, stage: str, begin: float) -> None:
+        self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(time.perf_counter() - begin)
+
+    def _refuse(self, request: Request, reason: protocol.Reason, error: Exception) -> None:
+        request.answer(protocol.encode(protocol.Refused(reason, str(error)[:_LONGEST_MESSAGE])))
+
+    # -- questions -----------------------------------------------------------------------------------------
+
+    def _answer_questions(self, requests: Requests) -> None:
+        for request in requests:
+            try:
+                answer = self._answer(protocol.decode_request(request.payload))
+            except UnknownNameError as error:
+                self._refuse(request, "unknown", error)
+            except FormatError as error:
+                self._refuse(request, "malformed", error)
+            except Exception as error:  # a defect of this package must not end the server
+                _LOG.exception("A question could not be answered.")
+                self._refuse(request, "failed", error)
+            else:
+                request.answer(protocol.encode(answer))
+
+    def _answer(self, question: protocol.Request) -> protocol.Answer:
+        match question:
+            case protocol.Join():
+                return self._join(question)
+            case protocol.Since():
+                return self._list_missed(question)
+            case protocol.GetStatus():
+                return self._status()
+            case protocol.GetHistory():
+                return self._list_history(question)
+            case protocol.GetFile():
+                data = self._files.read(question.sha256, question.offset)
+                if data is None:
+                    return protocol.Refused("unknown", f"There is no file with SHA-256 {question.sha256}.")
+                return protocol.FilePart(data)
+            case protocol.Announce():
+                return self._announce(question)
+            case _:
+                raise FormatError("This is an edit, and is asked under another key.")
+
+    def _join(self, join: protocol.Join) -> protocol.Answer:
+        if join.protocol != protocol.PROTOCOL:
+            return protocol.Refused(
+                "protocol",
+                f"{self.name!r} is served by Kineverse {__version__} (protocol {protocol.PROTOCOL}), and "
+                f"this client is of {join.library} (protocol {join.protocol}). Update the older one.",
+            )
+        authority = self._authority
+        with self._lock:
+            if join.is_part:
+                view = self._views.add(Wish(join.frames, join.symbols, join.bodies))
+                entries, part = view.entries, view.id
+                self._logs.setdefault(part, _ViewLog(authority.revision))
+            else:
+                view, entries, part = None, tuple(authority.model.history.sequence), ""
+            revision, chain, epoch = authority.revision, authority.chain, authority.epoch
+            self._forget_client(join.client)
+            self._clients[join.client] = _Client(join.who, view, revision)
+        files = self._files.find(entries)
+        # Without folders, which are of no use elsewhere.
+        document = pack_document([entry_to_bytes(entry, entries) for entry in entries])
+        return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files)
+
+    def _list_missed(self, since: protocol.Since) -> protocol.Answer:
+        authority = self._authority
+        with self._lock:
+            epoch, revision, chain = authority.epoch, authority.revision, authority.chain
+            if since.view:
+                log = self._logs.get(since.view) if since.client in self._clients else None
+                found = None if log is None else log.find_after(since.revision)
+            else:
+                stored = self._store.commits_after(since.revision, since.chain, _MOST_MISSED)
+                found = (
+                    None
+                    if stored is None
+                    else [protocol.Published(epoch, link, commit) for commit, link in stored]
+                )
+                if found is not None and since.client not in self._clients:
+                    self._clients[since.client] = _Client(since.who, None, since.revision)
+            if found is None:
+                return protocol.Refused("stale", "The server does not know this state; join again.")
+            self._clients[since.client].note(since.revision)
+        return protocol.Missed(epoch, revision, chain, tuple(found))
+
+    def _status(self) -> protocol.Status:
+        authority, now, ticks = self._authority, time.time(), time.monotonic()
+        with self._lock:
+            stages = [(name, np.percentile([*times], (50, 95))) for name, times in self._times.items()]
+            return protocol.Status(
+                name=self.name,
+                library=__version__,
+                protocol=protocol.PROTOCOL,
+                epoch=authority.epoch,
+                process=os.getpid(),
+                since=self._since,
+                time=now,
+                store=str(self._store.path or ""),
+                durable=self._store.is_durable,
+                revision=authority.revision,
+                chain=authority.chain,
+                operations=len(authority.model.history.sequence),
+                edits=self._edits,
+                rate=sum(now - then < _MINUTE for then in self._accepted) / _MINUTE,
+                stages=tuple(
+                    protocol.StageTime(name, float(middle), float(high)) for name, (middle, high) in stages
+                ),
+                clients=tuple(
+                    protocol.ClientStatus(client, known.who, known.part, known.revision, ticks - known.heard)
+                    for client, known in self._clients.items()
+                ),
+                sources=tuple(self._sources.values()),
+                refusals=tuple(self._refusals),
+            )
+
+    def _list_history(self, question: protocol.GetHistory) -> protocol.History:
+        with self._lock:
+            found = self._store.last_commits(question.most, question.before)
+        rows = []
+        for commit in map(protocol.decode_commit, found):
+            changes = commit.changes
+            put = [protocol.tag_of(placed) for placed in changes.put]
+            known = {*changes.replaced, *changes.rerun}
+            rows.append(
+                protocol.HistoryRow(
+                    commit.revision,
+                    commit.time,
+                    commit.who,
+                    tuple(tag for tag in put if tag not in known),
+                    changes.removed,
+                    changes.replaced,
+                    changes.moved,
+                    changes.rerun,
+                )
+            )
+        return protocol.History(tuple(rows))
+
+    # -- who is there --------------------------------------------------------------------------------------
+
+    def _announce(self, announced: protocol.Announce) -> protocol.Done:
+        with self._lock:
+            if announced.endpoint:
+                self._sources[announced.source] = protocol.SourceStatus(
+                    announced.source,
+                    announced.endpoint,
+                    announced.coordinates,
+                    announced.offset,
+                    announced.client,
+                )
+            else:
+                self._sources.pop(announced.source, None)
+        self._publish_beat()
+        return protocol.Done(time.time())
+
+    def _watch_clients(self, presence: Iterable[tuple[str, bool]]) -> None:
+        for key, is_there in presence:
+            client = key.rpartition("/")[2]
+            if is_there:
+                continue  # it is known once it has joined
+            with self._lock:
+                self._forget_client(client)
+                for name in [s.source for s in self._sources.values() if s.client == client]:
+                    del self._sources[name]
+
+    def _forget_client(self, client: str) -> None:
+        known = self._clients.pop(client, None)
+        if known is not None and known.view is not None:
+            self._views.release(known.view)
+            if self._views.get(known.view.id) is None:
+                self._logs.pop(known.view.id, None)
+
+    def _note_seen(self, messages: Iterable[bytes]) -> None:
+        for data in messages:
+            with suppress(FormatError):
+                seen = protocol.decode_seen(data)
+                with self._lock:
+                    if seen.client in self._clients:
+                        self._clients[seen.client].note(seen.revision)
+
+    def _beat(self) -> None:
+        while not self._closed.wait(BEAT):
+            self._publish_beat()
+
+    def _publish_beat(self) -> None:
+        authority = self._authority
+        with self._lock:
+            beat = protocol.Beat(
+                authority.epoch,
+                authority.revision,
+                authority.chain,
+                {view: log.last for view, log in self._logs.items()},
+                tuple(self._sources.values()),
+            )
+        self._transport.publish(self._key("beat"), protocol.encode(beat))
+
+    def _key(self, end: str) -> str:
+        return f"kineverse/{self.name}/{end}"
+
+
+class _Client:
+    """Client that has joined, the part that it has, and the revision that it has told of."""
+
+    def __init__(self, who: str, view: View | None, revision: int) -> None:
+        self.who, self.view = who, view
+        self.note(revision)
+
+    @property
+    def part(self) -> str:
+        """Identifier of the part; empty for the whole model."""
+        return "" if self.view is None else self.view.id
+
+    def note(self, revision: int) -> None:
+        """Note a revision that the client has got."""
+        self.revision, self.heard = revision, time.monotonic()
+
+
+class _ViewLog:
+    """Last commits of a part."""
+
+    def __init__(self, revision: int) -> None:
+        self._begin = self.last = revision
+        self._commits: deque[tuple[int, protocol.Published]] = deque()
+
+    def add(self, revision: int, published: protocol.Published) -> None:
+        """Add a commit, and forget the oldest if there are many."""
+        self._commits.append((revision, published))
+        self.last = revision
+        if len(self._commits) > _MOST_MISSED:
+            self._begin = self._commits.popleft()[0]
+
+    def find_after(self, revision: int) -> list[protocol.Published] | None:
+        """Return the commits after a revision; None if some of them are forgotten."""
+        if revision < self._begin:
+            return None
+        return [published for number, published in self._commits if number > revision]

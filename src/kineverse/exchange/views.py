@@ -1,0 +1,481 @@
+"""Parts of a model: what frames and coordinates need of it, and how commits change that.
+
+A part is made of *cells*, the values of a model by kind and name: the frames of a wish with all frames above
+them, and everything about the coordinates that these have. In the part, coordinates come with their rates and
+with those that the rates are made of. A constraint about a coordinate of the part is in the part, and so are
+all other coordinates of the constraint, in its bounds as well. So whatever a query about the wish finds in
+the whole model, it finds in the part.
+
+Part and whole agree, for wished frames and for all frames above them, in ``fk``, ``jacobian``, ``speeds_of``,
+``symbols_of``, ``constraints_for`` and ``velocity_rows``. They agree, for every coordinate of the part, in
+``rates``, ``limits`` at all states and at one, and ``default_state``. All names are those of the whole. A
+listing, or a query without a subject, is about the part alone. Data are in no part, and a constraint that has
+a coordinate in nothing but its bounds is not about it. A wished symbol brings no frames: without constraint
+and rate there is nothing but its record.
+
+A part has operations of the same tags in the same order, with those of their writes that are in the part, but
+no parameters and traces: it shows the present of a model. What was overwritten since is not in it. A frame
+that was attached elsewhere is in the world until then, so that all parents are there at every place.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import dataclass
+from functools import cached_property
+from operator import attrgetter
+from typing import Any
+
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.graph import gradient_keys
+from kineverse.formats.document import OpaqueOperation, entry_to_bytes, to_bytes
+from kineverse.formats.document.parameters import document_kind
+from kineverse.model.changes import Diff, find_moved_tags
+from kineverse.model.frame import WORLD, Frame
+from kineverse.model.history import History, HistoryEntry
+from kineverse.model.model import Model, Snapshot
+from kineverse.model.operation import (
+    ARTICULATIONS,
+    BODIES,
+    CONSTRAINTS,
+    FRAMES,
+    RATES,
+    Cell,
+    find_expressions,
+)
+from kineverse.model.rates import collect_symbols
+from kineverse.model.read_recorder import Read, Reads, unknown_name_error
+from kineverse.symbols import parse_symbol_name, symbol_name
+
+from .protocol import Changes, Placed
+
+Key = tuple[str, str]
+"""Cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix."""
+
+_ABOUT, _TAG, _BELOW = "about", "tag", "below"
+_COUPLING = (CONSTRAINTS, RATES, ARTICULATIONS)
+_OVERWRITTEN = Frame(WORLD, ())
+_PLACE = attrgetter("place")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Frames and symbols by which a part of a model is asked for.
+
+    Attributes
+    ----------
+    frames
+        Names of frames. ``kitchen/fridge_door`` is this frame. ``kitchen/``, with a slash at its end, stands
+        for all frames with names that begin so, those that come later included.
+    symbols
+        Names of symbols, which stand for their coordinates.
+    bodies
+        True for the bodies of the wished frames; those above them come without.
+    """
+
+    frames: tuple[str, ...] = ()
+    symbols: tuple[str, ...] = ()
+    bodies: bool = True
+
+    @cached_property
+    def id(self) -> str:
+        """Digest of the wish, 32 hexadecimal digits; equal wishes have equal ones."""
+        content = json.dumps([sorted({*self.frames}), sorted({*self.symbols}), self.bodies])
+        return hashlib.sha256(content.encode(errors="surrogatepass")).hexdigest()[:32]
+
+    @cached_property
+    def paths(self) -> frozenset[str]:
+        """Coordinates of the symbols, by path."""
+        return frozenset(parse_symbol_name(name)[0] for name in self.symbols)
+
+    def check(self, model: Model) -> None:
+        """Check that all that is wished is there.
+
+        Raises
+        ------
+        UnknownNameError
+            If a name is unknown, with similar ones.
+        ExpressionError
+            If a text is no name of a symbol.
+        """
+        frames = model.frames
+        for name in self.frames:
+            if name.endswith("/"):
+                if not any(known.startswith(name) for known in frames):
+                    prefixes = {known[: i + 1] for known in frames for i, c in enumerate(known) if c == "/"}
+                    raise UnknownNameError(
+                        f"There is no frame below {name!r}. {suggest(name, prefixes, 'prefix')}"
+                    )
+            elif name != WORLD and name not in frames:
+                raise unknown_name_error(FRAMES, name, frames)
+        for name in self.symbols:
+            model.symbol(name)
+
+
+class Closure:
+    """Cells of a part, and the keys of commits that may change it."""
+
+    def __init__(self, cells: dict[Cell, None], keys: set[Key]) -> None:
+        self.cells = cells
+        self.keys = keys
+
+
+class Coupling:
+    """Index of a model: what is about each coordinate, kept up to date by the changes of commits."""
+
+    def __init__(self, history: History) -> None:
+        self._history = history
+        self._paths: dict[Cell, tuple[Any, frozenset[str]]] = {}
+        self._entered: dict[Cell, tuple[tuple[str, str], ...]] = {}
+        self._groups: defaultdict[tuple[str, str], dict[str, None]] = defaultdict(dict)
+        for kind in _COUPLING:
+            for name in history.head[kind]:
+                self.update((kind, name))
+
+    def update(self, cell: Cell) -> Iterable[str]:
+        """Enter the present value of a constraint, a rate or a record; return the coordinates it is about."""
+        kind, name = cell
+        for group in self._entered.pop(cell, ()):
+            self._groups[group].pop(name, None)
+        self._paths.pop(cell, None)
+        value = self._history.head[kind].get(name)
+        if value is None:
+            return ()
+        groups: list[tuple[str, str]]
+        if kind == CONSTRAINTS:
+            groups = [("constraints", path) for path in _paths_of((value.expression,))]
+        elif kind == ARTICULATIONS:
+            groups = [("records", symbol.path) for symbol in value.coordinates]
+            groups.append(("child", value.child))
+        elif isinstance(value[1], Expression):
+            groups = [("dependent", path) for path in _paths_of((value[1],))]
+        else:
+            groups = [("driven", speed.path) for speed, _ in value[1]]
+        self._entered[cell] = tuple(groups)
+        for group in groups:
+            self._groups[group][name] = None
+        about = [path for what, path in groups if what != "child"]
+        return [value[0].path, *about] if kind == RATES else about
+
+    def paths(self, cell: Cell) -> frozenset[str]:
+        """Return the coordinates in the value of a cell."""
+        value = self._history.head[cell[0]][cell[1]]
+        known = self._paths.get(cell)
+        if known is None or known[0] is not value:
+            found = _paths_of(find_expressions(cell[0], value))
+            if cell[0] == RATES:
+                found |= {value[0].path}
+                if not isinstance(value[1], Expression):
+                    found |= {speed.path for speed, _ in value[1]}
+            known = self._paths[cell] = value, found
+        return known[1]
+
+    def close(self, wish: Wish) -> Closure:
+        """Return the cells that a wish needs; what is not there any more is left out."""
+        head = self._history.head
+        frames, bodies = head[FRAMES], head[BODIES]
+        cells: dict[Cell, None] = {}
+        keys: set[Key] = set()
+        wished: dict[str, None] = {}
+        for name in wish.frames:
+            if name.endswith("/"):
+                keys.add((_BELOW, name))
+                wished |= dict.fromkeys(known for known in frames if known.startswith(name))
+            else:
+                wished[name] = None
+        waiting = list(wish.paths)
+        for name in wished:
+            keys.add((FRAMES, name))
+            if wish.bodies:
+                keys.add((BODIES, name))
+                if name in bodies:
+                    cells[BODIES, name] = None
+            while name != WORLD and name in frames and (FRAMES, name) not in cells:
+                cell = FRAMES, name
+                cells[cell] = None
+                waiting += self.paths(cell)
+                name = frames[name].parent
+        self._add_coordinates(waiting, cells, keys)
+        for kind, name in list(cells):
+            if kind == FRAMES:
+                cells |= dict.fromkeys((ARTICULATIONS, record) for record in self._find("child", name))
+        keys.update(cells)
+        return Closure(cells, keys)
+
+    def _add_coordinates(self, waiting: list[str], cells: dict[Cell, None], keys: set[Key]) -> None:
+        """Add everything about coordinates, and about those that it has in turn."""
+        rates = self._history.head[RATES]
+        found: set[str] = set()
+        followed: set[str] = set()
+        while waiting:
+            path = waiting.pop()
+            if path in found:
+                continue
+            found.add(path)
+            rate = RATES, symbol_name(path, 0)
+            keys.add(rate)
+            if rate[1] in rates:
+                cells[rate] = None
+                waiting += self.paths(rate)
+            cells |= dict.fromkeys((ARTICULATIONS, name) for name in self._find("records", path))
+            # A constraint on the angles of a loop is about its crank, and one on a heading about the wheels.
+            following = [path]
+            while following:
+                mover = following.pop()
+                if mover in followed:
+                    continue
+                followed.add(mover)
+                keys.add((_ABOUT, mover))
+                for name in self._find("constraints", mover):
+                    cell = CONSTRAINTS, name
+                    if cell not in cells:
+                        cells[cell] = None
+                        waiting += self.paths(cell)
+                following += (rates[name][0].path for name in self._find("dependent", mover))
+                waiting += (rates[name][0].path for name in self._find("driven", mover))
+
+    def _find(self, what: str, name: str) -> Iterable[str]:
+        return self._groups.get((what, name), ())
+
+
+def _paths_of(expressions: Iterable[Expression]) -> frozenset[str]:
+    """Return the coordinates of expressions and of their gradients, heuristic ones included."""
+    found: set[str] = set()
+    for expression in expressions:
+        found.update(symbol.path for symbol in collect_symbols(expression))
+        found.update(symbol.path for symbol in gradient_keys(expression))
+    return frozenset(found)
+
+
+def close(model: Model, wish: Wish) -> set[Cell]:
+    """Return the cells, by kind and name, that the part of a wish has."""
+    return {*Coupling(model.history).close(wish).cells}
+
+
+def part_entries(
+    model: Model, cells: Set[Cell] | Mapping[Cell, Any], known: Mapping[str, HistoryEntry] | None = None
+) -> list[HistoryEntry]:
+    """Return the operations of a part in order, each with its blob.
+
+    Parameters
+    ----------
+    model
+        The whole model.
+    cells
+        Cells of the part, from :func:`close`.
+    known
+        Entries of an earlier part by tag; those that have not changed are the same objects in the result.
+    """
+    history, known = model.history, known or {}
+    writers: dict[str, HistoryEntry] = {}
+    for cell in cells:
+        # Frames hold others at every place; of all other values the last one counts.
+        for entry in history.cells[cell] if cell[0] == FRAMES else history.cells[cell][-1:]:
+            writers[entry.tag] = entry
+    return [
+        _part_entry(history, entry, cells, known.get(entry.tag))
+        for entry in sorted(writers.values(), key=_PLACE)
+    ]
+
+
+def _part_entry(
+    history: History,
+    entry: HistoryEntry,
+    cells: Set[Cell] | Mapping[Cell, Any],
+    known: HistoryEntry | None,
+) -> HistoryEntry:
+    writes: dict[Cell, Any] = {}
+    reads = Reads()
+    for cell, value in entry.writes.items():
+        if cell not in cells:
+            continue
+        all_writers = history.cells[cell]
+        if all_writers[-1] is entry:
+            writes[cell] = value
+        elif cell[0] == FRAMES:
+            writes[cell] = _OVERWRITTEN
+        if cell[0] == FRAMES and all_writers[0] is not entry:
+            reads.add(cell, Read.EXISTENCE)  # without which it may not be overwritten
+    for (written, _), value in writes.items():
+        if written == FRAMES and value.parent != WORLD and (FRAMES, value.parent) not in writes:
+            reads.add((FRAMES, value.parent), Read.EXISTENCE)
+    operation = entry.operation
+    kind = operation.kind if isinstance(operation, OpaqueOperation) else document_kind(type(operation))
+    if known is not None and _is_same(known, kind, reads, writes):
+        return known
+    made = HistoryEntry(
+        entry.tag, OpaqueOperation(kind, reads=reads.cells, recorded=writes), 0, reads, writes
+    )
+    blob = entry_to_bytes(made, ())
+    return known if known is not None and known.blob == blob else made
+
+
+def _is_same(known: HistoryEntry, kind: str, reads: Reads, writes: Mapping[Cell, Any]) -> bool:
+    operation = known.operation
+    return (
+        isinstance(operation, OpaqueOperation)
+        and operation.kind == kind
+        and known.reads.cells == reads.cells
+        and list(known.writes) == list(writes)
+        and all(known.writes[cell] is value for cell, value in writes.items())
+    )
+
+
+class View:
+    """Part of a model that clients follow, kept up to date by :class:`Views`.
+
+    Attributes
+    ----------
+    id
+        Identifier of the wish, 32 hexadecimal digits.
+    users
+        Number of times that it was asked for and not released.
+    """
+
+    def __init__(self, model: Model, coupling: Coupling, wish: Wish) -> None:
+        self._model = model
+        self._coupling = coupling
+        self.wish = wish
+        self.id = wish.id
+        self.users = 0
+        self._entries: dict[str, HistoryEntry] = {}
+        self._keys: set[Key] = set()
+        self._renew()
+
+    @property
+    def entries(self) -> tuple[HistoryEntry, ...]:
+        """Operations of the part in order."""
+        return tuple(self._entries.values())
+
+    def document(self) -> bytes:
+        """Return the part as a document in msgpack."""
+        return to_bytes(Snapshot({}, self.entries, 0))
+
+    def is_concerned(self, keys: Set[Key]) -> bool:
+        """Return whether a commit with some keys may change the part."""
+        return not self._keys.isdisjoint(keys)
+
+    def commit(self, replaced: Set[str]) -> Changes | None:
+        """Bring the part to the present model; return the changes for a replica, None if there are none.
+
+        Parameters
+        ----------
+        replaced
+            Tags of operations that the commit itself has replaced or moved; others of the part that changed
+            count as run again.
+        """
+        old = self._entries
+        new = self._renew()
+        moved = _find_moved(old, new)
+        put, after = [], ""
+        again: dict[str, list[str]] = {"replaced": [], "rerun": []}
+        for tag, entry in new.items():
+            if old.get(tag) is not entry or tag in moved:
+                put.append(Placed(entry_to_bytes(entry, ()), after))
+                if tag in old:
+                    again["replaced" if tag in replaced or tag in moved else "rerun"].append(tag)
+            after = tag
+        removed = tuple(tag for tag in old if tag not in new)
+        if not (put or removed):
+            return None
+        return Changes(tuple(put), tuple(again["replaced"]), tuple(again["rerun"]), moved, removed)
+
+    def _renew(self) -> dict[str, HistoryEntry]:
+        closure = self._coupling.close(self.wish)
+        found = part_entries(self._model, closure.cells, self._entries)
+        self._entries = {entry.tag: entry for entry in found}
+        self._keys = closure.keys.union((_TAG, tag) for tag in self._entries)
+        return self._entries
+
+
+def _find_moved(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
+    before, after = [tag for tag in old if tag in new], [tag for tag in new if tag in old]
+    return () if before == after else find_moved_tags(before, after)
+
+
+class Views:
+    """Parts of a model that are followed. Not thread-safe."""
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self._views: dict[str, View] = {}
+
+    @cached_property
+    def _coupling(self) -> Coupling:
+        return Coupling(self._model.history)
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def get(self, view: str) -> View | None:
+        """Return the view of an identifier, if it is followed."""
+        return self._views.get(view)
+
+    def add(self, wish: Wish) -> View:
+        """Return the view of a wish; equal wishes share one. Each user releases it at the end.
+
+        Raises
+        ------
+        UnknownNameError
+            If a frame or a symbol is unknown, with similar names.
+        """
+        known = self._views.get(wish.id)
+        if known is None:
+            wish.check(self._model)
+            known = self._views[wish.id] = View(self._model, self._coupling, wish)
+        known.users += 1
+        return known
+
+    def release(self, view: View) -> None:
+        """Follow a view no longer for one of its users."""
+        view.users -= 1
+        if view.users <= 0:
+            self._views.pop(view.id, None)
+
+    def commit(self, *diffs: Diff) -> list[tuple[View, Changes]]:
+        """Return the views that commits have changed, each with the changes for its replicas.
+
+        Parameters
+        ----------
+        diffs
+            Diffs of one or several commits in order. The model is at the last of them, and so are the views
+            afterwards.
+        """
+        if not self._views:
+            vars(self).pop("_coupling", None)  # it would miss the changes
+            return []
+        keys: set[Key] = set()
+        replaced: set[str] = set()
+        for diff in diffs:
+            keys |= self._find_keys(diff)
+            replaced.update(diff.replaced)
+        result = []
+        for view in self._views.values():
+            if view.is_concerned(keys):
+                changes = view.commit(replaced)
+                if changes is not None:
+                    result.append((view, changes))
+        return result
+
+    def _find_keys(self, diff: Diff) -> set[Key]:
+        """Return the keys of a commit, and enter its changes into the index."""
+        history = self._model.history
+        keys: set[Key] = set()
+        for tag in diff.tags:
+            keys.add((_TAG, tag))
+            if tag in history.entries:
+                keys.update(history.entries[tag].writes)
+        for change in diff.changes:
+            cell = change.kind, change.name
+            keys.add(cell)
+            if change.kind in _COUPLING:
+                keys.update((_ABOUT, path) for path in self._coupling.update(cell))
+            if change.kind == ARTICULATIONS and change.after is not None:
+                keys.add((FRAMES, change.after.child))
+            elif change.kind == FRAMES and change.before is None:
+                keys.update((_BELOW, change.name[: i + 1]) for i, c in enumerate(change.name) if c == "/")
+        return keys
