@@ -1,4 +1,4 @@
-"""Requests, messages and signs of life between processes, also when some are killed, frozen, or just end."""
+"""Questions, messages and signs of life between processes, also when some are killed, frozen, or just end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytest.importorskip("zenoh")
 
 from kineverse.errors import InvalidValueError
 from kineverse.exchange.address import Claim
-from kineverse.exchange.transport import Channel, NoAnswerError, Request, Transport
+from kineverse.exchange.transport import Channel, NoAnswerError, Question, Transport
 
 LATE = 10.0
 """Time after which a test fails [s]; what is awaited comes within milliseconds."""
@@ -157,7 +157,7 @@ def test_requests_are_taken_in_batches(pair: tuple[Transport, Transport]) -> Non
     server, client = pair
     requests = server.answers("k/ask")
     askers = [in_thread(lambda n=n: client.ask("k/ask", bytes([n]), LATE)) for n in range(5)]
-    taken: list[Request] = []
+    taken: list[Question] = []
     sizes = []
     while len(taken) < 5:
         batch = requests.take(2, 1.0)
