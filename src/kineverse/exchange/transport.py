@@ -315,6 +315,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "scouting/delay": 0,  # a server would wait for others to find, half a second
     "transport/shared_memory/enabled": False,  # files of it outlive a process that is killed
     "transport/link/tx/lease": round(1e3 * LEASE),
+    "transport/link/tx/queue/size/data": 16,  # batches of 64 kB that wait for a reader before messages drop
     # An answer to one who reads nothing holds up the others no longer than he counts as there.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * LEASE),
 }
