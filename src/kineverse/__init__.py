@@ -4,8 +4,8 @@
 :mod:`kineverse.articulations` (joints, mechanisms, locks), :mod:`kineverse.model` (operations, edits, data),
 :mod:`kineverse.errors`, :mod:`kineverse.logic`, :mod:`kineverse.spatial`, :mod:`kineverse.loops` and
 :mod:`kineverse.formats`. :mod:`kineverse.geometry`, :mod:`kineverse.estimation`, :mod:`kineverse.reasoning`,
-:mod:`kineverse.planning`, the viewer (:func:`show`) and :mod:`kineverse.exchange`, models shared by processes,
-are imported on first use.
+:mod:`kineverse.planning`, :mod:`kineverse.exchange` (models that processes share) and the viewer
+(:func:`show`) are imported on first use.
 """
 
 from typing import TYPE_CHECKING

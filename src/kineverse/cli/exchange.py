@@ -138,17 +138,17 @@ def _format_status(address: Address, status: protocol.Status) -> list[str]:
         sections.append(format_table(("stage of an edit", "p50 [ms]", "p95 [ms]"), rows, "<>>"))
     if status.clients:
         # A client of a part has what concerns it, at a revision that may be long past.
-        rows = [
+        clients = [
             (c.who, "part" if c.view else "all", str(status.revision - c.revision), f"{c.seconds:.1f}")
             for c in status.clients
         ]
-        sections.append(format_table(("client", "has", "revisions behind", "told [s ago]"), rows, "<<>>"))
+        sections.append(format_table(("client", "has", "revisions behind", "told [s ago]"), clients, "<<>>"))
     if status.sources:
-        rows = [
+        sources = [
             (s.source, str(len(s.coordinates)), f"{1e3 * s.offset:.3f}", s.endpoint) for s in status.sources
         ]
         head = ("source of states", "coordinates", "clock offset [ms]", "endpoint")
-        sections.append(format_table(head, rows, "<>>"))
+        sections.append(format_table(head, sources, "<>>"))
     if status.refusals:
         lines = [
             f"  {_format_time(one.time, status.time)}  {one.who}: {join_lines(one.message)}"

@@ -9,5 +9,6 @@ if TYPE_CHECKING:
     from .client import LiveModel as LiveModel
     from .connection import Connection as Connection
     from .server import Server as Server, serve as serve
+    from .state import StatePublisher as StatePublisher, StateReader as StateReader
 
 lazy_face(__name__)
