@@ -73,6 +73,9 @@ def load_live(
         Without the extra ``exchange``.
     """
     is_part = frames is not None or symbols is not None
+    if bodies is None:
+        bodies = not is_part
+    check_flag("bodies", bodies)
     wish = protocol.Join(
         protocol.PROTOCOL,
         __version__,
@@ -80,8 +83,8 @@ def load_live(
         "",
         as_entries("frames=", frames or (), str, "names of frames"),
         tuple(map(str, symbols or ())),
-        not is_part if bodies is None else check_flag("bodies", bodies),
-        is_part or bodies is False,
+        bodies,
+        is_part or not bodies,
     )
     return LiveModel(Connection(Address.parse(source)), wish)
 
@@ -330,14 +333,15 @@ class LiveModel(Model):
                 if isinstance(answer, protocol.Refused):
                     self._join_again()
                     return
-                connection.epoch = answer.epoch
-                for published in answer.commits:
+                missed = answer
+                connection.epoch = missed.epoch
+                for published in missed.commits:
                     commit = protocol.decode_commit(published.commit)
                     if commit.revision > connection.revision:
                         self._adopt_commit(published, commit)
-                is_behind = bool(answer.commits) and connection.revision < answer.revision
-            if connection.revision < answer.revision:  # nothing of a part has changed
-                connection.advance(answer.revision, answer.chain)
+                is_behind = bool(missed.commits) and connection.revision < missed.revision
+            if connection.revision < missed.revision:  # nothing of a part has changed
+                connection.advance(missed.revision, missed.chain)
             connection.note_presence(True)
 
     def _join_again(self) -> None:

@@ -253,7 +253,7 @@ class Connection:
         key, end = self.key("edit" if changes_model else "ask"), time.monotonic() + min(timeout, _ROUTING)
         while True:
             try:
-                return protocol.decode_answer(self.transport.ask(key, data, timeout))  # type: ignore[no-any-return]
+                return protocol.decode_answer(self.transport.ask(key, data, timeout))
             except NoAnswerError:
                 # For moments after a connection was made it is not known who answers.
                 if not self.is_online or time.monotonic() >= end:
