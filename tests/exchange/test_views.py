@@ -156,6 +156,37 @@ def test_equal_wishes_share_a_view_until_the_last_is_released() -> None:
     assert views.get(one.id) is None
 
 
+def test_a_part_has_the_limits_of_what_shares_its_wheels() -> None:
+    model = furniture()
+    with model.edit() as edit:
+        edit.add_frame("compass", "world", kv.rotation_z(kv.position("drive/angle")))
+        edit.constrain("drive/slow", -1, kv.velocity("drive/x"), 1)
+    part = make_replica(Views(model).add(Wish(("compass",))))
+    assert "drive/slow" in part.velocity_rows(0.01, "compass").names
+    check_agreement(model, part, ["compass"])
+
+
+def test_a_part_has_what_moves_it_by_a_gradient_alone() -> None:
+    model = furniture()
+    angle = kv.position("sensor").augment({kv.velocity("motor"): 1.0})
+    with model.edit() as edit:
+        edit.add_frame("needle", "world", kv.rotation_z(angle))
+        edit.constrain("motor/gentle", -1, kv.velocity("motor"), 1)
+    part = make_replica(Views(model).add(Wish(("needle",))))
+    assert list(part.constraints) == ["motor/gentle"]
+    check_agreement(model, part, ["needle"])
+
+
+def test_a_part_has_the_records_of_its_frames_and_coordinates() -> None:
+    model = furniture()
+    with model.edit() as edit:
+        edit.apply(kv.Fixed(name="glue", parent="robot/hand", child="tool"))
+        edit.apply(SetHome("arm", (0.5,)))
+    part = make_replica(Views(model).add(Wish(("tool",))))
+    assert dict(part.articulations) == dict(model.articulations)
+    assert part.default_state()["arm"] == 0.5
+
+
 def test_a_frame_that_was_attached_elsewhere_has_its_last_value() -> None:
     model = furniture()
     with model.edit() as edit:
@@ -164,9 +195,7 @@ def test_a_frame_that_was_attached_elsewhere_has_its_last_value() -> None:
     part = make_replica(Views(model).add(Wish(("knob",))))
     assert "cabinet/door" not in part.frames
     check_agreement(model, part, ["knob", "cabinet/door/handle"])
-    assert part.history.tags == [
-        tag for tag in model.history.tags if tag in {*part.history.tags}
-    ]
+    assert part.history.tags == [tag for tag in model.history.tags if tag in {*part.history.tags}]
 
 
 # -- commits -------------------------------------------------------------------------------------------------
@@ -257,9 +286,7 @@ class Record(kv.Operation):
     home: float
 
     def apply(self, model: Any) -> kv.model.Writes:
-        record = kv.model.Articulation(
-            "hinge", self.parent, self.child, (self.coordinate,), (self.home,)
-        )
+        record = kv.model.Articulation("hinge", self.parent, self.child, (self.coordinate,), (self.home,))
         return kv.model.Writes(articulations={self.name: record})
 
 
@@ -371,7 +398,9 @@ def do(edit: Edit, kind: str, *what: Any) -> None:
             edit.insert(operation, tag, before=edit.model.history.tags[what[1] % (len(tags) - 1)])
         else:
             name = next((n for k, n in edit.model.history.entry(tag).writes if k == FRAMES), "a")
-            edit.replace(tag, kv.model.AddFrame(name, kv.model.Frame.from_transform(what[1], kv.rotation_x(what[2]))))
+            edit.replace(
+                tag, kv.model.AddFrame(name, kv.model.Frame.from_transform(what[1], kv.rotation_x(what[2])))
+            )
 
 
 @dataclass(frozen=True)
@@ -385,7 +414,7 @@ class Depend(kv.Operation):
         return kv.model.Writes(rates={self.coordinate: 2 * self.on})
 
 
-@settings(max_examples=attempts(25, long=400))
+@settings(max_examples=attempts(60, long=400))
 @given(st.lists(st.lists(action, min_size=1, max_size=4), min_size=1, max_size=12), st.integers(1, 3))
 def test_replicas_that_follow_random_edits_are_equal_to_parts_made_anew(
     edits: list[list[tuple[Any, ...]]], together: int

@@ -217,7 +217,6 @@ class Coupling:
                 continue
             found.add(path)
             rate = RATES, symbol_name(path, 0)
-            keys.add(rate)
             if rate[1] in rates:
                 cells[rate] = None
                 waiting += self.paths(rate)
@@ -247,7 +246,8 @@ def _paths_of(expressions: Iterable[Expression]) -> frozenset[str]:
     found: set[str] = set()
     for expression in expressions:
         found.update(symbol.path for symbol in collect_symbols(expression))
-        found.update(symbol.path for symbol in gradient_keys(expression))
+        if expression.nodes:  # else the gradient has the speeds of these
+            found.update(symbol.path for symbol in gradient_keys(expression))
     return frozenset(found)
 
 
@@ -307,7 +307,8 @@ def _part_entry(
     kind = operation.kind if isinstance(operation, OpaqueOperation) else document_kind(type(operation))
     if known is not None and _is_same(known, kind, reads, writes):
         return known
-    made = HistoryEntry(entry.tag, OpaqueOperation(kind, reads=reads.cells, recorded=writes), 0, reads, writes)
+    shown = OpaqueOperation(kind, reads=reads.cells, recorded=writes)
+    made = HistoryEntry(entry.tag, shown, 0, reads, writes)
     blob = entry_to_bytes(made, ())
     return known if known is not None and known.blob == blob else made
 
@@ -477,4 +478,3 @@ class Views:
             elif change.kind == FRAMES and change.before is None:
                 keys.update((_BELOW, change.name[: i + 1]) for i, c in enumerate(change.name) if c == "/")
         return keys
-
