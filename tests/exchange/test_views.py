@@ -198,6 +198,13 @@ def test_a_frame_that_was_attached_elsewhere_has_its_last_value() -> None:
     assert part.history.tags == [tag for tag in model.history.tags if tag in {*part.history.tags}]
 
 
+def test_operations_of_a_part_say_why_they_cannot_be_run_again() -> None:
+    replica = make_replica(Views(furniture()).add(Wish(("cabinet/door",))))
+    reason = "AddFrame was made from it: only a part of it is here"
+    with pytest.raises(kv.errors.EditError, match=reason), replica.edit() as edit:
+        edit.remove("frame cabinet")
+
+
 # -- commits -------------------------------------------------------------------------------------------------
 
 
@@ -268,7 +275,11 @@ def enter(edit: Edit, what: str) -> None:
     elif what == "dependence":
         edit.apply(Depend(kv.position("bolt"), kv.position("crank")))
     elif what == "record":
-        edit.apply(Record("door", "cabinet", "cabinet/door", kv.position("door"), 0.3))
+        edit.apply(Record("door", "robot", "elsewhere", (kv.position("door"),), (0.3,)))
+    elif what == "record of a frame":
+        edit.apply(Record("glue", "cabinet", "cabinet/door/handle"))
+    elif what == "first body":
+        edit.apply(SetBody("cabinet/knob", kv.model.Body()))
     elif what == "body":
         edit.apply(SetBody("cabinet/door/handle", kv.model.Body()), override=True)
     else:
@@ -282,27 +293,40 @@ class Record(kv.Operation):
     name: str
     parent: str
     child: str
-    coordinate: kv.Symbol
-    home: float
+    coordinates: tuple[kv.Symbol, ...] = ()
+    home: tuple[float, ...] = ()
 
     def apply(self, model: Any) -> kv.model.Writes:
-        record = kv.model.Articulation("hinge", self.parent, self.child, (self.coordinate,), (self.home,))
+        record = kv.model.Articulation("hinge", self.parent, self.child, self.coordinates, self.home)
         return kv.model.Writes(articulations={self.name: record})
 
 
 @pytest.mark.parametrize(
     "what",
-    ["constraint", "constraint of the bolt", "rate", "dependence", "record", "body", "frame below a prefix"],
+    [
+        "constraint",
+        "constraint of the bolt",
+        "rate",
+        "dependence",
+        "record",
+        "record of a frame",
+        "body",
+        "first body",
+        "frame below a prefix",
+    ],
 )
 def test_what_enters_a_part_is_sent(what: str) -> None:
-    followed = Followed(furniture(), Wish(("cabinet/",)), Wish((), ("drawer",)))
-    with followed.model.edit() as edit:
+    model = furniture()
+    with model.edit() as edit:
+        edit.add_frame("cabinet/knob", "cabinet/door")
+    followed = Followed(model, Wish(("cabinet/",)), Wish((), ("drawer",)))
+    with model.edit() as edit:
         enter(edit, what)
     (changes,) = followed.publish()
     assert decode_changes(encode(changes)) == changes
     followed.check()
-    with followed.model.edit() as edit:
-        edit.remove(followed.model.history.tags[-1])
+    with model.edit() as edit:
+        edit.remove(model.history.tags[-1])
     assert len(followed.publish()) == 1
     followed.check()
 
@@ -323,12 +347,33 @@ def test_a_wished_frame_that_is_removed_comes_back() -> None:
     followed.publish()
     assert not any("bolt" in name for name in replica.constraints)
     with followed.model.edit() as edit:
-        edit.add_frame("cabinet/door/handle", "cabinet/door", kv.translation(0.3, 0, 0))
         edit.constrain("bolt/range", 0, kv.position("bolt"), 1)
-    followed.publish()
+    assert len(followed.publish()) == 1
+    with followed.model.edit() as edit:
+        edit.add_frame("cabinet/door/handle", "cabinet/door", kv.translation(0.3, 0, 0))
+    assert len(followed.publish()) == 1
     followed.check()
     assert {"cabinet/door", "cabinet/door/handle"} <= {*replica.frames}
     assert "bolt/range" in replica.constraints
+
+
+def test_what_was_overwritten_and_is_removed_is_removed_from_the_part() -> None:
+    followed = Followed(furniture(), Wish(("cabinet/drawer",)))
+    ((_, replica),) = followed.replicas
+    with followed.model.edit() as edit:
+        edit.add_frame("cabinet/drawer", "world", tag="again", override=True)
+    followed.publish()
+    with followed.model.edit() as edit:
+        edit.remove("frame cabinet/drawer")
+    (changes,) = followed.publish()
+    assert changes.removed == ("frame cabinet/drawer",)
+    assert replica.history.tags == ["again"]
+    with followed.model.edit() as edit:
+        drawer = kv.model.AddFrame("cabinet/drawer", kv.model.Frame("cabinet", ()))
+        edit.insert(drawer, before="again")
+    followed.publish()
+    assert replica.frames["cabinet/drawer"].parent == "world"
+    followed.check()
 
 
 def test_operations_at_the_same_place_keep_their_order_when_places_are_renumbered() -> None:

@@ -14,8 +14,9 @@ a coordinate in nothing but its bounds is not about it. A wished symbol brings n
 and rate there is nothing but its record.
 
 A part has operations of the same tags in the same order, with those of their writes that are in the part, but
-no parameters and traces: it shows the present of a model. What was overwritten since is not in it. A frame
-that was attached elsewhere is in the world until then, so that all parents are there at every place.
+no parameters and traces, so they cannot be run again. It shows the present of a model: what was overwritten
+is not in it. A frame that was attached elsewhere is in the world until then, so that all parents are there at
+every place. So a value before the end of the sequence may be another one than that of the whole.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
-from typing import Any
+from typing import Any, Final
 
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
@@ -55,6 +56,9 @@ from .protocol import Changes, Placed
 
 Key = tuple[str, str]
 """Cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix."""
+
+PARTIAL: Final = "only a part of it is here"
+"""Reason why an operation of a part is not run again and not put into the whole: it lacks other writes."""
 
 _ABOUT, _TAG, _BELOW = "about", "tag", "below"
 _COUPLING = (CONSTRAINTS, RATES, ARTICULATIONS)
@@ -307,7 +311,7 @@ def _part_entry(
     kind = operation.kind if isinstance(operation, OpaqueOperation) else document_kind(type(operation))
     if known is not None and _is_same(known, kind, reads, writes):
         return known
-    shown = OpaqueOperation(kind, reads=reads.cells, recorded=writes)
+    shown = OpaqueOperation(kind, reads=reads.cells, recorded=writes, frozen=PARTIAL)
     made = HistoryEntry(entry.tag, shown, 0, reads, writes)
     blob = entry_to_bytes(made, ())
     return known if known is not None and known.blob == blob else made
