@@ -1,0 +1,535 @@
+"""The model of a server: checks edits, makes them, and stores them before they are answered.
+
+Nothing that a client sends is trusted. Blobs are decoded anew, and the model is their fold: traces are run
+and compared with the writes, and operations that read what changes are run again here. There is no network
+and no thread in it. The reader of documents bounds the size of an edit; nothing bounds the time it takes.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Any, Final, TypeAlias
+
+from kineverse._runtime import no_collection
+from kineverse.errors import EditError, FormatError, KineverseError, suggest
+from kineverse.formats import entry_to_bytes, operation_from_bytes
+from kineverse.formats.document import OpaqueOperation
+from kineverse.model import Diff, Edit, Model, NetChanges, PlacedEntry
+from kineverse.model.history import History, HistoryEntry, TouchedEntry
+
+from . import protocol
+from .conflicts import KEPT, Conflict, ConflictFoundError, Revisions
+from .meshes import put_contents
+from .protocol import Commit, Committed, FileContent, Placed, Published, Refused
+from .store import Replaced, Store, StoredCommit
+from .stored_undo import computes, find_inverse
+
+ANSWERS: Final = 10_000
+"""Number of answers that are kept in memory, to answer an edit that is asked twice alike."""
+_LONGEST_TAG: Final = 4096
+_LONGEST_MESSAGE: Final = 1000
+
+EditAnswer: TypeAlias = Committed | Refused
+FindFiles: TypeAlias = Callable[[Sequence[HistoryEntry], Sequence[FileContent]], tuple[FileContent, ...]]
+Watch: TypeAlias = Callable[[Model, Diff, Commit], Any]
+
+
+@dataclass(slots=True)
+class Result:
+    """Outcome of a request.
+
+    Attributes
+    ----------
+    answer
+        Message to the client.
+    published
+        Commit for the readers of the log; None if there is none, or it was answered before.
+    watched
+        Result of ``watch`` for the commit.
+    seconds
+        Times of the stages decode, check, fold, encode and, of the whole batch, persist [s].
+    """
+
+    answer: EditAnswer
+    published: Published | None = None
+    watched: Any = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class _Made:
+    """Commit that the model has made: its message, what it touched and replaced, and if places are new."""
+
+    commit: Commit
+    data: bytes
+    touched: list[TouchedEntry]
+    replaced: tuple[Replaced, ...]
+    are_places_new: bool
+
+
+class _RefusedError(Exception):
+    """Edit that is not made, with its answer."""
+
+    def __init__(self, answer: Refused) -> None:
+        super().__init__(answer.message)
+        self.answer = answer
+
+
+class Authority:
+    """Model of a server with its store. One thread uses it.
+
+    Parameters
+    ----------
+    store
+        Operations, log and answers.
+    clock
+        Function that returns the time [s since 1970].
+    find_files
+        Function of the entries that a commit puts, and of the files that the client has named; it returns the
+        files that the commit names. By default, none.
+    watch
+        Function of the model, the diff and the commit, called after each commit, before the next one and
+        before it is stored. If it raises, the commit is taken back as if the store had failed.
+
+    Attributes
+    ----------
+    model
+        The model; its version is the revision. Another object after an error of the store.
+    epoch
+        Id of this run. Another one after an error of the store, when the model is what the store has.
+
+    Raises
+    ------
+    FormatError
+        If the operations of the store are no model.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        clock: Callable[[], float] = time.time,
+        *,
+        find_files: FindFiles = lambda entries, named: (),
+        watch: Watch = lambda model, diff, commit: None,
+    ) -> None:
+        self._store, self._clock = store, clock
+        self._find_files, self._watch = find_files, watch
+        self._answers: OrderedDict[tuple[str, int], EditAnswer] = OrderedDict()
+        self._batch: list[StoredCommit] = []
+        self._load()
+
+    def _load(self) -> None:
+        """Make the model by linking the operations of the store."""
+        with no_collection():
+            stored = self._store.operations()
+            entries = [operation_from_bytes(blob) for _, blob, _ in stored]
+            put_contents(entries, (file for *_, files in stored for file in files))
+            self.model = Model(entries, self._store.revision)
+        self.model.history.commits.clear()
+        # A model numbers its places anew; they are stored with the next commit.
+        self._are_places_new = bool(entries)
+        self.chain = self._store.chain
+        self.epoch = secrets.token_hex(16)
+        self._start = self.revision
+        self._revisions = Revisions(self.revision, self.chain)
+        self._diffs: list[Diff] = []
+        self.model.listen(self._diffs.append)
+
+    @property
+    def revision(self) -> int:
+        """The revision of the last commit, 0 for an empty model."""
+        return self.model.version
+
+    def fill(self, build: Callable[[Edit], None], who: str) -> None:
+        """Make the first commit of an empty store, by an edit of an empty model.
+
+        Parameters
+        ----------
+        build
+            Function that makes the edit.
+        who
+            Name of its author, for people.
+
+        Raises
+        ------
+        EditError
+            If the store is not empty, or the edit is refused.
+        FormatError
+            For content that has no place in a document, or an error of the store.
+        KineverseError
+            Errors of the edit pass.
+        """
+        if self.revision:
+            raise EditError(f"The store is at revision {self.revision}; only an empty one is filled.")
+        source = Model()
+        with source.edit() as edit:
+            build(edit)
+        entries = source.history.sequence
+        placed = tuple(Placed(entry_to_bytes(entry, entries), at_end=True) for entry in entries)
+        files = self._find_files(entries, ())
+        request = protocol.Edit("0" * 32, 0, who, 0, self.chain, protocol.Changes(placed), files=files)
+        (result,) = self.process([request])
+        if isinstance(result.answer, Refused):
+            kind = FormatError if result.answer.reason in ("failed", "malformed") else EditError
+            raise kind(result.answer.message)
+
+    # -- requests ------------------------------------------------------------------------------------------
+
+    def process(self, requests: Sequence[protocol.Edit | protocol.Undo]) -> list[Result]:
+        """Make edits, store their commits in one transaction, and return the results in order.
+
+        An edit is made whole or not at all, and others are made if one is refused. If the store fails, all of
+        them are refused, and the model is what the store has, under a new epoch.
+        """
+        new: set[tuple[str, int]] = set()
+        results = []
+        try:
+            for request in requests:
+                key = request.client, request.number
+                answer = self._find_answer(key)
+                if isinstance(request, protocol.Undo):
+                    self._persist()  # it may need all commits of the store
+                if answer is None:
+                    results.append(self._answer(request))
+                    self._keep_answer(key, results[-1].answer)
+                    new.add(key)
+                else:
+                    results.append(Result(answer))
+            begin = perf_counter()
+            self._persist()
+            seconds = perf_counter() - begin
+        except Exception as error:
+            if not isinstance(error, KineverseError | OSError):
+                logging.getLogger(__name__).exception("Edits were taken back.")
+            refused = Refused(
+                "failed", _one_line(f"Nothing was done, because the server has failed. {error}")
+            )
+            for key in new:
+                self._answers.pop(key, None)
+            self._batch.clear()
+            self._store.reload()
+            self._load()
+            return [Result(self._find_answer((one.client, one.number)) or refused) for one in requests]
+        for result in results:
+            if result.published is not None:
+                result.seconds["persist"] = seconds
+        return results
+
+    def _persist(self) -> None:
+        if self._batch:
+            self._store.commit(self._batch)
+            self._batch.clear()
+
+    def _find_answer(self, key: tuple[str, int]) -> EditAnswer | None:
+        """Return the answer to an edit that was asked before."""
+        known = self._answers.get(key)
+        if known is not None:
+            return known
+        stored = self._store.find_answer(*key)
+        return None if stored is None else Committed(*stored)
+
+    def _keep_answer(self, key: tuple[str, int], answer: EditAnswer) -> None:
+        self._answers[key] = answer
+        if len(self._answers) > ANSWERS:
+            self._answers.popitem(last=False)
+
+    def _answer(self, request: protocol.Edit | protocol.Undo) -> Result:
+        """Make one edit, if it can be made."""
+        seconds: dict[str, float] = {}
+        try:
+            with no_collection():
+                if isinstance(request, protocol.Undo):
+                    made = self._undo(request, seconds)
+                else:
+                    made = self._make(request, seconds)
+        except _RefusedError as refused:
+            return Result(refused.answer, seconds=seconds)
+        except ConflictFoundError as found:
+            return Result(_as_answer(found.conflict), seconds=seconds)
+        except EditError as error:
+            tag = next(iter(error.failures), "")
+            text = f"{tag!r}: {error.failures[tag]}" if tag else str(error)
+            return Result(Refused("refused", _one_line(text), tag), seconds=seconds)
+        except KineverseError as error:
+            return Result(Refused("refused", _one_line(str(error))), seconds=seconds)
+        except RecursionError:
+            message = "The edit has expressions or data that are nested too deeply."
+            return Result(Refused("refused", message), seconds=seconds)
+        except MemoryError:
+            return Result(Refused("refused", "There is not enough memory for the edit."), seconds=seconds)
+        except Exception as error:  # the edit is rolled back, and the server lives
+            logging.getLogger(__name__).exception("An edit of %r failed.", request.who)
+            message = f"The edit has failed in the server, with {type(error).__name__}: {error}"
+            return Result(Refused("failed", _one_line(message)), seconds=seconds)
+        if made is None:
+            return Result(Committed(self.revision, self.chain), seconds=seconds)
+        return self._note(request, made, seconds)
+
+    def _make(self, request: protocol.Edit, seconds: dict[str, float]) -> _Made | None:
+        """Make an edit of a client; None if it does nothing."""
+        begin = perf_counter()
+        self._check_base(request)
+        changes, history = request.changes, self.model.history
+        put = tuple(map(_decode, changes.put))
+        rerun: tuple[str, ...] = ()
+        if request.base == self.revision:
+            # What the client has run again is taken, so that loops are not closed once more.
+            _check_reruns(put, changes, history)
+            rerun = changes.rerun
+        else:
+            # It has run them on an older model, so they are run here.
+            put = tuple(placed for placed in put if placed.entry.tag not in changes.rerun)
+        net = NetChanges(put, changes.replaced, rerun, changes.moved, changes.removed)
+        seconds["decode"] = perf_counter() - begin
+        begin = perf_counter()
+        if request.base < self.revision:
+            entries = [placed.entry for placed in put]
+            found = self._revisions.find_conflict(
+                request.base, entries, changes.moved, changes.removed, history
+            )
+            if found is not None:
+                raise _RefusedError(_as_answer(found))
+        self._check_tags(net, request.base)
+        seconds["check"] = perf_counter() - begin
+        return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net), seconds)
+
+    def _check_base(self, request: protocol.Edit) -> None:
+        """Check that the client knows the present model, or one of the last."""
+        base, now = request.base, self.revision
+        if request.strict and base < now:
+            who = self._revisions.who_made(now)
+            message = f"Revision {now}, by {who}, has changed the model meanwhile. Try again."
+            raise _RefusedError(Refused("conflict", _one_line(message), revision=now, who=who))
+        if base < self._start and self._store.commits_after(base, request.chain, KEPT) is not None:
+            message = f"The server was started again after revision {base}. Try again at revision {now}."
+            raise _RefusedError(Refused("conflict", message, revision=now))
+        if self._revisions.chain_at(base) != request.chain:
+            message = f"Revision {base} is not known to the server, which is at revision {now}. Join again."
+            raise _RefusedError(Refused("stale", message))
+
+    def _check_tags(self, changes: NetChanges, base: int) -> None:
+        """Check that the operations are there that an edit replaces, removes, or puts others after."""
+        entries = self.model.history.entries
+        gone, put = {*changes.removed, *changes.moved}, set[str]()
+        for tag in (*changes.removed, *changes.replaced):
+            if tag not in entries:
+                raise self._missing_error(tag, tag, base)
+        for placed in changes.put:
+            tag, after = placed.entry.tag, placed.after
+            is_placed = tag not in entries or tag in gone
+            if is_placed and not placed.at_end and after is not None and after not in put:
+                if after not in entries or after in gone:
+                    raise self._missing_error(tag, after, base)
+                if self._revisions.last_move(after) > base:
+                    raise _RefusedError(_as_answer(self._revisions.conflict_about(tag, after, "has moved")))
+            put.add(tag)
+
+    def _missing_error(self, tag: str, missing: str, base: int) -> _RefusedError:
+        if self._revisions.last_change(missing) > base:
+            return _RefusedError(_as_answer(self._revisions.conflict_about(tag, missing, "has removed")))
+        message = f"There is no operation {missing!r}. {suggest(missing, self.model.history.entries, 'tag')}"
+        return _RefusedError(Refused("refused", _one_line(message), tag))
+
+    # -- the fold ------------------------------------------------------------------------------------------
+
+    def _adopt(self, edit: Edit, changes: NetChanges) -> None:
+        """Put the entries of an edit, and run those that compute with values that they read.
+
+        They are run when all before them have their new values. A trace that leads to other values than the
+        writes counts, and what an operation without one finds then is what it has read.
+        """
+        history = self.model.history
+        edit.adopt(replace(changes, put=tuple(_unlinked(placed) for placed in changes.put)))
+        run = [placed.entry for placed in changes.put if computes(placed.entry)]
+        for entry in run:
+            history.mark_outdated(entry.tag)
+        history.settle()
+        for given in run:
+            now = history.entries[given.tag]
+            is_equal = now.reads.cells == given.reads.cells and now.reads.listings == given.reads.listings
+            if is_equal and now.writes is given.writes:
+                now.blob = given.blob
+
+    def _fold(
+        self,
+        request: protocol.Edit | protocol.Undo,
+        act: Callable[[Edit], None],
+        own: Iterable[str],
+        seconds: dict[str, float],
+    ) -> _Made | None:
+        """Make an edit, and the message of its commit.
+
+        ``own`` are the operations that it puts or removes itself.
+        """
+        history = self.model.history
+        begin = perf_counter()
+        sequence = history.sequence
+        replaced = tuple(self._find_replaced(tag) for tag in own)
+        with self.model.edit() as edit:
+            act(edit)
+            net = edit.net()
+            seconds["fold"] = perf_counter() - begin
+            if net.is_empty:
+                return None
+            begin = perf_counter()
+            entries = [placed.entry for placed in net.put]
+            put = [
+                Placed(entry_to_bytes(placed.entry, history.sequence), placed.after or "", placed.at_end)
+                for placed in net.put
+            ]
+            commit = Commit(
+                revision=self.revision + 1,
+                previous=self.revision,
+                client=request.client,
+                number=request.number,
+                who=request.who,
+                time=self._clock(),
+                changes=protocol.Changes(tuple(put), net.replaced, net.rerun, net.moved, net.removed),
+                files=self._find_files(entries, getattr(request, "files", ())),
+            )
+            data = protocol.encode(commit)
+            if len(data) > protocol.MAX_BYTES or len(put) > protocol.MAX_OPERATIONS:
+                raise EditError(
+                    f"The edit leads to a commit of {len(put)} operations in {len(data)} bytes; the most is "
+                    f"{protocol.MAX_OPERATIONS} in {protocol.MAX_BYTES}. Make several smaller edits."
+                )
+            touched = list(history.touched())
+        seconds["encode"] = perf_counter() - begin
+        return _Made(commit, data, touched, replaced, history.sequence is not sequence)
+
+    def _find_replaced(self, tag: str) -> Replaced:
+        """Return what an edit will replace under a tag."""
+        history = self.model.history
+        entry = history.entries.get(tag)
+        if entry is None:
+            return Replaced(tag, None, "", 0)
+        index = history.index(tag)
+        after = history.sequence[index - 1].tag if index else ""
+        return Replaced(tag, entry_to_bytes(entry, history.sequence), after, entry.place)
+
+    def _note(self, request: protocol.Edit | protocol.Undo, made: _Made, seconds: dict[str, float]) -> Result:
+        """Note a commit that the model has made, to be stored and published."""
+        history, revision = self.model.history, self.revision
+        self.chain = protocol.chain(self.chain, made.data)
+        self._revisions.note(revision, self.chain, request.who, made.touched, history)
+        put = [entry for _, entry, _ in made.touched if entry is not None]
+        are_all_placed = made.are_places_new or self._are_places_new
+        self._are_places_new = False
+        self._batch.append(
+            StoredCommit(
+                revision,
+                self.chain,
+                request.client,
+                request.number,
+                made.data,
+                [(entry.tag, history.entries[entry.tag].place, entry.blob or b"") for entry in put],
+                made.commit.changes.removed,
+                [(entry.tag, entry.place) for entry in history.sequence] if are_all_placed else None,
+                made.replaced,
+                made.commit.files,
+            )
+        )
+        diff = self._diffs.pop()
+        watched = self._watch(self.model, diff, made.commit)
+        published = Published(self.epoch, self.chain, made.data)
+        return Result(Committed(revision, self.chain), published, watched, seconds)
+
+    # -- undo ----------------------------------------------------------------------------------------------
+
+    def _undo(self, request: protocol.Undo, seconds: dict[str, float]) -> _Made | None:
+        """Take back a commit: by the model if it has it, else by what the store has kept of it."""
+        revision, kept = request.revision, self.model.history.commits
+        if not 0 < revision <= self.revision:
+            message = f"There is no revision {revision}; the model is at revision {self.revision}."
+            raise _RefusedError(Refused("unknown", message))
+        if revision in kept:
+            return self._fold(request, lambda edit: self._take_back(edit, revision), kept[revision], seconds)
+        net = find_inverse(self._store, self.model.history, revision)
+        return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net), seconds)
+
+    def _take_back(self, edit: Edit, revision: int) -> None:
+        try:
+            edit.undo(revision)
+        except EditError as error:
+            tag = max(self.model.history.commits[revision], key=self._revisions.last_change)
+            later = self._revisions.last_change(tag)
+            who = self._revisions.who_made(later)
+            raise ConflictFoundError(Conflict(str(error), tag, "", later, who)) from None
+
+
+def _decode(placed: Placed) -> PlacedEntry:
+    """Return an operation that is put, decoded from its blob."""
+    try:
+        entry = operation_from_bytes(placed.blob)
+    except FormatError as error:
+        raise _RefusedError(Refused("malformed", _one_line(str(error)))) from None
+    if len(entry.tag) > _LONGEST_TAG:
+        message = f"A tag has {len(entry.tag)} letters; the most is {_LONGEST_TAG}."
+        raise _RefusedError(Refused("malformed", message))
+    operation = entry.operation
+    if isinstance(operation, OpaqueOperation) and operation.frozen and not computes(entry):
+        message = f"The operation {entry.tag!r} is frozen, and does not say by what it has read."
+        raise _RefusedError(Refused("malformed", _one_line(message), entry.tag))
+    return PlacedEntry(entry, placed.after or None, placed.at_end)
+
+
+def _unlinked(placed: PlacedEntry) -> PlacedEntry:
+    """Return an entry that does not take what there is when it is linked as what it has read."""
+    entry = placed.entry
+    if not computes(entry):
+        return placed
+    other = HistoryEntry(entry.tag, entry.operation, entry.place, entry.reads, dict(entry.writes))
+    return replace(placed, entry=other)
+
+
+def _check_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, history: History) -> None:
+    """Check that what a client says to have run again is an operation that reads what the edit changes."""
+    again = {*changes.rerun}
+    tags = {*changes.removed, *(placed.entry.tag for placed in put)} - again
+    known = [history.entries[tag] for tag in tags if tag in history.entries]
+    new = [placed.entry for placed in put if placed.entry.tag in tags]
+    changed = {cell for entry in (*known, *new) for cell in entry.writes}
+    for entry in (placed.entry for placed in put if placed.entry.tag in again):
+        old = history.entries.get(entry.tag)
+        is_same = (
+            old is not None
+            and isinstance(old.operation, OpaqueOperation)
+            and isinstance(entry.operation, OpaqueOperation)
+            and old.operation.kind == entry.operation.kind
+            and old.operation.given == entry.operation.given
+            and old.operation.scope == entry.operation.scope
+        )
+        if old is None or not is_same or not _reads_any(old, changed):
+            message = f"The operation {entry.tag!r} is not one that the edit leads to be run again."
+            raise _RefusedError(Refused("refused", _one_line(message), entry.tag))
+        changed |= old.writes.keys() | entry.writes.keys()
+
+
+def _reads_any(entry: HistoryEntry, cells: set[tuple[str, str]]) -> bool:
+    kinds = {kind for kind, _ in cells}
+    return not (cells.isdisjoint(entry.reads.cells) and kinds.isdisjoint(entry.reads.listings))
+
+
+def _find_own(changes: NetChanges) -> list[str]:
+    """Return the operations that an edit itself puts or removes."""
+    again = {*changes.rerun}
+    return [
+        *changes.removed,
+        *(placed.entry.tag for placed in changes.put if placed.entry.tag not in again),
+    ]
+
+
+def _as_answer(conflict: Conflict) -> Refused:
+    message = _one_line(conflict.message)
+    return Refused("conflict", message, conflict.tag, conflict.path, conflict.revision, conflict.who)
+
+
+def _one_line(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= _LONGEST_MESSAGE else f"{text[:_LONGEST_MESSAGE]} ..."

@@ -1,0 +1,131 @@
+"""Clients of an authority without a network, and operations for their edits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import kineverse as kv
+from kineverse.exchange import protocol
+from kineverse.exchange.authority import Authority, Result
+from kineverse.formats import entry_to_bytes, operation_from_bytes
+from kineverse.model import Edit, NetChanges, PlacedEntry
+from kineverse.model.read_recorder import ReadRecorder
+
+Act = Callable[[Edit], object]
+
+
+@dataclass(frozen=True)
+class Twice(kv.Operation):
+    """Writes twice a datum: it has a trace."""
+
+    name: str
+    source: str
+
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
+        return kv.model.Writes(data={self.name: 2 * model.data[self.source]})
+
+
+@dataclass(frozen=True)
+class Capped(kv.Operation):
+    """Decides by a datum: it is frozen."""
+
+    name: str
+    source: str
+
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
+        return kv.model.Writes(data={self.name: min(model.data[self.source], 2)})
+
+
+@dataclass(frozen=True)
+class Count(kv.Operation):
+    """Counts the frames: it is frozen."""
+
+    name: str
+
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
+        return kv.model.Writes(data={self.name: len(model.frames)})
+
+
+@dataclass(frozen=True)
+class Exists(kv.Operation):
+    """Looks whether a datum is there."""
+
+    name: str
+    source: str
+
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
+        return kv.model.Writes(data={self.name: int(self.source in model.data)})
+
+
+@dataclass(frozen=True)
+class Watch(kv.Operation):
+    """Puts a frame where another one is: it has a trace."""
+
+    name: str
+    frame: str
+
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
+        return kv.model.Writes(frames={self.name: ("world", kv.translation(model.fk(self.frame)[:3, 3]))})
+
+
+class Replica:
+    """Client with a model that follows the commits of an authority."""
+
+    def __init__(self, authority: Authority, client: str = "a") -> None:
+        self.client, self.number = 32 * client, 0
+        entries = authority.model.history.sequence
+        blobs = [entry_to_bytes(entry, entries) for entry in entries]
+        self.model = kv.Model([operation_from_bytes(blob) for blob in blobs], authority.revision)
+        self.revision, self.chain = authority.revision, authority.chain
+
+    def draft(self, act: Act, *, strict: bool = False) -> protocol.Edit:
+        """Return the request for an edit; the model stays as it is."""
+        with self.model.edit() as edit:
+            start = edit.savepoint()
+            act(edit)
+            net = edit.net()
+            sequence = self.model.history.sequence
+            put = [
+                protocol.Placed(entry_to_bytes(one.entry, sequence), one.after or "", one.at_end)
+                for one in net.put
+            ]
+            start.roll_back()
+        changes = protocol.Changes(tuple(put), net.replaced, net.rerun, net.moved, net.removed)
+        return self.request(changes, strict=strict)
+
+    def request(self, changes: protocol.Changes, *, strict: bool = False) -> protocol.Edit:
+        """Return the request for changes, with the next number."""
+        self.number += 1
+        return protocol.Edit(
+            self.client, self.number, f"client {self.client[0]}", self.revision, self.chain, changes, strict
+        )
+
+    def undo(self, revision: int) -> protocol.Undo:
+        """Return the request to take back a commit."""
+        self.number += 1
+        return protocol.Undo(self.client, self.number, f"client {self.client[0]}", revision)
+
+    def follow(self, results: Sequence[Result]) -> None:
+        """Adopt what was published."""
+        for result in results:
+            if result.published is not None:
+                self.adopt(result.published.commit)
+
+    def adopt(self, data: bytes) -> None:
+        """Adopt one commit."""
+        commit: protocol.Commit = protocol.decode_commit(data)
+        assert commit.previous == self.revision
+        changes = commit.changes
+        put = [
+            PlacedEntry(operation_from_bytes(one.blob), one.after or None, one.at_end) for one in changes.put
+        ]
+        self.model.adopt(
+            NetChanges(tuple(put), changes.replaced, changes.rerun, changes.moved, changes.removed)
+        )
+        self.revision, self.chain = commit.revision, protocol.chain(self.chain, data)
+
+
+def content(model: kv.Model) -> tuple[str, list[str]]:
+    """Return what equal models have in common."""
+    return kv.formats.document_hash(model), model.history.tags
