@@ -376,6 +376,37 @@ def test_what_was_overwritten_and_is_removed_is_removed_from_the_part() -> None:
     followed.check()
 
 
+@dataclass(frozen=True)
+class Same(kv.Operation):
+    """Another kind of operation that writes a given frame."""
+
+    name: str
+    frame: kv.model.Frame
+
+    def apply(self, model: Any) -> kv.model.Writes:
+        return kv.model.Writes(frames={self.name: self.frame})
+
+
+def test_another_kind_of_operation_is_sent_though_it_writes_the_same() -> None:
+    followed = Followed(furniture(), Wish(("cabinet/drawer",), bodies=False))
+    with followed.model.edit() as edit:
+        edit.replace("frame cabinet/drawer", Same("cabinet/drawer", edit.model.frames["cabinet/drawer"]))
+    (changes,) = followed.publish()
+    assert changes.replaced == ("frame cabinet/drawer",)
+
+
+def test_commits_while_nobody_follows_are_in_later_views() -> None:
+    followed = Followed(furniture(), Wish(("cabinet/door",)))
+    views, ((view, _),) = followed.views, followed.replicas
+    views.release(view)
+    with followed.model.edit() as edit:
+        edit.constrain("door/gentle", -1, kv.velocity("door"), 1)
+    assert views.commit(*followed.diffs) == []
+    part = make_replica(views.add(view.wish))
+    check_agreement(followed.model, part, ["cabinet/door"])
+    assert "door/gentle" in part.constraints
+
+
 def test_operations_at_the_same_place_keep_their_order_when_places_are_renumbered() -> None:
     followed = Followed(furniture(), Wish(("cabinet/",)))
     for i in range(40):

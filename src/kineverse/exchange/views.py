@@ -68,17 +68,11 @@ _PLACE = attrgetter("place")
 
 @dataclass(frozen=True)
 class Wish:
-    """Frames and symbols by which a part of a model is asked for.
+    """Frames and symbols by which a part of a model is asked for, all by name.
 
-    Attributes
-    ----------
-    frames
-        Names of frames. ``kitchen/fridge_door`` is this frame. ``kitchen/``, with a slash at its end, stands
-        for all frames with names that begin so, those that come later included.
-    symbols
-        Names of symbols, which stand for their coordinates.
-    bodies
-        True for the bodies of the wished frames; those above them come without.
+    ``kitchen/fridge_door`` is this frame. ``kitchen/``, with a slash at its end, stands for all frames with
+    names that begin so, those that come later included. Symbols stand for their coordinates. With ``bodies``,
+    wished frames have their bodies; the frames above them come without.
     """
 
     frames: tuple[str, ...] = ()
@@ -97,14 +91,9 @@ class Wish:
         return frozenset(parse_symbol_name(name)[0] for name in self.symbols)
 
     def check(self, model: Model) -> None:
-        """Check that all that is wished is there.
+        """Check that all that is wished is there, else raise UnknownNameError with similar names.
 
-        Raises
-        ------
-        UnknownNameError
-            If a name is unknown, with similar ones.
-        ExpressionError
-            If a text is no name of a symbol.
+        A text that is no name of a symbol at all is an ExpressionError.
         """
         frames = model.frames
         for name in self.frames:
@@ -171,10 +160,8 @@ class Coupling:
         known = self._paths.get(cell)
         if known is None or known[0] is not value:
             found = _paths_of(find_expressions(cell[0], value))
-            if cell[0] == RATES:
-                found |= {value[0].path}
-                if not isinstance(value[1], Expression):
-                    found |= {speed.path for speed, _ in value[1]}
+            if cell[0] == RATES and not isinstance(value[1], Expression):
+                found |= {speed.path for speed, _ in value[1]}
             known = self._paths[cell] = value, found
         return known[1]
 
@@ -263,16 +250,10 @@ def close(model: Model, wish: Wish) -> set[Cell]:
 def part_entries(
     model: Model, cells: Set[Cell] | Mapping[Cell, Any], known: Mapping[str, HistoryEntry] | None = None
 ) -> list[HistoryEntry]:
-    """Return the operations of a part in order, each with its blob.
+    """Return the operations of a part of a model in order, each with its blob.
 
-    Parameters
-    ----------
-    model
-        The whole model.
-    cells
-        Cells of the part, from :func:`close`.
-    known
-        Entries of an earlier part by tag; those that have not changed are the same objects in the result.
+    The cells are those of :func:`close`. Entries of an earlier part by tag may be given as ``known``; those
+    that have not changed are the same objects in the result.
     """
     history, known = model.history, known or {}
     writers: dict[str, HistoryEntry] = {}
@@ -331,12 +312,7 @@ def _is_same(known: HistoryEntry, kind: str, reads: Reads, writes: Mapping[Cell,
 class View:
     """Part of a model that clients follow, kept up to date by :class:`Views`.
 
-    Attributes
-    ----------
-    id
-        Identifier of the wish, 32 hexadecimal digits.
-    users
-        Number of times that it was asked for and not released.
+    ``id`` is that of the wish; ``users`` is the number of times that it was asked for and not released.
     """
 
     def __init__(self, model: Model, coupling: Coupling, wish: Wish) -> None:
@@ -365,11 +341,8 @@ class View:
     def commit(self, replaced: Set[str]) -> Changes | None:
         """Bring the part to the present model; return the changes for a replica, None if there are none.
 
-        Parameters
-        ----------
-        replaced
-            Tags of operations that the commit itself has replaced or moved; others of the part that changed
-            count as run again.
+        Operations that changed count as replaced if their tags are among those given, which the commit itself
+        has replaced or moved; all others as run again.
         """
         old = self._entries
         new = self._renew()
@@ -421,10 +394,7 @@ class Views:
     def add(self, wish: Wish) -> View:
         """Return the view of a wish; equal wishes share one. Each user releases it at the end.
 
-        Raises
-        ------
-        UnknownNameError
-            If a frame or a symbol is unknown, with similar names.
+        Unknown names are refused as by :meth:`Wish.check`, unless others follow this view already.
         """
         known = self._views.get(wish.id)
         if known is None:
@@ -442,11 +412,8 @@ class Views:
     def commit(self, *diffs: Diff) -> list[tuple[View, Changes]]:
         """Return the views that commits have changed, each with the changes for its replicas.
 
-        Parameters
-        ----------
-        diffs
-            Diffs of one or several commits in order. The model is at the last of them, and so are the views
-            afterwards.
+        The diffs are those of one or several commits in order. The model is at the last of them, and so are
+        the views afterwards.
         """
         if not self._views:
             vars(self).pop("_coupling", None)  # it would miss the changes
