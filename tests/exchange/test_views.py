@@ -368,6 +368,8 @@ def test_what_was_overwritten_and_is_removed_is_removed_from_the_part() -> None:
     (changes,) = followed.publish()
     assert changes.removed == ("frame cabinet/drawer",)
     assert replica.history.tags == ["again"]
+    followed = Followed(followed.model, Wish(("cabinet/drawer",)))
+    ((_, replica),) = followed.replicas
     with followed.model.edit() as edit:
         drawer = kv.model.AddFrame("cabinet/drawer", kv.model.Frame("cabinet", ()))
         edit.insert(drawer, before="again")

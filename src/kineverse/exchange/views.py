@@ -130,11 +130,13 @@ class Coupling:
                 self.update((kind, name))
 
     def update(self, cell: Cell) -> Iterable[str]:
-        """Enter the present value of a constraint, a rate or a record; return the coordinates it is about."""
+        """Enter the present value of a cell; return the coordinates that it adds something about."""
         kind, name = cell
+        self._paths.pop(cell, None)
+        if kind not in _COUPLING:
+            return ()
         for group in self._entered.pop(cell, ()):
             self._groups[group].pop(name, None)
-        self._paths.pop(cell, None)
         value = self._history.head[kind].get(name)
         if value is None:
             return ()
@@ -442,8 +444,7 @@ class Views:
         for change in diff.changes:
             cell = change.kind, change.name
             keys.add(cell)
-            if change.kind in _COUPLING:
-                keys.update((_ABOUT, path) for path in self._coupling.update(cell))
+            keys.update((_ABOUT, path) for path in self._coupling.update(cell))
             if change.kind == ARTICULATIONS and change.after is not None:
                 keys.add((FRAMES, change.after.child))
             elif change.kind == FRAMES and change.before is None:
