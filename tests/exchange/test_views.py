@@ -12,11 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from parts import adopt, check_agreement, make_replica
+from replicas import Replica
 
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse import gallery
-from kineverse.exchange.protocol import Changes, Decoder, encode
+from kineverse.exchange.authority import Authority
+from kineverse.exchange.protocol import Changes, Decoder, Refused, encode
+from kineverse.exchange.store import Store
 from kineverse.exchange.views import Coupling, View, Views, Wish, close
 from kineverse.formats.document import document_hash, to_bytes
 from kineverse.gallery.lockboxes import draw_tangled_lockbox, make_lockbox_model
@@ -203,6 +206,33 @@ def test_operations_of_a_part_say_why_they_cannot_be_run_again() -> None:
     reason = "AddFrame was made from it: only a part of it is here"
     with pytest.raises(kv.errors.EditError, match=reason), replica.edit() as edit:
         edit.remove("frame cabinet")
+
+
+@pytest.mark.parametrize("is_run_again", [False, True])
+def test_an_operation_of_a_part_is_not_put_into_the_whole(is_run_again: bool) -> None:
+    def build(edit: Edit) -> None:
+        edit.add_frame("box", "world", kv.rotation_z(kv.position("lid")), body=kv.model.Body(), tag="box")
+        edit.add_frame("lid", "box", body=kv.model.Body(), tag="lid")
+
+    def move(edit: Edit) -> None:
+        if is_run_again:  # the frame below it looks whether it is there again
+            edit.remove("box")
+            box = kv.model.AddFrame("box", kv.model.Frame("world", ()))
+            edit.insert(box, "another", before="lid")
+        else:
+            lid = edit.model.history.operation("lid")
+            edit.remove("lid")
+            edit.apply(lid, "lid")
+
+    authority = Authority(Store(None))
+    authority.fill(build, "me")
+    replica = Replica(authority)
+    replica.model = make_replica(Views(authority.model).add(Wish(("lid",), bodies=False)))
+    before = document_hash(authority.model)
+    (result,) = authority.process([replica.draft(move)])
+    assert isinstance(result.answer, Refused)
+    assert "load the whole model" in result.answer.message
+    assert document_hash(authority.model) == before
 
 
 # -- commits -------------------------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ from .meshes import put_contents
 from .protocol import Commit, Committed, FileContent, Placed, Published, Refused
 from .store import Replaced, Store, StoredCommit
 from .stored_undo import computes, find_inverse
+from .views import LOAD_THE_WHOLE, is_partial
 
 ANSWERS: Final = 10_000
 """Number of answers that are kept in memory, to answer an edit that is asked twice alike."""
@@ -473,6 +474,9 @@ def _decode(placed: Placed) -> PlacedEntry:
         message = f"A tag has {len(entry.tag)} letters; the most is {_LONGEST_TAG}."
         raise _RefusedError(Refused("malformed", message))
     operation = entry.operation
+    if is_partial(entry):
+        message = f"Of the operation {entry.tag!r} the client has only a part. {LOAD_THE_WHOLE}"
+        raise _RefusedError(Refused("refused", _one_line(message), entry.tag))
     if isinstance(operation, OpaqueOperation) and operation.frozen and not computes(entry):
         message = f"The operation {entry.tag!r} is frozen, and does not say by what it has read."
         raise _RefusedError(Refused("malformed", _one_line(message), entry.tag))

@@ -57,12 +57,12 @@ from .protocol import Changes, Placed
 Key = tuple[str, str]
 """Cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix."""
 
-PARTIAL: Final = "only a part of it is here"
-"""Reason why an operation of a part is not run again and not put into the whole: it lacks other writes."""
+LOAD_THE_WHOLE: Final = "To move it, or to run it again, load the whole model; or replace it by a new one."
 
 _ABOUT, _TAG, _BELOW = "about", "tag", "below"
 _COUPLING = (CONSTRAINTS, RATES, ARTICULATIONS)
 _OVERWRITTEN = Frame(WORLD, ())
+_PARTIAL = "only a part of it is here"
 _PLACE = attrgetter("place")
 
 
@@ -294,10 +294,15 @@ def _part_entry(
     kind = operation.kind if isinstance(operation, OpaqueOperation) else document_kind(type(operation))
     if known is not None and _is_same(known, kind, reads, writes):
         return known
-    shown = OpaqueOperation(kind, reads=reads.cells, recorded=writes, frozen=PARTIAL)
+    shown = OpaqueOperation(kind, reads=reads.cells, recorded=writes, frozen=_PARTIAL)
     made = HistoryEntry(entry.tag, shown, 0, reads, writes)
     blob = entry_to_bytes(made, ())
     return known if known is not None and known.blob == blob else made
+
+
+def is_partial(entry: HistoryEntry) -> bool:
+    """Return whether an operation comes from a part: it may lack writes, and is put nowhere else."""
+    return isinstance(entry.operation, OpaqueOperation) and entry.operation.frozen == _PARTIAL
 
 
 def _is_same(known: HistoryEntry, kind: str, reads: Reads, writes: Mapping[Cell, Any]) -> bool:
