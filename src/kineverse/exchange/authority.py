@@ -137,6 +137,7 @@ class Authority:
         self._revisions = Revisions(self.revision, self.chain)
         self._diffs: list[Diff] = []
         self.model.listen(self._diffs.append)
+        self._is_lost = False
 
     @property
     def revision(self) -> int:
@@ -175,6 +176,8 @@ class Authority:
         if isinstance(result.answer, Refused):
             kind = FormatError if result.answer.reason in ("failed", "malformed") else EditError
             raise kind(result.answer.message)
+        # Nobody has an earlier state.
+        self._start, self._revisions = self.revision, Revisions(self.revision, self.chain)
 
     # -- requests ------------------------------------------------------------------------------------------
 
@@ -184,39 +187,47 @@ class Authority:
         An edit is made whole or not at all, and others are made if one is refused. If the store fails, all of
         them are refused, and the model is what the store has, under a new epoch.
         """
-        new: set[tuple[str, int]] = set()
+        new: list[tuple[str, int]] = []
         results = []
         try:
+            if self._is_lost:
+                self._recover()
             for request in requests:
                 key = request.client, request.number
                 answer = self._find_answer(key)
+                if answer is not None:
+                    results.append(Result(answer))
+                    continue
                 if isinstance(request, protocol.Undo):
                     self._persist()  # it may need all commits of the store
-                if answer is None:
-                    results.append(self._answer(request))
-                    self._keep_answer(key, results[-1].answer)
-                    new.add(key)
-                else:
-                    results.append(Result(answer))
+                results.append(self._answer(request))
+                self._keep_answer(key, results[-1].answer)
+                new.append(key)
             begin = perf_counter()
             self._persist()
             seconds = perf_counter() - begin
         except Exception as error:
             if not isinstance(error, KineverseError | OSError):
                 logging.getLogger(__name__).exception("Edits were taken back.")
-            refused = Refused(
-                "failed", _one_line(f"Nothing was done, because the server has failed. {error}")
-            )
             for key in new:
                 self._answers.pop(key, None)
-            self._batch.clear()
-            self._store.reload()
-            self._load()
-            return [Result(self._find_answer((one.client, one.number)) or refused) for one in requests]
+            self._is_lost = True
+            refused = Refused("failed", _one_line(f"The server has failed, and nothing was done. {error}"))
+            try:
+                self._recover()
+                return [Result(self._find_answer((one.client, one.number)) or refused) for one in requests]
+            except (KineverseError, OSError):  # it is tried again before the next edit
+                return [Result(refused) for _ in requests]
         for result in results:
             if result.published is not None:
                 result.seconds["persist"] = seconds
         return results
+
+    def _recover(self) -> None:
+        """Go back to what the store has, under a new epoch."""
+        self._batch.clear()
+        self._store.reload()
+        self._load()
 
     def _persist(self) -> None:
         if self._batch:
@@ -388,7 +399,7 @@ class Authority:
                 who=request.who,
                 time=self._clock(),
                 changes=protocol.Changes(tuple(put), net.replaced, net.rerun, net.moved, net.removed),
-                files=self._find_files(entries, getattr(request, "files", ())),
+                files=self._find_files(entries, request.files if isinstance(request, protocol.Edit) else ()),
             )
             data = protocol.encode(commit)
             if len(data) > protocol.MAX_BYTES or len(put) > protocol.MAX_OPERATIONS:
