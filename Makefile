@@ -13,7 +13,7 @@ INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INST
 # What the demo and every command in the README need.
 DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording)
 
-.PHONY: help demo test sanitize fuzz format clean
+.PHONY: help demo test sanitize fuzz faults format clean
 .NOTPARALLEL:
 
 help:
@@ -21,6 +21,7 @@ help:
 	@echo "make test    formatter, linter, types, layers, tests"
 	@echo "make sanitize  all C with sanitizers, and the tests that use it (ARGS=--short: a little of each)"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
+	@echo "make faults  damage files of model servers and kill their processes (ARGS='store --damages 1000')"
 	@echo "make format  format the code and mend what the linter can mend"
 	@echo "make clean   remove the environment and what the tools left"
 
@@ -44,6 +45,9 @@ sanitize: $(VENV)/test.installed
 
 fuzz: $(VENV)/fuzz.installed
 	PYTHONPATH=tools $(BIN)/python -m fuzz $(ARGS)
+
+faults: $(VENV)/test.installed
+	PYTHONPATH=tools $(BIN)/python -m faults $(ARGS)
 
 format: $(VENV)/test.installed
 	$(BIN)/ruff format .

@@ -62,6 +62,15 @@ def test_error_survives_a_pickle(kind: type[Exception]) -> None:
     assert {k: str(v) for k, v in vars(after).items()} == {k: str(v) for k, v in vars(error).items()}
 
 
+def test_errors_of_live_models_are_those_that_local_code_expects() -> None:
+    conflict = kineverse.ConflictError("it met another", ["joint door"], ["frames/door"], 7, "robot")
+    assert (conflict.tags, conflict.paths) == (("joint door",), ("frames/door",))
+    assert (conflict.revision, conflict.who, conflict.failures) == (7, "robot", {})
+    assert isinstance(conflict, kineverse.errors.EditError)
+    assert issubclass(kineverse.OfflineError, ConnectionError)
+    assert str(kineverse.OfflineError("nobody answers")) == "nobody answers"
+
+
 def test_all_error_classes_are_found() -> None:
     names = {kind.__name__ for kind in ERRORS}
     assert names >= {"SkillError", "UnsupportedError", "DisagreementError", "EditError", *ARGUMENTS}

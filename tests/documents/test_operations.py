@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from kineverse.formats.document.parameters import find_class
 from kineverse.geometry.mesh_files import read_mesh
 from kineverse.model.body import Body, Box, Mesh, Shape
 from kineverse.model.history import HistoryEntry
+from kineverse.model.read_recorder import Reads
 
 MODEL = rich_model()
 BLOB = kv.formats.operation_to_bytes(MODEL, "the arm")
@@ -41,6 +43,10 @@ def of_number(value: float) -> kv.Model:
     with model.edit() as edit:
         edit.write("number", value)
     return model
+
+
+FROZEN = sent(build(branching), "custom")
+TRACED = sent(build(lambda m: kv.model.Writes(data={"twice": 2 * m.data["number"]})), "custom")
 
 
 def test_blob_is_that_of_the_snapshot_and_of_an_open_edit() -> None:
@@ -121,6 +127,78 @@ def test_first_run_takes_what_is_there_as_what_was_read() -> None:
         edit.apply(frozen.operation, frozen.tag)
     assert other.data["sign"] == 1
     with pytest.raises(kv.errors.EditError, match="data/number has changed"), other.edit() as edit:
+        edit.replace("data number", kv.model.SetData("number", -1.0))
+
+
+@settings(max_examples=attempts(25), deadline=None)
+@given(numbers=st.lists(st.floats(-4, 4), min_size=2, max_size=4), is_frozen=st.booleans())
+def test_operation_is_a_value_that_many_models_can_have(numbers: list[float], is_frozen: bool) -> None:
+    """What one model has read with it is nothing to another: it does there what it does decoded anew."""
+    entry = FROZEN if is_frozen else TRACED
+    before = repr(entry.operation)
+    for number in numbers:
+        model, fresh = of_number(number), of_number(number)
+        with model.edit() as edit:
+            edit.apply(entry.operation, entry.tag)
+        with fresh.edit() as edit:
+            edit.apply(kv.formats.operation_from_bytes(entry.blob or b"").operation, entry.tag)
+        assert model.snapshot() == fresh.snapshot()
+        for each in (model, fresh):
+            if is_frozen:
+                with pytest.raises(kv.errors.EditError, match="data/number has changed"), each.edit() as edit:
+                    edit.replace("data number", kv.model.SetData("number", number + 1))
+            else:
+                with each.edit() as edit:
+                    edit.replace("data number", kv.model.SetData("number", number + 1))
+                assert each.data["twice"] == 2 * (number + 1)
+    assert repr(entry.operation) == before
+    assert entry.reads.seen is None
+
+
+def test_linked_entry_keeps_what_it_read_where_it_is_run() -> None:
+    """A document is linked into a model that has other values: code that decided by them is refused."""
+    document = kv.formats.to_bytes(build(branching))
+    model = of_number(-1.0)
+    with pytest.raises(kv.errors.ModelError, match="data/number has changed"), model.edit() as edit:
+        for entry in kv.formats.entries_from_bytes(document):
+            if entry.tag != "data number":
+                edit.link(entry)
+    assert model.snapshot() == of_number(-1.0).snapshot()
+    (*_, alone) = kv.formats.entries_from_bytes(document)
+    with model.edit() as edit:  # the operation without its entry is one that comes alone
+        edit.apply(alone.operation, alone.tag)
+    assert model.data["sign"] == 1
+
+
+def test_operation_that_replaces_another_has_not_read_what_that_has() -> None:
+    model = kv.formats.from_bytes(kv.formats.to_bytes(build(branching)))
+    other = model.copy()
+    with model.edit() as edit:
+        edit.replace("data number", kv.model.SetData("number", -1.0))
+        edit.replace("custom", FROZEN.operation)
+    assert model.data["sign"] == 1
+    for each, number in ((model, 1.5), (other, -1.0)):  # and the copy refers to what it has read
+        with pytest.raises(kv.errors.EditError, match="data/number has changed"), each.edit() as edit:
+            edit.replace("data number", kv.model.SetData("number", number))
+    with model.edit() as edit:
+        edit.undo(model.version)
+    assert model.snapshot() == other.snapshot()
+    with pytest.raises(kv.errors.EditError, match="data/number has changed"), model.edit() as edit:
+        edit.replace("data number", kv.model.SetData("number", -1.0))
+
+
+@pytest.mark.parametrize("way", ["model", "snapshot", "pickle"])
+def test_entries_alone_know_what_they_have_read_once_they_are_in_a_model(way: str) -> None:
+    home = build(branching)
+    model = kv.Model([sent(home, tag) for tag in home.history.tags])
+    if way == "snapshot":
+        model = model.snapshot().model()
+    elif way == "pickle":
+        read = kv.formats.from_bytes(kv.formats.to_bytes(home))
+        model = pickle.loads(pickle.dumps(read))
+    assert model.snapshot() == home.snapshot()
+    assert model.history.runs == 0
+    with pytest.raises(kv.errors.EditError, match="data/number has changed"), model.edit() as edit:
         edit.replace("data number", kv.model.SetData("number", -1.0))
 
 
@@ -312,3 +390,73 @@ def test_net_changes_with_operations_from_elsewhere_are_adopted() -> None:
     with replica.edit() as edit:
         edit.replace("data number", kv.model.SetData("number", 7.0))
     assert (replica.data["again"], replica.data["twice"]) == (14.0, 14.0)
+
+
+def test_adopting_changes_nothing_of_what_is_given() -> None:
+    """Two replicas take the same changes, each with what it has itself."""
+    home = of_number(1.0)
+    with home.edit() as edit:
+        edit.adopt(alone := changes_of(FROZEN, frame_without_reads()))
+    other = of_number(-1.0)
+    other.adopt(alone)
+    for each, number in ((home, -1.0), (other, 1.0)):
+        assert each.data["sign"] == 1
+        with pytest.raises(kv.errors.EditError, match="data/number has changed"), each.edit() as edit:
+            edit.replace("data number", kv.model.SetData("number", number))
+        with (
+            pytest.raises(kv.errors.EditError, match="parent of frame 'box' is missing"),
+            each.edit() as edit,
+        ):
+            edit.remove("frame table")
+    assert [placed.entry.reads.seen for placed in alone.put] == [None, None, None]
+    assert alone.put[-1].entry.reads.cells == {}
+
+
+def changes_of(*entries: HistoryEntry) -> kv.model.NetChanges:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("table", "world")
+        (table,) = edit.net().put
+    return kv.model.NetChanges(
+        (table, *(kv.model.PlacedEntry(entry, None, at_end=True) for entry in entries))
+    )
+
+
+def frame_without_reads() -> HistoryEntry:
+    operation = kv.model.AddFrame("box", kv.model.Frame.from_transform("table", np.eye(4)))
+    return HistoryEntry("box", operation, 0, Reads(), {("frames", "box"): operation.frame})
+
+
+def test_entry_of_an_open_edit_has_the_blob_of_its_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = of_number(3.0)
+    with model.edit() as edit:
+        edit.apply(Doubled("number", "twice"), "mine")
+        edit.add_frame("box", "world")
+        with monkeypatch.context() as patch:  # the cost does not grow with the model
+            patch.setattr(kv.Model, "snapshot", None)
+            entries = [placed.entry for placed in edit.net().put]
+            blobs = [kv.formats.entry_to_bytes(entry, model.history.sequence) for entry in entries]
+        assert [entry.blob for entry in entries] == blobs
+    assert blobs == [kv.formats.operation_to_bytes(model, entry.tag) for entry in entries]
+    again = of_number(3.0)
+    with again.edit() as edit:
+        edit.apply(Doubled("number", "twice"), "mine")
+        edit.add_frame("box", "world")
+    assert blobs == [kv.formats.operation_to_bytes(again, entry.tag) for entry in entries]
+
+
+def test_model_is_restored_as_of_a_version() -> None:
+    home = build(branching)
+    for version in (1, 7):
+        model = kv.Model()
+        model._restore(kv.formats.entries_from_bytes(kv.formats.to_bytes(home)), version)
+        assert (model.version, model.history.runs) == (version, 0)
+        assert kv.formats.document_hash(model) == kv.formats.document_hash(home)
+        with pytest.raises(kv.errors.EditError, match="none yet"), model.edit() as edit:
+            edit.undo(version)
+        with model.edit() as edit:
+            edit.write("more", 1.0)
+        assert model.version == version + 1
+    entry = kv.formats.entries_from_bytes(kv.formats.to_bytes(of_number(1.0)))[0]
+    with pytest.raises(kv.errors.DuplicateNameError):
+        kv.Model()._restore([entry, entry], 1)

@@ -48,8 +48,8 @@ def test_nested_prefixes_follow() -> None:
 
 def _include(model: kv.Model, text: str, prefix: str | None) -> None:
     with model.edit() as edit:
-        for tag, operation in read_operations(text, prefix=prefix):
-            edit.apply(operation, tag)
+        for entry in kv.formats.entries_from_bytes(text.encode(), prefix):
+            edit.link(entry)
 
 
 def test_saving_keeps_nothing_of_the_model_alive() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import kineverse as kv
-from kineverse.formats.document import read_operations, to_json
+from kineverse.formats.document import to_json
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
@@ -64,11 +64,7 @@ def reloaded(model: kv.Model) -> kv.Model:
 
 def read_document(text: str, prefix: str | None = None) -> kv.Model:
     """Return what a process without the code makes of the document of a model."""
-    result = kv.Model()
-    with result.edit() as edit:
-        for tag, operation in read_operations(text, prefix=prefix):
-            edit.apply(operation, tag)
-    return result
+    return kv.formats.from_bytes(text.encode(), prefix)
 
 
 def changed(model: kv.Model, other: kv.Model) -> None:

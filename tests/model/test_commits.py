@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -170,6 +170,81 @@ def test_a_savepoint_that_is_rolled_back_leaves_no_trace(first: Any, undone: Any
     assert whole(model) == whole(twin)
     assert results[0] is None or state_of(model) == before
     assert [(plain(d), d.reruns) for d in heard] == [(plain(d), d.reruns) for d in heard_there]
+
+
+class Client(kv.Model):
+    """Model whose edits are done elsewhere: each is tried, taken back, and adopted from there."""
+
+    def __init__(self, server: kv.Model) -> None:
+        super().__init__(server.history.copy(), server.version)
+        self.server, self.delivered = server, 0
+
+    def edit(self, *, strict: bool = False) -> contextlib.AbstractContextManager[Edit]:
+        return self._ask()
+
+    @contextlib.contextmanager
+    def _ask(self) -> Iterator[Edit]:
+        taken: list[NetChanges] = []
+        before, version = whole(self), self.version
+        with self._transaction(lambda edit: taken.append(edit.net())) as edit:
+            yield edit
+        assert (whole(self), self.version) == (before, version)
+        if not taken[0].is_empty:
+            self.server.adopt(taken[0])
+            self._adopt(taken[0], self.server.version)
+
+    def _deliver(self) -> None:
+        self.delivered += 1
+
+
+@given(st.lists(actions, min_size=1, max_size=3))
+@settings(max_examples=attempts(25), derandomize=True)
+def test_edit_is_taken_back_and_adopted_as_a_version(transactions: list[Any]) -> None:
+    model, _ = started()
+    client = Client(model.copy())
+    heard, heard_there = heard_by(model), heard_by(client)
+    for number, steps in enumerate(transactions):
+        errors = []
+        for each in (model, client):
+            try:
+                with each.edit() as edit:
+                    for k, one in enumerate(steps):
+                        do(edit, *one, f"t{number}.{k}")
+                errors.append("")
+            except kv.KineverseError as error:
+                errors.append(str(error))
+        assert errors[0] == errors[1]
+        assert whole(client) == whole(client.server) == whole(model)
+        assert client.version == client.server.version == model.version
+    assert heard_there == []  # until the client says so
+    assert client.delivered >= len(heard)
+    client._listeners.deliver()
+    assert [*map(plain, heard_there)] == [*map(plain, heard)]
+
+
+def test_commit_as_a_version_may_leave_some_out() -> None:
+    """A part of a model has the versions that concern it, and takes note of those that do not."""
+    home = build(Put("a", 1))
+    replica = home.copy()
+    heard = heard_by(replica)
+    with home.edit() as edit:
+        edit.apply(Put("b", 2))
+        replica._adopt(edit.net(), 7)
+    assert (replica.version, [diff.version for diff in heard]) == (7, [7])
+    replica._adopt(NetChanges(), 9)
+    assert (replica.version, [diff.is_empty for diff in heard]) == (9, [False, True])
+    with replica.edit() as edit:
+        edit.undo(7)
+    assert (replica.version, list(replica.data)) == (10, ["a"])
+
+
+def test_strict_is_a_flag_without_effect_on_a_local_model() -> None:
+    model = build(Put("a", 1))
+    with model.edit(strict=True) as edit:
+        edit.apply(Put("b", 2))
+    assert list(model.data) == ["a", "b"]
+    with pytest.raises(kv.errors.InvalidValueError, match="strict= is True or False"):
+        model.edit(strict="no")  # type: ignore[arg-type]
 
 
 def build(*operations: kv.Operation) -> kv.Model:

@@ -133,7 +133,7 @@ MESSAGES: dict[str, tuple[Callable[[kv.Model], Any], str]] = {
     ),
     "a mistyped name in kv.formats": (
         lambda _: kv.formats.from_byte,
-        "The package kineverse.formats has no 'from_byte'. Did you mean 'from_bytes' or 'to_bytes' or 'operation_from_bytes'?",
+        "The package kineverse.formats has no 'from_byte'. Did you mean 'from_bytes' or 'to_bytes' or 'entries_from_bytes'?",
     ),
     "a name of another package": (
         lambda _: kv.reasoning.interlock_,

@@ -11,12 +11,26 @@ from kineverse.model import registry
 
 @pytest.fixture
 def scheme(monkeypatch):
-    """An address scheme whose reader adds one frame, named after the address."""
-    monkeypatch.setattr(registry, "_SCHEMES", {"memory": f"{__name__}:include_frame"})
+    """An address scheme whose models have one frame, named after the address."""
+    entry = registry.Scheme(load=f"{__name__}:load_frame", include=f"{__name__}:include_frame")
+    monkeypatch.setattr(registry, "_SCHEMES", {"memory": entry})
     return "memory"
 
 
-def include_frame(edit, source, prefix, *, root, strict, loops):
+class Served(kv.Model):
+    """Model that came by its address, and the part that was asked for."""
+
+    part: dict
+
+
+def load_frame(source, **part):
+    model = Served()
+    model.part = part
+    model.include(source)
+    return model
+
+
+def include_frame(edit, source, prefix):
     name = source.partition(":")[2]
     return [edit.add_frame(f"{prefix}/{name}" if prefix else name, parent="world")]
 
@@ -27,8 +41,35 @@ def test_include_reads_an_address_by_its_scheme(scheme):
     assert list(model.frames) == ["kitchen/door"]
 
 
-def test_load_reads_an_address_by_its_scheme(scheme):
-    assert list(kv.load(f"{scheme}:door").frames) == ["door"]
+def test_load_returns_the_model_of_an_address(scheme):
+    model = kv.load(f"{scheme}:door", frames=["door"], bodies=True)
+    assert isinstance(model, Served)
+    assert list(model.frames) == ["door"]
+    assert model.part == {"frames": ["door"], "symbols": None, "bodies": True}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"prefix": "a"}, "A live model keeps its names"),
+        ({"root": "."}, "root= is about reading a file"),
+        ({"strict": True}, "strict= is about reading a file"),
+        ({"loops": "refuse"}, "loops= is about reading a file"),
+        ({"arguments": {"side": "left"}}, "arguments= is about reading a file"),
+    ],
+)
+def test_options_of_files_are_refused_for_an_address(scheme, options, message):
+    with pytest.raises(kv.errors.InvalidValueError, match=message):
+        kv.load(f"{scheme}:door", **options)
+    if options.keys() <= {"root", "strict", "loops"}:
+        with pytest.raises(kv.errors.InvalidValueError, match=message):
+            kv.Model().include(f"{scheme}:door", **options)
+
+
+@pytest.mark.parametrize("part", [{"frames": []}, {"symbols": ["kitchen/fridge_door"]}, {"bodies": False}])
+def test_a_file_is_loaded_as_a_whole(part):
+    with pytest.raises(kv.errors.InvalidValueError, match=r"choose a part of a live model, live:NAME"):
+        kv.load("kitchen", **part)
 
 
 def test_a_path_with_an_unknown_scheme_is_a_file(scheme, tmp_path):
@@ -53,7 +94,9 @@ def test_each_written_suffix_can_be_read():
 
 
 def test_every_entry_can_be_imported():
-    entries = [*registry._SCHEMES.values(), *registry._SHORTHANDS.values(), *registry._SERVICES.values()]
+    entries = [*registry._SHORTHANDS.values(), *registry._SERVICES.values()]
+    for scheme in registry._SCHEMES.values():
+        entries += [scheme.load, scheme.include]
     for one in registry._COLLECTIONS.values():
         entries += filter(None, (one.list_names, one.build, one.find_document, one.accept))
     entries += [registry._FORMATS]

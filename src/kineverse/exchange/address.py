@@ -148,6 +148,12 @@ class Claim:
         with open(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w", encoding="utf-8") as file:
             json.dump({"endpoint": self.endpoint, "secret": self.secret}, file)
 
+    def __enter__(self) -> Claim:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
     def release(self) -> None:
         """Give the name back, once the server no longer listens."""
         if self._lock is not None:

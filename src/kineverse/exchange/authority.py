@@ -25,6 +25,7 @@ from kineverse.model.history import History, HistoryEntry, TouchedEntry
 
 from . import protocol
 from .conflicts import KEPT, Conflict, ConflictFoundError, Revisions
+from .meshes import put_contents
 from .protocol import Commit, Committed, FileContent, Placed, Published, Refused
 from .store import Replaced, Store, StoredCommit
 from .stored_undo import computes, find_inverse
@@ -126,7 +127,9 @@ class Authority:
     def _load(self) -> None:
         """Make the model by linking the operations of the store."""
         with no_collection():
-            entries = [operation_from_bytes(blob) for _, blob in self._store.operations()]
+            stored = self._store.operations()
+            entries = [operation_from_bytes(blob) for _, blob, _ in stored]
+            put_contents(entries, (file for *_, files in stored for file in files))
             self.model = Model(entries, self._store.revision)
         self.model.history.commits.clear()
         # A model numbers its places anew; they are stored with the next commit.
@@ -440,6 +443,7 @@ class Authority:
                 made.commit.changes.removed,
                 [(entry.tag, entry.place) for entry in history.sequence] if are_all_placed else None,
                 made.replaced,
+                made.commit.files,
             )
         )
         diff = self._diffs.pop()

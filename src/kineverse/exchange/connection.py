@@ -27,7 +27,8 @@ from .transport import NoAnswerError, Transport
 PATIENCE = 10.0
 """Time that an edit waits for a server that went away, before it is given up [s]."""
 _ASK_TIMEOUT = 5.0
-_PAUSE = 0.02
+_PAUSE = 0.005
+_ROUTING = 0.5
 
 A = TypeVar("A")
 
@@ -215,11 +216,15 @@ class Connection:
                 f"This takes a message of {len(data) / 1e6:.0f} MB, and the most is "
                 f"{protocol.MAX_BYTES / 1e6:.0f} MB. Split it into several edits."
             )
-        try:
-            answer = self.transport.ask(self.key("edit" if changes_model else "ask"), data, timeout)
-        except NoAnswerError:
-            raise OfflineError(f"The server {self.address.name!r} does not answer.") from None
-        return protocol.decode_answer(answer)
+        key, end = self.key("edit" if changes_model else "ask"), time.monotonic() + min(timeout, _ROUTING)
+        while True:
+            try:
+                return protocol.decode_answer(self.transport.ask(key, data, timeout))  # type: ignore[no-any-return]
+            except NoAnswerError:
+                # For moments after a connection was made it is not known who answers.
+                if not self.is_online or time.monotonic() >= end:
+                    raise OfflineError(f"The server {self.address.name!r} does not answer.") from None
+                time.sleep(_PAUSE)
 
 
 def refusal_error(answer: object, address: Address) -> Exception:

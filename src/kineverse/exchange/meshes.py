@@ -33,7 +33,7 @@ class ServedFiles:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._paths = store.files()
+        self._paths = store.paths()
 
     def find(
         self, entries: Iterable[HistoryEntry], named: Iterable[FileContent] = ()
@@ -48,7 +48,7 @@ class ServedFiles:
                     known = measure_content(mesh)
                     if known is not None and known[0] not in self._paths:
                         self._paths[known[0]] = os.fspath(locate_mesh(mesh))
-                        self._store.add_file(known[0], self._paths[known[0]])
+                        self._store.add_path(known[0], self._paths[known[0]])
                 if known is not None and known[0] in self._paths:
                     result.append(FileContent(entry.tag, index, *known))
         return tuple(result)

@@ -153,10 +153,11 @@ class Server:
         self._edits = 0
         self._lock = threading.RLock()  # of the model, the views and the lists above
         self._closed = threading.Event()
-        self._token = transport.alive(self._key(f"alive/{authority.epoch}"))
         edits, questions = transport.answers(self._key("edit")), transport.answers(self._key("ask"))
         presence = transport.watch_alive(self._key("client/*"))
         seen = transport.subscribe(self._key("seen"))
+        # Last, for those who wait for a server to ask it.
+        self._token = transport.alive(self._key(f"alive/{authority.epoch}"))
         for task, work in (
             ("edits", lambda: self._take_edits(edits)),
             ("questions", lambda: self._answer_questions(questions)),
@@ -384,8 +385,8 @@ class Server:
                 process=os.getpid(),
                 since=self._since,
                 time=now,
-                store=self._store.place,
-                durable=self._store.durable,
+                store=str(self._store.path or ""),
+                durable=self._store.is_durable,
                 revision=authority.revision,
                 chain=authority.chain,
                 operations=len(authority.model.history.sequence),

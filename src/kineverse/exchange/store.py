@@ -30,9 +30,11 @@ _APPLICATION: Final = 0x4B764D53
 _SCHEMA: Final = (
     "CREATE TABLE meta (name TEXT NOT NULL, revision INTEGER NOT NULL, chain BLOB NOT NULL,"
     " total BLOB NOT NULL)",
-    "CREATE TABLE operations (place INTEGER PRIMARY KEY, tag TEXT NOT NULL, blob BLOB NOT NULL)",
+    "CREATE TABLE operations (place INTEGER PRIMARY KEY, tag TEXT NOT NULL, blob BLOB NOT NULL,"
+    " files BLOB NOT NULL)",
     "CREATE TABLE log (revision INTEGER PRIMARY KEY, chain BLOB NOT NULL, client TEXT NOT NULL,"
     " number INTEGER NOT NULL, data BLOB NOT NULL, replaced BLOB NOT NULL)",
+    "CREATE TABLE paths (sha256 TEXT PRIMARY KEY, path TEXT NOT NULL)",
     "CREATE UNIQUE INDEX answers ON log (client, number)",
 )
 _MODULUS: Final = 1 << 256
@@ -55,6 +57,8 @@ class Replaced(msgspec.Struct, frozen=True, array_like=True):
     place: int
 
 
+_NO_FILES: Final = _ENCODE(())
+_decode_files = msgspec.msgpack.Decoder(tuple[protocol.FileContent, ...]).decode
 _decode_replaced = msgspec.msgpack.Decoder(tuple[Replaced, ...]).decode
 
 
@@ -62,8 +66,8 @@ _decode_replaced = msgspec.msgpack.Decoder(tuple[Replaced, ...]).decode
 class StoredCommit:
     """Commit to be stored: its message, its rows, and what its edit replaced.
 
-    ``put`` has tags, places and blobs. ``places`` has the tags and places of all operations after the commit
-    if it gave them new places.
+    ``put`` has tags, places and blobs, and ``files`` the digests of their meshes. ``places`` has the tags and
+    places of all operations after the commit if it gave them new places.
     """
 
     revision: int
@@ -75,6 +79,7 @@ class StoredCommit:
     removed: Sequence[str] = ()
     places: Sequence[tuple[str, int]] | None = None
     replaced: tuple[Replaced, ...] = ()
+    files: Sequence[protocol.FileContent] = ()
 
 
 class Store:
@@ -85,32 +90,33 @@ class Store:
     """
 
     def __init__(self, path: Path | None, *, durable: bool = False) -> None:
-        self._path = "The store" if path is None else str(path)
+        self.path, self.is_durable = path, durable
+        self._path = "The store" if path is None else os.path.realpath(path)
         self._lock = threading.RLock()
-        may_create = path is None or not path.exists()
-        if path is not None:
-            _check_path(path)
-            if not may_create and os.path.exists(f"{path}-wal"):
-                _check_unclosed(path)
+        is_there = path is not None and _check_path(Path(self._path))
+        if is_there and os.path.exists(f"{self._path}-wal"):
+            _check_unclosed(self._path)
         with _reporting(self._path):
-            self._db = _connect(":memory:" if path is None else os.path.abspath(path))
+            self._db = _connect(":memory:" if path is None else self._path)
         try:
             with _reporting(self._path):
                 self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
-                if may_create:
+                if not is_there:
                     _create(self._db)
                 self._contents = _load(self._db, self._path)
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
                 self._db.execute("BEGIN IMMEDIATE")  # an error if the file cannot be written
                 self._db.execute("ROLLBACK")
+            if path is not None:
+                Path(f"{self._path}-shm").unlink(missing_ok=True)  # of readers; nobody else has the file open
         except BaseException:
             self._db.close()
             raise
 
     @property
     def name(self) -> str:
-        """The name of the model, empty if it has none yet; it is set once."""
+        """The name of the model, empty if it has none yet."""
         return self._contents.name
 
     @name.setter
@@ -119,8 +125,6 @@ class Store:
             old = self._contents
             if old.name == name:
                 return
-            if old.name:
-                raise StoreError(f"{self._path} is the store of the model {old.name!r}, not of {name!r}.")
             new = replace(old, name=name)
             with self._transaction():
                 self._write_meta(new)
@@ -136,9 +140,19 @@ class Store:
         """The digest of all commits."""
         return self._contents.chain
 
-    def operations(self) -> list[tuple[int, bytes]]:
-        """Return the places and blobs of all operations, in order."""
-        return self._rows("SELECT place, blob FROM operations ORDER BY place")
+    def operations(self) -> list[tuple[int, bytes, tuple[protocol.FileContent, ...]]]:
+        """Return the places, blobs and files of all operations, in order."""
+        rows = self._rows("SELECT place, blob, files FROM operations ORDER BY place")
+        return [(place, blob, _decode_files(files)) for place, blob, files in rows]
+
+    def paths(self) -> dict[str, str]:
+        """Return the paths of files by SHA-256; what is there now may be something else."""
+        return dict(self._rows("SELECT sha256, path FROM paths"))
+
+    def add_path(self, sha256: str, path: str) -> None:
+        """Note where a file is; it is no part of the model."""
+        with self._lock, self._transaction():
+            self._db.execute("INSERT OR REPLACE INTO paths VALUES (?, ?)", (sha256, path))
 
     def commit(self, batch: Sequence[StoredCommit]) -> None:
         """Store commits in one transaction.
@@ -172,7 +186,7 @@ class Store:
         None if the chain is not the one of that revision here, or if there are more than ``most``.
         """
         with self._lock:
-            if not 0 <= self.revision - revision <= most or self._chain_at(revision) != chain:
+            if not 0 <= revision <= self.revision <= revision + most or self._chain_at(revision) != chain:
                 return None
             return self._rows("SELECT data, chain FROM log WHERE revision > ? ORDER BY revision", revision)
 
@@ -195,9 +209,8 @@ class Store:
 
     def backup(self, path: Path) -> None:
         """Write a copy of the store into a new file; it is complete, or there is none."""
-        if os.path.lexists(path):
+        if _check_path(path):
             raise StoreError(f"{path} exists already. Name a new file for the backup.")
-        _check_path(path)
         part = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex}")
         try:
             with self._lock, _reporting(str(path)):
@@ -241,9 +254,12 @@ class Store:
         """Write a commit after the new contents, and bring these up to date."""
         if (one.revision, one.chain) != (new.revision + 1, protocol.chain(new.chain, one.commit)):
             raise InvalidValueError(f"The commit {one.revision} does not follow revision {new.revision}.")
+        files = _files_by_tag(one)
         put, gone = one.put, {*one.removed, *(tag for tag, *_ in one.put if self._find(new, tag))}
         if one.places is not None:  # rare, and then all rows are written
-            blobs = dict(self._db.execute("SELECT tag, blob FROM operations").fetchall())
+            rows = self._db.execute("SELECT tag, blob, files FROM operations").fetchall()
+            blobs = {tag: blob for tag, blob, _ in rows}
+            files = {tag: known for tag, _, known in rows} | files
             gone |= blobs.keys()
             blobs.update({tag: blob for tag, _, blob in put})
             if {tag for tag, _ in one.places} != blobs.keys() - {*one.removed}:
@@ -252,15 +268,16 @@ class Store:
                 )
             put = [(tag, place, blobs[tag]) for tag, place in one.places]
         for tag in gone:
-            row = self._find(new, tag)
-            if row is None:
+            known = self._find(new, tag)
+            if known is None:
                 raise InvalidValueError(f"The commit {one.revision} removes {tag!r}, which is not there.")
-            self._db.execute("DELETE FROM operations WHERE place = ?", (row[0],))
-            new.total -= row[1]
+            self._db.execute("DELETE FROM operations WHERE place = ?", (known[0],))
+            new.total -= known[1]
             new.rows[tag] = None
         for tag, place, blob in put:
-            self._db.execute("INSERT INTO operations VALUES (?, ?, ?)", (place, tag, blob))
-            digest = _digest(place, tag, blob)
+            row = place, tag, blob, files.get(tag, _NO_FILES)
+            self._db.execute("INSERT INTO operations VALUES (?, ?, ?, ?)", row)
+            digest = _digest(*row)
             new.total += digest
             new.rows[tag] = place, digest
         logged = (one.revision, one.chain, one.client, one.number, one.commit, _ENCODE(one.replaced))
@@ -290,6 +307,13 @@ class _Contents:
     rows: dict[str, tuple[int, int] | None]
 
 
+def _files_by_tag(commit: StoredCommit) -> dict[str, bytes]:
+    found: dict[str, list[protocol.FileContent]] = {}
+    for file in commit.files:
+        found.setdefault(file.tag, []).append(file)
+    return {tag: _ENCODE(files) for tag, files in found.items()}
+
+
 def _digest(*row: object) -> int:
     """Return the digest of a row; the types of its values count."""
     return int.from_bytes(hashlib.sha256(_ENCODE(row)).digest())
@@ -306,27 +330,38 @@ def _connect(address: str, **options: Any) -> sqlite3.Connection:
     return db
 
 
-def _check_path(path: Path) -> None:
+def _check_path(path: Path) -> bool:
+    """Return True if there is a file at a path, False if one can be made there."""
+    try:
+        size = path.stat().st_size if path.exists() else None
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path} cannot be opened: {getattr(error, 'strerror', error)}.") from None
     if not path.parent.is_dir():
         raise StoreError(f"{path} cannot be opened: there is no folder {path.parent}. Make it first.")
-    if path.exists() and not path.is_file():
+    if size is not None and not path.is_file():
         raise StoreError(f"{path} is no file. Name a file for the store.")
-    if not path.exists() and os.path.lexists(f"{path}-wal"):  # SQLite would remove it
+    for place in (path.parent, path):
+        if place.exists() and not os.access(place, os.R_OK | os.W_OK):
+            raise StoreError(f"{path} cannot be written: this user has no access to {place}.")
+    if size == 0:
+        raise StoreError(f"{path} is empty. Restore a backup of it, or remove it to start a new store.")
+    if size is None and os.path.lexists(f"{path}-wal"):  # SQLite would remove it
         raise StoreError(
             f"{path} is missing, but {path}-wal is there, which has its newest commits. Restore the former, "
             "or remove the latter to start a new store."
         )
+    return size is not None
 
 
-def _check_unclosed(path: Path) -> None:
+def _check_unclosed(path: str) -> None:
     """Check a store whose server was killed, without a change.
 
     To close a file that may be written merges its log of writes (``-wal``) into it, a damaged one as well.
     """
-    with _reporting(str(path)):
-        reader = _connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+    with _reporting(path):
+        reader = _connect(f"{Path(path).as_uri()}?mode=ro", uri=True)
     try:
-        _load(reader, str(path))
+        _load(reader, path)
     finally:
         reader.close()
 
@@ -355,19 +390,19 @@ def _load(db: sqlite3.Connection, path: str) -> _Contents:
 
 
 def _read(db: sqlite3.Connection, path: str) -> _Contents:
-    ((pages,), (application,), (version,)) = (
-        db.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "application_id", "user_version")
+    (application,), (version,) = (
+        db.execute(f"PRAGMA {name}").fetchone() for name in ("application_id", "user_version")
     )
-    if not pages:
-        raise StoreError(f"{path} is empty, and no store. Remove it to start a new one there.")
     if application != _APPLICATION:
-        raise StoreError(f"{path} is no store of a model server, but a database of another program.")
+        raise StoreError(f"{path} is no store of a model server.")
     if version != VERSION:
         raise StoreError(
             f"{path} is a store of version {version}; Kineverse {__version__} reads version {VERSION}. "
             "Serve it with the Kineverse that wrote it, and dump the model to a document."
         )
-    schema = tuple(sql for (sql,) in db.execute("SELECT sql FROM sqlite_master ORDER BY rowid"))
+    schema = tuple(
+        sql for (sql,) in db.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL ORDER BY rowid")
+    )
     if schema != _SCHEMA:
         raise _damaged(path, "other tables")
     fault = db.execute("PRAGMA integrity_check(1)").fetchone()[0]
@@ -388,8 +423,8 @@ def _read(db: sqlite3.Connection, path: str) -> _Contents:
     if (last, link) != (revision, chain):
         raise _damaged(path, f"it is at revision {revision}, but the log ends at {last}")
     rows: dict[str, tuple[int, int] | None] = {}
-    for place, tag, blob in db.execute("SELECT place, tag, blob FROM operations"):
-        digest = _digest(place, tag, blob)
+    for place, tag, *rest in db.execute("SELECT place, tag, blob, files FROM operations"):
+        digest = _digest(place, tag, *rest)
         rows[tag] = place, digest
         total += digest
     if _encode_total(total) != stored:
@@ -403,7 +438,7 @@ def _damaged(path: str, what: str) -> StoreError:
 
 _REASONS = {
     sqlite3.SQLITE_BUSY: "{path} is served by another process. Connect to that one, or name another file.",
-    sqlite3.SQLITE_NOTADB: "{path} is no store of a model server, or its beginning is damaged.",
+    sqlite3.SQLITE_NOTADB: "{path} is no store of a model server, or damaged.",
     sqlite3.SQLITE_CONSTRAINT: "{path} has a row of the commit already: its place, or its client and number.",
     sqlite3.SQLITE_FULL: "{path} cannot be written: the disk is full.",
     sqlite3.SQLITE_READONLY: "{path} cannot be written: this user may only read it.",

@@ -15,8 +15,8 @@ import re
 import tempfile
 import time
 import weakref
-from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, TypeVar
 
 from kineverse._extras import install_command
 from kineverse.errors import InvalidValueError, MissingDependencyError
@@ -29,6 +29,9 @@ LEASE: Final = 1.0
 _USER: Final = "kineverse"
 _MOST_REQUESTS: Final = 10_000
 _END_SECONDS: Final = 0.2
+
+
+Value = TypeVar("Value")
 
 
 class NoAnswerError(Exception):
@@ -78,11 +81,11 @@ class Channel:
     def __init__(self, declared: Any) -> None:
         self._declared, self._handler = declared, declared.handler
 
-    def _wait(self) -> Any:
-        """Return the next thing that arrives, None after the end."""
+    def _wait(self, read: Callable[[Any], Value]) -> Value | None:
+        """Return what is read from the next thing that arrives, None after the end."""
         try:
             with _call:
-                return self._handler.recv()
+                return read(self._handler.recv())
         except (NoAnswerError, _zenoh().ZError):
             return None
 
@@ -96,8 +99,8 @@ class Messages(Channel):
     """Payloads of messages, as bytes; iterating waits for the next."""
 
     def __iter__(self) -> Iterator[bytes]:
-        while (sample := self._wait()) is not None:
-            yield sample.payload.to_bytes()
+        while (payload := self._wait(lambda sample: bytes(sample.payload))) is not None:
+            yield payload
 
 
 class LifeSigns(Channel):
@@ -105,8 +108,8 @@ class LifeSigns(Channel):
 
     def __iter__(self) -> Iterator[tuple[str, bool]]:
         put = _zenoh().SampleKind.PUT
-        while (sample := self._wait()) is not None:
-            yield str(sample.key_expr), sample.kind == put
+        while (sign := self._wait(lambda sample: (str(sample.key_expr), sample.kind == put))) is not None:
+            yield sign
 
 
 class Request:
@@ -115,7 +118,7 @@ class Request:
     def __init__(self, query: Any) -> None:
         self._query = query
         payload = query.payload
-        self.payload = b"" if payload is None else payload.to_bytes()
+        self.payload = b"" if payload is None else bytes(payload)
 
     def answer(self, payload: bytes) -> None:
         """Send the answer; an asker who is gone gets none."""
@@ -128,18 +131,18 @@ class Requests(Channel):
     """Requests that have come in; iterating waits for the next."""
 
     def __iter__(self) -> Iterator[Request]:
-        while (query := self._wait()) is not None:
-            yield Request(query)
+        while (request := self._wait(Request)) is not None:
+            yield request
 
     def take(self, most: int, seconds: float) -> list[Request]:
         """Wait for a request and return it with those that wait behind it; none after the end.
 
         Taking stops at the number ``most``, and after so many seconds.
         """
-        first = self._wait()
+        first = self._wait(Request)
         if first is None:
             return []
-        result, late = [Request(first)], time.monotonic() + seconds
+        result, late = [first], time.monotonic() + seconds
         with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
             while len(result) < most and (query := self._handler.try_recv()) is not None:
                 result.append(Request(query))
@@ -174,6 +177,7 @@ class Transport:
             config.insert_json5(path, json.dumps(value))
         with _call:
             self._session = zenoh.open(config)
+            self._end_of_questions = zenoh.CancellationToken()
         self._drop, self._block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
         self._all, self._error = zenoh.ConsolidationMode.NONE, zenoh.ZError
         _call.transports.add(self)
@@ -237,7 +241,7 @@ class Transport:
         NoAnswerError
             At once if nobody is there who answers; else after the timeout [s].
         """
-        channel: Any = _zenoh().handlers.RingChannel(1)
+        channel: Any = _zenoh().handlers.FifoChannel(2)  # a ring would lose the answer at its end
         try:
             with _call:
                 replies = self._session.get(
@@ -247,13 +251,16 @@ class Transport:
                     timeout=timeout,
                     consolidation=self._all,  # an answer is handed over when it comes, not when all have come
                     congestion_control=self._block,
+                    cancellation_token=self._end_of_questions,
                 )
-                reply = replies.recv()
+                sample = replies.recv().ok
+                answer = None if sample is None else bytes(sample.payload)
+                del replies, sample
         except self._error:
             raise NoAnswerError(f"Nobody answers {key}.") from None
-        if reply.ok is None:
+        if answer is None:
             raise NoAnswerError(f"No answer from {key} within {timeout:g} s.")
-        return bytes(reply.ok.payload)
+        return answer
 
     def answers(self, key: str) -> Requests:
         """Return the requests for a key, which is all of this process's to answer."""
@@ -274,7 +281,7 @@ class Transport:
             return Messages(self._session.declare_subscriber(key, _ring(most)))
 
     def alive(self, key: str) -> Token:
-        """Show that this process is there, until the token is closed."""
+        """Show that this process is there for as long as the token is kept and not closed."""
         with self._declaring():
             return Token(self._session.liveliness().declare_token(key))
 
@@ -288,6 +295,7 @@ class Transport:
     def close(self) -> None:
         """Close the connection and all that was made with it."""
         with contextlib.suppress(NoAnswerError, self._error), _call:
+            self._end_of_questions.cancel()
             self._session.close()
 
     @contextlib.contextmanager

@@ -23,7 +23,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -32,7 +32,7 @@ from typing import Any
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.graph import gradient_keys
-from kineverse.formats.document import OpaqueOperation, operation_to_bytes, to_bytes
+from kineverse.formats.document import OpaqueOperation, entry_to_bytes, to_bytes
 from kineverse.formats.document.parameters import document_kind
 from kineverse.model.changes import Diff, find_moved_tags
 from kineverse.model.frame import WORLD, Frame
@@ -307,9 +307,11 @@ def _part_entry(
     kind = operation.kind if isinstance(operation, OpaqueOperation) else document_kind(type(operation))
     if known is not None and _is_same(known, kind, reads, writes):
         return known
-    made = HistoryEntry(entry.tag, OpaqueOperation(kind, reads=reads.cells, recorded=writes), 0, reads, writes)
-    made.blob = operation_to_bytes(Snapshot({}, (made,), 0), made.tag)
-    return known if known is not None and known.blob == made.blob else made
+    made = HistoryEntry(
+        entry.tag, OpaqueOperation(kind, reads=reads.cells, recorded=writes), 0, reads, writes
+    )
+    blob = entry_to_bytes(made, ())
+    return known if known is not None and known.blob == blob else made
 
 
 def _is_same(known: HistoryEntry, kind: str, reads: Reads, writes: Mapping[Cell, Any]) -> bool:
@@ -373,8 +375,7 @@ class View:
         again: dict[str, list[str]] = {"replaced": [], "rerun": []}
         for tag, entry in new.items():
             if old.get(tag) is not entry or tag in moved:
-                assert entry.blob is not None
-                put.append(Placed(entry.blob, after))
+                put.append(Placed(entry_to_bytes(entry, ()), after))
                 if tag in old:
                     again["replaced" if tag in replaced or tag in moved else "rerun"].append(tag)
             after = tag
@@ -478,9 +479,3 @@ class Views:
             elif change.kind == FRAMES and change.before is None:
                 keys.update((_BELOW, change.name[: i + 1]) for i, c in enumerate(change.name) if c == "/")
         return keys
-
-
-def make_part(model: Model, wish: Wish) -> Sequence[HistoryEntry]:
-    """Return the operations of the part of a wish, without following it."""
-    wish.check(model)
-    return part_entries(model, close(model, wish))

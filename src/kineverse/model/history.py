@@ -36,7 +36,7 @@ from .commits.checks import (
     refused_error,
 )
 from .operation import DATA, FRAMES, KINDS, Cell, Operation, Writes
-from .read_recorder import ABSENT, Read, ReadRecorder, Reads, Seen, differs, unknown_path_error
+from .read_recorder import ABSENT, Read, ReadRecorder, Reads, SeenValues, differs, unknown_path_error
 
 _GAP = 1 << 32
 _PLACE = attrgetter("place")
@@ -172,7 +172,7 @@ class History:
     # -- changes of the sequence ---------------------------------------------------------------------------
 
     def insert(
-        self, tag: str, operation: Operation, index: int | None = None, seen: Seen | None = None
+        self, tag: str, operation: Operation, index: int | None = None, seen: SeenValues | None = None
     ) -> None:
         """Run an operation and insert it before the one at ``index``, by default last.
 

@@ -25,7 +25,7 @@ from .rates import as_entry, to_plain
 
 if TYPE_CHECKING:
     from .history import HistoryEntry
-    from .read_recorder import ReadRecorder, Seen
+    from .read_recorder import ReadRecorder, SeenValues
 
 FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS = (
     "frames",
@@ -209,7 +209,7 @@ class Operation(ABC):
         The result must be a pure function of the fields and of the values read from ``model``.
         """
 
-    def see(self, model: ReadRecorder) -> Seen | None:
+    def see(self, model: ReadRecorder) -> SeenValues | None:
         """Return what an operation of a document finds in a model; None if it has its code."""
         return None
 

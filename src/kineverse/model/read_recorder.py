@@ -42,7 +42,7 @@ class Read(IntFlag):
     VALUE = 2
 
 
-class Seen(NamedTuple):
+class SeenValues(NamedTuple):
     """Values that an operation of a document has read there; its writes in the document follow from them."""
 
     values: Mapping[Cell, Any]  # of the cells that it read
@@ -59,7 +59,7 @@ class Reads:
 
     __slots__ = ("cells", "listings", "seen", "trace")
 
-    def __init__(self, seen: Seen | None = None) -> None:
+    def __init__(self, seen: SeenValues | None = None) -> None:
         self.cells: dict[Cell, Read] = {}
         self.listings: set[str] = set()
         self.seen = seen
@@ -91,11 +91,11 @@ class ReadRecorder:
         self._reads = reads
 
     @property
-    def seen(self) -> Seen | None:
-        """Values that the operation has read in the document that it comes from; None until they are known."""
+    def seen(self) -> SeenValues | None:
+        """Values that the operation has read in its document; None until they are known."""
         return self._reads.seen
 
-    def remember(self, seen: Seen) -> None:
+    def remember(self, seen: SeenValues) -> None:
         """Keep values as those that the operation has read."""
         self._reads.seen = seen
 

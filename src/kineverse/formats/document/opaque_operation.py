@@ -8,7 +8,7 @@ from typing import Any
 
 from kineverse.errors import KineverseError, ModelError, UnknownNameError
 from kineverse.model.operation import Cell, FinishedWrites, Operation, Writes
-from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Seen, differs
+from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, SeenValues, differs
 from kineverse.model.traces import Trace
 from kineverse.model.traces.replay import writes_agree
 from kineverse.model.traces.trace import run_query, substitute_results
@@ -102,14 +102,14 @@ class OpaqueOperation(Operation):
             f"a new {self.kind}(...).{hint}"
         ) from None
 
-    def see(self, model: ReadRecorder) -> Seen:
+    def see(self, model: ReadRecorder) -> SeenValues:
         """Return what a model has of what the original read."""
         model = self._in_scope(model)
         values = {cell: model.read(cell, how) for cell, how in self.reads.items()}
         names = {kind: tuple(model.list_names(kind)) for kind in self.listings}
         silent = model.replaced({}, {})
         overrides = any(silent.read(cell, Read.EXISTENCE) is not ABSENT for cell in self.recorded)
-        return Seen(values, names, overrides)
+        return SeenValues(values, names, overrides)
 
     def _run_first(self, model: ReadRecorder) -> Writes:
         """Write what the original wrote, unless the trace shows that it has read other values."""
@@ -139,7 +139,7 @@ class OpaqueOperation(Operation):
         """Return a reader that lists only names below the document's prefix, if it has one."""
         return model.restricted(self.scope) if self.scope else model
 
-    def _changed(self, model: ReadRecorder, seen: Seen) -> list[str]:
+    def _changed(self, model: ReadRecorder, seen: SeenValues) -> list[str]:
         """Read what the original read, and return the names of what has changed."""
         changed = [
             f"the list of all {kind}"

@@ -19,7 +19,7 @@ from kineverse.model.frame import WORLD
 from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model
 from kineverse.model.operation import BODIES, FRAMES, KINDS, RATES, Cell, Writes, find_expressions
-from kineverse.model.read_recorder import ABSENT, Read, Reads, Seen
+from kineverse.model.read_recorder import ABSENT, Read, Reads, SeenValues
 from kineverse.model.registry import FileContent
 from kineverse.model.traces.trace import find_read_nodes
 
@@ -319,13 +319,13 @@ class _Document:
                 reads.listings.add(self._names.cell(kind, "x")[0])
         return reads
 
-    def _seen(self, reads: Reads, writes: dict[Cell, Any]) -> Seen:
+    def _seen(self, reads: Reads, writes: dict[Cell, Any]) -> SeenValues:
         names = {}
         for kind in reads.listings:
             self._budget.spend(COST_OF_NAME * len(self._listed[kind]))
             names[kind] = tuple(sorted(self._listed[kind]))
         values = {cell: self._cells.get(cell, ABSENT) for cell in reads.cells}
-        return Seen(values, names, not self._cells.keys().isdisjoint(writes))
+        return SeenValues(values, names, not self._cells.keys().isdisjoint(writes))
 
 
 def _add_parents(reads: Reads, writes: dict[Cell, Any]) -> None:

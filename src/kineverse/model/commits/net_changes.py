@@ -16,7 +16,7 @@ from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
 from kineverse.model.history import History, HistoryEntry, TouchedEntry
 from kineverse.model.operation import KINDS, RATES, Operation
-from kineverse.model.read_recorder import Read, Reads, Seen
+from kineverse.model.read_recorder import Read, Reads, SeenValues
 from kineverse.symbols import Symbol
 
 from .checks import check_parent, know_parents, know_reads
@@ -229,7 +229,7 @@ def _are_reads(reads: object) -> bool:
         and isinstance(reads.listings, set)
         and all(_is_cell(cell) and isinstance(how, Read) for cell, how in reads.cells.items())
         and reads.listings <= {*KINDS}
-        and (reads.seen is None or isinstance(reads.seen, Seen))
+        and (reads.seen is None or isinstance(reads.seen, SeenValues))
     )
 
 
