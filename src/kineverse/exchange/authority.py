@@ -24,7 +24,7 @@ from kineverse.model import Diff, Edit, Model, NetChanges, PlacedEntry
 from kineverse.model.history import History, HistoryEntry, TouchedEntry
 
 from . import protocol
-from .conflicts import KEPT, Conflict, ConflictFoundError, Revisions
+from .conflicts import KEPT, ConflictFoundError, EditConflict, Revisions
 from .meshes import put_contents
 from .protocol import Commit, Committed, FileContent, Placed, Published, Refused
 from .store import Replaced, Store, StoredCommit
@@ -42,18 +42,10 @@ Watch: TypeAlias = Callable[[Model, Diff, Commit], Any]
 
 @dataclass(slots=True)
 class Result:
-    """Outcome of a request.
+    """Outcome of a request: the answer, and for a new commit what is published.
 
-    Attributes
-    ----------
-    answer
-        Message to the client.
-    published
-        Commit for the readers of the log; None if there is none, or it was answered before.
-    watched
-        Result of ``watch`` for the commit.
-    seconds
-        Times of the stages decode, check, fold, encode and, of the whole batch, persist [s].
+    ``watched`` is the result of ``watch`` for the commit. ``seconds`` has the times of the stages decode,
+    check, fold, encode and, of the whole batch, persist [s].
     """
 
     answer: EditAnswer
@@ -84,30 +76,12 @@ class _RefusedError(Exception):
 class Authority:
     """Model of a server with its store. One thread uses it.
 
-    Parameters
-    ----------
-    store
-        Operations, log and answers.
-    clock
-        Function that returns the time [s since 1970].
-    find_files
-        Function of the entries that a commit puts, and of the files that the client has named; it returns the
-        files that the commit names. By default, none.
-    watch
-        Function of the model, the diff and the commit, called after each commit, before the next one and
-        before it is stored. If it raises, the commit is taken back as if the store had failed.
-
-    Attributes
-    ----------
-    model
-        The model; its version is the revision. Another object after an error of the store.
-    epoch
-        Id of this run. Another one after an error of the store, when the model is what the store has.
-
-    Raises
-    ------
-    FormatError
-        If the operations of the store are no model.
+    ``clock`` returns the time [s since 1970]. ``find_files`` gets the entries that a commit puts and the
+    files that the client has named, and returns the files that the commit names. ``watch`` gets the model,
+    the diff and the commit, after each commit and before the next one. If it raises, the commit is taken
+    back, as after an error of the store. The version of ``model`` is the revision. ``epoch`` identifies this
+    run; after an error of the store there is another one, and another model. A store with operations that are
+    no model is a FormatError.
     """
 
     def __init__(
@@ -148,23 +122,10 @@ class Authority:
         return self.model.version
 
     def fill(self, build: Callable[[Edit], None], who: str) -> None:
-        """Make the first commit of an empty store, by an edit of an empty model.
+        """Make the first commit of an empty store, by an edit of an empty model; ``who`` is its author.
 
-        Parameters
-        ----------
-        build
-            Function that makes the edit.
-        who
-            Name of its author, for people.
-
-        Raises
-        ------
-        EditError
-            If the store is not empty, or the edit is refused.
-        FormatError
-            For content that has no place in a document, or an error of the store.
-        KineverseError
-            Errors of the edit pass.
+        A store that is not empty and an edit that is refused are an EditError, content that has no place in a
+        document and an error of the store a FormatError. Errors of the edit pass.
         """
         if self.revision:
             raise EditError(f"The store is at revision {self.revision}; only an empty one is filled.")
@@ -288,6 +249,7 @@ class Authority:
         self._check_base(request)
         changes, history = request.changes, self.model.history
         put = tuple(map(_decode, changes.put))
+        put_contents([placed.entry for placed in put], request.files)
         rerun: tuple[str, ...] = ()
         if request.base == self.revision:
             # What the client has run again is taken, so that loops are not closed once more.
@@ -471,7 +433,7 @@ class Authority:
             tag = max(self.model.history.commits[revision], key=self._revisions.last_change)
             later = self._revisions.last_change(tag)
             who = self._revisions.who_made(later)
-            raise ConflictFoundError(Conflict(str(error), tag, "", later, who)) from None
+            raise ConflictFoundError(EditConflict(str(error), tag, "", later, who)) from None
 
 
 def _decode(placed: Placed) -> PlacedEntry:
@@ -536,7 +498,7 @@ def _find_own(changes: NetChanges) -> list[str]:
     ]
 
 
-def _as_answer(conflict: Conflict) -> Refused:
+def _as_answer(conflict: EditConflict) -> Refused:
     message = _one_line(conflict.message)
     return Refused("conflict", message, conflict.tag, conflict.path, conflict.revision, conflict.who)
 

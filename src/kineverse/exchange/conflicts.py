@@ -26,8 +26,8 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True, slots=True)
-class Conflict:
-    """What an edit has in common with a later commit: operation, path, revision, and who made it."""
+class EditConflict:
+    """Conflict of an edit with a later commit: operation and path, and revision and author of the commit."""
 
     message: str
     tag: str
@@ -39,7 +39,7 @@ class Conflict:
 class ConflictFoundError(Exception):
     """Edit in conflict with a later commit."""
 
-    def __init__(self, conflict: Conflict) -> None:
+    def __init__(self, conflict: EditConflict) -> None:
         super().__init__(conflict.message)
         self.conflict = conflict
 
@@ -133,19 +133,11 @@ class Revisions:
         moved: Collection[str],
         removed: Sequence[str],
         history: History,
-    ) -> Conflict | None:
-        """Return the first conflict of an edit with the commits after its base.
+    ) -> EditConflict | None:
+        """Return the first conflict of an edit with the commits after its base, a revision.
 
-        Parameters
-        ----------
-        base
-            Revision that the edit was made at.
-        put
-            Entries that it puts, with what they read.
-        moved, removed
-            Tags of those that it moves, and of operations that it removes.
-        history
-            History of the model, before the edit.
+        ``put`` are the entries that it puts, with what they read; ``moved`` and ``removed`` the tags of those
+        that it moves and of others that it removes. ``history`` is that before the edit.
         """
         for tag in (*(entry.tag for entry in put), *removed):
             if self._tags.get(tag, 0) > base:
@@ -176,11 +168,11 @@ class Revisions:
                     return self._conflict(last, tag, "reads", cell, "changes")
         return None
 
-    def conflict_about(self, tag: str, other: str, what: str) -> Conflict:
+    def conflict_about(self, tag: str, other: str, what: str) -> EditConflict:
         """Return the conflict of an operation with the last commit of another one, or of itself."""
         revision = self._tags[other]
         who = self.who_made(revision)
-        return Conflict(
+        return EditConflict(
             f"Revision {revision}, by {who}, {what} the operation {other!r}. Try again.",
             tag,
             "",
@@ -188,10 +180,10 @@ class Revisions:
             who,
         )
 
-    def _conflict(self, revision: int, tag: str, what: str, cell: Cell, how: str) -> Conflict:
+    def _conflict(self, revision: int, tag: str, what: str, cell: Cell, how: str) -> EditConflict:
         path, who = "/".join(cell).rstrip("/"), self.who_made(revision)
         message = f"Revision {revision}, by {who}, {what} {path}, which {tag!r} {how}. Try again."
-        return Conflict(message, tag, path, revision, who)
+        return EditConflict(message, tag, path, revision, who)
 
 
 def _put(revisions: OrderedDict[Key, int], key: Key, revision: int) -> None:
