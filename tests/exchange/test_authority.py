@@ -14,7 +14,8 @@ from replicas import Act, Capped, Count, Exists, Replica, Twice, Watch, content
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse import gallery
-from kineverse.exchange import protocol
+from kineverse.exchange import authority as authorities
+from kineverse.exchange import conflicts, protocol
 from kineverse.exchange.authority import Authority, Result
 from kineverse.exchange.protocol import Changes, Committed, Placed, Refused
 from kineverse.exchange.store import Store, StoreError
@@ -174,6 +175,33 @@ def test_dependents_are_run_again_without_their_code() -> None:
     assert one.model.data["twice"] == authority.model.data["twice"] == 8.0
 
 
+def test_a_loop_that_the_client_has_closed_is_not_closed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = kv.load("articulations/four_bar")
+    authority = Authority(Store(None))
+    authority.fill(lambda edit: [edit.apply(e.operation, e.tag) for e in scene.history.sequence], "me")
+    one, other = Replica(authority), Replica(authority, "b")
+    end = scene.frames["four_bar/coupler_end"].transform()
+    longer = kv.model.Pose.from_matrix(end @ kv.translation(1e-3, 0, 0)())
+    moved = kv.Fixed(name="e", parent="four_bar/coupler", child="four_bar/coupler_end", origin=longer)
+    request = one.draft(lambda edit: edit.replace("four_bar/frame coupler_end", moved))
+    assert request.changes.rerun == ("four_bar/loop four_bar",)
+    closed = list[int]()
+    apply = kv.CloseLoop.apply
+    monkeypatch.setattr(kv.CloseLoop, "apply", lambda *given: closed.append(1) or apply(*given))
+    late = other.request(request.changes)
+    results = authority.process([request])
+    assert accepted(results[0].answer), results[0].answer
+    assert closed == []
+    one.follow(results)
+    before = one.model.snapshot()
+    results += authority.process([one.undo(2), dataclass_like(late, client="c" * 32)])
+    one.follow(results[1:])
+    assert accepted(results[1].answer), results[1].answer
+    assert results[2].answer.reason == "conflict"  # type: ignore[union-attr]
+    assert content(one.model) == content(authority.model) == content(Authority(authority._store).model)
+    assert before.frames["four_bar/coupler_end"] == kv.model.Frame("four_bar/coupler", (longer,))
+
+
 # -- conflicts -----------------------------------------------------------------------------------------------
 
 
@@ -323,6 +351,25 @@ def test_a_base_that_is_not_known_is_stale_and_one_of_before_the_start_is_in_con
     of_before, elsewhere, later = ask(authority, early, wrong, ahead)
     assert (of_before.reason, elsewhere.reason, later.reason) == ("conflict", "stale", "stale")
     assert "started again" in of_before.message
+
+
+def test_what_is_long_ago_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    store, authority = started()
+    replica, late = Replica(authority), Replica(authority, "b")
+    early = late.draft(put("c", 2.0))
+    monkeypatch.setattr(conflicts, "KEPT", 3)
+    monkeypatch.setattr(authorities, "ANSWERS", 2)
+    first = replica.draft(lambda edit: edit.write("n", 0, "0"))
+    for number in range(4):
+        request = (
+            first if not number else replica.draft(lambda edit, tag=str(number): edit.write(tag, 0, tag))
+        )
+        results = authority.process([request])
+        replica.follow(results)
+    (stale,) = ask(authority, early)
+    assert stale.reason == "stale"
+    assert ask(authority, first) == [Committed(2, store.commits_after(1, late.chain, 10)[0][1])]  # type: ignore[index]
+    assert authority.revision == 5
 
 
 def dataclass_like(message: Any, **changes: Any) -> Any:

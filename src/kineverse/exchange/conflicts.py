@@ -17,7 +17,8 @@ from kineverse.model.operation import Cell
 from kineverse.model.read_recorder import ABSENT, Read, differs
 
 KEPT: Final = 10_000
-"""Number of revisions that edits may be behind."""
+"""Number of revisions that edits may be behind; fewer if they are of more than a million values."""
+_MOST_CELLS: Final = 1_000_000
 
 # Flags are compared as wholes, because operations on them are slow.
 _WITH_VALUE = (Read.VALUE, Read.EXISTENCE | Read.VALUE)
@@ -110,7 +111,7 @@ class Revisions:
                     _put(self._read_values if how in _WITH_VALUE else self._read_existence, cell, revision)
                 for kind in now.reads.listings:
                     self._listings[kind] = revision
-        if len(self._commits) > KEPT:
+        while len(self._commits) > KEPT or (len(self._values) > _MOST_CELLS and len(self._commits) > 1):
             self._forget()
 
     def _forget(self) -> None:
