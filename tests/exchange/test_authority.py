@@ -75,7 +75,7 @@ def do(edit: Edit, kind: int, i: int, k: int, new: str) -> None:
     """Do one thing in an edit, if it can be done."""
     history = edit.model.history  # type: ignore[attr-defined]
     tags, frames = history.tags, ("world", *edit.model.frames)
-    tag, other = tags[i % len(tags)], tags[k % len(tags)]
+    tag, other = (tags[n % len(tags)] if tags else "none" for n in (i, k))
     name, frame, parent = "abcd"[i % 4], frames[i % len(frames)], frames[k % len(frames)]
     steps: dict[int, Callable[[], object]] = {
         0: lambda: edit.write(name, k / 4, new),
