@@ -54,7 +54,7 @@ def put(name: str, value: Any) -> Act:
 
 def accepted(answer: Any) -> bool:
     assert isinstance(answer, Committed | Refused)
-    assert not isinstance(answer, Refused) or ("\n" not in answer.message and answer.message.endswith("."))
+    assert not isinstance(answer, Refused) or ("\n" not in answer.message and answer.message[-1] in ".?")
     return isinstance(answer, Committed)
 
 
@@ -115,7 +115,7 @@ def test_replicas_store_and_log_have_the_model_of_the_server(turns: list[Any]) -
             continue
         before = content(authority.model)
         if kind == "undo":
-            request: Any = replica.undo(what)
+            request: Any = replica.undo(max(authority.revision - what % 5, 1))
         else:
             try:
                 request = replica.draft(
