@@ -202,6 +202,25 @@ def test_a_loop_that_the_client_has_closed_is_not_closed_again(monkeypatch: pyte
     assert before.frames["four_bar/coupler_end"] == kv.model.Frame("four_bar/coupler", (longer,))
 
 
+def test_what_was_run_again_for_nothing_stays() -> None:
+    _, authority = started()
+    replica = Replica(authority)
+
+    def act(edit: Edit) -> None:
+        edit.insert(SetData("a", 9.0), "for a while", before="twice")
+        assert edit.model.data["twice"] == 18.0
+        edit.remove("for a while")
+        edit.write("n", 1, "n")
+
+    request = replica.draft(act)
+    assert request.changes.rerun == ("twice",)
+    results = authority.process([request])
+    assert accepted(results[0].answer), results[0].answer
+    replica.follow(results)
+    assert content(replica.model) == content(authority.model)
+    assert authority.model.data["twice"] == 3.0
+
+
 # -- conflicts -----------------------------------------------------------------------------------------------
 
 

@@ -250,18 +250,17 @@ class Authority:
         changes, history = request.changes, self.model.history
         put = tuple(map(_decode, changes.put))
         put_contents([placed.entry for placed in put], request.files)
-        rerun: tuple[str, ...] = ()
-        if request.base == self.revision:
-            # What the client has run again is taken, so that loops are not closed once more.
-            _check_reruns(put, changes, history)
-            rerun = changes.rerun
-        else:
-            # It has run them on an older model, so they are run here.
-            put = tuple(placed for placed in put if placed.entry.tag not in changes.rerun)
+        # What the client has run again on the present model is taken, so that loops are not closed once more.
+        # What it has run again on an older one is run here.
+        is_newest = request.base == self.revision
+        taken = _choose_reruns(put, changes, history) if is_newest else set[str]()
+        dropped = {placed.entry.tag for placed in put}.intersection(changes.rerun) - taken
+        put = tuple(placed for placed in put if placed.entry.tag not in dropped)
+        rerun = tuple(tag for tag in changes.rerun if tag not in dropped)
         net = NetChanges(put, changes.replaced, rerun, changes.moved, changes.removed)
         seconds["decode"] = perf_counter() - begin
         begin = perf_counter()
-        if request.base < self.revision:
+        if not is_newest:
             entries = [placed.entry for placed in put]
             found = self._revisions.find_conflict(
                 request.base, entries, changes.moved, changes.removed, history
@@ -461,9 +460,12 @@ def _unlinked(placed: PlacedEntry) -> PlacedEntry:
     return replace(placed, entry=other)
 
 
-def _check_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, history: History) -> None:
-    """Check that what a client says to have run again is an operation that reads what the edit changes."""
-    again = {*changes.rerun}
+def _choose_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, history: History) -> set[str]:
+    """Return the tags of operations that a client has run again, because they read what the edit changes.
+
+    The others may only be as they were: read what was there for a while within the edit.
+    """
+    again, taken = {*changes.rerun}, set[str]()
     tags = {*changes.removed, *(placed.entry.tag for placed in put)} - again
     known = [history.entries[tag] for tag in tags if tag in history.entries]
     new = [placed.entry for placed in put if placed.entry.tag in tags]
@@ -478,10 +480,14 @@ def _check_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, history
             and old.operation.given == entry.operation.given
             and old.operation.scope == entry.operation.scope
         )
+        if old is not None and old.blob == entry.blob and not _reads_any(old, changed):
+            continue
         if old is None or not is_same or not _reads_any(old, changed):
             message = f"The operation {entry.tag!r} is not one that the edit leads to be run again."
             raise _RefusedError(Refused("refused", _one_line(message), entry.tag))
         changed |= old.writes.keys() | entry.writes.keys()
+        taken.add(entry.tag)
+    return taken
 
 
 def _reads_any(entry: HistoryEntry, cells: set[tuple[str, str]]) -> bool:
