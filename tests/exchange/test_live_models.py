@@ -20,6 +20,7 @@ from kineverse.exchange import protocol
 from kineverse.exchange.client import LiveModel
 from kineverse.exchange.server import Server, serve
 from kineverse.formats import document_hash
+from kineverse.model.basic_operations import SetBody
 
 pytest.importorskip("zenoh")
 
@@ -240,6 +241,19 @@ def test_a_part_equals_the_whole_while_its_closure_changes(
     state = dict.fromkeys(map(str, whole.symbols_of("door")), 0.4)
     assert np.array_equal(part.fk("door")(state), whole.fk("door")(state))
     assert part.constraints_for("door") == whole.constraints_for("door")
+
+
+def test_all_frames_can_be_followed_without_bodies(server: Server, load: Callable[..., LiveModel]) -> None:
+    whole = load()
+    with whole.edit() as edit:
+        edit.apply(SetBody("door", kv.model.Body(visuals=(kv.model.Shape(kv.model.Sphere(0.1)),))))
+    part, body = load(bodies=False), load(frames=["door"], bodies=True)
+    add(whole, "shelf", 0.5)
+    for one in (part, body):
+        assert one.wait(whole.version, LONG)
+    assert list(part.frames) == list(whole.frames)
+    assert not part.bodies
+    assert list(body.bodies) == ["door"]
 
 
 def test_an_edit_of_a_part_is_in_the_whole(server: Server, load: Callable[..., LiveModel]) -> None:
