@@ -9,7 +9,7 @@ Commits are published under ``kineverse/NAME/log``, and those that concern a par
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Final, Generic, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -135,8 +135,8 @@ class Join(_Message, frozen=True, tag="join"):
     library: Text  # version of Kineverse
     client: Id
     who: Text
-    frames: Tags = ()
-    symbols: Tags = ()
+    frames: tuple[Text, ...] = ()
+    symbols: tuple[Text, ...] = ()
     bodies: bool = True
     is_part: bool = False
 
@@ -372,7 +372,7 @@ def encode(message: Struct) -> bytes:
 class Decoder(Generic[M]):
     """Decoder of messages of a type, which refuses all others with one error."""
 
-    def __init__(self, kind: object, what: str) -> None:
+    def __init__(self, kind: Any, what: str) -> None:
         self._decode = msgspec.msgpack.Decoder(kind).decode
         self._what = what
 
