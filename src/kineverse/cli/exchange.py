@@ -221,8 +221,8 @@ def _run_watch(arguments: argparse.Namespace) -> int:
         raise InvalidValueError("--count is a number of commits from 1.")
     arrived: SimpleQueue[Diff] = SimpleQueue()
     with handle_interrupts(), _join(arguments, frames=arguments.frames) as model:
-        model.listen(arrived.put)
         connection, is_online, shown, last = model.exchange, True, 0, model.version
+        model.listen(arrived.put)
         print_line(f"{connection.address} is at revision {last}   (Ctrl-C ends)")
         while arguments.count is None or shown < arguments.count:
             try:
