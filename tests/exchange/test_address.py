@@ -17,7 +17,7 @@ from kineverse.exchange.address import (
     Address,
     Claim,
     check_endpoint,
-    check_name,
+    check_server_name,
     list_servers,
     runtime_folder,
 )
@@ -77,7 +77,7 @@ def test_what_is_no_address_is_refused(text: str) -> None:
 @given(st.text(max_size=70))
 def test_a_name_is_a_name_of_a_file_in_the_folder(text: str) -> None:
     try:
-        check_name(text)
+        check_server_name(text)
     except InvalidValueError:
         return
     assert text.isascii()

@@ -39,6 +39,25 @@ with StatePublisher("home", "camera", sys.argv[1:]) as source:
         time.sleep(.002)
 """
 
+CARELESS = """
+import sys, threading
+from kineverse.exchange.protocol import SourceStatus
+from kineverse.exchange.state import StatePublisher, StateReader
+mine = StatePublisher("home", "mine", ["b"])
+reader = StateReader("home", ["a", "b"])
+places = [("mine", mine.endpoint), ("camera", mine.endpoint.replace("mine", "camera"))]
+reader.follow([SourceStatus(name, place, (), 0.0, 32 * "0") for name, place in places])
+def send():
+    while True:
+        mine.put([1.0])
+for work in (send, lambda: [None for _ in iter(lambda: reader.wait(10.0), None)]):
+    threading.Thread(target=work, daemon=True).start()
+while set(reader.age) != {"mine", "camera"}:
+    reader.wait(1.0)
+print("ready", flush=True)
+sys.stdin.readline()
+"""
+
 
 @pytest.fixture
 def server(sockets: Path) -> Generator[Transport]:
@@ -290,3 +309,13 @@ def test_a_source_needs_a_way() -> None:
         reader.follow([SourceStatus("camera", THROUGH_SERVER, ("a",), 0.0, 32 * "0")])
         assert reader.received == {}
         assert reader.state == kv.State({}, source="")
+
+
+@pytest.mark.skipif(not UNIX_SOCKETS, reason="there are no sockets")
+def test_a_script_ends_that_has_closed_nothing(start: Any) -> None:
+    start(SOURCE, "a")
+    script = start(CARELESS)
+    begin = time.monotonic()
+    _, errors = script.communicate("\n", timeout=LATE)
+    assert time.monotonic() - begin < 2.0
+    assert (script.returncode, errors) == (0, "")

@@ -42,28 +42,15 @@ _OPEN: Final = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC
 
 @dataclass(frozen=True)
 class Address:
-    """Address of a model server: ``live:NAME``, or ``live:ENDPOINT/NAME``.
-
-    Attributes
-    ----------
-    name
-        Name of the model that is served.
-    endpoint
-        ``tcp/HOST:PORT`` or ``unixsock-stream/PATH``; empty for a server of this user.
-    """
+    """Address of a model server: ``live:NAME``, or ``live:ENDPOINT/NAME``."""
 
     name: str
     endpoint: str = ""
+    """``tcp/HOST:PORT`` or ``unixsock-stream/PATH``; empty for a server of this user."""
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Return the address that a text names.
-
-        Raises
-        ------
-        FormatError
-            If it is none.
-        """
+        """Return the address that a text is; if it is none, that is a FormatError."""
         endpoint, _, name = text.removeprefix(SCHEME).rpartition("/")
         if not text.startswith(SCHEME) or (endpoint and not _ENDPOINT.fullmatch(endpoint)):
             raise FormatError(
@@ -71,7 +58,7 @@ class Address:
                 f"{SCHEME}tcp/HOST:PORT/NAME or {SCHEME}unixsock-stream/PATH/NAME."
             )
         try:
-            return cls(check_name(name), endpoint)
+            return cls(check_server_name(name), endpoint)
         except InvalidValueError as error:
             raise FormatError(f"{text!r} is no address of a model server. {error}") from None
 
@@ -81,10 +68,7 @@ class Address:
     def find(self) -> tuple[str, str]:
         """Return where the server listens, and the secret that it wants, empty for none.
 
-        Raises
-        ------
-        UnknownNameError
-            If no server of this user has that name; the message lists those that are there.
+        If no server of this user has the name, an UnknownNameError lists those that are there.
         """
         if self.endpoint:
             return self.endpoint, ""
@@ -100,30 +84,18 @@ class Address:
 class Claim:
     """Name of a server that this process holds until :meth:`release`, or until it ends.
 
-    Parameters
-    ----------
-    name
-        Name of the server, or with a source the name of the server that it belongs to.
-    source
-        Name of a source of state, which listens beside the server.
-
-    Attributes
-    ----------
-    endpoint
-        Where the server has to listen.
-    secret
-        What it has to ask of clients; empty where only this user can reach the endpoint.
-
-    Raises
-    ------
-    InvalidValueError
-        If the name is none, or the folder of sockets cannot be used.
-    DuplicateNameError
-        If a server of that name is running.
+    With a source of state it is the name under which that listens beside the server. An
+    InvalidValueError says that it is no name, or that the folder of sockets cannot be used, and a
+    DuplicateNameError that another process holds it.
     """
 
+    endpoint: str
+    """Place at which the server has to listen."""
+    secret: str
+    """Password that it has to ask of clients; empty where only this user can reach the endpoint."""
+
     def __init__(self, name: str, source: str = "") -> None:
-        self._stem = check_name(name) + (f"@{check_name(source, 'source')}" if source else "")
+        self._stem = check_server_name(name) + (f"@{check_server_name(source, 'source')}" if source else "")
         self._folder = folder = runtime_folder()
         self._lock = _lock(folder, self._stem)
         if self._lock is None:
@@ -162,7 +134,7 @@ class Claim:
             self._lock = None
 
 
-def check_name(name: str, what: str = "model server") -> str:
+def check_server_name(name: str, what: str = "model server") -> str:
     """Return the name of a server or source if it can be one, else raise an InvalidValueError."""
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InvalidValueError(
@@ -198,12 +170,8 @@ def runtime_folder() -> Path:
     """Return the folder of sockets, which is made if it is not there.
 
     It is ``KINEVERSE_RUNTIME_DIR``, else ``kineverse`` in ``XDG_RUNTIME_DIR``, else a folder of this user's
-    own in the folder for temporary files.
-
-    Raises
-    ------
-    InvalidValueError
-        If others can read or replace what is in it.
+    own in the folder for temporary files. If others can read or replace what is in it, that is an
+    InvalidValueError.
     """
     chosen, runtime = os.environ.get("KINEVERSE_RUNTIME_DIR"), os.environ.get("XDG_RUNTIME_DIR")
     if chosen:

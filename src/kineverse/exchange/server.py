@@ -28,7 +28,7 @@ from .authority import Authority, Result
 from .connection import describe_client
 from .meshes import ServedFiles
 from .store import Store
-from .transport import Request, Requests, Transport
+from .transport import Question, Questions, Transport
 from .views import View, Views, Wish
 
 _LOG = logging.getLogger(__name__)
@@ -203,7 +203,7 @@ class Server:
 
     # -- edits ---------------------------------------------------------------------------------------------
 
-    def _take_edits(self, requests: Requests) -> None:
+    def _take_edits(self, requests: Questions) -> None:
         while not self._closed.is_set():
             waiting = requests.take(MOST_TOGETHER, LONGEST_WAIT)
             if not waiting:
@@ -224,7 +224,7 @@ class Server:
             if edits:
                 self._process(edits, given)
 
-    def _process(self, edits: Sequence[protocol.Edit | protocol.Undo], requests: Sequence[Request]) -> None:
+    def _process(self, edits: Sequence[protocol.Edit | protocol.Undo], requests: Sequence[Question]) -> None:
         epoch = self._authority.epoch
         try:
             with self._lock:
@@ -290,12 +290,12 @@ class Server:
     def _note_time(self, stage: str, begin: float) -> None:
         self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(time.perf_counter() - begin)
 
-    def _refuse(self, request: Request, reason: protocol.Reason, error: Exception) -> None:
+    def _refuse(self, request: Question, reason: protocol.Reason, error: Exception) -> None:
         request.answer(protocol.encode(protocol.Refused(reason, str(error)[:_LONGEST_MESSAGE])))
 
     # -- questions -----------------------------------------------------------------------------------------
 
-    def _answer_questions(self, requests: Requests) -> None:
+    def _answer_questions(self, requests: Questions) -> None:
         for request in requests:
             try:
                 answer = self._answer(protocol.decode_request(request.payload))

@@ -28,9 +28,9 @@ from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol, parse_symbol_name
 
-from .address import UNIX_SOCKETS, Claim, check_name
+from .address import UNIX_SOCKETS, Claim, check_server_name
 from .protocol import SourceStatus
-from .transport import Messages, NoAnswerError, Requests, Transport
+from .transport import Messages, NoAnswerError, Questions, Transport
 
 THROUGH_SERVER: Final = "server"
 """Endpoint of sources that send through the model server only."""
@@ -82,7 +82,7 @@ class StatePublisher:
         direct: bool = True,
     ) -> None:
         self._layout = _Layout.make(coordinates)
-        self._key = _key(name, check_name(source, "source"))
+        self._key = _key(name, check_server_name(source, "source"))
         self._run, self._number, self._lock = secrets.randbits(64), 0, threading.Lock()
         self._claim = Claim(name, source) if direct and UNIX_SOCKETS else None
         self._own: Transport | None = None
@@ -170,7 +170,7 @@ class StatePublisher:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _tell(self, requests: Requests) -> None:
+    def _tell(self, requests: Questions) -> None:
         for request in requests:
             request.answer(msgspec.msgpack.encode(self._layout.names))
 
@@ -356,7 +356,7 @@ class _Layout:
 
 
 class _Stream:
-    """What a reader gets from a source, in a thread of its own."""
+    """Subscription of a reader to a source, in a thread of its own."""
 
     def __init__(self, reader: StateReader, key: str, endpoint: str, server: Transport | None) -> None:
         self.endpoint, self.offset = endpoint, 0.0

@@ -1,4 +1,4 @@
-"""Requests, messages and signs of life between processes: the one module that uses Zenoh.
+"""Questions, messages and signs of life between processes: the one module that uses Zenoh.
 
 A server listens, clients connect to it, and everything goes through it. There is no discovery, and no port is
 open unless one is asked for. What arrives waits in channels, from which threads of the library take it: Zenoh
@@ -27,7 +27,7 @@ LEASE: Final = 1.0
 """Time after which a process that says nothing counts as gone [s]."""
 
 _USER: Final = "kineverse"
-_MOST_REQUESTS: Final = 10_000
+_MOST_QUESTIONS: Final = 10_000
 _END_SECONDS: Final = 0.2
 
 
@@ -43,9 +43,11 @@ class _Entrances:
 
     A thread that comes back from one while the interpreter ends would abort the process: Zenoh's frames
     cannot be unwound. So when the process ends all transports are closed first, and no call begins after.
+    The end of an object of Zenoh is such a call, too; see :class:`_Owner`.
     """
 
     def __init__(self) -> None:
+        self.left: list[Any] = []  # objects of Zenoh that nobody may end any more
         self._inside: list[None] = []  # append and pop are atomic
         self._ended = False
         self.transports: weakref.WeakSet[Transport] = weakref.WeakSet()
@@ -72,27 +74,40 @@ class _Entrances:
 _call = _Entrances()
 
 
-class Channel:
-    """What has arrived for a subscription, oldest first.
+class _Owner:
+    """Owner of an object of Zenoh, which ends it in a call like any other."""
+
+    _owned: Any = None
+
+    def __init__(self, owned: Any) -> None:
+        self._owned = owned
+
+    def __del__(self) -> None:
+        try:
+            with _call:
+                self._owned = None
+        except NoAnswerError:
+            _call.left.append(self._owned)
+
+
+class Channel(_Owner):
+    """Subscription, and what has arrived for it, oldest first.
 
     The oldest is dropped where too much waits, so a slow reader holds up nobody.
     """
-
-    def __init__(self, declared: Any) -> None:
-        self._declared, self._handler = declared, declared.handler
 
     def _wait(self, read: Callable[[Any], Value]) -> Value | None:
         """Return what is read from the next thing that arrives, None after the end."""
         try:
             with _call:
-                return read(self._handler.recv())
+                return read(self._owned.handler.recv())
         except (NoAnswerError, _zenoh().ZError):
             return None
 
     def close(self) -> None:
         """End the subscription: those who wait go on, and get nothing more."""
         with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
-            self._declared.undeclare()
+            self._owned.undeclare()
 
 
 class Messages(Channel):
@@ -112,58 +127,59 @@ class LifeSigns(Channel):
             yield sign
 
 
-class Request:
-    """A request, to be answered once; one that is dropped gets no answer, which the asker hears at once."""
+class Question(_Owner):
+    """Question, to be answered once; the asker of one that is dropped hears at once that nobody answers."""
 
     def __init__(self, query: Any) -> None:
-        self._query = query
+        super().__init__(query)
         payload = query.payload
         self.payload = b"" if payload is None else bytes(payload)
 
     def answer(self, payload: bytes) -> None:
         """Send the answer; an asker who is gone gets none."""
         with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
-            self._query.reply(self._query.key_expr, payload)
-            self._query.drop()  # else the asker waits for more
+            self._owned.reply(self._owned.key_expr, payload)
+            self._owned.drop()  # else the asker waits for more
 
 
-class Requests(Channel):
-    """Requests that have come in; iterating waits for the next."""
+class Questions(Channel):
+    """Questions that have come in; iterating waits for the next."""
 
-    def __iter__(self) -> Iterator[Request]:
-        while (request := self._wait(Request)) is not None:
-            yield request
+    def __iter__(self) -> Iterator[Question]:
+        while (question := self._wait(Question)) is not None:
+            yield question
 
-    def take(self, most: int, seconds: float) -> list[Request]:
-        """Wait for a request and return it with those that wait behind it; none after the end.
+    def take(self, most: int, seconds: float) -> list[Question]:
+        """Wait for a question and return it with those that wait behind it; none after the end.
 
         Taking stops at the number ``most``, and after so many seconds.
         """
-        first = self._wait(Request)
+        first = self._wait(Question)
         if first is None:
             return []
         result, late = [first], time.monotonic() + seconds
         with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
-            while len(result) < most and (query := self._handler.try_recv()) is not None:
-                result.append(Request(query))
-                if time.monotonic() > late:
+            channel = self._owned.handler
+            while len(result) < most and time.monotonic() <= late:
+                query = channel.try_recv()
+                if query is None:
                     break
+                result.append(Question(query))
+                del query
+            del channel
         return result
 
 
-class Token:
+class Token(_Owner):
     """Sign of life, which others see until it is closed, this process ends, or its connection is cut."""
-
-    def __init__(self, declared: Any) -> None:
-        self._declared = declared
 
     def close(self) -> None:
         """Take the sign back."""
         with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
-            self._declared.undeclare()
+            self._owned.undeclare()
 
 
-class Transport:
+class Transport(_Owner):
     """Connection of this process to others, made by :meth:`serve` or :meth:`connect`.
 
     Endpoints are ``unixsock-stream/PATH`` or ``tcp/HOST:PORT``. All methods may be called in any thread.
@@ -176,8 +192,7 @@ class Transport:
         for path, value in {**_SETTINGS, **settings}.items():
             config.insert_json5(path, json.dumps(value))
         with _call:
-            self._session = zenoh.open(config)
-            self._end_of_questions = zenoh.CancellationToken()
+            super().__init__((zenoh.open(config), zenoh.CancellationToken()))
         self._drop, self._block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
         self._all, self._error = zenoh.ConsolidationMode.NONE, zenoh.ZError
         _call.transports.add(self)
@@ -186,10 +201,7 @@ class Transport:
     def serve(cls, endpoints: Sequence[str], secret: str = "") -> Transport:
         """Listen at endpoints, for clients that know the secret if there is one.
 
-        Raises
-        ------
-        InvalidValueError
-            If an endpoint is taken, or none to listen at.
+        An endpoint that is taken, or none to listen at, is an InvalidValueError.
         """
         for endpoint in endpoints:
             check_endpoint(endpoint)
@@ -211,15 +223,7 @@ class Transport:
     def connect(cls, endpoint: str, secret: str = "", timeout: float = 0.0) -> Transport:
         """Connect to a server; a connection that is cut is made again as soon as there is a server.
 
-        Parameters
-        ----------
-        timeout
-            How long to wait for a server [s]; with 0 it has to be there.
-
-        Raises
-        ------
-        NoAnswerError
-            If no server listens there, or it wants another secret.
+        If none is there after the timeout [s], or it wants another secret, that is a :class:`NoAnswerError`.
         """
         settings = {
             "mode": "client",
@@ -234,38 +238,36 @@ class Transport:
             raise NoAnswerError(f"No server answers at {endpoint}.") from None
 
     def ask(self, key: str, payload: bytes, timeout: float) -> bytes:
-        """Return the answer to a request.
+        """Return the answer to a question.
 
-        Raises
-        ------
-        NoAnswerError
-            At once if nobody is there who answers; else after the timeout [s].
+        Raise a :class:`NoAnswerError` at once if nobody is there who answers; else after the timeout [s].
         """
         channel: Any = _zenoh().handlers.FifoChannel(2)  # a ring would lose the answer at its end
         try:
             with _call:
-                replies = self._session.get(
+                session, cancelled = self._owned
+                replies = session.get(
                     key,
                     channel,
                     payload=payload,
                     timeout=timeout,
                     consolidation=self._all,  # an answer is handed over when it comes, not when all have come
                     congestion_control=self._block,
-                    cancellation_token=self._end_of_questions,
+                    cancellation_token=cancelled,
                 )
                 sample = replies.recv().ok
                 answer = None if sample is None else bytes(sample.payload)
-                del replies, sample
+                del replies, sample, session, cancelled
         except self._error:
             raise NoAnswerError(f"Nobody answers {key}.") from None
         if answer is None:
             raise NoAnswerError(f"No answer from {key} within {timeout:g} s.")
         return answer
 
-    def answers(self, key: str) -> Requests:
-        """Return the requests for a key, which is all of this process's to answer."""
+    def answers(self, key: str) -> Questions:
+        """Return the questions for a key, all of which this process answers."""
         with self._declaring():
-            return Requests(self._session.declare_queryable(key, _ring(_MOST_REQUESTS), complete=True))
+            return Questions(self._owned[0].declare_queryable(key, _ring(_MOST_QUESTIONS), complete=True))
 
     def publish(self, key: str, payload: bytes) -> None:
         """Send a message to the subscribers of a key.
@@ -273,30 +275,30 @@ class Transport:
         It waits for nobody: one who does not keep up loses messages. The others get them in order.
         """
         with contextlib.suppress(NoAnswerError, self._error), _call:
-            self._session.put(key, payload, congestion_control=self._drop)
+            self._owned[0].put(key, payload, congestion_control=self._drop)
 
     def subscribe(self, key: str, most: int = 10_000) -> Messages:
         """Return the messages of a key; of those that wait, the newest ``most`` are kept."""
         with self._declaring():
-            return Messages(self._session.declare_subscriber(key, _ring(most)))
+            return Messages(self._owned[0].declare_subscriber(key, _ring(most)))
 
     def alive(self, key: str) -> Token:
         """Show that this process is there for as long as the token is kept and not closed."""
         with self._declaring():
-            return Token(self._session.liveliness().declare_token(key))
+            return Token(self._owned[0].liveliness().declare_token(key))
 
     def watch_alive(self, key: str) -> LifeSigns:
         """Return the signs of life of a key, in which ``*`` stands for any part between slashes."""
         with self._declaring():
             return LifeSigns(
-                self._session.liveliness().declare_subscriber(key, _ring(_MOST_REQUESTS), history=True)
+                self._owned[0].liveliness().declare_subscriber(key, _ring(_MOST_QUESTIONS), history=True)
             )
 
     def close(self) -> None:
         """Close the connection and all that was made with it."""
         with contextlib.suppress(NoAnswerError, self._error), _call:
-            self._end_of_questions.cancel()
-            self._session.close()
+            self._owned[1].cancel()
+            self._owned[0].close()
 
     @contextlib.contextmanager
     def _declaring(self) -> Iterator[None]:
@@ -313,6 +315,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "scouting/delay": 0,  # a server would wait for others to find, half a second
     "transport/shared_memory/enabled": False,  # files of it outlive a process that is killed
     "transport/link/tx/lease": round(1e3 * LEASE),
+    "transport/link/tx/queue/size/data": 16,  # batches of 64 kB that wait for a reader before messages drop
     # An answer to one who reads nothing holds up the others no longer than he counts as there.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * LEASE),
 }
