@@ -11,7 +11,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version
 INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INSTALL) -r {}
 
 # What the demo and every command in the README need.
-DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording)
+DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording exchange)
 
 .PHONY: help demo test sanitize fuzz faults format clean
 .NOTPARALLEL:

@@ -274,7 +274,7 @@ def test_the_search_for_faults_notices_a_store_that_checks_nothing(
 ) -> None:
     monkeypatch.setattr(stores, "_digest", lambda *row: 0)
     with pytest.raises(AssertionError, match="damage"):
-        try_damages(1000, 1, tmp_path)
+        try_damages(100, 2, tmp_path)
 
 
 def test_what_was_acknowledged_survives_a_kill(tmp_path: Path) -> None:

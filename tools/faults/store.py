@@ -24,8 +24,9 @@ from kineverse.exchange.store import Replaced, Store, StoredCommit, StoreError
 PAGE = 4096
 GAP = 1 << 20
 CLIENT = "0123456789abcdef" * 2
-Operations = dict[str, tuple[int, bytes]]
-"""Place and blob of each operation by its tag."""
+Files = tuple[protocol.FileContent, ...]
+Operations = dict[str, tuple[int, bytes, Files]]
+"""Place, blob and files of each operation by its tag."""
 
 
 # -- commits -------------------------------------------------------------------------------------------------
@@ -34,14 +35,14 @@ Operations = dict[str, tuple[int, bytes]]
 def make_commit(seed: int, revision: int, chain: bytes, operations: Operations) -> StoredCommit:
     """Return the commit of a revision, and bring the operations up to date."""
     random = Random(f"{seed} {revision}")
-    tags = sorted(operations, key=operations.__getitem__)
+    tags = sorted(operations, key=lambda tag: operations[tag][0])
     removed = random.sample(tags, random.randint(0, 2)) if len(tags) > 20 else []
     again = random.sample(tags, random.randint(0, min(3, len(tags))))
     new = [f"op {revision} {i}" for i in range(random.randint(0, 3))]
     put, before = [], []
-    last = max((place for place, _ in operations.values()), default=0)
+    last = max((place for place, *_ in operations.values()), default=0)
     for tag in [*removed, *(tag for tag in again if tag not in removed), *new]:
-        place, blob = operations.get(tag, (None, None))
+        place, blob, _ = operations.get(tag, (None, None, ()))
         at = tags.index(tag) if tag in operations else len(tags)
         before.append(Replaced(tag, blob, tags[at - 1] if at else "", place or 0))
         if tag in removed:
@@ -50,17 +51,20 @@ def make_commit(seed: int, revision: int, chain: bytes, operations: Operations) 
         if place is None or random.random() < 0.1:  # new, or moved to the end
             place = last = last + GAP
         content = random.randbytes(random.choice((20, 900, 9000)))
-        operations[tag] = place, msgspec.msgpack.encode((tag, content))
+        sha256 = random.randbytes(32).hex()
+        files = (protocol.FileContent(tag, 0, sha256, revision),) if random.random() < 0.3 else ()
+        operations[tag] = place, msgspec.msgpack.encode((tag, content)), files
         put.append((tag, *operations[tag]))
     places = None
     if random.random() < 0.05:
-        order = sorted(operations, key=operations.__getitem__)
+        order = sorted(operations, key=lambda tag: operations[tag][0])
         places = [(tag, i * GAP) for i, tag in enumerate(order)]
-        operations.update({tag: (place, operations[tag][1]) for tag, place in places})
+        operations.update({tag: (place, *operations[tag][1:]) for tag, place in places})
         put = [(tag, *operations[tag]) for tag, *_ in put]
     data = msgspec.msgpack.encode((revision, removed, put))
     chain = protocol.chain(chain, data)
-    return StoredCommit(revision, chain, CLIENT, revision, data, put, removed, places, tuple(before))
+    rows, files = [one[:3] for one in put], [file for *_, some in put for file in some]
+    return StoredCommit(revision, chain, CLIENT, revision, data, rows, removed, places, tuple(before), files)
 
 
 def commits(
@@ -75,31 +79,38 @@ def commits(
         yield commit, now
 
 
+def make_path(commit: StoredCommit) -> tuple[str, str]:
+    """Return a digest and a path of a file, the same for equal commits."""
+    return commit.chain.hex(), f"meshes/{commit.revision}.stl"
+
+
 class Expected:
     """Contents of a store at each revision."""
 
     def __init__(self, seed: int) -> None:
         self._commits = commits(seed)
         self.log: list[StoredCommit] = []
-        self._operations: list[list[tuple[int, bytes]]] = [[]]
+        self._operations: list[list[tuple[int, bytes, Files]]] = [[]]
 
     def up_to(self, revision: int) -> Sequence[StoredCommit]:
         """Return the commits up to a revision."""
         while len(self.log) < revision:
             commit, operations = next(self._commits)
             self.log.append(commit)
-            self._operations.append(sorted(operations.values()))
+            self._operations.append(sorted(operations.values(), key=lambda row: row[0]))
         return self.log[:revision]
 
     def find_difference(self, store: Store) -> str:
         """Return what a store has wrong for the revision that it says it has, else an empty text."""
         log = self.up_to(store.revision)
-        if [row[:2] for row in store.operations()] != self._operations[store.revision]:
+        if store.operations() != self._operations[store.revision]:
             return "operations"
         if store.chain != (log[-1].chain if log else protocol.NO_CHAIN):
             return "chain"
         if store.commits_after(0, protocol.NO_CHAIN, 10**9) != [(one.commit, one.chain) for one in log]:
             return "log"
+        if not store.paths().items() <= {make_path(one) for one in log}:
+            return "paths"
         for one in [*log[::10], *log[-10:]]:  # each takes two queries
             if store.commit_of(one.revision) != (one.commit, one.replaced):
                 return "replaced"
@@ -128,13 +139,17 @@ def put_image(path: Path, image: Image) -> None:
         Path(f"{path}{suffix}").write_bytes(data)
 
 
-def make_images(folder: Path, expected: Expected, count: int = 240) -> list[tuple[int, Image]]:
+def make_images(folder: Path, expected: Expected, count: int = 120) -> list[tuple[int, Image]]:
     """Return images of a store that is open, at several revisions, and of one that is closed at the end."""
     path = folder / "images.db"
+    put_image(path, {})
     images = []
     store = Store(path)
+    store._db.execute("PRAGMA wal_autocheckpoint = 100")  # as in a long run, but in small files
     for one in expected.up_to(count):
         store.commit([one])
+        if one.revision % 20 == 0:
+            store.add_path(*make_path(one))
         if one.revision % (count // 8) == 0:
             images.append((one.revision, take_image(path)))
     store.close()
@@ -213,7 +228,9 @@ def check_image(path: Path, image: Image, expected: Expected) -> tuple[str, str]
     put_image(path, image)
     try:
         store = Store(path)
-    except StoreError as error:
+    except Exception as error:
+        if not isinstance(error, StoreError):
+            return "failed", repr(error)
         kept = {suffix: data for suffix, data in take_image(path).items() if suffix != "-shm"}
         return "refused", "" if kept == image else f"the files were changed, although: {error}"
     try:
@@ -221,8 +238,8 @@ def check_image(path: Path, image: Image, expected: Expected) -> tuple[str, str]
         if not wrong:  # it goes on from there
             store.commit([expected.up_to(store.revision + 1)[-1]])
             wrong = expected.find_difference(store)
-    except StoreError as error:
-        wrong = f"opened, then {error}"
+    except Exception as error:
+        wrong = repr(error)
     finally:
         store.close()
     return "opened", wrong
@@ -246,10 +263,10 @@ def try_damages(count: int, seed: int, folder: Path) -> dict[str, int]:
 # -- processes that are killed -------------------------------------------------------------------------------
 
 
-def commit_for_ever(path: Path, seed: int) -> None:
+def commit_for_ever(path: Path, seed: int, durable: bool) -> None:
     """Commit in batches, and write each revision to standard output when it is stored."""
-    store = Store(path)
-    operations = {msgspec.msgpack.decode(blob)[0]: (place, blob) for place, blob, _ in store.operations()}
+    store = Store(path, durable=durable)
+    operations = {msgspec.msgpack.decode(row[1])[0]: row for row in store.operations()}
     random, following = Random(), commits(seed, store.revision, store.chain, operations)
     sys.stdout.write(f"{store.revision}\n")
     sys.stdout.flush()
@@ -266,7 +283,7 @@ def try_kills(rounds: int, seed: int, folder: Path) -> list[int]:
     revisions = []
     for number in range(rounds):
         with subprocess.Popen(
-            [sys.executable, "-m", "faults.store", str(path), str(seed)],
+            [sys.executable, "-m", "faults.store", str(path), str(seed), ("durable", "fast")[number % 2]],
             stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         ) as process:
@@ -317,4 +334,4 @@ def run(given: argparse.Namespace) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    commit_for_ever(Path(sys.argv[1]), int(sys.argv[2]))
+    commit_for_ever(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "durable")

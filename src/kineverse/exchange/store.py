@@ -2,7 +2,7 @@
 
 A commit writes what it touches: the rows of its operations, one row of the log, and the only row of ``meta``.
 That row has the sum of the digests of all rows, its own included. So a file that is damaged, truncated or
-mixed from two states is refused when it is opened, and left as it is.
+mixed from two states is refused when it is opened, and left as it is. The paths of meshes are kept beside.
 """
 
 from __future__ import annotations
@@ -151,8 +151,17 @@ class Store:
 
     def add_path(self, sha256: str, path: str) -> None:
         """Note where a file is; it is no part of the model."""
-        with self._lock, self._transaction():
-            self._db.execute("INSERT OR REPLACE INTO paths VALUES (?, ?)", (sha256, path))
+        row = sha256, path
+        with self._lock:
+            new = replace(self._contents)
+            with self._transaction():
+                old = self._db.execute(
+                    "SELECT sha256, path FROM paths WHERE sha256 = ?", (sha256,)
+                ).fetchall()
+                new.total += _digest(*row) - sum(_digest(*one) for one in old)
+                self._db.execute("INSERT OR REPLACE INTO paths VALUES (?, ?)", row)
+                self._write_meta(new)
+            self._contents = new
 
     def commit(self, batch: Sequence[StoredCommit]) -> None:
         """Store commits in one transaction.
@@ -259,9 +268,10 @@ class Store:
         if one.places is not None:  # rare, and then all rows are written
             rows = self._db.execute("SELECT tag, blob, files FROM operations").fetchall()
             blobs = {tag: blob for tag, blob, _ in rows}
-            files = {tag: known for tag, _, known in rows} | files
             gone |= blobs.keys()
-            blobs.update({tag: blob for tag, _, blob in put})
+            again = {tag: blob for tag, _, blob in put}
+            files = {tag: known for tag, _, known in rows if tag not in again} | files
+            blobs |= again
             if {tag for tag, _ in one.places} != blobs.keys() - {*one.removed}:
                 raise InvalidValueError(
                     f"The commit {one.revision} does not give all operations their places."
@@ -427,6 +437,7 @@ def _read(db: sqlite3.Connection, path: str) -> _Contents:
         digest = _digest(place, tag, *rest)
         rows[tag] = place, digest
         total += digest
+    total += sum(_digest(*row) for row in db.execute("SELECT sha256, path FROM paths"))
     if _encode_total(total) != stored:
         raise _damaged(path, "the contents are not those that were written")
     return _Contents(name, revision, chain, total, rows)
