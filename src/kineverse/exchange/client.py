@@ -32,6 +32,7 @@ from .address import Address
 from .connection import Connection
 from .meshes import FetchedFiles, find_known_files, put_contents
 from .transport import Channel
+from .views import LOAD_THE_WHOLE, is_partial
 
 _LOG = logging.getLogger(__name__)
 
@@ -404,6 +405,8 @@ def _find_changes(old: Sequence[HistoryEntry], new: Sequence[HistoryEntry]) -> N
 def _check_part(history: History, changes: NetChanges, connection: Connection) -> None:
     """Refuse an edit that would depend on what is not in a part of the model."""
     for entry in (placed.entry for placed in changes.put):
+        if is_partial(entry):
+            raise EditError(f"Only a part of the operation {entry.tag!r} is here. {LOAD_THE_WHOLE}")
         missing = sorted(f"all {kind}" for kind in entry.reads.listings)
         missing += [
             "/".join(cell) for cell in entry.reads.cells if history.value_at(cell, entry.place) is ABSENT
