@@ -21,7 +21,11 @@ def listed() -> dict[str, tuple[str, list[str], list[str]]]:
         if re.fullmatch(r"`[A-Z]\w+`", cells[0]):
             tag = cells.pop(1).strip("`") if re.fullmatch(r"`[a-z]+`", cells[1]) and len(cells) > 2 else ""
             required, _, further = cells[1].partition(";")
-            found[cells[0].strip("`")] = tag, re.findall(r"`(\w+)`", required), re.findall(r"`(\w+)`", further)
+            found[cells[0].strip("`")] = (
+                tag,
+                re.findall(r"`(\w+)`", required),
+                re.findall(r"`(\w+)`", further),
+            )
     return found
 
 

@@ -89,10 +89,13 @@ def test_a_stream_survives_the_server_which_hears_of_it_again(tmp_path: Path) ->
         with pytest.raises(kv.errors.OfflineError):
             other.exchange.reader(["a"])
         with serve(store=store):
-            epoch = other.exchange.epoch
-            missing = 0
-            while other.exchange.epoch == epoch or not other.exchange.status().sources:
-                missing += reader.into(vector) == 0
-                assert comes() or sent < 500
+            fresh, found = load(), []
+
+            def is_known_again() -> bool:
+                found.append(reader.into(vector))
+                return bool(fresh.exchange.status().sources)
+
+            with fresh:
+                assert until(is_known_again)
             assert until(comes)
-            assert not missing
+            assert set(found) == {1}
