@@ -86,8 +86,10 @@ class Connection:
         """End the connection; the model can still be read. A second call has no effect."""
         self.is_closed = True
         self.note_presence(False)
-        for one in (*self._readers, *(publisher for publisher, _ in self._publishers)):
-            one.close()
+        for reader in self._readers:
+            reader.close()
+        for publisher, _ in list(self._publishers):
+            publisher.close()
         self.transport.close()
 
     # -- questions to the server ---------------------------------------------------------------------------
