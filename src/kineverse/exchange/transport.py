@@ -16,6 +16,7 @@ import tempfile
 import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import Any, Final, TypeVar
 
 from kineverse._extras import install_command
@@ -336,6 +337,7 @@ def _ring(most: int) -> Any:
     return _zenoh().handlers.RingChannel(most)
 
 
+@cache
 def _zenoh() -> Any:
     try:
         import zenoh
