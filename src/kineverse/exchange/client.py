@@ -50,30 +50,10 @@ def load_live(
     symbols: Iterable[Symbol | str] | None = None,
     bodies: bool | None = None,
 ) -> LiveModel:
-    """Connect to a model server and return its model, or a part of it.
+    """Connect to a model server and return its model, or a part of it; see :func:`kineverse.load`.
 
-    Parameters
-    ----------
-    source
-        Address ``live:NAME``, or ``live:tcp/host:port/NAME``.
-    frames, symbols
-        Names of frames and of coordinates of a part, which is closed: their forward kinematics, Jacobians,
-        constraints and rates are those of the whole. By default the model is whole.
-    bodies
-        Whether bodies are wanted: by default in the whole, and not in a part. Alone, False is for all frames
-        with what they need.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such server, or its model has no such frame or coordinate; the message lists
-        similar ones.
-    OfflineError
-        If nobody answers at a given endpoint.
-    FormatError
-        If the server is of another version.
-    MissingDependencyError
-        Without the extra ``exchange``.
+    An unknown server, frame or coordinate is an UnknownNameError with similar names, an endpoint where nobody
+    answers an OfflineError, and a server of another version a FormatError.
     """
     is_part = frames is not None or symbols is not None
     if bodies is None:
