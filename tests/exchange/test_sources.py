@@ -27,9 +27,11 @@ def load() -> LiveModel:
 
 def until(is_so: Callable[[], bool]) -> bool:
     end = time.monotonic() + LONG
-    while not is_so() and time.monotonic() < end:
+    while time.monotonic() < end:
+        if is_so():
+            return True
         time.sleep(0.01)
-    return is_so()
+    return False
 
 
 def test_a_source_is_found_by_readers_from_before_and_after() -> None:
