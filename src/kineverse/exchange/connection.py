@@ -27,7 +27,7 @@ from .address import Address
 from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
-from .transport import NoAnswerError, Transport
+from .transport import NoAnswerError, Transport, check_process
 
 PATIENCE = 10.0
 """Time that an edit waits for a server that went away, before it is given up [s]."""
@@ -236,10 +236,15 @@ class Connection:
         """Return the number of a new edit of this client."""
         return next(self._numbers)
 
-    def check_online(self) -> None:
-        """Raise an OfflineError if the server is away."""
+    def check_open(self) -> None:
+        """Raise an OfflineError if the connection was closed, or is that of the process this one is forked from."""
+        check_process()
         if self.is_closed:
             raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+
+    def check_online(self) -> None:
+        """Raise an OfflineError if the server is away."""
+        self.check_open()
         if not self.is_online:
             raise OfflineError(
                 f"The server of {self.address} is away. The model can be read, and edited when it is back."
@@ -338,8 +343,7 @@ class Connection:
             raise refusal_error(answer, self.address)
 
     def _ask(self, request: protocol.Request, timeout: float) -> protocol.Answer:
-        if self.is_closed:
-            raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+        self.check_open()
         changes_model = isinstance(request, (protocol.EditRequest, protocol.UndoRequest))
         data = protocol.encode(request)
         if len(data) > protocol.MAX_BYTES:
