@@ -163,8 +163,7 @@ class LiveModel(Model):
             except ConflictError as error:
                 if not left:
                     raise
-                connection, wanted = self.exchange, error.revision
-                connection.wait_for(lambda: connection.revision >= wanted or not connection.is_online, None)
+                self.exchange.wait_to_follow(error.revision)
         raise AssertionError
 
     def adopt(self, changes: NetChanges) -> None:

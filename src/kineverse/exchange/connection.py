@@ -18,8 +18,14 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from kineverse._checks import as_count
-from kineverse.errors import DuplicateNameError, FormatError, OfflineError, UnknownNameError
+from kineverse._checks import as_count, finite_number
+from kineverse.errors import (
+    DuplicateNameError,
+    FormatError,
+    InvalidValueError,
+    OfflineError,
+    UnknownNameError,
+)
 from kineverse.symbols import Symbol
 
 from . import protocol
@@ -158,9 +164,12 @@ class Connection:
         DuplicateNameError
             If another process of this computer sends under the same name.
         InvalidValueError
-            If a source cannot have that name.
+            If a source cannot have that name, or the offset is not a finite number.
         """
         self.check_online()
+        seconds = finite_number(offset)
+        if seconds is None:
+            raise InvalidValueError(f"The offset of a source is a time in seconds, not {offset!r}.")
         publisher = StatePublisher(
             self.address.name,
             source,
@@ -169,8 +178,12 @@ class Connection:
             direct=not self.address.endpoint,
             announce=self._announce,
         )
-        self._publishers.append((publisher, offset))
-        self._announce(publisher)
+        self._publishers.append((publisher, seconds))
+        try:
+            self._announce(publisher)
+        except BaseException:
+            publisher.close()
+            raise
         return publisher
 
     def reader(self, coordinates: Iterable[Symbol | str] = ()) -> StateReader:
@@ -213,12 +226,12 @@ class Connection:
             self._heard, self._settled = beat.epoch, now + _SETTLING
         kept = [] if now > self._settled else [one for one in self.sources if one.source not in listed]
         self.sources = (*kept, *beat.sources)
-        for publisher, _ in list(self._publishers):
-            if publisher.source not in listed:
-                self._announce(publisher)
         self._readers = [reader for reader in self._readers if not reader.is_closed]
         for reader in self._readers:
             reader.follow(self.sources)
+        for publisher, _ in list(self._publishers):
+            if publisher.source not in listed:
+                self._announce(publisher)
 
     # -- for the live model --------------------------------------------------------------------------------
 
@@ -237,7 +250,7 @@ class Connection:
         return next(self._numbers)
 
     def check_open(self) -> None:
-        """Raise an OfflineError if the connection was closed, or is that of the process this one is forked from."""
+        """Raise an OfflineError if the connection was closed, or belongs to the parent of a forked process."""
         check_process()
         if self.is_closed:
             raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
@@ -300,6 +313,10 @@ class Connection:
         """Wait until something is so, which is looked at when the model or the connection changes."""
         with self._changed:
             return self._changed.wait_for(is_done, timeout)
+
+    def wait_to_follow(self, revision: int) -> None:
+        """Wait until the model is at a revision, as long as the server is there."""
+        self.wait_for(lambda: self.revision >= revision or not self.is_online, None)
 
     def ask(self, request: protocol.Request, kind: type[A], timeout: float = _ASK_TIMEOUT) -> A:
         """Ask once and return the answer, which is of a kind.
