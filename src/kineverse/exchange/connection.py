@@ -250,10 +250,12 @@ class Connection:
         return next(self._numbers)
 
     def check_open(self) -> None:
-        """Raise an OfflineError if the connection was closed, or belongs to the parent of a forked process."""
+        """Raise an OfflineError if the connection was closed, or is that of the parent of a fork."""
         check_process()
         if self.is_closed:
-            raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+            raise OfflineError(
+                f"The connection to {self.address} was closed, or its model was not kept; load it again."
+            )
 
     def check_online(self) -> None:
         """Raise an OfflineError if the server is away."""

@@ -262,8 +262,9 @@ class Server:
     def _begin_again(self) -> None:
         """Follow a model that was loaded again from its store: parts are asked for anew, and clients join."""
         self._views, self._logs, self._clients = Views(self._authority.model), {}, {}
-        self._token.close()
+        before = self._token
         self._token = self._transport.alive(self._key(f"alive/{self._authority.epoch}"))
+        before.close()  # later, so that clients do not take the server for gone
 
     def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
         """Return the commits of parts, by the ids of their views."""

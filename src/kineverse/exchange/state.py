@@ -151,9 +151,7 @@ class StatePublisher:
             If the source has ended: a source ends with its model.
         """
         if self.is_closed:
-            raise OfflineError(
-                f"The source {self.source!r} has ended, by close() or with its model. Make another."
-            )
+            raise OfflineError(f"The source {self.source!r} was closed, or its model was. Make another one.")
         layout, now = self._layout, time.time()
         vector = np.asarray(values, dtype=_VALUE)
         if vector.shape != (len(layout.names),):
@@ -270,7 +268,11 @@ class StateReader:
         ------
         ShapeError
             If it has another shape.
+        InvalidValueError
+            If it is not of floating-point numbers, so that values would be rounded.
         """
+        if vector.dtype.kind != "f":
+            raise InvalidValueError(f"The vector has {vector.dtype}; values need floating-point numbers.")
         if vector.shape != (len(self.coordinates),):
             raise ShapeError(
                 f"The vector has shape {vector.shape}, and the reader {len(self.coordinates)} coordinates."

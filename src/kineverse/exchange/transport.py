@@ -69,9 +69,10 @@ class _Entrances:
         self._inside.pop()
 
     def _forbid(self) -> None:
-        """Begin no call in a forked process: Zenoh's threads are not in it, and its sockets are the parent's."""
+        """Begin no call in a forked process: the threads of Zenoh are not in it, its sockets are shared."""
         if self.is_used:
             self._ended = self.is_forked = True
+            self._inside.clear()
 
     def _end(self) -> None:
         for transport in list(self.transports):
