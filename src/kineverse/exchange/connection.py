@@ -106,8 +106,9 @@ class Connection:
 
     def history(self, most: int = 20, before: int | None = None) -> tuple[protocol.HistoryRow, ...]:
         """Return the last commits, newest first, from before a revision if one is given."""
-        most = as_count("most", most, 1)
-        asked = protocol.GetHistory(most) if before is None else protocol.GetHistory(most, before)
+        number = min(as_count("most", most, 1), protocol.MAX_LISTED)
+        end = protocol.MAX_REVISION if before is None else as_count("before", before, 0)
+        asked = protocol.GetHistory(number, min(end, protocol.MAX_REVISION))
         return self.ask(asked, protocol.CommitList).rows
 
     def backup(self, path: str | os.PathLike[str]) -> Store:
