@@ -2,312 +2,258 @@
 
 from __future__ import annotations
 
-import json
 import os
-import signal
-import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from multiprocessing import get_context
+from multiprocessing.managers import BaseManager
+from signal import SIGCONT, SIGKILL, SIGSTOP
+from statistics import median
 from time import perf_counter
-from typing import Any
+from typing import TypeVar
 
-from .harness import Benchmark, BenchmarkResult, BenchmarkSettings, Contender, ProgramError
+from .exchange_programs import (
+    PAUSE,
+    Crowd,
+    Editor,
+    Follower,
+    Program,
+    Reader,
+    Relay,
+    Server,
+    Source,
+    set_environment,
+)
+from .harness import Benchmark, BenchmarkResult, BenchmarkSettings, Contender
 from .workloads import find_benchmark_robot
 
-KINDS = {"datum": 1.2e-3, "constant frame": 1.2e-3, "joint with limits": 1.6e-3}
-"""Edits, with the bars of the time that they take longer than the relay [s]."""
-CPU = {"a frame": (1, 200e-6), "a joint": (1, 350e-6), "a frame in edits of 20": (20, 90e-6)}
-"""Streamed edits, with the number of operations in each and the bar of the server's CPU time for one [s]."""
-FEW, SIZE = 10, 20  # objects of the small model, coordinates of an object
-_EDITS = 20  # in a sample
-_STREAMED = 200
+TO_HOOK, BY_RELAY = "to the hook", "by the relay"
+EDITS = {
+    "datum": ("datum", 1.2e-3),
+    "frame": ("constant frame", 1.2e-3),
+    "joint": ("joint with limits", 1.6e-3),
+}
+"""Kinds of edits: name, and the bar of the time that one takes longer than by the relay [s]."""
+STREAMS = (
+    ("frame", 1, "a frame", 200e-6),
+    ("joint", 1, "a joint", 350e-6),
+    ("frame", 20, "a frame of 20", 90e-6),
+)
+"""Streamed edits: kind and number of their operations, name, and bar of the server's CPU time for one [s]."""
+FROZEN, CROWD = "longest time to a hook beside a frozen subscriber", "subscribers of a part, all in order"
+SCRIPT, KILLED = "end of a script that closes nothing", "server killed, until an edit is acknowledged"
+STATE, RATE, LOST = "20 values, to two readers", "20 values, vectors sent", "20 values, vectors lost"
+WHOLE, PART = "robot and kitchen joined, under edits", "part of an arm joined, under edits"
+RESTORED = "large store served"
+ENDING = """
+import time, kineverse as kv
+model = kv.load("live:bench")
+model.listen(print)
+print(time.perf_counter())
+"""
+
+Started = TypeVar("Started", bound=Program)
+_EDITS, _STREAMED, _LARGE_EDITS = 20, 200, 60
 _RATE, _SECONDS = 20_000.0, 0.5  # of vectors
 _CROWD = 200
-_LARGE_EDITS = 60  # what a subscriber does not read has to fill its socket
-
-FROZEN, CROWD = (
-    "longest time to a hook beside a frozen subscriber",
-    "subscribers of a part, all edits in order",
-)
-SCRIPT, KILLED = "end of a script that closes nothing", "server killed, until the next edit is acknowledged"
-STATE, STATE_RATE, STATE_LOST = (
-    f"20 values, {what}" for what in ("to a reader", "vectors sent", "vectors lost")
-)
-WHOLE, PART = "robot and kitchen joined, under edits", "part of an arm joined, under edits"
-RESTORE = "large store served"
+_FEW, _SIZE = 10, 20  # objects of the small model, coordinates of an object
 
 
-class Process:
-    """Object of :mod:`.exchange_programs` in a process of its own."""
+class Processes(BaseManager):
+    """Process with a program."""
 
-    def __init__(self, program: str, *arguments: object, folder: str, **options: object) -> None:
-        code = (
-            "import json, sys; from kineverse_studies.bench import exchange_programs as programs; "
-            "name, arguments, options = json.loads(sys.argv[1]); "
-            "programs.run(getattr(programs, name)(*arguments, **options))"
-        )
-        self.name = program
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", code, json.dumps([program, arguments, options])],
-            env={**os.environ, "KINEVERSE_RUNTIME_DIR": folder},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
 
-    def begin(self, method: str, *arguments: object) -> None:
-        """Call a method; its result is for :meth:`end`."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{json.dumps([method, *arguments])}\n")
-        self._process.stdin.flush()
-
-    def end(self) -> Any:
-        """Return the result of the method that was called, or None once the process is ready."""
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise ProgramError(f"The program {self.name!r} ended with status {self._process.wait()}.")
-        return json.loads(line)
-
-    def __call__(self, method: str, *arguments: object) -> Any:
-        self.begin(method, *arguments)
-        return self.end()
-
-    def signal(self, number: int) -> None:
-        """Send a signal to the process."""
-        self._process.send_signal(number)
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.kill()
-        self._process.communicate()
+for _program in (Server, Relay, Follower, Editor, Crowd, Source, Reader):
+    Processes.register(_program.__name__, _program)
 
 
 class Scene:
-    """Folder with sockets and stores, and processes that end with it."""
+    """Folder of sockets and of a store, with processes that end with it."""
 
-    def __init__(self, folder: str, opened: ExitStack) -> None:
-        self.folder, self._opened = folder, opened
-        self.relay = f"unixsock-stream/{folder}/relay.sock"
+    def __init__(self) -> None:
+        self._opened, self._started = ExitStack(), list[Program]()  # which end with their last proxies
+        # The path of a socket has to be short.
+        self.folder = self._opened.enter_context(tempfile.TemporaryDirectory(prefix="kv-"))
+        self.environment = "KINEVERSE_RUNTIME_DIR", self.folder
 
-    def start(self, *program: Any, **options: object) -> Process:
-        """Start a process, and return it when it is ready."""
-        process = Process(*program, folder=self.folder, **options)
-        self._opened.callback(process.close)
-        process.end()
-        return process
+    def __enter__(self) -> Scene:
+        return self
 
-    def run_script(self, code: str) -> tuple[str, float]:
-        """Run a script, and return its output and when it ended."""
-        environment = {**os.environ, "KINEVERSE_RUNTIME_DIR": self.folder}
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", code], env=environment, stdout=subprocess.PIPE, text=True, check=True
-        )
-        return done.stdout, perf_counter()
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
 
-    def serve(self, *models: str, **options: object) -> Process:
-        """Start a server of models, or of a number of joints."""
-        return self.start("Server", f"{self.folder}/bench.db", *models, **options)
+    def start(self, program: type[Started], *arguments: object) -> Started:
+        """Return an object whose methods are called in a process of its own."""
+        process = Processes(ctx=get_context("spawn"))
+        process.start(set_environment, self.environment)
+        self._opened.callback(process.shutdown)
+        found: Started = getattr(process, program.__name__)(*arguments)
+        self._started.append(found)
+        return found
 
+    def stop(self, *programs: Program) -> None:
+        for program in programs:
+            os.kill(program.pid(), SIGKILL)
 
-@contextmanager
-def make_scene() -> Iterator[Scene]:
-    # A socket's path has to be short.
-    with tempfile.TemporaryDirectory(prefix="kv-") as folder, ExitStack() as opened:
-        yield Scene(folder, opened)
+    def serve(self, joints: int = 0, *models: str) -> Server:
+        return self.start(Server, f"{self.folder}/bench.db", joints, *models)
 
 
 def measure_exchange(settings: BenchmarkSettings) -> BenchmarkResult:
     one = Benchmark("exchange", settings)
-    for measure in (
-        _measure_edits,
-        _measure_faults,
-        _measure_state,
-        _measure_joining,
-        _measure_restoring,
-        _measure_growth,
-    ):
-        measure(one)
+    for measure in (_edits, _faults, _state, _joining, _restoring, _growth):
+        with Scene() as scene:
+            measure(one, scene)
     return one.result(
         "a model server and its clients, each a process: an edit until a subscriber's hook is called, beside "
-        "a server that only publishes the same bytes; PR2 and kitchen joined; state; faults"
+        "a server that only publishes the same bytes; state; joining; faults; models of many objects"
     )
 
 
-def _measure_edits(one: Benchmark) -> None:
+def _time(one: Benchmark, samples: dict[str, Callable[[], float]], is_slow: bool = True) -> None:
+    contenders = [Contender(name, sample) for name, sample in samples.items()]
+    one.time(contenders, one.settings.processes if is_slow else None)
+
+
+def _edits(one: Benchmark, scene: Scene) -> None:
     """Measure the time to a subscriber beside the relay, and the CPU time of the server."""
-    with make_scene() as scene:
-        server, _ = scene.serve(), scene.start("Relay", scene.relay)
-        editor, follower = scene.start("Editor", scene.relay), scene.start("Follower", scene.relay)
+    place = f"unixsock-stream/{scene.folder}/relay.sock"
+    server, _ = scene.serve(), scene.start(Relay, place)
+    editor, follower = scene.start(Editor, place), scene.start(Follower, place)
 
-        def edit(kind: str) -> float:
-            return statistics.median(_delays(editor, follower, kind, _EDITS))
+    def relay(kind: str) -> float:
+        starts = editor.relay(kind, _EDITS)
+        return median(end - start for start, end in zip(starts, follower.relayed(_EDITS), strict=True))
 
-        def relay(kind: str) -> float:
-            starts = editor("relay", kind, _EDITS)
-            return _median_difference(follower("relayed", _EDITS), starts)
+    def stream(kind: str, size: int) -> float:
+        before = server.times()[1]
+        editor.stream(kind, _STREAMED // size, size)
+        return float(server.times()[1] - before) / _STREAMED
 
-        def cpu(kind: str, size: int) -> float:
-            before = server("cpu_time")
-            editor("stream", kind, _STREAMED // size, size)
-            return (server("cpu_time") - before) / (_STREAMED // size * size)
-
-        contenders = []
-        for name in KINDS:
-            kind = name.split()[0].replace("constant", "frame")
-            contenders += [
-                Contender(f"{name}, to the hook", lambda kind=kind: edit(kind)),
-                Contender(f"{name}, by the relay", lambda kind=kind: relay(kind)),
-            ]
-        one.time(contenders, what="exchange, edits")
-        for name, (size, limit) in CPU.items():
-            kind = "joint" if "joint" in name else "frame"
-            label = f"server's CPU time, {name}"
-            one.time(
-                [Contender(label, lambda kind=kind, size=size: cpu(kind, size))],
-                one.settings.processes,
-                "exchange, CPU",
-            )
-            one.bound(limit, label)
-    for name, limit in KINDS.items():
-        ours, theirs = (one.measured[f"{name}, {how}"].median for how in ("to the hook", "by the relay"))
-        one.compare(f"{name}, to the hook, longer than by the relay", ours - theirs, "s", limit)
+    samples: dict[str, Callable[[], float]] = {}
+    for kind, (name, _) in EDITS.items():
+        samples[f"{name}, {TO_HOOK}"] = lambda kind=kind: median(_delays(editor, follower, kind, _EDITS))
+        samples[f"{name}, {BY_RELAY}"] = partial(relay, kind)
+    _time(one, samples, is_slow=False)
+    for name, limit in EDITS.values():
+        ours, theirs = (one.measured[f"{name}, {how}"].samples for how in (TO_HOOK, BY_RELAY))
+        longer = median(a - b for a, b in zip(ours, theirs, strict=True))
+        one.compare(f"{name}, {TO_HOOK}, longer than {BY_RELAY}", longer, "s", limit)
+    for kind, size, name, limit in STREAMS:
+        _time(one, {f"server's CPU time, {name}": partial(stream, kind, size)})
+        one.bound(limit, f"server's CPU time, {name}")
 
 
-def _delays(editor: Process, follower: Process, kind: str, *how: float) -> list[float]:
-    made = editor("edit", kind, *how)
-    heard = follower("heard", [version for version, _ in made])
-    return [end - start for end, (_, start) in zip(heard, made, strict=True)]
+def _delays(editor: Editor, follower: Follower, kind: str, count: int, pause: float = PAUSE) -> list[float]:
+    made = editor.edit(kind, count, pause)
+    heard = follower.heard([version for version, *_ in made])
+    return [end - start for end, (_, start, _) in zip(heard, made, strict=True)]
 
 
-def _median_difference(ends: Sequence[float], starts: Sequence[float]) -> float:
-    return statistics.median(end - start for end, start in zip(ends, starts, strict=True))
+def _faults(one: Benchmark, scene: Scene) -> None:
+    """Measure subscribers that are frozen or many, the end of a script, and a server that is killed."""
+    server, editor = scene.serve(), scene.start(Editor)
+    follower, frozen = (scene.start(Follower) for _ in range(2))
+    editor.edit("frame", 1)
+    process = frozen.pid()
+    os.kill(process, SIGSTOP)
+    one.note(FROZEN, "s", max(_delays(editor, follower, "large", _LARGE_EDITS, 0.0)))
+    os.kill(process, SIGCONT)
+    crowd = scene.start(Crowd, _CROWD, "edited/")
+    one.note(CROWD, "subscribers", crowd.got([version for version, *_ in editor.edit("frame", _EDITS)]))
+    scene.stop(crowd, follower, frozen)
+    environment = dict([*os.environ.items(), scene.environment])
 
+    def end_script() -> float:
+        said = subprocess.check_output([sys.executable, "-c", ENDING], env=environment)
+        return perf_counter() - float(said)
 
-def _measure_faults(one: Benchmark) -> None:
-    """Measure a server that is killed, subscribers that are many or frozen, and the end of a script."""
-    settings = one.settings
-    with make_scene() as scene:
-        server, _ = scene.serve(), scene.start("Relay", scene.relay)
-        editor = scene.start("Editor")
-        follower, frozen = (scene.start("Follower", scene.relay) for _ in range(2))
-        editor("edit", "frame", 1)
+    def restart() -> float:
+        nonlocal server
+        start = perf_counter()
+        scene.stop(server)
+        server = scene.serve()
+        return editor.edit("frame", 1)[0][2] - start
 
-        frozen.signal(signal.SIGSTOP)
-        delays = _delays(editor, follower, "large", _LARGE_EDITS, 0.0)
-        one.note(FROZEN, "s", max(delays))
-        frozen.signal(signal.SIGCONT)
-
-        crowd = scene.start("Crowd", _CROWD, "edited/")
-        versions = [version for version, _ in editor("edit", "frame", _EDITS)]
-        one.note(CROWD, "subscribers", crowd("in_order", versions))
-        crowd.close()
-
-        def end_script() -> float:
-            line, end = scene.run_script(
-                "import kineverse as kv, time\nmodel = kv.load('live:bench')\n"
-                "model.listen(print)\nprint(time.perf_counter())"
-            )
-            return end - float(line)
-
-        def restart() -> float:
-            nonlocal server
-            server.signal(signal.SIGKILL)
-            start = perf_counter()
-            server.close()
-            server = scene.serve()
-            return editor("edit_again") - start
-
-        one.time(
-            [Contender(SCRIPT, end_script), Contender(KILLED, restart)],
-            settings.processes,
-            "exchange, faults",
-        )
+    _time(one, {SCRIPT: end_script, KILLED: restart})
     one.bound(0.15, FROZEN)
     one.compare(CROWD, one.measured[CROWD].median, "subscribers", _CROWD, at_least=True)
     one.bound(1.0, SCRIPT)
     one.bound(2.0, KILLED)
 
 
-def _measure_state(one: Benchmark) -> None:
-    with make_scene() as scene:
-        source = scene.start("Source")
-        readers = [scene.start("Reader", source("endpoint")) for _ in range(2)]
-        lost: list[int] = []
-        rates: list[float] = []
-        number = round(_RATE * _SECONDS)
-        source("send", 1, _RATE)  # by which the connections are known
-        sent = 1
-
-        def send() -> float:
-            nonlocal sent
-            rates.append(source("send", number, _RATE))
-            sent += number
-            taken = [reader("taken", sent) for reader in readers]
-            lost.append(max(missing for missing, _ in taken))
-            return max(delay for _, delay in taken)
-
-        one.time([Contender(STATE, send)], one.settings.processes, "exchange, state")
-    one.note(STATE_RATE, "1/s", min(rates))
-    one.note(STATE_LOST, "vectors", lost[-1])
+def _state(one: Benchmark, scene: Scene) -> None:
+    source = scene.start(Source)
+    readers = [scene.start(Reader, source.endpoint()) for _ in range(2)]
+    while not all(reader.take(1)[0] for reader in readers):
+        source.send(1, _RATE)
+    known = [reader.take(0)[0] for reader in readers]
+    number, sent = round(_RATE * _SECONDS), 0
+    rates, delays = [], []
+    for _ in range(one.settings.processes):
+        rates.append(source.send(number, _RATE))
+        sent += number
+        taken = [reader.take(sent + before) for reader, before in zip(readers, known, strict=True)]
+        delays.append(max(delay for _, delay in taken))
+    come = [reader.take(0)[0] - before for reader, before in zip(readers, known, strict=True)]
+    one.note(STATE, "s", *delays)
+    one.note(RATE, "vectors/s", *rates)
+    one.note(LOST, "vectors", sent - min(come))
     one.bound(0.5e-3, STATE)
-    one.compare(STATE_RATE, min(rates), "1/s", 0.99 * _RATE, at_least=True)
-    one.bound(0, STATE_LOST)
+    one.bound(0.0, LOST)
+    one.compare(RATE, one.measured[RATE].median, "vectors/s", 0.99 * _RATE, at_least=True)
 
 
-def _measure_joining(one: Benchmark) -> None:
+def _joining(one: Benchmark, scene: Scene) -> None:
     robot = find_benchmark_robot(one.settings)
-    with make_scene() as scene:
-        scene.serve(str(robot.file), "kitchen")
-        editor, joiner = scene.start("Editor"), scene.start("Joiner")
-        arm = joiner("frame", robot.frame)
+    scene.serve(0, str(robot.file), "kitchen")
+    editor, joiner = scene.start(Editor), scene.start(Editor)
 
-        def join(frame: str | None) -> float:
-            editor.begin("keep_editing", 0.3)
-            seconds = float(joiner("join", frame))
-            editor.end()
-            return seconds
+    def join(*frames: str) -> float:
+        with ThreadPoolExecutor() as beside:
+            beside.submit(editor.edit, "frame", _EDITS)
+            return joiner.join(*frames)
 
-        contenders = [Contender(WHOLE, lambda: join(None)), Contender(PART, lambda: join(arm))]
-        one.time(contenders, what="exchange, joining")
+    _time(one, {WHOLE: join, PART: partial(join, robot.frame)}, is_slow=False)
     one.bound(0.2, WHOLE)
     one.bound(0.05, PART)
 
 
-def _measure_restoring(one: Benchmark) -> None:
-    with make_scene() as scene:
-        scene.serve(joints=one.settings.operations).close()
+def _restoring(one: Benchmark, scene: Scene) -> None:
+    scene.stop(scene.serve(one.settings.operations))
 
-        def restore() -> float:
-            server = scene.serve()
-            seconds = float(server("start_time"))
-            server.close()
-            return seconds
+    def restore() -> float:
+        server = scene.serve()
+        seconds, _ = server.times()
+        scene.stop(server)
+        return seconds
 
-        one.time([Contender(RESTORE, restore)], one.settings.processes, "exchange, restoring")
-    one.bound(2.0, RESTORE)
+    _time(one, {RESTORED: restore})
+    one.bound(2.0, RESTORED)
 
 
-def _measure_growth(one: Benchmark) -> None:
-    """Compare edits of a large model with those of a small one."""
-    sizes = FEW, max(one.settings.operations // 10, FEW)
-    with ExitStack() as scenes:
-        editors = []
-        for objects in sizes:
-            scene = scenes.enter_context(make_scene())
-            scene.serve(joints=SIZE * objects)
-            editors.append(scene.start("Editor"))
-        times: dict[str, list[float]] = {}
-        for _ in range(one.settings.processes):
-            for objects, editor in zip(sizes, editors, strict=True):
-                for what, seconds in editor("touch", _EDITS).items():
-                    times.setdefault(f"{what} a joint among {objects:,} objects", []).append(seconds)
+def _growth(one: Benchmark, small: Scene) -> None:
+    """Compare edits of a model of many objects with those of few."""
+    many = max(one.settings.operations // 10, _FEW)
+    times: dict[str, list[float]] = {}
+    with Scene() as large:
+        scenes = {_FEW: small, many: large}
+        for objects, scene in scenes.items():
+            scene.serve(_SIZE * objects)
+        editors = {objects: scene.start(Editor) for objects, scene in scenes.items()}
+        for _ in range(one.settings.processes * _EDITS):
+            for objects, editor in editors.items():
+                for what, kind in (("append", "joint"), ("replace", "replace"), ("remove", "remove")):
+                    ((_, start, end),) = editor.edit(kind, 1)
+                    times.setdefault(f"{what} a joint, {objects:,} objects", []).append(end - start)
     for name, seconds in times.items():
-        one.note(name, "s", *seconds)
-    names = list(times)
-    for small, large in zip(names[:3], names[3:], strict=True):
-        ratio = one.measured[large].median / one.measured[small].median
-        one.compare(f"{large}, beside {FEW}", ratio, "x", 2.0)
+        one.note(name, "s", median(seconds))
+    names = [*times]
+    for few, name in zip(names[:3], names[3:], strict=True):
+        ratio = one.measured[name].median / one.measured[few].median
+        one.compare(f"{name}, beside {_FEW}", ratio, "x", 2.0)

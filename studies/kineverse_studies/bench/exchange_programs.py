@@ -1,10 +1,10 @@
-"""Programs of benchmark ``exchange``: each is an object in a process of its own, called by standard input."""
+"""Programs of benchmark ``exchange``: objects in processes of their own."""
 
 from __future__ import annotations
 
-import json
+import gc
+import os
 import statistics
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -28,283 +28,224 @@ from kineverse.model import Edit
 
 from .models import make_joints
 
-ADDRESS = "live:bench"
-_RELAY, _SOURCE = "relay", "arm"
-_VALUES = tuple(f"arm/joint {k}" for k in range(20))
-_PAUSE = 0.004  # between edits, so that everybody sleeps when one comes [s]
+_NAME, _ADDRESS = "bench", "live:bench"
+_VALUES = tuple(f"joint {k}" for k in range(20))
+PAUSE = 0.004  # before an edit, so that it finds everybody asleep [s]
 _AT_ONCE = 64  # edits under way while they are streamed
 _LARGE = "x" * 100_000
 _LONG = 20.0  # longest time that anything is waited for [s]
 
 
-def run(program: object) -> None:
-    """Call methods of an object: standard input has a list of name and arguments in each line."""
-    print("null", flush=True)
-    for line in sys.stdin:
-        name, *arguments = json.loads(line)
-        print(json.dumps(getattr(program, name)(*arguments)), flush=True)
+def set_environment(name: str, value: str) -> None:
+    os.environ[name] = value
 
 
-class Server:
-    """Model server, of models or of a number of joints."""
+class Program:
+    def pid(self) -> int:
+        return os.getpid()
 
-    def __init__(self, store: str, *models: str, joints: int = 0) -> None:
+
+class Server(Program):
+    """Server of models, or of a number of joints, with a store."""
+
+    def __init__(self, store: str, joints: int, *models: str) -> None:
         given = make_joints(joints) if joints and not Path(store).exists() else models
         start = perf_counter()
-        self._server = serve(given, name="bench", store=store)
-        self._seconds = perf_counter() - start
+        self._server = serve(given, name=_NAME, store=store)
+        self.seconds = perf_counter() - start
+        gc.collect()
+        gc.freeze()  # as the command does
 
-    def start_time(self) -> float:
-        """Return the time that it took to serve [s]."""
-        return self._seconds
-
-    def cpu_time(self) -> float:
-        """Return the CPU time of this process [s]."""
-        return time.process_time()
+    def times(self) -> tuple[float, float]:
+        """Return the time until it served and the CPU time of the process [s]."""
+        return self.seconds, time.process_time()
 
 
-class Relay:
+class Relay(Program):
     """Server that publishes what it is asked."""
 
     def __init__(self, endpoint: str) -> None:
         self._transport = Transport.serve([endpoint])
-        self._questions = self._transport.answers(f"{_RELAY}/edit")
-        threading.Thread(target=self._relay, daemon=True).start()
+        self._questions = self._transport.answers("relay/edit")
+        _start(self._work)
 
-    def _relay(self) -> None:
+    def _work(self) -> None:
         for question in self._questions:
-            self._transport.publish(f"{_RELAY}/log", question.payload)
+            self._transport.publish("relay/log", question.payload)
             question.answer(b"")
 
 
-class Follower:
+class Follower(Program):
     """Subscriber of all commits, and of the relay."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, relay: str = "") -> None:
+        self._model, self._transport = load_live(_ADDRESS), _connect(relay)
         self._heard: dict[int, float] = {}
         self._relayed: list[float] = []
-        self._model = load_live(ADDRESS)
         self._model.listen(lambda diff: self._heard.setdefault(diff.version, perf_counter()))
-        self._transport = Transport.connect(endpoint)
-        self._messages = self._transport.subscribe(f"{_RELAY}/log")
-        threading.Thread(target=self._follow, daemon=True).start()
+        _start(self._work, self._transport.subscribe("relay/log"))
 
-    def _follow(self) -> None:
-        for _ in self._messages:
+    def _work(self, messages: Iterable[bytes]) -> None:
+        for _ in messages:
             self._relayed.append(perf_counter())
 
     def heard(self, versions: Sequence[int]) -> list[float]:
-        """Return when hooks were called."""
-        wait_for(lambda: versions[-1] in self._heard)
+        _wait(lambda: versions[-1] in self._heard)
         return [self._heard[version] for version in versions]
 
     def relayed(self, count: int) -> list[float]:
-        """Return when messages came from the relay."""
-        wait_for(lambda: len(self._relayed) >= count)
+        _wait(lambda: len(self._relayed) >= count)
         found, self._relayed = self._relayed, []
         return found
 
 
-class Editor:
-    """Client that edits."""
+class Editor(Program):
+    """Client that edits and joins."""
 
-    def __init__(self, endpoint: str = "") -> None:
-        self._number = 0
-        self._model = load_live(ADDRESS)
-        self._transport = Transport.connect(endpoint) if endpoint else self._model.exchange.transport
+    def __init__(self, relay: str = "") -> None:
+        self._model, self._transport = load_live(_ADDRESS), _connect(relay)
+        self._number, self._tag = 0, ""
 
-    def edit(self, kind: str, count: int, pause: float = _PAUSE) -> list[tuple[int, float]]:
-        """Make edits, and return their versions and when they began."""
-        made = []
-        for _ in range(count):
+    def edit(self, kind: str, count: int, pause: float = PAUSE) -> list[tuple[int, float, float]]:
+        """Make edits, and return their versions, when they began and when they were acknowledged."""
+        made: list[tuple[int, float, float]] = []
+        while len(made) < count:
             time.sleep(pause)
             start = perf_counter()
-            with self._model.edit() as edit:
-                self._put(edit, kind)
-            made.append((self._model.version, start))
+            try:
+                with self._model.edit() as edit:
+                    self._put(edit, kind)
+            except OfflineError:
+                continue
+            made.append((self._model.version, start, perf_counter()))
         return made
 
     def relay(self, kind: str, count: int) -> list[float]:
-        """Ask the relay with the bytes of edits, and return when."""
-        data = protocol.encode(self._requests(kind, 1, 1)[0])
-        starts = []
+        """Ask the relay with the bytes of an edit, and return when."""
+        data, starts = protocol.encode(self._request(kind, 1)), []
         for _ in range(count):
-            time.sleep(_PAUSE)
+            time.sleep(PAUSE)
             starts.append(perf_counter())
-            self._transport.ask(f"{_RELAY}/edit", data, _LONG)
+            self._transport.ask("relay/edit", data, _LONG)
         return starts
 
     def stream(self, kind: str, count: int, size: int) -> None:
-        """Make edits of so many operations, many at once."""
-        requests = self._requests(kind, count, size)
+        requests = [self._request(kind, size) for _ in range(count)]
         with ThreadPoolExecutor(_AT_ONCE) as pool:
-            answers = list(pool.map(self._model.exchange.ask_edit, requests))
-        refused = [answer.message for answer in answers if isinstance(answer, protocol.Refused)]
-        if refused:
-            raise KineverseError(refused[0])
+            for answer in pool.map(self._model.exchange.ask_edit, requests):
+                if isinstance(answer, protocol.Refused):
+                    raise KineverseError(answer.message)
 
-    def keep_editing(self, seconds: float) -> int:
-        """Edit for some time, and return how often."""
-        end, count = time.monotonic() + seconds, 0
-        while time.monotonic() < end:
-            self.edit("frame", 1)
-            count += 1
-        return count
-
-    def edit_again(self) -> float:
-        """Return when the first edit is acknowledged by a server that starts."""
-        while True:
-            try:
-                self.edit("frame", 1, 0.001)
-                return perf_counter()
-            except OfflineError:
-                continue
-
-    def touch(self, count: int) -> dict[str, float]:
-        """Return the times of appending, replacing and removing a joint [s]."""
-        times: dict[str, list[float]] = {"append": [], "replace": [], "remove": []}
-        for _ in range(count):
-            self._number += 1
-            name = f"touched {self._number}"
-            tag = ""
-            for what, seconds in times.items():
-                time.sleep(_PAUSE)
-                start = perf_counter()
-                with self._model.edit() as edit:
-                    if what == "append":
-                        tag = edit.apply(_joint(name, 1.0))
-                    elif what == "replace":
-                        edit.replace(tag, _joint(name, 2.0))
-                    else:
-                        edit.remove(tag)
-                seconds.append(perf_counter() - start)
-        return {what: statistics.median(seconds) for what, seconds in times.items()}
-
-    def _put(self, edit: Edit, kind: str) -> None:
-        self._number += 1
-        name = f"edited/{self._model.exchange.client[:8]}/{self._number}"
-        if kind == "frame":
-            edit.add_frame(name, "world", kv.translation(0.1, 0.2, 0.3))
-        elif kind == "joint":
-            edit.apply(_joint(name, 1.0))
-        else:
-            edit.write(name, _LARGE if kind == "large" else 1.0)
-
-    def _requests(self, kind: str, count: int, size: int) -> list[protocol.Edit]:
-        connection, requests = self._model.exchange, []
-        for _ in range(count):
-            model = kv.Model()
-            with model.edit() as edit:
-                for _ in range(size):
-                    self._put(edit, kind)
-            put = tuple(
-                protocol.Placed(operation_to_bytes(model, tag), at_end=True) for tag in model.history.tags
-            )
-            number, changes = connection.next_number(), protocol.Changes(put)
-            requests.append(
-                protocol.Edit(connection.client, number, connection.who, *connection.position, changes)
-            )
-        return requests
-
-
-def _joint(name: str, upper: float) -> kv.Revolute:
-    return kv.Revolute(name=name, parent="world", child=name, lower=-1.0, upper=upper, velocity=1.0)
-
-
-class Joiner:
-    """Client that joins again and again."""
-
-    def join(self, frame: str | None) -> float:
-        """Return the time of loading the whole model, or the part of a frame [s]."""
+    def join(self, *frames: str) -> float:
         start = perf_counter()
-        model = load_live(ADDRESS, frames=None if frame is None else [frame])
+        model = load_live(_ADDRESS, frames=frames or None)
         seconds = perf_counter() - start
         model.close()
         return seconds
 
-    def frame(self, end: str) -> str:
-        """Return the frame of a name with some prefix."""
-        with load_live(ADDRESS) as model:
-            return next(name for name in model.frames if f"/{name}".endswith(f"/{end}"))
+    def _put(self, edit: Edit, kind: str) -> None:
+        if kind == "remove":
+            edit.remove(self._tag)
+            return
+        self._number += kind != "replace"
+        name = f"edited/{self._model.exchange.client[:8]}/{self._number}"
+        if kind == "frame":
+            edit.add_frame(name, "world", kv.translation(0.1, 0.2, 0.3))
+        elif kind in ("datum", "large"):
+            edit.write(name, _LARGE if kind == "large" else 1.0)
+        else:
+            upper = 1.0 if kind == "joint" else 2.0
+            made = kv.Revolute(name=name, parent="world", child=name, lower=-1.0, upper=upper, velocity=1.0)
+            if kind == "joint":
+                self._tag = edit.apply(made)
+            else:
+                edit.replace(self._tag, made)
+
+    def _request(self, kind: str, size: int) -> protocol.Edit:
+        model, connection = kv.Model(), self._model.exchange
+        with model.edit() as edit:
+            for _ in range(size):
+                self._put(edit, kind)
+        blobs = [operation_to_bytes(model, tag) for tag in model.history.tags]
+        changes = protocol.Changes(tuple(protocol.Placed(blob, at_end=True) for blob in blobs))
+        number, who = connection.next_number(), connection.who
+        return protocol.Edit(connection.client, number, who, *connection.position, changes)
 
 
-class Crowd:
-    """Many subscribers of one part, each with a connection of its own."""
+class Crowd(Program):
+    """Many subscribers of a part, each with a connection of its own."""
 
     def __init__(self, count: int, frame: str) -> None:
-        self._model = load_live(ADDRESS, frames=[frame])
-        self._numbers: list[list[int]] = [[] for _ in range(count)]
-        endpoint, _ = Address.parse(ADDRESS).find()
+        self._model = load_live(_ADDRESS, frames=[frame])
         key = self._model.exchange.key(f"view/{Wish((frame,), bodies=False).id}")
-        self._transports = [Transport.connect(endpoint) for _ in range(count)]
-        for transport, numbers in zip(self._transports, self._numbers, strict=True):
-            messages = transport.subscribe(key)
-            threading.Thread(target=self._follow, args=(messages, numbers), daemon=True).start()
+        self._versions: list[list[int]] = [[] for _ in range(count)]
+        self._transports = [_connect() for _ in range(count)]
+        for transport, versions in zip(self._transports, self._versions, strict=True):
+            _start(self._work, transport.subscribe(key), versions)
 
-    def _follow(self, messages: Iterable[bytes], numbers: list[int]) -> None:
+    def _work(self, messages: Iterable[bytes], versions: list[int]) -> None:
         for data in messages:
-            numbers.append(protocol.decode_commit(protocol.decode_published(data).commit).revision)
+            versions += [protocol.decode_commit(protocol.decode_published(data).commit).revision]
 
-    def in_order(self, versions: list[int]) -> int:
-        """Return how many got all of these versions, in order and once."""
-        late = time.monotonic() + _LONG
-        while any(len(n) < len(versions) for n in self._numbers) and time.monotonic() < late:
-            time.sleep(0.001)
-        return sum(numbers == versions for numbers in self._numbers)
+    def got(self, versions: list[int]) -> int:
+        """Return how many have got all of these versions, in order and once."""
+        _wait(lambda: all(len(own) >= len(versions) for own in self._versions))
+        return self._versions.count(versions)
 
 
-class Source:
-    """Source of vectors; the first value is the time of sending."""
+class Source(Program):
+    """Source of vectors; the first value is when one was sent."""
 
     def __init__(self) -> None:
-        self._publisher = StatePublisher("bench", _SOURCE, _VALUES)
+        self._publisher = StatePublisher(_NAME, "source", _VALUES)
 
     def endpoint(self) -> str:
-        """Return where it listens."""
         return self._publisher.endpoint
 
     def send(self, count: int, rate: float) -> float:
-        """Send vectors at a rate [1/s], and return the rate that was reached."""
+        """Send vectors at a rate, and return the rate that was reached [1/s]."""
         vector, start = np.zeros(len(_VALUES)), perf_counter()
         for number in range(count):
-            due = start + number / rate
-            while (now := perf_counter()) < due:
-                time.sleep(max(0.0, due - now))
+            while (now := perf_counter()) < start + number / rate:
+                time.sleep(start + number / rate - now)
             vector[0] = now
             self._publisher.put(vector)
         return count / (perf_counter() - start)
 
 
-class Reader:
-    """Reader of a source, awake whenever a vector comes."""
+class Reader(Program):
+    """Reader of the source, awake whenever a vector comes."""
 
     def __init__(self, endpoint: str) -> None:
-        self._reader = StateReader("bench", _VALUES)
-        self._reader.follow([protocol.SourceStatus(_SOURCE, endpoint, _VALUES, 0.0, "0" * 32)])
-        self._delays: list[float] = []
-        threading.Thread(target=self._read, daemon=True).start()
+        self._reader, self._delays = StateReader(_NAME, _VALUES), list[float]()
+        self._reader.follow([protocol.SourceStatus("source", endpoint, _VALUES, 0.0, "0" * 32)])
+        _start(self._work)
 
-    def _read(self) -> None:
+    def _work(self) -> None:
         vector = np.zeros(len(_VALUES))
         while True:
             if self._reader.wait(_LONG):
                 self._reader.into(vector)
                 self._delays.append(perf_counter() - vector[0])
 
-    def taken(self, count: int) -> tuple[int, float]:
-        """Return how many of all vectors did not come, and the median time that one took [s]."""
+    def take(self, count: int) -> tuple[int, float]:
+        """Return how many vectors have come so far, and the median time of the last ones [s]."""
         late = time.monotonic() + 1.0
-        while self._received() < count and time.monotonic() < late:
+        while (come := self._reader.received["source"]) < count and time.monotonic() < late:
             time.sleep(0.001)
         delays, self._delays = self._delays, []
-        return count - self._received(), statistics.median(delays)
-
-    def _received(self) -> int:
-        return self._reader.received[_SOURCE]
+        return come, statistics.median(delays or [0.0])
 
 
-def wait_for(is_done: Callable[[], bool]) -> None:
-    """Wait until something is so."""
+def _connect(endpoint: str = "") -> Transport:
+    return Transport.connect(endpoint or Address.parse(_ADDRESS).find()[0])
+
+
+def _start(work: Callable[..., None], *arguments: object) -> None:
+    threading.Thread(target=work, args=arguments, daemon=True).start()
+
+
+def _wait(is_done: Callable[[], bool]) -> None:
     late = time.monotonic() + _LONG
     while not is_done():
         if time.monotonic() > late:
