@@ -16,15 +16,16 @@ from typing import Any, TypeVar
 
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
 from kineverse._version import __version__
-from kineverse.errors import ConflictError, EditError, KineverseError, OfflineError
+from kineverse.errors import ConflictError, EditError, OfflineError
 from kineverse.formats import entries_from_bytes, entry_to_bytes, operation_from_bytes
 from kineverse.formats.resources import add_resolver, remove_resolver
 from kineverse.model.changes import find_moved_tags
 from kineverse.model.commits.net_changes import NetChanges, PlacedEntry
 from kineverse.model.edit import Edit
-from kineverse.model.history import History, HistoryEntry
+from kineverse.model.history import HistoryEntry
 from kineverse.model.model import EditContext, Model
-from kineverse.model.read_recorder import ABSENT
+from kineverse.model.operation import RATES
+from kineverse.model.read_recorder import ABSENT, Read
 from kineverse.symbols import Symbol
 
 from . import protocol
@@ -32,6 +33,7 @@ from .address import Address
 from .connection import Connection
 from .meshes import FetchedFiles, find_known_files, put_contents
 from .transport import Channel
+from .views import EVERY_FRAME, LOAD_THE_WHOLE, is_partial
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,7 +60,8 @@ def load_live(
         Names of frames and of coordinates of a part, which is closed: their forward kinematics, Jacobians,
         constraints and rates are those of the whole. By default the model is whole.
     bodies
-        Whether bodies are wanted: by default in the whole, and not in a part.
+        Whether bodies are wanted: by default in the whole, and not in a part. Alone, False is for all frames
+        with what they need.
 
     Raises
     ------
@@ -73,15 +76,18 @@ def load_live(
         Without the extra ``exchange``.
     """
     is_part = frames is not None or symbols is not None
+    if bodies is None:
+        bodies = not is_part
+    check_flag("bodies", bodies)
     wish = protocol.Join(
         protocol.PROTOCOL,
         __version__,
         "",
         "",
-        as_entries("frames=", frames or (), str, "names of frames"),
+        as_entries("frames=", frames or (), str, "names of frames") if is_part else EVERY_FRAME,
         tuple(map(str, symbols or ())),
-        not is_part if bodies is None else check_flag("bodies", bodies),
-        is_part or bodies is False,
+        bodies,
+        is_part or not bodies,
     )
     return LiveModel(Connection(Address.parse(source)), wish)
 
@@ -199,6 +205,9 @@ class LiveModel(Model):
         A listener is called after the model has its version, so hooks of that version may still run.
         """
         wanted = as_count("version", version, 0)
+        if self._edit is not None and self._lock.acquire(blocking=False):  # this thread edits
+            self._lock.release()
+            raise EditError("A model gets no commits while it is edited: wait after the edit.")
         return self.exchange.wait_for(
             lambda: self.exchange.revision >= wanted,
             None if timeout is None else as_tolerance(timeout, "A timeout"),
@@ -230,7 +239,7 @@ class LiveModel(Model):
         if changes.is_empty:
             return []
         if self._wish.is_part:
-            _check_part(self._history, changes, connection)
+            _check_part(self, changes)
         sequence = self._history.sequence
         put = tuple(
             protocol.Placed(entry_to_bytes(placed.entry, sequence), placed.after or "", placed.at_end)
@@ -252,7 +261,7 @@ class LiveModel(Model):
         """Wait until the replica has an edit that was committed, or raise the error of one that was not."""
         if isinstance(answer, protocol.Refused):
             if answer.reason == "stale":
-                self._catch_up()
+                self._close_gap()
             if answer.reason in ("conflict", "stale"):
                 named = {
                     "tags": (answer.tag,) if answer.tag else (),
@@ -265,7 +274,7 @@ class LiveModel(Model):
         while not connection.wait_for(lambda: connection.revision >= answer.revision, first):
             if not connection.is_online:
                 return  # it is stored, and comes when the server is back
-            self._catch_up()
+            self._close_gap()
             first = _OWN_COMMIT
 
     # -- following -----------------------------------------------------------------------------------------
@@ -285,7 +294,7 @@ class LiveModel(Model):
         add_resolver(fetched)
         self._finish = weakref.finalize(self, _finish, connection, self._deliveries, fetched)
         if log is None:
-            self._catch_up()  # what came before the subscription
+            self._close_gap()  # what came before the subscription
 
     def _pump(self, channel: Channel, method: Callable[[LiveModel, Any], None]) -> None:
         threading.Thread(
@@ -299,7 +308,7 @@ class LiveModel(Model):
         with self._following:
             connection = self.exchange
             if published.epoch != connection.epoch or commit.previous > connection.revision:
-                self._catch_up()
+                self._close_gap()
             elif commit.revision > connection.revision:
                 self._adopt_commit(published, commit)
 
@@ -311,23 +320,22 @@ class LiveModel(Model):
             return
         try:
             self._adopt(_decode_changes(commit), commit.revision)
-        except KineverseError:
+        except Exception:
             _LOG.exception("A commit of %s cannot be adopted; its model is joined again.", connection.address)
             self._join_again()
             return
         connection.advance(commit.revision, published.chain)
 
-    def _catch_up(self) -> None:
+    def _close_gap(self) -> None:
         """Ask for what was missed, and adopt it."""
         connection = self.exchange
         with self._following:
-            is_behind = True
-            while is_behind:
+            while True:
                 try:
                     answer = connection.ask_missed(self._view)
                 except OfflineError:
                     return  # when the server is back, it says so
-                if isinstance(answer, protocol.Refused):
+                if answer is None:
                     self._join_again()
                     return
                 connection.epoch = answer.epoch
@@ -335,10 +343,16 @@ class LiveModel(Model):
                     commit = protocol.decode_commit(published.commit)
                     if commit.revision > connection.revision:
                         self._adopt_commit(published, commit)
-                is_behind = bool(answer.commits) and connection.revision < answer.revision
-            if connection.revision < answer.revision:  # nothing of a part has changed
-                connection.advance(answer.revision, answer.chain)
+                if connection.revision >= answer.revision or not answer.commits:
+                    break
+            if connection.revision < answer.revision:
+                self._pass_by(answer.revision, answer.chain)
             connection.note_presence(True)
+
+    def _pass_by(self, revision: int, chain: bytes) -> None:
+        """Take the version of commits that concern nothing of a part."""
+        self._adopt(NetChanges(), revision)
+        self.exchange.advance(revision, chain)
 
     def _join_again(self) -> None:
         """Take the model anew, as one commit, if the server does not know the state that this one is in."""
@@ -359,9 +373,9 @@ class LiveModel(Model):
         with self._following:
             last = beat.views.get(self._view, 0) if self._wish.is_part else beat.revision
             if beat.epoch != connection.epoch or connection.revision < self._announced:
-                self._catch_up()
+                self._close_gap()
             elif self._wish.is_part and last <= connection.revision < beat.revision:
-                connection.advance(beat.revision, beat.chain)
+                self._pass_by(beat.revision, beat.chain)
             self._announced = last
         connection.hear(beat)
 
@@ -370,7 +384,7 @@ class LiveModel(Model):
         key, is_there = sign
         connection = self.exchange
         if is_there:
-            self._catch_up()
+            self._close_gap()
         elif key.endswith(connection.epoch):
             connection.note_presence(False)
 
@@ -401,17 +415,23 @@ def _find_changes(old: Sequence[HistoryEntry], new: Sequence[HistoryEntry]) -> N
     return NetChanges(tuple(put), replaced, (), moved, removed)
 
 
-def _check_part(history: History, changes: NetChanges, connection: Connection) -> None:
-    """Refuse an edit that would depend on what is not in a part of the model."""
+def _check_part(model: LiveModel, changes: NetChanges) -> None:
+    """Refuse an edit that would depend on what is not in a part of a model."""
+    history, symbols = model.history, {*map(str, model.symbols)}
     for entry in (placed.entry for placed in changes.put):
+        if is_partial(entry):
+            raise EditError(f"Only a part of the operation {entry.tag!r} is here. {LOAD_THE_WHOLE}")
         missing = sorted(f"all {kind}" for kind in entry.reads.listings)
-        missing += [
-            "/".join(cell) for cell in entry.reads.cells if history.value_at(cell, entry.place) is ABSENT
-        ]
+        for cell, how in entry.reads.cells.items():
+            found, last = history.value_at(cell, entry.place), history.head[cell[0]].get(cell[1], ABSENT)
+            # Coordinates of a part come with their rates. What was overwritten is not in it.
+            is_missing = found is ABSENT and not (cell[0] == RATES and cell[1] in symbols)
+            if is_missing or (how & Read.VALUE and found is not last):
+                missing.append("/".join(cell))
         if missing:
             raise EditError(
                 f"The edit needs more than this part of the model: {entry.tag!r} reads {missing[0]}. Name it "
-                f"when the part is loaded, or load the whole, {str(connection.address)!r}."
+                f"when the part is loaded, or load the whole, {str(model.exchange.address)!r}."
             )
 
 
@@ -433,7 +453,7 @@ def _pump(channel: Any, model: weakref.ref[LiveModel], method: Callable[[LiveMod
             return
         try:
             method(target, item)
-        except KineverseError:
+        except Exception:  # the next sign of life shows what is missing
             _LOG.exception("A message of %s is left out.", target.exchange.address)
         del target
 
