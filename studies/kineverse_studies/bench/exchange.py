@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.managers import BaseManager
+from operator import sub
 from signal import SIGCONT, SIGKILL, SIGSTOP
 from statistics import median
 from time import perf_counter
@@ -142,8 +143,8 @@ def _edits(one: Benchmark, scene: Scene) -> None:
     _time(one, samples, is_slow=False)
     for name, limit in EDITS.values():
         ours, theirs = (one.measured[f"{name}, {how}"].samples for how in (TO_HOOK, BY_RELAY))
-        longer = median(a - b for a, b in zip(ours, theirs, strict=True))
-        one.compare(f"{name}, {TO_HOOK}, longer than {BY_RELAY}", longer, "s", limit)
+        longer = one.note(f"{name}, longer than {BY_RELAY}", "s", median(map(sub, ours, theirs)))
+        one.bound(limit, longer.name)
     for kind, size, name, limit in STREAMS:
         _time(one, {f"server's CPU time, {name}": partial(stream, kind, size)})
         one.bound(limit, f"server's CPU time, {name}")
@@ -200,10 +201,10 @@ def _state(one: Benchmark, scene: Scene) -> None:
         sent += number
         taken = [reader.take(sent + before) for reader, before in zip(readers, known, strict=True)]
         delays.append(max(delay for _, delay in taken))
-    come = [reader.take(0)[0] - before for reader, before in zip(readers, known, strict=True)]
+    lost = max(sent + before - come for (come, _), before in zip(taken, known, strict=True))
     one.note(STATE, "s", *delays)
     one.note(RATE, "vectors/s", *rates)
-    one.note(LOST, "vectors", sent - min(come))
+    one.note(LOST, "vectors", lost)
     one.bound(0.5e-3, STATE)
     one.bound(0.0, LOST)
     one.compare(RATE, one.measured[RATE].median, "vectors/s", 0.99 * _RATE, at_least=True)
