@@ -22,12 +22,12 @@ from .exchange_programs import (
     PAUSE,
     Crowd,
     Editor,
-    Follower,
-    Program,
     Reader,
     Relay,
-    Server,
-    Source,
+    Remote,
+    ServerProgram,
+    SourceProgram,
+    Subscriber,
     set_environment,
 )
 from .harness import Benchmark, BenchmarkResult, BenchmarkSettings, Contender
@@ -58,7 +58,7 @@ model.listen(print)
 print(time.perf_counter())
 """
 
-Started = TypeVar("Started", bound=Program)
+Started = TypeVar("Started", bound=Remote)
 _EDITS, _STREAMED, _LARGE_EDITS = 20, 200, 60
 _RATE, _SECONDS = 20_000.0, 0.5  # of vectors
 _CROWD = 200
@@ -69,20 +69,20 @@ class Processes(BaseManager):
     """Process with a program."""
 
 
-for _program in (Server, Relay, Follower, Editor, Crowd, Source, Reader):
+for _program in (ServerProgram, Relay, Subscriber, Editor, Crowd, SourceProgram, Reader):
     Processes.register(_program.__name__, _program)
 
 
-class Scene:
+class ProcessGroup:
     """Folder of sockets and of a store, with processes that end with it."""
 
     def __init__(self) -> None:
-        self._opened, self._started = ExitStack(), list[Program]()  # which end with their last proxies
+        self._opened, self._started = ExitStack(), list[Remote]()  # which end with their last proxies
         # The path of a socket has to be short.
         self.folder = self._opened.enter_context(tempfile.TemporaryDirectory(prefix="kv-"))
         self.environment = "KINEVERSE_RUNTIME_DIR", self.folder
 
-    def __enter__(self) -> Scene:
+    def __enter__(self) -> ProcessGroup:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -97,18 +97,18 @@ class Scene:
         self._started.append(found)
         return found
 
-    def stop(self, *programs: Program) -> None:
+    def stop(self, *programs: Remote) -> None:
         for program in programs:
             os.kill(program.pid(), SIGKILL)
 
-    def serve(self, joints: int = 0, *models: str) -> Server:
-        return self.start(Server, f"{self.folder}/bench.db", joints, *models)
+    def serve(self, joints: int = 0, *models: str) -> ServerProgram:
+        return self.start(ServerProgram, f"{self.folder}/bench.db", joints, *models)
 
 
 def measure_exchange(settings: BenchmarkSettings) -> BenchmarkResult:
     one = Benchmark("exchange", settings)
     for measure in (_edits, _faults, _state, _joining, _restoring, _growth):
-        with Scene() as scene:
+        with ProcessGroup() as scene:
             measure(one, scene)
     return one.result(
         "a model server and its clients, each a process: an edit until a subscriber's hook is called, beside "
@@ -121,11 +121,14 @@ def _time(one: Benchmark, samples: dict[str, Callable[[], float]], is_slow: bool
     one.time(contenders, one.settings.processes if is_slow else None)
 
 
-def _edits(one: Benchmark, scene: Scene) -> None:
+def _edits(one: Benchmark, scene: ProcessGroup) -> None:
     """Measure the time to a subscriber beside the relay, and the CPU time of the server."""
     place = f"unixsock-stream/{scene.folder}/relay.sock"
     server, _ = scene.serve(), scene.start(Relay, place)
-    editor, follower = scene.start(Editor, place), scene.start(Follower, place)
+    editor, follower = scene.start(Editor, place), scene.start(Subscriber, place)
+
+    def edit(kind: str) -> float:
+        return median(_delays(editor, follower, kind, _EDITS))
 
     def relay(kind: str) -> float:
         starts = editor.relay(kind, _EDITS)
@@ -138,7 +141,7 @@ def _edits(one: Benchmark, scene: Scene) -> None:
 
     samples: dict[str, Callable[[], float]] = {}
     for kind, (name, _) in EDITS.items():
-        samples[f"{name}, {TO_HOOK}"] = lambda kind=kind: median(_delays(editor, follower, kind, _EDITS))
+        samples[f"{name}, {TO_HOOK}"] = partial(edit, kind)
         samples[f"{name}, {BY_RELAY}"] = partial(relay, kind)
     _time(one, samples, is_slow=False)
     for name, limit in EDITS.values():
@@ -150,16 +153,16 @@ def _edits(one: Benchmark, scene: Scene) -> None:
         one.bound(limit, f"server's CPU time, {name}")
 
 
-def _delays(editor: Editor, follower: Follower, kind: str, count: int, pause: float = PAUSE) -> list[float]:
+def _delays(editor: Editor, follower: Subscriber, kind: str, count: int, pause: float = PAUSE) -> list[float]:
     made = editor.edit(kind, count, pause)
     heard = follower.heard([version for version, *_ in made])
     return [end - start for end, (_, start, _) in zip(heard, made, strict=True)]
 
 
-def _faults(one: Benchmark, scene: Scene) -> None:
+def _faults(one: Benchmark, scene: ProcessGroup) -> None:
     """Measure subscribers that are frozen or many, the end of a script, and a server that is killed."""
     server, editor = scene.serve(), scene.start(Editor)
-    follower, frozen = (scene.start(Follower) for _ in range(2))
+    follower, frozen = (scene.start(Subscriber) for _ in range(2))
     editor.edit("frame", 1)
     process = frozen.pid()
     os.kill(process, SIGSTOP)
@@ -188,8 +191,8 @@ def _faults(one: Benchmark, scene: Scene) -> None:
     one.bound(2.0, KILLED)
 
 
-def _state(one: Benchmark, scene: Scene) -> None:
-    source = scene.start(Source)
+def _state(one: Benchmark, scene: ProcessGroup) -> None:
+    source = scene.start(SourceProgram)
     readers = [scene.start(Reader, source.endpoint()) for _ in range(2)]
     while not all(reader.take(1)[0] for reader in readers):
         source.send(1, _RATE)
@@ -210,7 +213,7 @@ def _state(one: Benchmark, scene: Scene) -> None:
     one.compare(RATE, one.measured[RATE].median, "vectors/s", 0.99 * _RATE, at_least=True)
 
 
-def _joining(one: Benchmark, scene: Scene) -> None:
+def _joining(one: Benchmark, scene: ProcessGroup) -> None:
     robot = find_benchmark_robot(one.settings)
     scene.serve(0, str(robot.file), "kitchen")
     editor, joiner = scene.start(Editor), scene.start(Editor)
@@ -225,7 +228,7 @@ def _joining(one: Benchmark, scene: Scene) -> None:
     one.bound(0.05, PART)
 
 
-def _restoring(one: Benchmark, scene: Scene) -> None:
+def _restoring(one: Benchmark, scene: ProcessGroup) -> None:
     scene.stop(scene.serve(one.settings.operations))
 
     def restore() -> float:
@@ -238,11 +241,11 @@ def _restoring(one: Benchmark, scene: Scene) -> None:
     one.bound(2.0, RESTORED)
 
 
-def _growth(one: Benchmark, small: Scene) -> None:
+def _growth(one: Benchmark, small: ProcessGroup) -> None:
     """Compare edits of a model of many objects with those of few."""
-    many = max(one.settings.operations // 10, _FEW)
+    many = max(one.settings.operations // 10, 2 * _FEW)
     times: dict[str, list[float]] = {}
-    with Scene() as large:
+    with ProcessGroup() as large:
         scenes = {_FEW: small, many: large}
         for objects, scene in scenes.items():
             scene.serve(_SIZE * objects)

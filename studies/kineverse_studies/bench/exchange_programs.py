@@ -24,7 +24,7 @@ from kineverse.exchange.state import StatePublisher, StateReader
 from kineverse.exchange.transport import Transport
 from kineverse.exchange.views import Wish
 from kineverse.formats import operation_to_bytes
-from kineverse.model import Edit
+from kineverse.model import Diff, Edit
 
 from .models import make_joints
 
@@ -40,12 +40,12 @@ def set_environment(name: str, value: str) -> None:
     os.environ[name] = value
 
 
-class Program:
+class Remote:
     def pid(self) -> int:
         return os.getpid()
 
 
-class Server(Program):
+class ServerProgram(Remote):
     """Server of models, or of a number of joints, with a store."""
 
     def __init__(self, store: str, joints: int, *models: str) -> None:
@@ -61,7 +61,7 @@ class Server(Program):
         return self.seconds, time.process_time()
 
 
-class Relay(Program):
+class Relay(Remote):
     """Server that publishes what it is asked."""
 
     def __init__(self, endpoint: str) -> None:
@@ -75,15 +75,18 @@ class Relay(Program):
             question.answer(b"")
 
 
-class Follower(Program):
+class Subscriber(Remote):
     """Subscriber of all commits, and of the relay."""
 
     def __init__(self, relay: str = "") -> None:
         self._model, self._transport = load_live(_ADDRESS), _connect(relay)
         self._heard: dict[int, float] = {}
         self._relayed: list[float] = []
-        self._model.listen(lambda diff: self._heard.setdefault(diff.version, perf_counter()))
+        self._model.listen(self._hear)
         _start(self._work, self._transport.subscribe("relay/log"))
+
+    def _hear(self, diff: Diff) -> None:
+        self._heard[diff.version] = perf_counter()
 
     def _work(self, messages: Iterable[bytes]) -> None:
         for _ in messages:
@@ -99,7 +102,7 @@ class Follower(Program):
         return found
 
 
-class Editor(Program):
+class Editor(Remote):
     """Client that edits and joins."""
 
     def __init__(self, relay: str = "") -> None:
@@ -172,7 +175,7 @@ class Editor(Program):
         return protocol.Edit(connection.client, number, who, *connection.position, changes)
 
 
-class Crowd(Program):
+class Crowd(Remote):
     """Many subscribers of a part, each with a connection of its own."""
 
     def __init__(self, count: int, frame: str) -> None:
@@ -193,7 +196,7 @@ class Crowd(Program):
         return self._versions.count(versions)
 
 
-class Source(Program):
+class SourceProgram(Remote):
     """Source of vectors; the first value is when one was sent."""
 
     def __init__(self) -> None:
@@ -213,7 +216,7 @@ class Source(Program):
         return count / (perf_counter() - start)
 
 
-class Reader(Program):
+class Reader(Remote):
     """Reader of the source, awake whenever a vector comes."""
 
     def __init__(self, endpoint: str) -> None:
