@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
@@ -155,7 +155,7 @@ class Server:
         self._backups: dict[str, TemporaryDirectory[str]] = {}
         self._clients: dict[str, _Client] = {}
         self._refusals: deque[protocol.Refusal] = deque(maxlen=_KEPT_REFUSALS)
-        self._times: dict[str, deque[float]] = {}
+        self._times: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_KEPT_TIMES))
         self._accepted: deque[float] = deque(maxlen=100_000)
         self._edits = 0
         self._lock = threading.RLock()  # of the model, the views and the lists above
@@ -288,7 +288,7 @@ class Server:
         now = time.time()
         with self._lock:
             for stage, seconds in result.seconds.items():
-                self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(seconds)
+                self._times[stage].append(seconds)
             if isinstance(result.answer, protocol.Refused):
                 self._refusals.append(protocol.Refusal(now, edit.who, result.answer.message))
                 _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
@@ -297,7 +297,7 @@ class Server:
                 self._accepted.append(now)
 
     def _note_time(self, stage: str, begin: float) -> None:
-        self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(time.perf_counter() - begin)
+        self._times[stage].append(time.perf_counter() - begin)
 
     def _refuse(self, request: Question, reason: protocol.Reason, error: Exception) -> None:
         request.answer(protocol.encode(protocol.Refused(reason, str(error)[:_LONGEST_MESSAGE])))
