@@ -18,18 +18,7 @@ from statistics import median
 from time import perf_counter
 from typing import TypeVar
 
-from .exchange_programs import (
-    PAUSE,
-    Crowd,
-    Editor,
-    Reader,
-    Relay,
-    Remote,
-    ServerProgram,
-    SourceProgram,
-    Subscriber,
-    set_environment,
-)
+from . import exchange_programs as programs
 from .harness import Benchmark, BenchmarkResult, BenchmarkSettings, Contender
 from .workloads import find_benchmark_robot
 
@@ -46,11 +35,6 @@ STREAMS = (
     ("frame", 20, "a frame of 20", 90e-6),
 )
 """Streamed edits: kind and number of their operations, name, and bar of the server's CPU time for one [s]."""
-FROZEN, CROWD = "longest time to a hook beside a frozen subscriber", "subscribers of a part, all in order"
-SCRIPT, KILLED = "end of a script that closes nothing", "server killed, until an edit is acknowledged"
-STATE, RATE, LOST = "20 values, to two readers", "20 values, vectors sent", "20 values, vectors lost"
-WHOLE, PART = "robot and kitchen joined, under edits", "part of an arm joined, under edits"
-RESTORED = "large store served"
 ENDING = """
 import time, kineverse as kv
 model = kv.load("live:bench")
@@ -58,7 +42,7 @@ model.listen(print)
 print(time.perf_counter())
 """
 
-Started = TypeVar("Started", bound=Remote)
+Started = TypeVar("Started", bound=programs.Remote)
 _EDITS, _STREAMED, _LARGE_EDITS = 20, 200, 60
 _RATE, _SECONDS = 20_000.0, 0.5  # of vectors
 _CROWD = 200
@@ -69,7 +53,7 @@ class Processes(BaseManager):
     """Process with a program."""
 
 
-for _program in (ServerProgram, Relay, Subscriber, Editor, Crowd, SourceProgram, Reader):
+for _program in programs.Remote.__subclasses__():
     Processes.register(_program.__name__, _program)
 
 
@@ -77,7 +61,10 @@ class ProcessGroup:
     """Folder of sockets and of a store, with processes that end with it."""
 
     def __init__(self) -> None:
-        self._opened, self._started = ExitStack(), list[Remote]()  # which end with their last proxies
+        self._opened, self._started = (
+            ExitStack(),
+            list[programs.Remote](),
+        )  # which end with their last proxies
         # The path of a socket has to be short.
         self.folder = self._opened.enter_context(tempfile.TemporaryDirectory(prefix="kv-"))
         self.environment = "KINEVERSE_RUNTIME_DIR", self.folder
@@ -91,18 +78,18 @@ class ProcessGroup:
     def start(self, program: type[Started], *arguments: object) -> Started:
         """Return an object whose methods are called in a process of its own."""
         process = Processes(ctx=get_context("spawn"))
-        process.start(set_environment, self.environment)
+        process.start(programs.set_environment, self.environment)
         self._opened.callback(process.shutdown)
         found: Started = getattr(process, program.__name__)(*arguments)
         self._started.append(found)
         return found
 
-    def stop(self, *programs: Remote) -> None:
+    def stop(self, *programs: programs.Remote) -> None:
         for program in programs:
             os.kill(program.pid(), SIGKILL)
 
-    def serve(self, joints: int = 0, *models: str) -> ServerProgram:
-        return self.start(ServerProgram, f"{self.folder}/bench.db", joints, *models)
+    def serve(self, joints: int = 0, *models: str) -> programs.ServerProgram:
+        return self.start(programs.ServerProgram, f"{self.folder}/bench.db", joints, *models)
 
 
 def measure_exchange(settings: BenchmarkSettings) -> BenchmarkResult:
@@ -116,16 +103,18 @@ def measure_exchange(settings: BenchmarkSettings) -> BenchmarkResult:
     )
 
 
-def _time(one: Benchmark, samples: dict[str, Callable[[], float]], is_slow: bool = True) -> None:
-    contenders = [Contender(name, sample) for name, sample in samples.items()]
-    one.time(contenders, one.settings.processes if is_slow else None)
+def _time(one: Benchmark, samples: dict[str, tuple[Callable[[], float], float]]) -> None:
+    """Measure some processes, each with its bar."""
+    one.time([Contender(name, sample) for name, (sample, _) in samples.items()], one.settings.processes)
+    for name, (_, limit) in samples.items():
+        one.bound(limit, name)
 
 
 def _edits(one: Benchmark, scene: ProcessGroup) -> None:
     """Measure the time to a subscriber beside the relay, and the CPU time of the server."""
     place = f"unixsock-stream/{scene.folder}/relay.sock"
-    server, _ = scene.serve(), scene.start(Relay, place)
-    editor, follower = scene.start(Editor, place), scene.start(Subscriber, place)
+    server, _ = scene.serve(), scene.start(programs.Relay, place)
+    editor, follower = scene.start(programs.Editor, place), scene.start(programs.Subscriber, place)
 
     def edit(kind: str) -> float:
         return median(_delays(editor, follower, kind, _EDITS))
@@ -139,21 +128,27 @@ def _edits(one: Benchmark, scene: ProcessGroup) -> None:
         editor.stream(kind, _STREAMED // size, size)
         return float(server.times()[1] - before) / _STREAMED
 
-    samples: dict[str, Callable[[], float]] = {}
-    for kind, (name, _) in EDITS.items():
-        samples[f"{name}, {TO_HOOK}"] = partial(edit, kind)
-        samples[f"{name}, {BY_RELAY}"] = partial(relay, kind)
-    _time(one, samples, is_slow=False)
+    ways = (edit, TO_HOOK), (relay, BY_RELAY)
+    one.time(
+        Contender(f"{name}, {how}", partial(sample, kind))
+        for kind, (name, _) in EDITS.items()
+        for sample, how in ways
+    )
     for name, limit in EDITS.values():
         ours, theirs = (one.measured[f"{name}, {how}"].samples for how in (TO_HOOK, BY_RELAY))
         longer = one.note(f"{name}, longer than {BY_RELAY}", "s", median(map(sub, ours, theirs)))
         one.bound(limit, longer.name)
     for kind, size, name, limit in STREAMS:
-        _time(one, {f"server's CPU time, {name}": partial(stream, kind, size)})
-        one.bound(limit, f"server's CPU time, {name}")
+        _time(one, {f"server's CPU time, {name}": (partial(stream, kind, size), limit)})
 
 
-def _delays(editor: Editor, follower: Subscriber, kind: str, count: int, pause: float = PAUSE) -> list[float]:
+def _delays(
+    editor: programs.Editor,
+    follower: programs.Subscriber,
+    kind: str,
+    count: int,
+    pause: float = programs.PAUSE,
+) -> list[float]:
     made = editor.edit(kind, count, pause)
     heard = follower.heard([version for version, *_ in made])
     return [end - start for end, (_, start, _) in zip(heard, made, strict=True)]
@@ -161,15 +156,18 @@ def _delays(editor: Editor, follower: Subscriber, kind: str, count: int, pause: 
 
 def _faults(one: Benchmark, scene: ProcessGroup) -> None:
     """Measure subscribers that are frozen or many, the end of a script, and a server that is killed."""
-    server, editor = scene.serve(), scene.start(Editor)
-    follower, frozen = (scene.start(Subscriber) for _ in range(2))
+    server, editor = scene.serve(), scene.start(programs.Editor)
+    follower, frozen = (scene.start(programs.Subscriber) for _ in range(2))
     editor.edit("frame", 1)
     process = frozen.pid()
     os.kill(process, SIGSTOP)
-    one.note(FROZEN, "s", max(_delays(editor, follower, "large", _LARGE_EDITS, 0.0)))
+    slowest = max(_delays(editor, follower, "large", _LARGE_EDITS, 0.0))
+    one.bound(0.15, one.note("longest time to a hook beside a frozen subscriber", "s", slowest).name)
     os.kill(process, SIGCONT)
-    crowd = scene.start(Crowd, _CROWD, "edited/")
-    one.note(CROWD, "subscribers", crowd.got([version for version, *_ in editor.edit("frame", _EDITS)]))
+    crowd = scene.start(programs.Crowd, _CROWD, "edited/")
+    served = crowd.got([version for version, *_ in editor.edit("frame", _EDITS)])
+    got = one.note("subscribers of a part, all in order", "subscribers", served)
+    one.compare(got.name, served, got.unit, _CROWD, at_least=True)
     scene.stop(crowd, follower, frozen)
     environment = dict([*os.environ.items(), scene.environment])
 
@@ -184,16 +182,13 @@ def _faults(one: Benchmark, scene: ProcessGroup) -> None:
         server = scene.serve()
         return editor.edit("frame", 1)[0][2] - start
 
-    _time(one, {SCRIPT: end_script, KILLED: restart})
-    one.bound(0.15, FROZEN)
-    one.compare(CROWD, one.measured[CROWD].median, "subscribers", _CROWD, at_least=True)
-    one.bound(1.0, SCRIPT)
-    one.bound(2.0, KILLED)
+    script, killed = "end of a script that closes nothing", "server killed, until an edit is acknowledged"
+    _time(one, {script: (end_script, 1.0), killed: (restart, 2.0)})
 
 
 def _state(one: Benchmark, scene: ProcessGroup) -> None:
-    source = scene.start(SourceProgram)
-    readers = [scene.start(Reader, source.endpoint()) for _ in range(2)]
+    source = scene.start(programs.SourceProgram)
+    readers = [scene.start(programs.Reader, source.endpoint()) for _ in range(2)]
     while not all(reader.take(1)[0] for reader in readers):
         source.send(1, _RATE)
     known = [reader.take(0)[0] for reader in readers]
@@ -205,27 +200,24 @@ def _state(one: Benchmark, scene: ProcessGroup) -> None:
         taken = [reader.take(sent + before) for reader, before in zip(readers, known, strict=True)]
         delays.append(max(delay for _, delay in taken))
     lost = max(sent + before - come for (come, _), before in zip(taken, known, strict=True))
-    one.note(STATE, "s", *delays)
-    one.note(RATE, "vectors/s", *rates)
-    one.note(LOST, "vectors", lost)
-    one.bound(0.5e-3, STATE)
-    one.bound(0.0, LOST)
-    one.compare(RATE, one.measured[RATE].median, "vectors/s", 0.99 * _RATE, at_least=True)
+    one.bound(0.5e-3, one.note("20 values, to two readers", "s", *delays).name)
+    one.bound(0.0, one.note("20 values, vectors lost", "vectors", lost).name)
+    reached = one.note("20 values, vectors sent", "vectors/s", *rates)
+    one.compare(reached.name, reached.median, reached.unit, 0.99 * _RATE, at_least=True)
 
 
 def _joining(one: Benchmark, scene: ProcessGroup) -> None:
     robot = find_benchmark_robot(one.settings)
     scene.serve(0, str(robot.file), "kitchen")
-    editor, joiner = scene.start(Editor), scene.start(Editor)
+    editor, joiner = scene.start(programs.Editor), scene.start(programs.Editor)
 
     def join(*frames: str) -> float:
         with ThreadPoolExecutor() as beside:
             beside.submit(editor.edit, "frame", _EDITS)
             return joiner.join(*frames)
 
-    _time(one, {WHOLE: join, PART: partial(join, robot.frame)}, is_slow=False)
-    one.bound(0.2, WHOLE)
-    one.bound(0.05, PART)
+    whole, part = "robot and kitchen joined, under edits", "part of an arm joined, under edits"
+    _time(one, {whole: (join, 0.2), part: (partial(join, robot.frame), 0.05)})
 
 
 def _restoring(one: Benchmark, scene: ProcessGroup) -> None:
@@ -237,8 +229,7 @@ def _restoring(one: Benchmark, scene: ProcessGroup) -> None:
         scene.stop(server)
         return seconds
 
-    _time(one, {RESTORED: restore})
-    one.bound(2.0, RESTORED)
+    _time(one, {"large store served": (restore, 2.0)})
 
 
 def _growth(one: Benchmark, small: ProcessGroup) -> None:
@@ -249,7 +240,7 @@ def _growth(one: Benchmark, small: ProcessGroup) -> None:
         scenes = {_FEW: small, many: large}
         for objects, scene in scenes.items():
             scene.serve(_SIZE * objects)
-        editors = {objects: scene.start(Editor) for objects, scene in scenes.items()}
+        editors = {objects: scene.start(programs.Editor) for objects, scene in scenes.items()}
         for _ in range(one.settings.processes * _EDITS):
             for objects, editor in editors.items():
                 for what, kind in (("append", "joint"), ("replace", "replace"), ("remove", "remove")):

@@ -164,7 +164,7 @@ class Editor(Remote):
             else:
                 edit.replace(self._tag, made)
 
-    def _request(self, kind: str, size: int) -> protocol.Edit:
+    def _request(self, kind: str, size: int) -> protocol.EditRequest:
         model, connection = kv.Model(), self._model.exchange
         with model.edit() as edit:
             for _ in range(size):
@@ -172,7 +172,7 @@ class Editor(Remote):
         blobs = [operation_to_bytes(model, tag) for tag in model.history.tags]
         changes = protocol.Changes(tuple(protocol.Placed(blob, at_end=True) for blob in blobs))
         number, who = connection.next_number(), connection.who
-        return protocol.Edit(connection.client, number, who, *connection.position, changes)
+        return protocol.EditRequest(connection.client, number, who, *connection.position, changes)
 
 
 class Crowd(Remote):
