@@ -285,6 +285,7 @@ def test_a_page_follows_a_live_model(run: Run, live: LiveModel, monkeypatch: pyt
         ("serve --name a/b", "'a/b' is no name of a model server"),
         ("serve --name home", "'home' is running already. Use that one, or another name"),
         ("serve --name new --listen 7410", "tcp/HOST:PORT"),
+        ("serve --name new --durable", "Name one: --store FILE"),
         ("serve --name new --store text.db", "text.db is no store of a model server"),
         ("serve --name new --store nowhere/new.db", "there is no folder"),
         ("serve --name new --store used.db", "used.db is served by another process"),

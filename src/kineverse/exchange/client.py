@@ -59,7 +59,7 @@ def load_live(
     if bodies is None:
         bodies = not is_part
     check_flag("bodies", bodies)
-    wish = protocol.Join(
+    wish = protocol.JoinRequest(
         protocol.PROTOCOL,
         __version__,
         "",
@@ -76,7 +76,7 @@ def include_live(edit: Edit, source: str, prefix: str | None = None, **others: A
     """Append the present operations of a server's model to an edit of another one, and return their tags."""
     connection = Connection(Address.parse(source))
     try:
-        joined = connection.join(protocol.Join(protocol.PROTOCOL, __version__, "", ""))
+        joined = connection.join(protocol.JoinRequest(protocol.PROTOCOL, __version__, "", ""))
     finally:
         connection.close()
     return [edit.link(entry) for entry in entries_from_bytes(joined.document, prefix)]
@@ -91,7 +91,7 @@ class LiveModel(Model):
     server is away, reading goes on and edits raise; afterwards the model catches up.
     """
 
-    def __init__(self, connection: Connection, wish: protocol.Join) -> None:
+    def __init__(self, connection: Connection, wish: protocol.JoinRequest) -> None:
         self.exchange = connection
         self._wish = wish
         self._following = threading.RLock()
@@ -176,7 +176,7 @@ class LiveModel(Model):
         number = connection.next_number()
         wanted = as_count("revision", revision, 1)
         self._finish_edit(
-            connection.ask_edit(protocol.Undo(connection.client, number, connection.who, wanted))
+            connection.ask_edit(protocol.UndoRequest(connection.client, number, connection.who, wanted))
         )
 
     def wait(self, version: int, timeout: float | None = None) -> bool:
@@ -207,13 +207,13 @@ class LiveModel(Model):
     def _ask_for_edit(self, strict: bool) -> Iterator[Edit]:
         connection = self.exchange
         connection.check_online()
-        proposed: list[protocol.Edit] = []
+        proposed: list[protocol.EditRequest] = []
         with self._transaction(lambda edit: proposed.extend(self._propose(edit, strict))) as edit:
             yield edit
         for request in proposed:
             self._finish_edit(connection.ask_edit(request))
 
-    def _propose(self, edit: Edit, strict: bool) -> list[protocol.Edit]:
+    def _propose(self, edit: Edit, strict: bool) -> list[protocol.EditRequest]:
         """Return an open edit as a request; none if it does nothing."""
         changes, connection = edit.net(), self.exchange
         if changes.is_empty:
@@ -226,7 +226,7 @@ class LiveModel(Model):
             for placed in changes.put
         )
         return [
-            protocol.Edit(
+            protocol.EditRequest(
                 connection.client,
                 connection.next_number(),
                 connection.who,
@@ -292,7 +292,7 @@ class LiveModel(Model):
             elif commit.revision > connection.revision:
                 self._adopt_commit(published, commit)
 
-    def _adopt_commit(self, published: protocol.Published, commit: protocol.Commit) -> None:
+    def _adopt_commit(self, published: protocol.Published, commit: protocol.CommitMessage) -> None:
         connection = self.exchange
         is_whole = not self._wish.is_part
         if is_whole and protocol.chain(connection.chain, published.commit) != published.chain:
@@ -415,7 +415,7 @@ def _check_part(model: LiveModel, changes: NetChanges) -> None:
             )
 
 
-def _decode_changes(commit: protocol.Commit) -> NetChanges:
+def _decode_changes(commit: protocol.CommitMessage) -> NetChanges:
     changes = commit.changes
     put = []
     for placed in changes.put:

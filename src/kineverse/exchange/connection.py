@@ -102,7 +102,7 @@ class Connection:
         """Return the last commits, newest first, from before a revision if one is given."""
         most = as_count("most", most, 1)
         asked = protocol.GetHistory(most) if before is None else protocol.GetHistory(most, before)
-        return self.ask(asked, protocol.History).rows
+        return self.ask(asked, protocol.CommitList).rows
 
     def backup(self, path: str | os.PathLike[str]) -> Store:
         """Write a copy of the server's store into a new file, checked, and return it, closed.
@@ -245,7 +245,7 @@ class Connection:
                 f"The server of {self.address} is away. The model can be read, and edited when it is back."
             )
 
-    def join(self, wish: protocol.Join) -> protocol.Joined:
+    def join(self, wish: protocol.JoinRequest) -> protocol.Joined:
         """Join and return the model, or the part that is wished for."""
         return self.ask(replace(wish, client=self.client, who=self.who), protocol.Joined)
 
@@ -313,7 +313,7 @@ class Connection:
             return answer
         raise refusal_error(answer, self.address)
 
-    def ask_edit(self, edit: protocol.Edit | protocol.Undo) -> protocol.Committed | protocol.Refused:
+    def ask_edit(self, edit: protocol.ChangeRequest) -> protocol.Committed | protocol.Refused:
         """Ask for an edit until it is answered: under its number it is done once.
 
         Raises
@@ -340,7 +340,7 @@ class Connection:
     def _ask(self, request: protocol.Request, timeout: float) -> protocol.Answer:
         if self.is_closed:
             raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
-        changes_model = isinstance(request, (protocol.Edit, protocol.Undo))
+        changes_model = isinstance(request, (protocol.EditRequest, protocol.UndoRequest))
         data = protocol.encode(request)
         if len(data) > protocol.MAX_BYTES:
             raise FormatError(

@@ -222,7 +222,7 @@ class Server:
             for request in waiting:
                 try:
                     decoded = protocol.decode_request(request.payload)
-                    if not isinstance(decoded, (protocol.Edit, protocol.Undo)):
+                    if not isinstance(decoded, (protocol.EditRequest, protocol.UndoRequest)):
                         raise FormatError("This is no edit, and is asked under another key.")
                 except FormatError as error:
                     self._refuse(request, "malformed", error)
@@ -233,7 +233,7 @@ class Server:
             if edits:
                 self._process(edits, given)
 
-    def _process(self, edits: Sequence[protocol.Edit | protocol.Undo], requests: Sequence[Question]) -> None:
+    def _process(self, edits: Sequence[protocol.ChangeRequest], requests: Sequence[Question]) -> None:
         epoch = self._authority.epoch
         try:
             with self._lock:
@@ -276,7 +276,7 @@ class Server:
             log = self._logs[view.id]
             put = {*map(protocol.tag_of, changes.put)}
             files = self._files.find([entry for entry in view.entries if entry.tag in put])
-            commit = protocol.Commit(
+            commit = protocol.CommitMessage(
                 last.revision, log.last, last.client, last.number, last.who, last.time, changes, files
             )
             published = protocol.Published(authority.epoch, authority.chain, protocol.encode(commit))
@@ -284,7 +284,7 @@ class Server:
             commits.append((view.id, published))
         return commits
 
-    def _note(self, edit: protocol.Edit | protocol.Undo, result: Result) -> None:
+    def _note(self, edit: protocol.ChangeRequest, result: Result) -> None:
         now = time.time()
         with self._lock:
             for stage, seconds in result.seconds.items():
@@ -320,7 +320,7 @@ class Server:
 
     def _answer(self, question: protocol.Request) -> protocol.Answer:
         match question:
-            case protocol.Join():
+            case protocol.JoinRequest():
                 return self._join(question)
             case protocol.Since():
                 return self._list_missed(question)
@@ -340,7 +340,7 @@ class Server:
             case _:
                 raise FormatError("This is an edit, and is asked under another key.")
 
-    def _join(self, join: protocol.Join) -> protocol.Answer:
+    def _join(self, join: protocol.JoinRequest) -> protocol.Answer:
         if join.protocol != protocol.PROTOCOL:
             return protocol.Refused(
                 "protocol",
@@ -416,7 +416,7 @@ class Server:
                 refusals=tuple(self._refusals),
             )
 
-    def _list_history(self, question: protocol.GetHistory) -> protocol.History:
+    def _list_history(self, question: protocol.GetHistory) -> protocol.CommitList:
         with self._lock:
             found = self._store.last_commits(question.most, question.before)
         rows = []
@@ -436,7 +436,7 @@ class Server:
                     changes.rerun,
                 )
             )
-        return protocol.History(tuple(rows))
+        return protocol.CommitList(tuple(rows))
 
     def _read_backup(self, question: protocol.GetBackup) -> protocol.Answer:
         with self._lock:
