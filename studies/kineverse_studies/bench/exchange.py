@@ -78,7 +78,7 @@ class ProcessGroup:
     def start(self, program: type[Started], *arguments: object) -> Started:
         """Return an object whose methods are called in a process of its own."""
         process = Processes(ctx=get_context("spawn"))
-        process.start(programs.set_environment, self.environment)
+        process.start(programs.begin, self.environment)
         self._opened.callback(process.shutdown)
         found: Started = getattr(process, program.__name__)(*arguments)
         self._started.append(found)

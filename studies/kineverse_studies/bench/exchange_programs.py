@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import parent_process
 from pathlib import Path
 from time import perf_counter
 
@@ -36,8 +37,17 @@ _LARGE = "x" * 100_000
 _LONG = 20.0  # longest time that anything is waited for [s]
 
 
-def set_environment(name: str, value: str) -> None:
+def begin(name: str, value: str) -> None:
+    """Set a variable of a process that ends with the one that has started it."""
     os.environ[name] = value
+    _start(_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 class Remote:
