@@ -1,0 +1,212 @@
+"""Faults of model servers: what was acknowledged is there, once and whole, and all have the same model."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import kineverse as kv
+from kineverse.errors import DuplicateNameError, FormatError
+from kineverse.exchange import protocol
+from kineverse.exchange.authority import Authority
+from kineverse.exchange.client import LiveModel
+from kineverse.exchange.server import serve
+from kineverse.exchange.store import Store
+from kineverse.formats import document_hash, operation_from_bytes
+from kineverse.model import NetChanges, PlacedEntry
+
+from .client import load
+from .edits import build, count
+from .processes import Process, begin, folder, start, wait_until
+from .served import NAME
+from .store import damage, put_image, take_image
+
+KINDS = ("whole", "0", "1")
+"""What the clients of a process load: the whole model, and two parts."""
+LONG = 20.0
+"""Time in which a client notices that a server is back, and all have the same [s]."""
+SOON = 3.0
+"""Time in which a server forgets clients that are gone [s]."""
+ROUNDS_TOGETHER = 20
+"""Kills of one store, before the next one."""
+
+
+# -- what must hold ------------------------------------------------------------------------------------------
+
+
+class Log:
+    """Log of a store: replayed, and checked."""
+
+    def __init__(self, store: Store) -> None:
+        commits = store.commits_after(0, protocol.NO_CHAIN, 10**9)
+        check(commits is not None and len(commits) == store.revision, "the log has gaps")
+        self.model, self.commits = kv.Model(), list[protocol.Commit]()
+        self.added, self.removed = dict[str, int](), dict[str, int]()  # revisions of chains
+        chain, known = protocol.NO_CHAIN, set[tuple[str, int]]()
+        for number, (data, link) in enumerate(commits or (), 1):
+            commit: protocol.Commit = protocol.decode_commit(data)
+            chain = protocol.chain(chain, data)
+            check(link == chain, f"the chain of revision {number} is another")
+            check((commit.revision, commit.previous) == (number, number - 1), f"{number} is out of order")
+            edit = commit.client, commit.number
+            check(edit not in known, f"an edit is at revision {number}, and was made before")
+            known.add(edit)
+            self.commits.append(commit)
+            self._note_chains(commit)
+            changes = commit.changes
+            put = [
+                PlacedEntry(operation_from_bytes(one.blob), one.after or None, one.at_end) for one in changes.put
+            ]
+            self.model.adopt(
+                NetChanges(tuple(put), changes.replaced, changes.rerun, changes.moved, changes.removed)
+            )
+
+    def _note_chains(self, commit: protocol.Commit) -> None:
+        known = {*commit.changes.replaced, *commit.changes.rerun}
+        put = [tag for tag in map(protocol.tag_of, commit.changes.put) if tag not in known]
+        for tags, into in ((put, self.added), (commit.changes.removed, self.removed)):
+            parts = Counter(tag.rpartition("/")[0] for tag in tags if tag.startswith("part/") and tag[-2] == "/")
+            for name, parts_there in parts.items():
+                check(parts_there == 3, f"revision {commit.revision} has {parts_there} of 3 frames of {name}")
+                check(name not in into, f"{name} is at revision {commit.revision}, and was so before")
+                into[name] = commit.revision
+
+
+def check(is_so: bool, violation: str) -> None:
+    if not is_so:
+        raise AssertionError(violation)
+
+
+def check_store(path: Path, clients: Iterable[Process], killed: int = 0) -> tuple[int, str]:
+    """Check the log of a store against what clients were told; return its revision and hash."""
+    store = Store(path)
+    try:
+        log = Log(store)
+        model = Authority(store).model
+        check(document_hash(model) == document_hash(log.model), "the store has another model than its log")
+        made, unknown = 0, killed
+        for told in (told for client in clients for told in client.told):
+            if "number" in told:
+                _check_answer(store, log, told)
+            elif told.get("added") == "made":
+                check(told["chain"] in log.added, f"{told['chain']} was acknowledged, and was not added")
+            elif told.get("removed") == "made":
+                check(told["chain"] in log.removed, f"{told['chain']} was acknowledged, and is there")
+            made += told.get("counted") == "made"
+            unknown += told.get("counted") == "unknown"
+        counted = count(model) if "counter" in model.frames else made
+        check(made <= counted <= made + unknown, f"{made} to {made + unknown} were counted, and {counted} are")
+        return model.version, document_hash(model)
+    finally:
+        store.close()
+
+
+def _check_answer(store: Store, log: Log, told: dict[str, Any]) -> None:
+    client, number, revision, chain = (told[name] for name in ("client", "number", "revision", "chain"))
+    found = store.find_answer(client, number)
+    what = f"edit {number} of {client} was acknowledged as revision {revision}"
+    check(revision <= store.revision, f"{what}, and the store ends at {store.revision}")
+    if found is None:  # it did nothing, and got the last revision then
+        check(chain == store._chain_at(revision).hex(), f"{what}, with another chain")
+        return
+    check(found == (revision, bytes.fromhex(chain)), f"{what}, and is {found[0]}")
+    commit = log.commits[revision - 1]
+    check((commit.client, commit.number) == (client, number), f"{what}, which is another edit")
+
+
+def check_replicas(server: Process, clients: Sequence[Process]) -> tuple[int, str]:
+    """Check that the server, all clients and those who join now have the same; return revision and hash."""
+    revision, digest = server.ask("state")
+    fresh = [load(kind) for kind in KINDS]
+    try:
+        wanted = [[revision, document_hash(model)] for model in fresh]
+    finally:
+        for model in fresh:
+            model.close()
+    check(wanted[0][1] == digest, "one who joins gets another model than the server has")
+    for client in clients:
+        told = client.ask("state", revision)
+        for kind, want, got in zip(KINDS, wanted, told, strict=False):
+            check(got == want, f"{client.what}: the replica of {kind!r} is {got}, and should be {want}")
+    return revision, digest
+
+
+def make_store(path: Path) -> None:
+    serve(build(), store=path, name=NAME).close()
+
+
+# -- processes that are killed -------------------------------------------------------------------------------
+
+
+def try_kills(rounds: int, seed: int, processes: int = 3) -> dict[str, int]:
+    """Kill servers and clients at random moments under load; return what happened."""
+    random = Random(seed)
+    found: Counter[str] = Counter()
+    while found["servers"] < rounds:
+        with folder() as path, ExitStack() as running:
+            store = path / "home.db"
+            make_store(store)
+            server = start(running, "served", store)
+            clients = [_start_client(running, f"{seed}.{found['servers']}", k) for k in range(processes)]
+            gone: list[Process] = []
+            for _ in range(min(ROUNDS_TOGETHER, rounds - found["servers"])):
+                time.sleep(random.uniform(0, 0.8))
+                if random.random() < 0.4:
+                    clients[0].kill()
+                    gone.append(clients.pop(0))
+                    name = processes + len(gone)
+                    clients.append(_start_client(running, f"{seed}.{found['servers']}", name))
+                server.kill()
+                begin_time = time.monotonic()
+                before = {client.what: len(client.told) for client in clients}
+                server = start(running, "served", store)
+                wait_until(
+                    lambda before=before: any(_has_edited(one, before[one.what]) for one in clients),
+                    LONG,
+                    "an edit after the start of a server",
+                )
+                found["ms"] = max(found["ms"], round(1e3 * (time.monotonic() - begin_time)))
+                found["servers"] += 1
+            before = {client.what: len(client.told) for client in clients}
+            for client in clients:
+                wait_until(
+                    lambda client=client: _has_edited(client, before[client.what]), LONG, f"an edit of {client.what}"
+                )
+            _check_presence(len(clients) * len(KINDS))
+            for client in clients:
+                for outcomes, _ in client.ask("stop"):
+                    found.update({f"{name} edits": number for name, number in outcomes.items()})
+            end = check_replicas(server, clients)
+            server.kill()
+            check(check_store(store, [*clients, *gone], len(gone) * len(KINDS)) == end, "the store has another model")
+            found["clients"] += len(gone)
+            found["revisions"] += end[0]
+    return dict(found)
+
+
+def _start_client(running: ExitStack, seed: str, number: int) -> Process:
+    return start(running, "client", f"p{number}", seed, 0, *KINDS)
+
+
+def _has_edited(client: Process, since: int) -> bool:
+    client.check()
+    return any("number" in told for told in client.told[since:])
+
+
+def _check_presence(wanted: int) -> None:
+    """Check that a server knows the clients that are there, and no others."""
+    model = load("whole")
+    try:
+        wait_until(
+            lambda: len(model.exchange.status().clients) == wanted + 1,
+            SOON,
+            f"a server that knows {wanted} clients and this one",
+        )
+    finally:
+        model.close()
