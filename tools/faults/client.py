@@ -8,6 +8,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from itertools import count
 from random import Random
 from typing import Any
 
@@ -22,8 +23,12 @@ from .processes import commands, tell
 from .served import NAME
 
 
+PAUSE = 0.02
+"""Time between two edits of one who edits at random until it is stopped [s]."""
+
+
 class Client:
-    """Live model, and the thread that edits it."""
+    """Live model, and the thread that edits it: a number of random edits, 0: chains, or -1: for ever."""
 
     def __init__(self, name: str, kind: str, seed: str, edits: int) -> None:
         self.name, self.edits = name, edits
@@ -44,7 +49,9 @@ class Client:
 
         def ask_edit(edit: Any) -> Any:
             self.asked += 1
+            begin = time.monotonic()
             answer = ask(edit)
+            self.longest = max(self.longest, time.monotonic() - begin)
             if isinstance(answer, protocol.Committed):
                 tell(
                     client=connection.client,
@@ -64,7 +71,7 @@ class Client:
 
     def _try(self, act: Callable[[], object], *, slow: float = 1.0) -> str:
         """Edit, and return how that ended."""
-        asked, begin = self.asked, time.monotonic()
+        asked = self.asked
         try:
             act()
             outcome = "made"
@@ -75,8 +82,6 @@ class Client:
         except EditError as error:
             outcome = "failed" if "has failed" in str(error) else "refused"
         self.outcomes[outcome] = self.outcomes.get(outcome, 0) + 1
-        took = time.monotonic() - begin
-        self.longest = max(self.longest, took)
         if outcome == "offline":
             self.model.exchange.wait_for(lambda: self.model.exchange.is_online, slow)
         return outcome
@@ -109,9 +114,11 @@ class Client:
             act(edit)
 
     def _make_anything(self) -> None:
-        """Make a number of random edits."""
+        """Make a number of random edits, or some until it is stopped."""
         model, random = self.model, self.random
-        for number in range(self.edits):
+        for number in range(self.edits) if self.edits > 0 else count():
+            if self.edits < 0 and self.stopped.wait(PAUSE):
+                return
             if random.random() < 0.03 and model.version > 2:
                 self._try(lambda: model.undo(random.randint(max(1, model.version - 20), model.version)))
                 continue
@@ -121,7 +128,6 @@ class Client:
                     do_something(edit, random, f"{self.name} {number} {k}")
 
             self._try(lambda act=act: self._edit(act))  # type: ignore[misc]
-        self.stopped.set()
 
 
 def load(kind: str) -> LiveModel:
@@ -143,7 +149,7 @@ def main() -> None:
     for words in commands():
         if words[0] == "stop":
             for client in clients:
-                if not client.edits:
+                if client.edits <= 0:
                     client.stopped.set()
                 client.thread.join()
             tell(reply=[(client.outcomes, client.longest) for client in clients])
@@ -152,7 +158,7 @@ def main() -> None:
             for client in clients:
                 if not client.model.wait(wanted, 20.0):
                     tell(violation=f"{client.name} is at {client.model.version} and not at {wanted}")
-            tell(reply=[[client.model.version, document_hash(client.model)] for client in clients])
+            tell(reply=[document_hash(client.model) for client in clients])
         elif words[0] == "online":
             tell(reply=[client.model.exchange.is_online for client in clients])
 
