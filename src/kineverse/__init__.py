@@ -4,7 +4,8 @@
 :mod:`kineverse.articulations` (joints, mechanisms, locks), :mod:`kineverse.model` (operations, edits, data),
 :mod:`kineverse.errors`, :mod:`kineverse.logic`, :mod:`kineverse.spatial`, :mod:`kineverse.loops` and
 :mod:`kineverse.formats`. :mod:`kineverse.geometry`, :mod:`kineverse.estimation`, :mod:`kineverse.reasoning`,
-:mod:`kineverse.planning` and the viewer (:func:`show`) are imported on first use.
+:mod:`kineverse.planning`, :mod:`kineverse.exchange` (models that processes share) and the viewer
+(:func:`show`) are imported on first use.
 """
 
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
         control as control,
         errors as errors,
         estimation as estimation,
+        exchange as exchange,
         expressions as expressions,
         formats as formats,
         geometry as geometry,
@@ -99,7 +101,17 @@ def _list_names_below() -> dict[str, str]:
 
 
 _PACKAGES = (
-    *("symbols", "control", "estimation", "geometry", "grasping", "manipulation", "planning", "reasoning"),
+    *(
+        "exchange",
+        "symbols",
+        "control",
+        "estimation",
+        "geometry",
+        "grasping",
+        "manipulation",
+        "planning",
+        "reasoning",
+    ),
     *("worlds", "expressions", "spatial", "logic", "errors", "loops", "formats", "model", "articulations"),
 )
 """Packages and modules of the face; a name that several have is that of the last one."""

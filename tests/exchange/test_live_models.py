@@ -92,6 +92,17 @@ def test_an_edit_of_one_process_is_in_all_replicas(server: Server, load: Callabl
     assert len({document_hash(model) for model in (one, other, server.snapshot(), load())}) == 1
 
 
+def test_a_live_model_answers_like_any_model(server: Server, load: Callable[..., LiveModel]) -> None:
+    live, model = load(), cupboard()
+    assert live.degrees_of_freedom == model.degrees_of_freedom
+    assert live.speeds == model.speeds
+    assert live.constraints_for(live.degrees_of_freedom).keys() == model.constraints.keys()
+    assert live.default_state() == model.default_state()
+    assert vars(LiveModel).keys() & {name for kind in kv.Model.__mro__[:-1] for name in vars(kind)} == {
+        *("__doc__", "__init__", "__module__", "_deliver", "edit")
+    }
+
+
 def test_an_edit_that_raises_is_not_asked_for(server: Server, load: Callable[..., LiveModel]) -> None:
     model = load()
     before = document_hash(model)

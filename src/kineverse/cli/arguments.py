@@ -29,6 +29,7 @@ from kineverse.errors import (
 )
 from kineverse.expressions.printing import format_number
 from kineverse.formats.file_formats import is_mjcf
+from kineverse.model.registry import find_scheme
 from kineverse.view.sliders import infer_units
 
 from .output import format_cells, print_line
@@ -176,9 +177,22 @@ def add_model_options(
     parser.add_argument("--strict", action="store_true", help=strict)
 
 
-def load_model(arguments: argparse.Namespace, source: str, prefix: str | None = None) -> kv.Model:
-    """Load a model with the options of the command line."""
-    return kv.load(source, prefix, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
+def load_model(
+    arguments: argparse.Namespace, source: str, prefix: str | None = None, *, follow: bool = False
+) -> kv.Model:
+    """Load a model with the options of the command line.
+
+    Of a live model it is a copy, which the command may edit, unless it is to ``follow`` the server.
+    """
+    options = {"root": arguments.root, "strict": arguments.strict, "loops": arguments.loops}
+    if find_scheme(source) is None:
+        return kv.load(source, prefix, **options)
+    live = arguments.live = kv.load(source, **options)  # kept, as meshes come from its server
+    if prefix is None:
+        return live if follow else live.copy()
+    copy = kv.Model()
+    copy.include(source, prefix)
+    return copy
 
 
 ALTERNATIVE_UNITS = {"rad": ("deg",), "m": ("cm", "mm")}
@@ -284,6 +298,7 @@ MODULES: Mapping[str, str] = MappingProxyType(
     {
         "control": "daqp",
         "decomposition": "coacd",
+        "exchange": "zenoh",
         "figures": "matplotlib",
         "geometry": "coal",
         "mjcf": "mujoco",

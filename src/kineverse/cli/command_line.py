@@ -59,6 +59,14 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         ),
         "spheres": ("spheres", "cover collision shapes by spheres, and show how far these stick out"),
         "fit": ("fit", "identify the joint of a part from a table of its poses"),
+        "serve": ("serve", "serve a model that other processes read and edit, and keep it"),
+        "ls": ("exchange:LS", "list the model servers of this user"),
+        "status": ("exchange:STATUS", "print how a model server is: times, clients, refused edits"),
+        "watch": ("exchange:WATCH", "print a line for each commit of a served model"),
+        "history": ("exchange:HISTORY", "list the last commits of a served model"),
+        "undo": ("exchange:UNDO", "take back a commit of a served model"),
+        "dump": ("exchange:DUMP", "write a backup of a served model, or a document of it"),
+        "apply": ("exchange:APPLY", "add the operations of a file to a served model"),
         "demo": ("demo", "let a robot open and close the doors and drawers of a kitchen"),
     }
 )
@@ -83,7 +91,8 @@ VERBOSE = "print more messages on standard error"
 QUIET = ("kineverse.view.meshes", "kineverse.compile.toolchain")
 
 EXAMPLES = """\
-A MODEL is the name of a shipped model (kitchen, pr2, articulations/screw ...) or the path of a file.
+A MODEL is the name of a shipped model (kitchen, pr2, articulations/screw ...), the path of a file, or the
+address of a model that kineverse serve keeps (live:kitchen).
 
 examples:
   kineverse info kitchen                              its frames, degrees of freedom, constraints
@@ -95,6 +104,8 @@ examples:
   kineverse view kitchen                              move it in the browser
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              differences of two models
+  kineverse serve kitchen --store kitchen.db          share it between processes, and keep it
+  kineverse info live:kitchen                         the one that is served
   kineverse fit poses.csv --child door                learn a joint from recorded poses
   kineverse demo --headless                           a robot opens and closes a door, a flap, a drawer
 """

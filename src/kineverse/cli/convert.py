@@ -14,7 +14,7 @@ from kineverse.formats.document import to_json
 from kineverse.formats.export.capabilities import UnsupportedError
 from kineverse.formats.locate import locate_model
 from kineverse.formats.reader_warnings import collect_warnings
-from kineverse.model.registry import SaveResult, writable_suffixes
+from kineverse.model.registry import SaveResult, find_scheme, writable_suffixes
 
 from .arguments import add_model_options, load_model
 from .diff import format_pose_difference
@@ -143,8 +143,8 @@ def check_writable(target: str, source: str, force: bool = False) -> None:
         return
     if not path.is_file():
         raise FormatError(f"{target} is no regular file.")
-    found = locate_model(source)
-    if not found.collection and path.samefile(found.path):
+    found = None if find_scheme(source) else locate_model(source)
+    if found is not None and not found.collection and path.samefile(found.path):
         raise DuplicateNameError(f"{target} is the input; give the output another name.")
     if not force:
         raise DuplicateNameError(f"{target} exists already; --force replaces it.")

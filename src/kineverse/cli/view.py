@@ -126,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
     if recording is not None:
         model = recording.model
     else:
-        model = loaded = load_model(arguments, arguments.model)
+        model = loaded = load_model(arguments, arguments.model, follow=arguments.robot is None)
         if arguments.robot is not None:
             _, standing = include_robot(arguments, loaded)
             assigned = {str(s): v for s, v in standing.items()} | assigned

@@ -74,10 +74,9 @@ class Address:
             return self.endpoint, ""
         folder = runtime_folder()
         if not _is_served(folder, self.name):
-            raise UnknownNameError(
-                f"There is no model server {self.name!r} of this user. "
-                f"{suggest(self.name, list_servers(), 'model server')}"
-            )
+            others = list_servers()
+            hint = suggest(self.name, others) if others else "None is running; 'kineverse serve' starts one."
+            raise UnknownNameError(f"There is no model server {self.name!r} of this user. {hint}")
         return _read_place(folder, self.name) or (_socket_endpoint(folder, self.name), "")
 
 
@@ -100,7 +99,7 @@ class Claim:
         self._lock = _lock(folder, self._stem)
         if self._lock is None:
             what = f"A source {source!r} of the model server" if source else "A model server"
-            raise DuplicateNameError(f"{what} {name!r} is running already.")
+            raise DuplicateNameError(f"{what} {name!r} is running already. Use that one, or another name.")
         self.secret = ""
         if UNIX_SOCKETS:
             _discard(folder, self._stem)

@@ -24,11 +24,12 @@ from kineverse.model import Diff, Edit, Model, NetChanges, PlacedEntry
 from kineverse.model.history import History, HistoryEntry, TouchedEntry
 
 from . import protocol
-from .conflicts import KEPT, Conflict, ConflictFoundError, Revisions
+from .conflicts import KEPT, ConflictFoundError, EditConflict, Revisions
 from .meshes import put_contents
 from .protocol import Commit, Committed, FileContent, Placed, Published, Refused
 from .store import Replaced, Store, StoredCommit
 from .stored_undo import computes, find_inverse
+from .views import LOAD_THE_WHOLE, is_partial
 
 ANSWERS: Final = 10_000
 """Number of answers that are kept in memory, to answer an edit that is asked twice alike."""
@@ -42,18 +43,10 @@ Watch: TypeAlias = Callable[[Model, Diff, Commit], Any]
 
 @dataclass(slots=True)
 class Result:
-    """Outcome of a request.
+    """Outcome of a request: the answer, and for a new commit what is published.
 
-    Attributes
-    ----------
-    answer
-        Message to the client.
-    published
-        Commit for the readers of the log; None if there is none, or it was answered before.
-    watched
-        Result of ``watch`` for the commit.
-    seconds
-        Times of the stages decode, check, fold, encode and, of the whole batch, persist [s].
+    ``watched`` is the result of ``watch`` for the commit. ``seconds`` has the times of the stages decode,
+    check, fold, encode and, of the whole batch, persist [s].
     """
 
     answer: EditAnswer
@@ -84,30 +77,12 @@ class _RefusedError(Exception):
 class Authority:
     """Model of a server with its store. One thread uses it.
 
-    Parameters
-    ----------
-    store
-        Operations, log and answers.
-    clock
-        Function that returns the time [s since 1970].
-    find_files
-        Function of the entries that a commit puts, and of the files that the client has named; it returns the
-        files that the commit names. By default, none.
-    watch
-        Function of the model, the diff and the commit, called after each commit, before the next one and
-        before it is stored. If it raises, the commit is taken back as if the store had failed.
-
-    Attributes
-    ----------
-    model
-        The model; its version is the revision. Another object after an error of the store.
-    epoch
-        Id of this run. Another one after an error of the store, when the model is what the store has.
-
-    Raises
-    ------
-    FormatError
-        If the operations of the store are no model.
+    ``clock`` returns the time [s since 1970]. ``find_files`` gets the entries that a commit puts and the
+    files that the client has named, and returns the files that the commit names. ``watch`` gets the model,
+    the diff and the commit, after each commit and before the next one. If it raises, the commit is taken
+    back, as after an error of the store. The version of ``model`` is the revision. ``epoch`` identifies this
+    run; after an error of the store there is another one, and another model. A store with operations that are
+    no model is a FormatError.
     """
 
     def __init__(
@@ -140,6 +115,7 @@ class Authority:
         self._revisions = Revisions(self.revision, self.chain)
         self._diffs: list[Diff] = []
         self.model.listen(self._diffs.append)
+        self._is_lost = False
 
     @property
     def revision(self) -> int:
@@ -147,23 +123,10 @@ class Authority:
         return self.model.version
 
     def fill(self, build: Callable[[Edit], None], who: str) -> None:
-        """Make the first commit of an empty store, by an edit of an empty model.
+        """Make the first commit of an empty store, by an edit of an empty model; ``who`` is its author.
 
-        Parameters
-        ----------
-        build
-            Function that makes the edit.
-        who
-            Name of its author, for people.
-
-        Raises
-        ------
-        EditError
-            If the store is not empty, or the edit is refused.
-        FormatError
-            For content that has no place in a document, or an error of the store.
-        KineverseError
-            Errors of the edit pass.
+        A store that is not empty and an edit that is refused are an EditError, content that has no place in a
+        document and an error of the store a FormatError. Errors of the edit pass.
         """
         if self.revision:
             raise EditError(f"The store is at revision {self.revision}; only an empty one is filled.")
@@ -178,6 +141,8 @@ class Authority:
         if isinstance(result.answer, Refused):
             kind = FormatError if result.answer.reason in ("failed", "malformed") else EditError
             raise kind(result.answer.message)
+        # Nobody has an earlier state.
+        self._start, self._revisions = self.revision, Revisions(self.revision, self.chain)
 
     # -- requests ------------------------------------------------------------------------------------------
 
@@ -187,39 +152,47 @@ class Authority:
         An edit is made whole or not at all, and others are made if one is refused. If the store fails, all of
         them are refused, and the model is what the store has, under a new epoch.
         """
-        new: set[tuple[str, int]] = set()
+        new: list[tuple[str, int]] = []
         results = []
         try:
+            if self._is_lost:
+                self._recover()
             for request in requests:
                 key = request.client, request.number
                 answer = self._find_answer(key)
+                if answer is not None:
+                    results.append(Result(answer))
+                    continue
                 if isinstance(request, protocol.Undo):
                     self._persist()  # it may need all commits of the store
-                if answer is None:
-                    results.append(self._answer(request))
-                    self._keep_answer(key, results[-1].answer)
-                    new.add(key)
-                else:
-                    results.append(Result(answer))
+                results.append(self._answer(request))
+                self._keep_answer(key, results[-1].answer)
+                new.append(key)
             begin = perf_counter()
             self._persist()
             seconds = perf_counter() - begin
         except Exception as error:
             if not isinstance(error, KineverseError | OSError):
                 logging.getLogger(__name__).exception("Edits were taken back.")
-            refused = Refused(
-                "failed", _one_line(f"Nothing was done, because the server has failed. {error}")
-            )
             for key in new:
                 self._answers.pop(key, None)
-            self._batch.clear()
-            self._store.reload()
-            self._load()
-            return [Result(self._find_answer((one.client, one.number)) or refused) for one in requests]
+            self._is_lost = True
+            refused = Refused("failed", _one_line(f"The server has failed, and nothing was done. {error}"))
+            try:
+                self._recover()
+                return [Result(self._find_answer((one.client, one.number)) or refused) for one in requests]
+            except (KineverseError, OSError):  # it is tried again before the next edit
+                return [Result(refused) for _ in requests]
         for result in results:
             if result.published is not None:
                 result.seconds["persist"] = seconds
         return results
+
+    def _recover(self) -> None:
+        """Go back to what the store has, under a new epoch."""
+        self._batch.clear()
+        self._store.reload()
+        self._load()
 
     def _persist(self) -> None:
         if self._batch:
@@ -277,18 +250,18 @@ class Authority:
         self._check_base(request)
         changes, history = request.changes, self.model.history
         put = tuple(map(_decode, changes.put))
-        rerun: tuple[str, ...] = ()
-        if request.base == self.revision:
-            # What the client has run again is taken, so that loops are not closed once more.
-            _check_reruns(put, changes, history)
-            rerun = changes.rerun
-        else:
-            # It has run them on an older model, so they are run here.
-            put = tuple(placed for placed in put if placed.entry.tag not in changes.rerun)
+        put_contents([placed.entry for placed in put], request.files)
+        # What the client has run again on the present model is taken, so that loops are not closed once more.
+        # What it has run again on an older one is run here.
+        is_newest = request.base == self.revision
+        taken = _choose_reruns(put, changes, history) if is_newest else set[str]()
+        dropped = {placed.entry.tag for placed in put}.intersection(changes.rerun) - taken
+        put = tuple(placed for placed in put if placed.entry.tag not in dropped)
+        rerun = tuple(tag for tag in changes.rerun if tag not in dropped)
         net = NetChanges(put, changes.replaced, rerun, changes.moved, changes.removed)
         seconds["decode"] = perf_counter() - begin
         begin = perf_counter()
-        if request.base < self.revision:
+        if not is_newest:
             entries = [placed.entry for placed in put]
             found = self._revisions.find_conflict(
                 request.base, entries, changes.moved, changes.removed, history
@@ -391,7 +364,7 @@ class Authority:
                 who=request.who,
                 time=self._clock(),
                 changes=protocol.Changes(tuple(put), net.replaced, net.rerun, net.moved, net.removed),
-                files=self._find_files(entries, getattr(request, "files", ())),
+                files=self._find_files(entries, request.files if isinstance(request, protocol.Edit) else ()),
             )
             data = protocol.encode(commit)
             if len(data) > protocol.MAX_BYTES or len(put) > protocol.MAX_OPERATIONS:
@@ -460,7 +433,7 @@ class Authority:
             tag = max(self.model.history.commits[revision], key=self._revisions.last_change)
             later = self._revisions.last_change(tag)
             who = self._revisions.who_made(later)
-            raise ConflictFoundError(Conflict(str(error), tag, "", later, who)) from None
+            raise ConflictFoundError(EditConflict(str(error), tag, "", later, who)) from None
 
 
 def _decode(placed: Placed) -> PlacedEntry:
@@ -473,6 +446,9 @@ def _decode(placed: Placed) -> PlacedEntry:
         message = f"A tag has {len(entry.tag)} letters; the most is {_LONGEST_TAG}."
         raise _RefusedError(Refused("malformed", message))
     operation = entry.operation
+    if is_partial(entry):
+        message = f"Of the operation {entry.tag!r} the client has only a part. {LOAD_THE_WHOLE}"
+        raise _RefusedError(Refused("refused", _one_line(message), entry.tag))
     if isinstance(operation, OpaqueOperation) and operation.frozen and not computes(entry):
         message = f"The operation {entry.tag!r} is frozen, and does not say by what it has read."
         raise _RefusedError(Refused("malformed", _one_line(message), entry.tag))
@@ -488,9 +464,12 @@ def _unlinked(placed: PlacedEntry) -> PlacedEntry:
     return replace(placed, entry=other)
 
 
-def _check_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, history: History) -> None:
-    """Check that what a client says to have run again is an operation that reads what the edit changes."""
-    again = {*changes.rerun}
+def _choose_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, history: History) -> set[str]:
+    """Return the tags of operations that a client has run again, because they read what the edit changes.
+
+    The others may only be as they were: read what was there for a while within the edit.
+    """
+    again, taken = {*changes.rerun}, set[str]()
     tags = {*changes.removed, *(placed.entry.tag for placed in put)} - again
     known = [history.entries[tag] for tag in tags if tag in history.entries]
     new = [placed.entry for placed in put if placed.entry.tag in tags]
@@ -505,10 +484,14 @@ def _check_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, history
             and old.operation.given == entry.operation.given
             and old.operation.scope == entry.operation.scope
         )
+        if old is not None and old.blob == entry.blob and not _reads_any(old, changed):
+            continue
         if old is None or not is_same or not _reads_any(old, changed):
             message = f"The operation {entry.tag!r} is not one that the edit leads to be run again."
             raise _RefusedError(Refused("refused", _one_line(message), entry.tag))
         changed |= old.writes.keys() | entry.writes.keys()
+        taken.add(entry.tag)
+    return taken
 
 
 def _reads_any(entry: HistoryEntry, cells: set[tuple[str, str]]) -> bool:
@@ -525,7 +508,7 @@ def _find_own(changes: NetChanges) -> list[str]:
     ]
 
 
-def _as_answer(conflict: Conflict) -> Refused:
+def _as_answer(conflict: EditConflict) -> Refused:
     message = _one_line(conflict.message)
     return Refused("conflict", message, conflict.tag, conflict.path, conflict.revision, conflict.who)
 

@@ -32,6 +32,7 @@ from .address import Address
 from .connection import Connection
 from .meshes import FetchedFiles, find_known_files, put_contents
 from .transport import Channel
+from .views import LOAD_THE_WHOLE, is_partial
 
 _LOG = logging.getLogger(__name__)
 
@@ -252,7 +253,7 @@ class LiveModel(Model):
         """Wait until the replica has an edit that was committed, or raise the error of one that was not."""
         if isinstance(answer, protocol.Refused):
             if answer.reason == "stale":
-                self._catch_up()
+                self._close_gap()
             if answer.reason in ("conflict", "stale"):
                 named = {
                     "tags": (answer.tag,) if answer.tag else (),
@@ -265,7 +266,7 @@ class LiveModel(Model):
         while not connection.wait_for(lambda: connection.revision >= answer.revision, first):
             if not connection.is_online:
                 return  # it is stored, and comes when the server is back
-            self._catch_up()
+            self._close_gap()
             first = _OWN_COMMIT
 
     # -- following -----------------------------------------------------------------------------------------
@@ -285,7 +286,7 @@ class LiveModel(Model):
         add_resolver(fetched)
         self._finish = weakref.finalize(self, _finish, connection, self._deliveries, fetched)
         if log is None:
-            self._catch_up()  # what came before the subscription
+            self._close_gap()  # what came before the subscription
 
     def _pump(self, channel: Channel, method: Callable[[LiveModel, Any], None]) -> None:
         threading.Thread(
@@ -299,7 +300,7 @@ class LiveModel(Model):
         with self._following:
             connection = self.exchange
             if published.epoch != connection.epoch or commit.previous > connection.revision:
-                self._catch_up()
+                self._close_gap()
             elif commit.revision > connection.revision:
                 self._adopt_commit(published, commit)
 
@@ -317,7 +318,7 @@ class LiveModel(Model):
             return
         connection.advance(commit.revision, published.chain)
 
-    def _catch_up(self) -> None:
+    def _close_gap(self) -> None:
         """Ask for what was missed, and adopt it."""
         connection = self.exchange
         with self._following:
@@ -359,7 +360,7 @@ class LiveModel(Model):
         with self._following:
             last = beat.views.get(self._view, 0) if self._wish.is_part else beat.revision
             if beat.epoch != connection.epoch or connection.revision < self._announced:
-                self._catch_up()
+                self._close_gap()
             elif self._wish.is_part and last <= connection.revision < beat.revision:
                 connection.advance(beat.revision, beat.chain)
             self._announced = last
@@ -370,7 +371,7 @@ class LiveModel(Model):
         key, is_there = sign
         connection = self.exchange
         if is_there:
-            self._catch_up()
+            self._close_gap()
         elif key.endswith(connection.epoch):
             connection.note_presence(False)
 
@@ -404,6 +405,8 @@ def _find_changes(old: Sequence[HistoryEntry], new: Sequence[HistoryEntry]) -> N
 def _check_part(history: History, changes: NetChanges, connection: Connection) -> None:
     """Refuse an edit that would depend on what is not in a part of the model."""
     for entry in (placed.entry for placed in changes.put):
+        if is_partial(entry):
+            raise EditError(f"Only a part of the operation {entry.tag!r} is here. {LOAD_THE_WHOLE}")
         missing = sorted(f"all {kind}" for kind in entry.reads.listings)
         missing += [
             "/".join(cell) for cell in entry.reads.cells if history.value_at(cell, entry.place) is ABSENT

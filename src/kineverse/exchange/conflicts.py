@@ -17,7 +17,8 @@ from kineverse.model.operation import Cell
 from kineverse.model.read_recorder import ABSENT, Read, differs
 
 KEPT: Final = 10_000
-"""Number of revisions that edits may be behind."""
+"""Number of revisions that edits may be behind; fewer if they are of more than a million values."""
+_MOST_CELLS: Final = 1_000_000
 
 # Flags are compared as wholes, because operations on them are slow.
 _WITH_VALUE = (Read.VALUE, Read.EXISTENCE | Read.VALUE)
@@ -26,8 +27,8 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True, slots=True)
-class Conflict:
-    """What an edit has in common with a later commit: operation, path, revision, and who made it."""
+class EditConflict:
+    """Conflict of an edit with a later commit: operation and path, and revision and author of the commit."""
 
     message: str
     tag: str
@@ -39,7 +40,7 @@ class Conflict:
 class ConflictFoundError(Exception):
     """Edit in conflict with a later commit."""
 
-    def __init__(self, conflict: Conflict) -> None:
+    def __init__(self, conflict: EditConflict) -> None:
         super().__init__(conflict.message)
         self.conflict = conflict
 
@@ -110,7 +111,7 @@ class Revisions:
                     _put(self._read_values if how in _WITH_VALUE else self._read_existence, cell, revision)
                 for kind in now.reads.listings:
                     self._listings[kind] = revision
-        if len(self._commits) > KEPT:
+        while len(self._commits) > KEPT or (len(self._values) > _MOST_CELLS and len(self._commits) > 1):
             self._forget()
 
     def _forget(self) -> None:
@@ -133,19 +134,11 @@ class Revisions:
         moved: Collection[str],
         removed: Sequence[str],
         history: History,
-    ) -> Conflict | None:
-        """Return the first conflict of an edit with the commits after its base.
+    ) -> EditConflict | None:
+        """Return the first conflict of an edit with the commits after its base, a revision.
 
-        Parameters
-        ----------
-        base
-            Revision that the edit was made at.
-        put
-            Entries that it puts, with what they read.
-        moved, removed
-            Tags of those that it moves, and of operations that it removes.
-        history
-            History of the model, before the edit.
+        ``put`` are the entries that it puts, with what they read; ``moved`` and ``removed`` the tags of those
+        that it moves and of others that it removes. ``history`` is that before the edit.
         """
         for tag in (*(entry.tag for entry in put), *removed):
             if self._tags.get(tag, 0) > base:
@@ -176,11 +169,11 @@ class Revisions:
                     return self._conflict(last, tag, "reads", cell, "changes")
         return None
 
-    def conflict_about(self, tag: str, other: str, what: str) -> Conflict:
+    def conflict_about(self, tag: str, other: str, what: str) -> EditConflict:
         """Return the conflict of an operation with the last commit of another one, or of itself."""
         revision = self._tags[other]
         who = self.who_made(revision)
-        return Conflict(
+        return EditConflict(
             f"Revision {revision}, by {who}, {what} the operation {other!r}. Try again.",
             tag,
             "",
@@ -188,10 +181,10 @@ class Revisions:
             who,
         )
 
-    def _conflict(self, revision: int, tag: str, what: str, cell: Cell, how: str) -> Conflict:
+    def _conflict(self, revision: int, tag: str, what: str, cell: Cell, how: str) -> EditConflict:
         path, who = "/".join(cell).rstrip("/"), self.who_made(revision)
         message = f"Revision {revision}, by {who}, {what} {path}, which {tag!r} {how}. Try again."
-        return Conflict(message, tag, path, revision, who)
+        return EditConflict(message, tag, path, revision, who)
 
 
 def _put(revisions: OrderedDict[Key, int], key: Key, revision: int) -> None:

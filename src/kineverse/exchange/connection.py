@@ -10,6 +10,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import closing
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -18,10 +19,12 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from kineverse._checks import as_count
-from kineverse.errors import FormatError, OfflineError, UnknownNameError
+from kineverse.errors import DuplicateNameError, FormatError, OfflineError, UnknownNameError
 
 from . import protocol
 from .address import Address
+from .meshes import MAX_PART
+from .store import Store
 from .transport import NoAnswerError, Transport
 
 PATIENCE = 10.0
@@ -90,6 +93,37 @@ class Connection:
         most = as_count("most", most, 1)
         asked = protocol.GetHistory(most) if before is None else protocol.GetHistory(most, before)
         return self.ask(asked, protocol.History).rows
+
+    def backup(self, path: str | os.PathLike[str]) -> Store:
+        """Write a copy of the server's store into a new file, checked, and return it, closed.
+
+        Raises
+        ------
+        DuplicateNameError
+            If there is a file already.
+        FormatError
+            If the file cannot be written, or the server cannot make a copy.
+        """
+        path = Path(path)
+        if os.path.lexists(path):
+            raise DuplicateNameError(f"{path} exists already. Name a new file for the backup.")
+        part = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex}")
+        try:
+            with part.open("xb") as file:
+                size = MAX_PART
+                while size == MAX_PART:
+                    asked = protocol.GetBackup(self.client, file.tell())
+                    size = file.write(self.ask(asked, protocol.FilePart, PATIENCE).data)
+                file.flush()
+                os.fsync(file.fileno())
+            with closing(Store(part)) as store:
+                pass
+            part.rename(path)
+            return store
+        except OSError as error:
+            raise FormatError(f"{path} cannot be written: {error.strerror}.") from None
+        finally:
+            part.unlink(missing_ok=True)
 
     # -- for the live model --------------------------------------------------------------------------------
 
@@ -223,7 +257,9 @@ class Connection:
             except NoAnswerError:
                 # For moments after a connection was made it is not known who answers.
                 if not self.is_online or time.monotonic() >= end:
-                    raise OfflineError(f"The server {self.address.name!r} does not answer.") from None
+                    raise OfflineError(
+                        f"The server {self.address.name!r} does not answer. Look if it runs, by that name."
+                    ) from None
                 time.sleep(_PAUSE)
 
 
@@ -242,5 +278,6 @@ def describe_client() -> str:
         user = getpass.getuser()
     except (KeyError, OSError):
         user = str(os.getuid()) if hasattr(os, "getuid") else "somebody"
-    program = Path(sys.argv[0]).name if sys.argv and sys.argv[0] not in ("", "-c") else "python"
+    path = Path(sys.argv[0] if sys.argv and sys.argv[0] != "-c" else "")
+    program = (path.parent if path.name == "__main__.py" else path).name or "python"
     return f"{user}@{socket.gethostname()} {program} {os.getpid()}"

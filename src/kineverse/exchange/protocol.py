@@ -21,6 +21,8 @@ MAX_BYTES: Final = 1 << 26
 """Largest message [byte]; files are sent in parts."""
 MAX_OPERATIONS: Final = 100_000
 """Most operations in the changes of one edit."""
+MAX_LISTED: Final = 10_000
+"""Most commits in one listing."""
 
 Id: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{32}$", max_length=32)]
 Name: TypeAlias = Annotated[str, Meta(min_length=1, max_length=4096)]
@@ -156,7 +158,7 @@ class GetStatus(_Message, frozen=True, tag="status"):
 class GetHistory(_Message, frozen=True, tag="history"):
     """Ask for the last commits, newest first, from a revision on backwards."""
 
-    most: Annotated[int, Meta(ge=1, le=10_000)] = 20
+    most: Annotated[int, Meta(ge=1, le=MAX_LISTED)] = 20
     before: Revision = (1 << 62) - 1
 
 
@@ -164,6 +166,16 @@ class GetFile(_Message, frozen=True, tag="file"):
     """Ask for a part of a file by the digest of its content."""
 
     sha256: Sha256
+    offset: Number = 0
+
+
+class GetBackup(_Message, frozen=True, tag="backup"):
+    """Ask for a part of a copy of the store, which is made at the offset 0 and kept until the last part.
+
+    That is the first one with less than 2**24 bytes.
+    """
+
+    client: Id
     offset: Number = 0
 
 
@@ -180,7 +192,7 @@ class Announce(_Message, frozen=True, tag="announce"):
     offset: Seconds = 0.0
 
 
-Request: TypeAlias = Edit | Undo | Join | Since | GetStatus | GetHistory | GetFile | Announce
+Request: TypeAlias = Edit | Undo | Join | Since | GetStatus | GetHistory | GetFile | GetBackup | Announce
 
 # -- answers -------------------------------------------------------------------------------------------------
 
@@ -283,6 +295,7 @@ class Status(_Message, frozen=True, tag="status"):
     revision: Revision
     chain: Chain
     operations: int
+    frames: int
     edits: int  # accepted since the start
     rate: float  # accepted edits per second in the last minute
     stages: tuple[StageTime, ...]
@@ -311,7 +324,7 @@ class History(_Message, frozen=True, tag="history"):
 
 
 class FilePart(_Message, frozen=True, tag="file"):
-    """Part of a file."""
+    """Part of a file, or of the copy of a store."""
 
     data: bytes
 

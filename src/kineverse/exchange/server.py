@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
 import numpy as np
@@ -26,7 +27,7 @@ from . import protocol
 from .address import Claim, check_endpoint
 from .authority import Authority, Result
 from .connection import describe_client
-from .meshes import ServedFiles
+from .meshes import MAX_PART, ServedFiles
 from .store import Store
 from .transport import Question, Questions, Transport
 from .views import View, Views, Wish
@@ -39,11 +40,14 @@ MOST_TOGETHER, LONGEST_WAIT = 200, 0.002
 """Most edits that are stored together, and the time in which they have to arrive [s]."""
 BEAT = 0.5
 """Time between two signs of life [s]."""
+STAGES = ("receive", "decode", "check", "fold", "encode", "persist", "publish", "answer")
+"""Stages of an edit, in order; their times are in the status."""
 _KEPT_REFUSALS = 20
 _KEPT_TIMES = 1000
 _MOST_MISSED = 1000
 _LONGEST_MESSAGE = 10_000
 _MINUTE = 60.0
+_BACKUP = "store"
 
 
 def serve(
@@ -96,7 +100,9 @@ def serve(
         opened.callback(claim.release)
         files = ServedFiles(kept)
         authority = Authority(kept, find_files=files.find, watch=lambda _, diff, commit: (diff, commit))
-        if not authority.revision and given:
+        if authority.revision and given:
+            _LOG.warning("%s has a model already, which is served. Nothing else is read.", store)
+        elif given:
             authority.fill(lambda edit: _include(edit, given), describe_client())
         kept.name = chosen
         transport = Transport.serve([claim.endpoint, *endpoints], claim.secret)
@@ -107,7 +113,7 @@ def serve(
 def _name_of(given: Sequence[Source]) -> str:
     first = given[0] if given else None
     if first is None or isinstance(first, Model):
-        raise InvalidValueError("A server has a name: give one with name= (on the command line, --name).")
+        raise InvalidValueError("A server has a name: give it one with name=.")
     stem = Path(first).name
     return stem.partition(".")[0] or stem
 
@@ -146,6 +152,7 @@ class Server:
         self._views = Views(authority.model)
         self._logs: dict[str, _ViewLog] = {}
         self._sources: dict[str, protocol.SourceStatus] = {}
+        self._backups: dict[str, TemporaryDirectory[str]] = {}
         self._clients: dict[str, _Client] = {}
         self._refusals: deque[protocol.Refusal] = deque(maxlen=_KEPT_REFUSALS)
         self._times: dict[str, deque[float]] = {}
@@ -193,6 +200,8 @@ class Server:
         if not self._closed.is_set():
             self._closed.set()
             with self._lock:
+                for client in [*self._backups]:
+                    self._drop_backup(client)
                 self._opened.close()
 
     def __enter__(self) -> Server:
@@ -220,7 +229,7 @@ class Server:
                     continue
                 edits.append(decoded)
                 given.append(request)
-            self._note_time("decode", begin)
+            self._note_time("receive", begin)
             if edits:
                 self._process(edits, given)
 
@@ -324,6 +333,8 @@ class Server:
                 if data is None:
                     return protocol.Refused("unknown", f"There is no file with SHA-256 {question.sha256}.")
                 return protocol.FilePart(data)
+            case protocol.GetBackup():
+                return self._read_backup(question)
             case protocol.Announce():
                 return self._announce(question)
             case _:
@@ -376,7 +387,8 @@ class Server:
     def _status(self) -> protocol.Status:
         authority, now, ticks = self._authority, time.time(), time.monotonic()
         with self._lock:
-            stages = [(name, np.percentile([*times], (50, 95))) for name, times in self._times.items()]
+            known = [(stage, self._times[stage]) for stage in STAGES if stage in self._times]
+            stages = [(stage, np.percentile([*times], (50, 95))) for stage, times in known]
             return protocol.Status(
                 name=self.name,
                 library=__version__,
@@ -390,6 +402,7 @@ class Server:
                 revision=authority.revision,
                 chain=authority.chain,
                 operations=len(authority.model.history.sequence),
+                frames=len(authority.model.frames),
                 edits=self._edits,
                 rate=sum(now - then < _MINUTE for then in self._accepted) / _MINUTE,
                 stages=tuple(
@@ -425,6 +438,27 @@ class Server:
             )
         return protocol.History(tuple(rows))
 
+    def _read_backup(self, question: protocol.GetBackup) -> protocol.Answer:
+        with self._lock:
+            if not question.offset:
+                self._drop_backup(question.client)
+                beside = None if self._store.path is None else Path(self._store.path).parent
+                folder = self._backups[question.client] = TemporaryDirectory(prefix=".backup-", dir=beside)
+                self._store.backup(Path(folder.name, _BACKUP))
+            if question.client not in self._backups:
+                return protocol.Refused("unknown", "There is no copy of the store any more. Ask again.")
+            with open(Path(self._backups[question.client].name, _BACKUP), "rb") as file:
+                file.seek(question.offset)
+                data = file.read(MAX_PART)
+            if len(data) < MAX_PART:
+                self._drop_backup(question.client)
+        return protocol.FilePart(data)
+
+    def _drop_backup(self, client: str) -> None:
+        folder = self._backups.pop(client, None)
+        if folder is not None:
+            folder.cleanup()
+
     # -- who is there --------------------------------------------------------------------------------------
 
     def _announce(self, announced: protocol.Announce) -> protocol.Done:
@@ -449,6 +483,7 @@ class Server:
                 continue  # it is known once it has joined
             with self._lock:
                 self._forget_client(client)
+                self._drop_backup(client)
                 for name in [s.source for s in self._sources.values() if s.client == client]:
                     del self._sources[name]
 

@@ -15,7 +15,7 @@ from kineverse.model.operation import Cell
 from kineverse.model.read_recorder import ABSENT, Read, differs
 
 from . import protocol
-from .conflicts import Conflict, ConflictFoundError
+from .conflicts import ConflictFoundError, EditConflict
 from .protocol import Commit
 from .store import Replaced, Store
 
@@ -24,21 +24,10 @@ _UNKNOWN: Final = object()
 
 
 def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
-    """Return the changes that take back a commit of a store.
+    """Return the changes that take back a commit of a store, which has all commits of a model.
 
-    Parameters
-    ----------
-    store
-        Store of the commits, up to the present one.
-    history
-        History of the present model.
-    revision
-        Revision of the commit.
-
-    Raises
-    ------
-    ConflictFoundError
-        If a later commit has changed one of its operations, or what a frozen one had read.
+    If a later commit has changed one of its operations, or what a frozen one had read, it is in conflict with
+    that (ConflictFoundError).
     """
     data, replaced = store.commit_of(revision)
     commit: Commit = protocol.decode_commit(data)
@@ -107,7 +96,7 @@ def _check_unread(store: Store, history: History, entry: HistoryEntry, later: Se
 
 def _conflict(later: Commit, tag: str, path: str, what: str) -> ConflictFoundError:
     message = f"Revision {later.revision}, by {later.who}, {what}. Undo it first."
-    return ConflictFoundError(Conflict(message, tag, path, later.revision, later.who))
+    return ConflictFoundError(EditConflict(message, tag, path, later.revision, later.who))
 
 
 def _find_anchor(history: History, old: Replaced, put: Sequence[PlacedEntry], gone: set[str]) -> str | None:

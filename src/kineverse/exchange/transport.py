@@ -29,6 +29,7 @@ LEASE: Final = 1.0
 _USER: Final = "kineverse"
 _MOST_QUESTIONS: Final = 10_000
 _END_SECONDS: Final = 0.2
+_OPEN_SECONDS: Final = 3.0  # for a server that is held up
 
 
 Value = TypeVar("Value")
@@ -217,7 +218,10 @@ class Transport(_Owner):
                 return cls(settings)
             except _zenoh().ZError as error:
                 reason = re.sub(r"\s+at /\S+?\.rs:\d+\.?", "", str(error)).strip().rstrip(".")  # no places
-                raise InvalidValueError(f"Cannot listen at {' and '.join(endpoints)}: {reason}.") from None
+                named = " and ".join([e for e in endpoints if e in reason] or endpoints)
+                raise InvalidValueError(
+                    f"Cannot listen at {named}: {reason}. Choose another endpoint."
+                ) from None
 
     @classmethod
     def connect(cls, endpoint: str, secret: str = "", timeout: float = 0.0) -> Transport:
@@ -313,6 +317,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "scouting/delay": 0,  # a server would wait for others to find, half a second
+    "transport/unicast/open_timeout": round(1e3 * _OPEN_SECONDS),
     "transport/shared_memory/enabled": False,  # files of it outlive a process that is killed
     "transport/link/tx/lease": round(1e3 * LEASE),
     "transport/link/tx/queue/size/data": 16,  # batches of 64 kB that wait for a reader before messages drop

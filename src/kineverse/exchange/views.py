@@ -14,8 +14,9 @@ a coordinate in nothing but its bounds is not about it. A wished symbol brings n
 and rate there is nothing but its record.
 
 A part has operations of the same tags in the same order, with those of their writes that are in the part, but
-no parameters and traces: it shows the present of a model. What was overwritten since is not in it. A frame
-that was attached elsewhere is in the world until then, so that all parents are there at every place.
+no parameters and traces, so they cannot be run again. It shows the present of a model: what was overwritten
+is not in it. A frame that was attached elsewhere is in the world until then, so that all parents are there at
+every place. So a value before the end of the sequence may be another one than that of the whole.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
-from typing import Any
+from typing import Any, Final
 
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
@@ -56,25 +57,22 @@ from .protocol import Changes, Placed
 Key = tuple[str, str]
 """Cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix."""
 
+LOAD_THE_WHOLE: Final = "To move it, or to run it again, load the whole model; or replace it by a new one."
+
 _ABOUT, _TAG, _BELOW = "about", "tag", "below"
 _COUPLING = (CONSTRAINTS, RATES, ARTICULATIONS)
 _OVERWRITTEN = Frame(WORLD, ())
+_PARTIAL = "only a part of it is here"
 _PLACE = attrgetter("place")
 
 
 @dataclass(frozen=True)
 class Wish:
-    """Frames and symbols by which a part of a model is asked for.
+    """Frames and symbols by which a part of a model is asked for, all by name.
 
-    Attributes
-    ----------
-    frames
-        Names of frames. ``kitchen/fridge_door`` is this frame. ``kitchen/``, with a slash at its end, stands
-        for all frames with names that begin so, those that come later included.
-    symbols
-        Names of symbols, which stand for their coordinates.
-    bodies
-        True for the bodies of the wished frames; those above them come without.
+    ``kitchen/fridge_door`` is this frame. ``kitchen/``, with a slash at its end, stands for all frames with
+    names that begin so, those that come later included. Symbols stand for their coordinates. With ``bodies``,
+    wished frames have their bodies; the frames above them come without.
     """
 
     frames: tuple[str, ...] = ()
@@ -93,14 +91,9 @@ class Wish:
         return frozenset(parse_symbol_name(name)[0] for name in self.symbols)
 
     def check(self, model: Model) -> None:
-        """Check that all that is wished is there.
+        """Check that all that is wished is there, else raise UnknownNameError with similar names.
 
-        Raises
-        ------
-        UnknownNameError
-            If a name is unknown, with similar ones.
-        ExpressionError
-            If a text is no name of a symbol.
+        A text that is no name of a symbol at all is an ExpressionError.
         """
         frames = model.frames
         for name in self.frames:
@@ -137,11 +130,13 @@ class Coupling:
                 self.update((kind, name))
 
     def update(self, cell: Cell) -> Iterable[str]:
-        """Enter the present value of a constraint, a rate or a record; return the coordinates it is about."""
+        """Enter the present value of a cell; return the coordinates that it adds something about."""
         kind, name = cell
+        self._paths.pop(cell, None)
+        if kind not in _COUPLING:
+            return ()
         for group in self._entered.pop(cell, ()):
             self._groups[group].pop(name, None)
-        self._paths.pop(cell, None)
         value = self._history.head[kind].get(name)
         if value is None:
             return ()
@@ -167,10 +162,8 @@ class Coupling:
         known = self._paths.get(cell)
         if known is None or known[0] is not value:
             found = _paths_of(find_expressions(cell[0], value))
-            if cell[0] == RATES:
-                found |= {value[0].path}
-                if not isinstance(value[1], Expression):
-                    found |= {speed.path for speed, _ in value[1]}
+            if cell[0] == RATES and not isinstance(value[1], Expression):
+                found |= {speed.path for speed, _ in value[1]}
             known = self._paths[cell] = value, found
         return known[1]
 
@@ -217,7 +210,6 @@ class Coupling:
                 continue
             found.add(path)
             rate = RATES, symbol_name(path, 0)
-            keys.add(rate)
             if rate[1] in rates:
                 cells[rate] = None
                 waiting += self.paths(rate)
@@ -247,7 +239,8 @@ def _paths_of(expressions: Iterable[Expression]) -> frozenset[str]:
     found: set[str] = set()
     for expression in expressions:
         found.update(symbol.path for symbol in collect_symbols(expression))
-        found.update(symbol.path for symbol in gradient_keys(expression))
+        if expression.nodes:  # else the gradient has the speeds of these
+            found.update(symbol.path for symbol in gradient_keys(expression))
     return frozenset(found)
 
 
@@ -259,16 +252,10 @@ def close(model: Model, wish: Wish) -> set[Cell]:
 def part_entries(
     model: Model, cells: Set[Cell] | Mapping[Cell, Any], known: Mapping[str, HistoryEntry] | None = None
 ) -> list[HistoryEntry]:
-    """Return the operations of a part in order, each with its blob.
+    """Return the operations of a part of a model in order, each with its blob.
 
-    Parameters
-    ----------
-    model
-        The whole model.
-    cells
-        Cells of the part, from :func:`close`.
-    known
-        Entries of an earlier part by tag; those that have not changed are the same objects in the result.
+    The cells are those of :func:`close`. Entries of an earlier part by tag may be given as ``known``; those
+    that have not changed are the same objects in the result.
     """
     history, known = model.history, known or {}
     writers: dict[str, HistoryEntry] = {}
@@ -307,11 +294,15 @@ def _part_entry(
     kind = operation.kind if isinstance(operation, OpaqueOperation) else document_kind(type(operation))
     if known is not None and _is_same(known, kind, reads, writes):
         return known
-    made = HistoryEntry(
-        entry.tag, OpaqueOperation(kind, reads=reads.cells, recorded=writes), 0, reads, writes
-    )
+    shown = OpaqueOperation(kind, reads=reads.cells, recorded=writes, frozen=_PARTIAL)
+    made = HistoryEntry(entry.tag, shown, 0, reads, writes)
     blob = entry_to_bytes(made, ())
     return known if known is not None and known.blob == blob else made
+
+
+def is_partial(entry: HistoryEntry) -> bool:
+    """Return whether an operation comes from a part: it may lack writes, and is put nowhere else."""
+    return isinstance(entry.operation, OpaqueOperation) and entry.operation.frozen == _PARTIAL
 
 
 def _is_same(known: HistoryEntry, kind: str, reads: Reads, writes: Mapping[Cell, Any]) -> bool:
@@ -328,12 +319,7 @@ def _is_same(known: HistoryEntry, kind: str, reads: Reads, writes: Mapping[Cell,
 class View:
     """Part of a model that clients follow, kept up to date by :class:`Views`.
 
-    Attributes
-    ----------
-    id
-        Identifier of the wish, 32 hexadecimal digits.
-    users
-        Number of times that it was asked for and not released.
+    ``id`` is that of the wish; ``users`` is the number of times that it was asked for and not released.
     """
 
     def __init__(self, model: Model, coupling: Coupling, wish: Wish) -> None:
@@ -362,11 +348,8 @@ class View:
     def commit(self, replaced: Set[str]) -> Changes | None:
         """Bring the part to the present model; return the changes for a replica, None if there are none.
 
-        Parameters
-        ----------
-        replaced
-            Tags of operations that the commit itself has replaced or moved; others of the part that changed
-            count as run again.
+        Operations that changed count as replaced if their tags are among those given, which the commit itself
+        has replaced or moved; all others as run again.
         """
         old = self._entries
         new = self._renew()
@@ -418,10 +401,7 @@ class Views:
     def add(self, wish: Wish) -> View:
         """Return the view of a wish; equal wishes share one. Each user releases it at the end.
 
-        Raises
-        ------
-        UnknownNameError
-            If a frame or a symbol is unknown, with similar names.
+        Unknown names are refused as by :meth:`Wish.check`, unless others follow this view already.
         """
         known = self._views.get(wish.id)
         if known is None:
@@ -439,11 +419,8 @@ class Views:
     def commit(self, *diffs: Diff) -> list[tuple[View, Changes]]:
         """Return the views that commits have changed, each with the changes for its replicas.
 
-        Parameters
-        ----------
-        diffs
-            Diffs of one or several commits in order. The model is at the last of them, and so are the views
-            afterwards.
+        The diffs are those of one or several commits in order. The model is at the last of them, and so are
+        the views afterwards.
         """
         if not self._views:
             vars(self).pop("_coupling", None)  # it would miss the changes
@@ -472,8 +449,7 @@ class Views:
         for change in diff.changes:
             cell = change.kind, change.name
             keys.add(cell)
-            if change.kind in _COUPLING:
-                keys.update((_ABOUT, path) for path in self._coupling.update(cell))
+            keys.update((_ABOUT, path) for path in self._coupling.update(cell))
             if change.kind == ARTICULATIONS and change.after is not None:
                 keys.add((FRAMES, change.after.child))
             elif change.kind == FRAMES and change.before is None:

@@ -16,7 +16,7 @@ from kineverse.loops.loop_records import find_loops
 from kineverse.model.body import Inertia, Mesh
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
-from kineverse.model.registry import LoopTreatment
+from kineverse.model.registry import LoopTreatment, find_scheme
 from kineverse.model.sampling import StateSamples
 from kineverse.state import State
 
@@ -239,7 +239,7 @@ def validate_file(
     Parameters
     ----------
     name
-        Name of a shipped model, or path of a file.
+        Name of a shipped model, path of a file, or address of a live model.
     meshes
         True to check that mesh files exist.
     strict
@@ -252,10 +252,10 @@ def validate_file(
     name, language = os.fspath(name), ""
     with collect_warnings() as remarks:
         try:
-            source = locate_model(name)
-            language = detect_format(source)
+            source = None if find_scheme(name) else locate_model(name)
+            language = "live model" if source is None else detect_format(source)
             model = load(name, root=root, loops=loops)
-            facts = _document_header(source)
+            facts = {} if source is None else _document_header(source)
             problems = (*find_problems(model, meshes), *(further(model) if further else ()))
         except (KineverseError, OSError) as error:
             return ValidationResult(name, language, error=error, remarks=remarks, strict=strict)
