@@ -154,6 +154,8 @@ class Server:
         self._sources: dict[str, protocol.SourceStatus] = {}
         self._backups: dict[str, TemporaryDirectory[str]] = {}
         self._clients: dict[str, _Client] = {}
+        self._present: set[str] = set()  # clients whose signs of life are there
+        self._absent: set[str] = set()  # those that were not, at the last beat
         self._refusals: deque[protocol.Refusal] = deque(maxlen=_KEPT_REFUSALS)
         self._times: dict[str, deque[float]] = {}
         self._accepted: deque[float] = deque(maxlen=100_000)
@@ -241,7 +243,7 @@ class Server:
                 published = [result.published for result in results if result.published is not None]
                 if self._authority.epoch != epoch:
                     self._begin_again()
-                for_parts = self._commit_views(results)
+                for_parts = self._follow_views(results)
         except Exception as error:  # a defect of this package must not end the server
             _LOG.exception("Edits could not be processed.")
             for request in requests:
@@ -264,6 +266,14 @@ class Server:
         self._views, self._logs = Views(self._authority.model), {}
         self._token.close()
         self._token = self._transport.alive(self._key(f"alive/{self._authority.epoch}"))
+
+    def _follow_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
+        try:
+            return self._commit_views(results)
+        except Exception:  # a defect of this package; the edits are made, and clients of parts join again
+            _LOG.exception("Parts of the model could not follow it.")
+            self._views, self._logs = Views(self._authority.model), {}
+            return []
 
     def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
         """Return the commits of parts, by the ids of their views."""
@@ -294,7 +304,7 @@ class Server:
                 _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
             elif result.published is not None:
                 self._edits += 1
-                self._accepted.append(now)
+                self._accepted.append(time.monotonic())
 
     def _note_time(self, stage: str, begin: float) -> None:
         self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(time.perf_counter() - begin)
@@ -369,7 +379,8 @@ class Server:
             epoch, revision, chain = authority.epoch, authority.revision, authority.chain
             if since.view:
                 log = self._logs.get(since.view) if since.client in self._clients else None
-                found = None if log is None else log.find_after(since.revision)
+                is_known = authority.knows(since.revision, since.chain)
+                found = log.find_after(since.revision) if log is not None and is_known else None
             else:
                 stored = self._store.commits_after(since.revision, since.chain, _MOST_MISSED)
                 found = (
@@ -404,7 +415,7 @@ class Server:
                 operations=len(authority.model.history.sequence),
                 frames=len(authority.model.frames),
                 edits=self._edits,
-                rate=sum(now - then < _MINUTE for then in self._accepted) / _MINUTE,
+                rate=sum(ticks - then < _MINUTE for then in self._accepted) / _MINUTE,
                 stages=tuple(
                     protocol.StageTime(name, float(middle), float(high)) for name, (middle, high) in stages
                 ),
@@ -479,13 +490,27 @@ class Server:
     def _watch_clients(self, presence: Iterable[tuple[str, bool]]) -> None:
         for key, is_there in presence:
             client = key.rpartition("/")[2]
-            if is_there:
-                continue  # it is known once it has joined
             with self._lock:
-                self._forget_client(client)
-                self._drop_backup(client)
-                for name in [s.source for s in self._sources.values() if s.client == client]:
-                    del self._sources[name]
+                if is_there:
+                    self._present.add(client)
+                else:
+                    self._present.discard(client)
+                    self._forget(client)
+
+    def _forget_absent(self) -> None:
+        """Forget those who have asked without a sign of life, or ended before they were answered."""
+        with self._lock:
+            sources = {source.client for source in self._sources.values()}
+            absent = {*self._clients, *self._backups, *sources} - self._present
+            for client in absent & self._absent:  # a sign may come after a question
+                self._forget(client)
+            self._absent = absent
+
+    def _forget(self, client: str) -> None:
+        self._forget_client(client)
+        self._drop_backup(client)
+        for name in [s.source for s in self._sources.values() if s.client == client]:
+            del self._sources[name]
 
     def _forget_client(self, client: str) -> None:
         known = self._clients.pop(client, None)
@@ -504,6 +529,7 @@ class Server:
 
     def _beat(self) -> None:
         while not self._closed.wait(BEAT):
+            self._forget_absent()
             self._publish_beat()
 
     def _publish_beat(self) -> None:
