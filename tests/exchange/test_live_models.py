@@ -244,13 +244,19 @@ def test_a_part_equals_the_whole_while_its_closure_changes(
 
 def test_an_edit_of_a_part_is_in_the_whole(server: Server, load: Callable[..., LiveModel]) -> None:
     whole, part = load(), load(frames=["door"])
+    heard: list[kv.model.Diff] = []
+    part.listen(heard.append)
     with part.edit() as edit:
         edit.add_frame("knob", "door", kv.translation(0.6, 0, 0))
+    assert part.version == server.revision
     assert whole.wait(part.version, LONG)
     assert whole.frames["knob"].parent == "door"
     add(whole, "wall")
     with pytest.raises(kv.errors.KineverseError, match="wall"), part.edit() as edit:
         edit.add_frame("hook", "wall")
+    with pytest.raises(kv.errors.EditError, match="while it is edited"), part.edit():
+        part.wait(server.revision, LONG)
+    assert heard == []  # nothing of this part has changed
 
 
 def test_a_part_of_a_file_and_unknown_names_are_refused(

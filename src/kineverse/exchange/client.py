@@ -22,9 +22,10 @@ from kineverse.formats.resources import add_resolver, remove_resolver
 from kineverse.model.changes import find_moved_tags
 from kineverse.model.commits.net_changes import NetChanges, PlacedEntry
 from kineverse.model.edit import Edit
-from kineverse.model.history import History, HistoryEntry
+from kineverse.model.history import HistoryEntry
+from kineverse.model.operation import RATES
 from kineverse.model.model import EditContext, Model
-from kineverse.model.read_recorder import ABSENT
+from kineverse.model.read_recorder import ABSENT, Read
 from kineverse.symbols import Symbol
 
 from . import protocol
@@ -200,6 +201,9 @@ class LiveModel(Model):
         A listener is called after the model has its version, so hooks of that version may still run.
         """
         wanted = as_count("version", version, 0)
+        if self._edit is not None and self._lock.acquire(blocking=False):  # this thread edits
+            self._lock.release()
+            raise EditError("A model gets no commits while it is edited: wait after the edit.")
         return self.exchange.wait_for(
             lambda: self.exchange.revision >= wanted,
             None if timeout is None else as_tolerance(timeout, "A timeout"),
@@ -231,7 +235,7 @@ class LiveModel(Model):
         if changes.is_empty:
             return []
         if self._wish.is_part:
-            _check_part(self._history, changes, connection)
+            _check_part(self, changes)
         sequence = self._history.sequence
         put = tuple(
             protocol.Placed(entry_to_bytes(placed.entry, sequence), placed.after or "", placed.at_end)
@@ -312,7 +316,7 @@ class LiveModel(Model):
             return
         try:
             self._adopt(_decode_changes(commit), commit.revision)
-        except KineverseError:
+        except Exception:
             _LOG.exception("A commit of %s cannot be adopted; its model is joined again.", connection.address)
             self._join_again()
             return
@@ -337,9 +341,14 @@ class LiveModel(Model):
                     if commit.revision > connection.revision:
                         self._adopt_commit(published, commit)
                 is_behind = bool(answer.commits) and connection.revision < answer.revision
-            if connection.revision < answer.revision:  # nothing of a part has changed
-                connection.advance(answer.revision, answer.chain)
+            if connection.revision < answer.revision:
+                self._pass_by(answer.revision, answer.chain)
             connection.note_presence(True)
+
+    def _pass_by(self, revision: int, chain: bytes) -> None:
+        """Take the version of commits that concern nothing of a part."""
+        self._adopt(NetChanges(), revision)
+        self.exchange.advance(revision, chain)
 
     def _join_again(self) -> None:
         """Take the model anew, as one commit, if the server does not know the state that this one is in."""
@@ -358,6 +367,7 @@ class LiveModel(Model):
         beat = protocol.decode_beat(data)
         connection = self.exchange
         with self._following:
+<<<<<<< HEAD
             last = beat.views.get(self._view) if self._wish.is_part else beat.revision
             is_lost = last is None or connection.revision > beat.revision  # to it, or to what was no server
             if beat.epoch != connection.epoch or is_lost or connection.revision < self._announced:
@@ -365,6 +375,14 @@ class LiveModel(Model):
             elif last is not None and last <= connection.revision < beat.revision:
                 connection.advance(beat.revision, beat.chain)
             self._announced = last or 0
+=======
+            last = beat.views.get(self._view, 0) if self._wish.is_part else beat.revision
+            if beat.epoch != connection.epoch or connection.revision < self._announced:
+                self._close_gap()
+            elif self._wish.is_part and last <= connection.revision < beat.revision:
+                self._pass_by(beat.revision, beat.chain)
+            self._announced = last
+>>>>>>> main
         connection.hear(beat)
 
     def _notice(self, sign: tuple[str, bool]) -> None:
@@ -403,19 +421,23 @@ def _find_changes(old: Sequence[HistoryEntry], new: Sequence[HistoryEntry]) -> N
     return NetChanges(tuple(put), replaced, (), moved, removed)
 
 
-def _check_part(history: History, changes: NetChanges, connection: Connection) -> None:
-    """Refuse an edit that would depend on what is not in a part of the model."""
+def _check_part(model: LiveModel, changes: NetChanges) -> None:
+    """Refuse an edit that would depend on what is not in a part of a model."""
+    history, symbols = model.history, {*map(str, model.symbols)}
     for entry in (placed.entry for placed in changes.put):
         if is_partial(entry):
             raise EditError(f"Only a part of the operation {entry.tag!r} is here. {LOAD_THE_WHOLE}")
         missing = sorted(f"all {kind}" for kind in entry.reads.listings)
-        missing += [
-            "/".join(cell) for cell in entry.reads.cells if history.value_at(cell, entry.place) is ABSENT
-        ]
+        for cell, how in entry.reads.cells.items():
+            found, last = history.value_at(cell, entry.place), history.head[cell[0]].get(cell[1], ABSENT)
+            # Coordinates of a part come with their rates. What was overwritten is not in it.
+            is_missing = found is ABSENT and not (cell[0] == RATES and cell[1] in symbols)
+            if is_missing or (how & Read.VALUE and found is not last):
+                missing.append("/".join(cell))
         if missing:
             raise EditError(
                 f"The edit needs more than this part of the model: {entry.tag!r} reads {missing[0]}. Name it "
-                f"when the part is loaded, or load the whole, {str(connection.address)!r}."
+                f"when the part is loaded, or load the whole, {str(model.exchange.address)!r}."
             )
 
 
@@ -437,7 +459,7 @@ def _pump(channel: Any, model: weakref.ref[LiveModel], method: Callable[[LiveMod
             return
         try:
             method(target, item)
-        except KineverseError:
+        except Exception:  # the next sign of life shows what is missing
             _LOG.exception("A message of %s is left out.", target.exchange.address)
         del target
 

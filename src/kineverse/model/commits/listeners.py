@@ -230,6 +230,8 @@ class Listeners:
         """Queue what each listener gets of the present commit; called in the order of versions."""
         for witness in tuple(self.witnesses):
             witness(commit)
+        if commit.diff.is_empty:  # only its version is new
+            return
         parts = [(listener, listener.filter.select(commit)) for listener in self._listeners]
         heard = [(listener, part) for listener, part in parts if part is not None]
         if heard:
