@@ -139,6 +139,7 @@ def load(kind: str) -> LiveModel:
 
 def main() -> None:
     name, seed, edits = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    threading.excepthook = lambda what: tell(violation=f"{what.thread}: {what.exc_value!r}")
     logging.disable(logging.CRITICAL)  # servers that are killed are no news
     clients = [
         Client(f"{name}{k}", kind, f"{seed} {name}{k}", edits) for k, kind in enumerate(sys.argv[4:])

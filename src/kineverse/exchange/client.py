@@ -367,22 +367,13 @@ class LiveModel(Model):
         beat = protocol.decode_beat(data)
         connection = self.exchange
         with self._following:
-<<<<<<< HEAD
             last = beat.views.get(self._view) if self._wish.is_part else beat.revision
-            is_lost = last is None or connection.revision > beat.revision  # to it, or to what was no server
+            is_lost = last is None or connection.revision > beat.revision  # to the server, or to a false sign
             if beat.epoch != connection.epoch or is_lost or connection.revision < self._announced:
-                self._catch_up()
-            elif last is not None and last <= connection.revision < beat.revision:
-                connection.advance(beat.revision, beat.chain)
-            self._announced = last or 0
-=======
-            last = beat.views.get(self._view, 0) if self._wish.is_part else beat.revision
-            if beat.epoch != connection.epoch or connection.revision < self._announced:
                 self._close_gap()
-            elif self._wish.is_part and last <= connection.revision < beat.revision:
+            elif last is not None and last <= connection.revision < beat.revision:
                 self._pass_by(beat.revision, beat.chain)
-            self._announced = last
->>>>>>> main
+            self._announced = last or 0
         connection.hear(beat)
 
     def _notice(self, sign: tuple[str, bool]) -> None:
