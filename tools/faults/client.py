@@ -32,8 +32,9 @@ class Client:
 
     def __init__(self, name: str, kind: str, seed: str, edits: int) -> None:
         self.name, self.edits = name, edits
+        self.kind = kind
         self.add = add_constraints if kind == "1" else add_chain
-        self.asked, self.longest = 0, 0.0
+        self.unknown, self.longest = 0, 0.0
         self.random = Random(seed)
         self.model = load(kind)
         self.stopped = threading.Event()
@@ -48,9 +49,10 @@ class Client:
         ask = connection.ask_edit
 
         def ask_edit(edit: Any) -> Any:
-            self.asked += 1
+            self.unknown += 1
             begin = time.monotonic()
             answer = ask(edit)
+            self.unknown -= 1
             self.longest = max(self.longest, time.monotonic() - begin)
             if isinstance(answer, protocol.Committed):
                 tell(
@@ -71,14 +73,14 @@ class Client:
 
     def _try(self, act: Callable[[], object], *, slow: float = 1.0) -> str:
         """Edit, and return how that ended."""
-        asked = self.asked
+        unknown = self.unknown
         try:
             act()
             outcome = "made"
         except ConflictError:
             outcome = "conflict"
         except OfflineError:
-            outcome = "unknown" if self.asked > asked else "offline"
+            outcome = "unknown" if self.unknown > unknown else "offline"
         except EditError as error:
             outcome = "failed" if "has failed" in str(error) else "refused"
         self.outcomes[outcome] = self.outcomes.get(outcome, 0) + 1
@@ -154,14 +156,23 @@ def main() -> None:
                     client.stopped.set()
                 client.thread.join()
             tell(reply=[(client.outcomes, client.longest) for client in clients])
+        elif words[0] == "longest":
+            tell(reply=[(client.outcomes, client.longest) for client in clients])
         elif words[0] == "state":
             wanted = int(words[1])
             for client in clients:
                 if not client.model.wait(wanted, 20.0):
                     tell(violation=f"{client.name} is at {client.model.version} and not at {wanted}")
-            tell(reply=[document_hash(client.model) for client in clients])
+            tell(reply=[(client.kind, document_hash(client.model)) for client in clients])
         elif words[0] == "online":
-            tell(reply=[client.model.exchange.is_online for client in clients])
+            tell(reply=any(client.model.exchange.is_online for client in clients))
+        elif words[0] == "read":
+            tell(reply=[len(client.model.frames) for client in clients])
+        elif words[0] == "hook":  # one that takes long
+            seconds = float(words[1])
+            for client in clients:
+                client.model.listen(lambda _: time.sleep(seconds))
+            tell(reply="ready")
 
 
 if __name__ == "__main__":

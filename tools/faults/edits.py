@@ -121,6 +121,9 @@ def do_something(edit: Edit, random: Random, new: str) -> None:
     model: Any = edit.model
     history = model.history
     tags, frames = history.tags, ["world", *model.frames]
+    if not tags:  # of a part
+        edit.add_frame("part/base", "world", kv.translation(1, 0, 0))
+        return
     tag, other = random.choice(tags), random.choice(tags)
     name, frame, parent, k = random.choice("abcd"), random.choice(frames), random.choice(frames), random.randrange(30)
     below = f"{random.choice(('part', 'more'))}/{random.randrange(6)}"

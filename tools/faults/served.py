@@ -39,9 +39,9 @@ def main() -> None:
             if words[0] == "state":
                 snapshot = server.snapshot()
                 tell(reply=[snapshot.version, document_hash(snapshot)])
-            elif words[0] == "room":  # in the file that commits are written to
+            elif words[0] == "room":  # up to some part of the file that commits are written to
                 size = Path(f"{path}-wal").stat().st_size
-                set_limit(size + int(words[1]))
+                set_limit(1 + round(float(words[1]) * size))
                 tell(reply=size)
             elif words[0] == "any-room":
                 set_limit(0)

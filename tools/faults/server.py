@@ -6,13 +6,13 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import kineverse as kv
-from kineverse.errors import DuplicateNameError, FormatError
+from kineverse.errors import DuplicateNameError, FormatError, KineverseError, UnknownNameError
 from kineverse.exchange import protocol
 from kineverse.exchange.authority import Authority
 from kineverse.exchange.client import LiveModel
@@ -22,7 +22,7 @@ from kineverse.formats import document_hash, operation_from_bytes
 from kineverse.model import NetChanges, PlacedEntry
 
 from .client import load
-from .edits import build, count
+from .edits import build, count, do_something
 from .processes import Process, begin, folder, start, wait_until
 from .served import NAME
 from .store import damage, put_image, take_image
@@ -90,7 +90,7 @@ def check_store(path: Path, clients: Iterable[Process], killed: int = 0) -> tupl
         log = Log(store)
         model = Authority(store).model
         check(document_hash(model) == document_hash(log.model), "the store has another model than its log")
-        made, unknown = 0, killed
+        made, unknown, counts = 0, killed, False
         for told in (told for client in clients for told in client.told):
             if "number" in told:
                 _check_answer(store, log, told)
@@ -98,9 +98,10 @@ def check_store(path: Path, clients: Iterable[Process], killed: int = 0) -> tupl
                 check(told["chain"] in log.added, f"{told['chain']} was acknowledged, and was not added")
             elif told.get("removed") == "made":
                 check(told["chain"] in log.removed, f"{told['chain']} was acknowledged, and is there")
+            counts |= "counted" in told
             made += told.get("counted") == "made"
             unknown += told.get("counted") == "unknown"
-        counted = count(model) if "counter" in model.frames else made
+        counted = count(model) if counts else made
         check(made <= counted <= made + unknown, f"{made} to {made + unknown} were counted, and {counted} are")
         return model.version, document_hash(model)
     finally:
@@ -123,18 +124,25 @@ def _check_answer(store: Store, log: Log, told: dict[str, Any]) -> None:
 def check_replicas(server: Process, clients: Sequence[Process]) -> tuple[int, str]:
     """Check that the server, all clients and those who join now have the same; return revision and hash."""
     revision, digest = server.ask("state")
-    fresh = [load(kind) for kind in KINDS]
-    try:
-        wanted = [document_hash(model) for model in fresh]
-    finally:
-        for model in fresh:
-            model.close()
-    check(wanted[0] == digest, "one who joins gets another model than the server has")
+    wanted = {kind: _join(kind) for kind in KINDS}
+    check(wanted["whole"] == digest, "one who joins gets another model than the server has")
     for client in clients:
-        told = client.ask("state", revision)
-        for kind, want, got in zip(KINDS, wanted, told, strict=False):
-            check(got == want, f"{client.what}: the replica of {kind!r} differs from what one who joins gets")
+        for kind, got in client.ask("state", revision):
+            what = f"{client.what}: the replica of {kind!r} differs from what one who joins gets"
+            check(wanted[kind] in ("", got), what)
     return revision, digest
+
+
+def _join(kind: str) -> str:
+    """Return the hash of what one gets who joins, empty if the frames of a part are not there."""
+    try:
+        model = load(kind)
+    except UnknownNameError:
+        return ""
+    try:
+        return document_hash(model)
+    finally:
+        model.close()
 
 
 def make_store(path: Path) -> None:
@@ -173,15 +181,9 @@ def try_kills(rounds: int, seed: int, processes: int = 3) -> dict[str, int]:
                 )
                 found["ms"] = max(found["ms"], round(1e3 * (time.monotonic() - begin_time)))
                 found["servers"] += 1
-            before = {client.what: len(client.told) for client in clients}
-            for client in clients:
-                wait_until(
-                    lambda client=client: _has_edited(client, before[client.what]), LONG, f"an edit of {client.what}"
-                )
+            _wait_for_edits(*clients)
             _check_presence(len(clients) * len(KINDS))
-            for client in clients:
-                for outcomes, _ in client.ask("stop"):
-                    found.update({f"{name} edits": number for name, number in outcomes.items()})
+            found += _stop(clients)
             end = check_replicas(server, clients)
             server.kill()
             check(check_store(store, [*clients, *gone], len(gone) * len(KINDS)) == end, "the store has another model")
@@ -223,6 +225,8 @@ def try_messages(requests: int, publications: int, seed: int, senders: int = 2) 
         make_store(store)
         server = start(running, "served", store)
         client = start(running, "client", "p", f"{seed}", -1, "whole")
+        follower = start(running, "client", "q", f"{seed}", 1, *KINDS)
+        follower.ask("stop")
         enemies = [begin(running, "messages", f"{seed}.{k}") for k in range(senders)]
         for enemy in enemies:
             enemy.wait_for_reply()
@@ -234,8 +238,6 @@ def try_messages(requests: int, publications: int, seed: int, senders: int = 2) 
         (_, longest), = client.ask("stop")
         check(longest < 0.5, f"while nonsense was sent, an edit of another client took {longest:.2f} s")
         found["longest of others ms"] = round(1e3 * longest)
-        follower = start(running, "client", "q", f"{seed}", 1, *KINDS)
-        follower.ask("stop")
         check_replicas(server, [client, follower])
         _check_presence(1 + len(KINDS))
         for enemy in enemies:
@@ -252,3 +254,185 @@ def try_messages(requests: int, publications: int, seed: int, senders: int = 2) 
         server.close()
         check_store(store, [client])
     return dict(found)
+
+
+# -- disks, files, clocks and names --------------------------------------------------------------------------
+
+
+def try_full_disks(rounds: int, seed: int) -> dict[str, int]:
+    """Let the disk be full under load: edits are refused, and made again when there is room."""
+    random = Random(seed)
+    with folder() as path, ExitStack() as running:
+        store = path / "home.db"
+        make_store(store)
+        server = start(running, "served", store)
+        client = _start_client(running, f"{seed}", 0)
+        _wait_for_edits(client)
+        for _ in range(rounds):
+            server.ask("room", random.uniform(0, 1.1))
+            begin = len(client.told)
+            wait_until(lambda begin=begin: "failed" in _outcomes(client, begin), LONG, "an edit that is refused")
+            server.ask("any-room")
+            _wait_for_edits(client)
+        found = Counter(_outcomes(client, 0))
+        client.ask("stop")
+        end = check_replicas(server, [client])
+        server.close()
+        check(check_store(store, [client]) == end, "the store has another model")
+    return dict(found)
+
+
+def _outcomes(client: Process, since: int) -> list[str]:
+    client.check()
+    names = ("added", "removed", "counted")
+    return [told[name] for told in client.told[since:] for name in names if name in told]
+
+
+def _wait_for_edits(*clients: Process) -> None:
+    """Wait until each client has got an edit made from now on."""
+    for client in clients:
+        since = len(client.told)
+        wait_until(
+            lambda client=client, since=since: _has_edited(client, since), LONG, f"an edit of {client.what}"
+        )
+
+
+def try_damages(count: int, seed: int) -> dict[str, int]:
+    """Serve damaged stores: they are refused in one line, and the name can be used by another."""
+    random = Random(seed)
+    found = Counter(opened=0, refused=0)
+    with folder() as path:
+        store = path / "home.db"
+        images = []
+        with serve(build(), store=store, name=NAME) as server:
+            model = load("whole")
+            for number in range(60):
+                with suppress(KineverseError), model.edit() as edit:
+                    do_something(edit, random, f"{number}")
+                if number % 10 == 0:
+                    images.append((server.revision, take_image(store)))
+            model.close()
+        for _ in range(count):
+            how, image = damage(random, images)
+            put_image(store, image)
+            try:
+                serve(store=store).close()
+            except FormatError as error:
+                check("\n" not in str(error) and str(store) in str(error), f"{how}: {error}")
+                found["refused"] += 1
+            except Exception as error:
+                raise AssertionError(f"{how}: {error!r}") from error
+            else:
+                found["opened"] += 1
+        put_image(store, images[-1][1])
+        with serve(store=store, name=NAME) as server:
+            check(server.revision == images[-1][0], "the store is at another revision")
+    return dict(found)
+
+
+def try_clocks(seconds: float, seed: int) -> dict[str, int]:
+    """Let the clock of a server jump: only the times that it tells depend on it."""
+    with folder() as path, ExitStack() as running:
+        store = path / "home.db"
+        make_store(store)
+        server = start(running, "served", store, "jump")
+        clients = [_start_client(running, f"{seed}", k) for k in range(2)]
+        time.sleep(seconds)
+        _wait_for_edits(*clients)
+        _check_presence(len(clients) * len(KINDS))
+        outcomes = _stop(clients)
+        check(outcomes.keys() <= {"made", "conflict"}, f"edits were {outcomes}")
+        end = check_replicas(server, clients)
+        server.close()
+        check(check_store(store, clients) == end, "the store has another model")
+        return dict(outcomes)
+
+
+def _stop(clients: Iterable[Process]) -> Counter[str]:
+    found: Counter[str] = Counter()
+    for client in clients:
+        for outcomes, _ in client.ask("stop"):
+            found.update(outcomes)
+    return found
+
+
+def try_twice() -> None:
+    """Start a second server on a store, and one with a name that is taken: both are refused."""
+    with folder() as path, ExitStack() as running:
+        store, other = path / "home.db", path / "other.db"
+        make_store(store)
+        start(running, "served", store)
+        for options, error in (
+            ({"store": store, "name": "second"}, FormatError),
+            ({"store": other, "name": NAME}, DuplicateNameError),
+            ({"models": build(), "name": NAME}, DuplicateNameError),
+        ):
+            try:
+                serve(**options).close()  # type: ignore[arg-type]
+            except error as refusal:
+                check("\n" not in str(refusal), str(refusal))
+            else:
+                raise AssertionError(f"{options} is served twice")
+        check(_join("whole") != "", "the first server is there")
+
+
+# -- many edits, and processes that stand still --------------------------------------------------------------
+
+
+def try_edits(edits: int, clients: int, seed: int) -> dict[str, int]:
+    """Make random edits in processes of two clients each; in the end all have the same model."""
+    with folder() as path, ExitStack() as running:
+        store = path / "home.db"
+        make_store(store)
+        server = start(running, "served", store)
+        kinds = [("whole", "0"), ("whole", "1"), ("whole", "whole")]
+        processes = [
+            begin(running, "client", f"p{k}", seed, edits // clients, *kinds[k % len(kinds)])
+            for k in range(clients // 2)
+        ]
+        for process in processes:
+            process.wait_for_reply()
+        found: Counter[str] = Counter()
+        for process in processes:
+            for outcomes, _ in process.ask("stop", timeout=3600):
+                found.update(outcomes)
+        end = check_replicas(server, processes)
+        server.close()
+        check(check_store(store, processes) == end, "the store has another model")
+        found["revisions"] = end[0]
+        return dict(found)
+
+
+def try_freezing(seconds: float, seed: int) -> dict[str, int]:
+    """Let a client and then the server stand still: others go on, and all have the same afterwards."""
+    found: dict[str, int] = {}
+    with folder() as path, ExitStack() as running:
+        store = path / "home.db"
+        make_store(store)
+        server = start(running, "served", store)
+        clients = [_start_client(running, f"{seed}", k) for k in range(2)]
+        frozen, other = clients
+        slow = start(running, "client", "slow", seed, 0, *KINDS)
+        slow.ask("stop")
+        slow.ask("hook", 0.3)
+        _wait_for_edits(*clients)
+        frozen.freeze()
+        time.sleep(seconds)
+        ((_, longest), *_) = other.ask("longest")
+        frozen.thaw()
+        found["longest of others ms"] = round(1e3 * longest)
+        check(longest < 0.5, f"while a client stood still, an edit of another took {longest:.2f} s")
+        _wait_for_edits(*clients)
+        server.freeze()
+        begin_time = time.monotonic()
+        wait_until(lambda: not other.ask("online"), seconds, "a client that notices a frozen server")
+        found["noticed after ms"] = round(1e3 * (time.monotonic() - begin_time))
+        check(min(other.ask("read")) > 0, "there is nothing to read")
+        time.sleep(max(0.0, seconds - (time.monotonic() - begin_time)))
+        server.thaw()
+        _wait_for_edits(*clients)
+        found.update(_stop(clients))
+        end = check_replicas(server, [*clients, slow])
+        server.close()
+        check(check_store(store, clients) == end, "the store has another model")
+    return found
