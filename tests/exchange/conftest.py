@@ -7,8 +7,11 @@ import sys
 import tempfile
 from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+import kineverse as kv
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -43,3 +46,17 @@ def start() -> Generator[Start]:
     for process in running:
         process.kill()
         process.communicate()
+
+
+@pytest.fixture
+def load(sockets: Path) -> Generator[Callable[..., Any]]:
+    """Function that loads a live model, by default that of the server ``home``."""
+    opened: list[Any] = []
+
+    def load_one(address: str = "live:home", **part: Any) -> Any:
+        opened.append(kv.load(address, **part))
+        return opened[-1]
+
+    yield load_one
+    for model in opened:
+        model.close()

@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,15 +19,11 @@ from kineverse.exchange import protocol
 from kineverse.exchange.client import LiveModel
 from kineverse.exchange.server import Server, serve
 from kineverse.formats import document_hash
+from kineverse.model.basic_operations import SetBody
 
 pytest.importorskip("zenoh")
 
 LONG = 10.0  # longest time that anything is waited for [s]
-
-
-@pytest.fixture(autouse=True)
-def runtime_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("KINEVERSE_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
 
 
 def cupboard() -> kv.Model:
@@ -41,24 +36,9 @@ def cupboard() -> kv.Model:
 
 
 @pytest.fixture
-def server() -> Iterator[Server]:
+def server(sockets: Path) -> Iterator[Server]:
     with serve(cupboard(), name="home") as running:
         yield running
-
-
-@pytest.fixture
-def load() -> Iterator[Callable[..., LiveModel]]:
-    opened: list[LiveModel] = []
-
-    def load_one(address: str = "live:home", **part: object) -> LiveModel:
-        model = kv.load(address, **part)  # type: ignore[arg-type]
-        assert isinstance(model, LiveModel)
-        opened.append(model)
-        return model
-
-    yield load_one
-    for model in opened:
-        model.close()
 
 
 def add(model: kv.Model, name: str, x: float = 0.0, parent: str = "world") -> None:
@@ -242,6 +222,19 @@ def test_a_part_equals_the_whole_while_its_closure_changes(
     assert part.constraints_for("door") == whole.constraints_for("door")
 
 
+def test_all_frames_can_be_followed_without_bodies(server: Server, load: Callable[..., LiveModel]) -> None:
+    whole = load()
+    with whole.edit() as edit:
+        edit.apply(SetBody("door", kv.model.Body(visuals=(kv.model.Shape(kv.model.Sphere(0.1)),))))
+    part, body = load(bodies=False), load(frames=["door"], bodies=True)
+    add(whole, "shelf", 0.5)
+    for one in (part, body):
+        assert one.wait(whole.version, LONG)
+    assert list(part.frames) == list(whole.frames)
+    assert not part.bodies
+    assert list(body.bodies) == ["door"]
+
+
 def test_an_edit_of_a_part_is_in_the_whole(server: Server, load: Callable[..., LiveModel]) -> None:
     whole, part = load(), load(frames=["door"])
     heard: list[kv.model.Diff] = []
@@ -395,8 +388,8 @@ def test_another_protocol_is_one_error(server: Server, load: Callable[..., LiveM
         model.exchange.join(other)
 
 
-KILLED = """
-import sys, kineverse as kv
+SERVER = """
+import sys
 from kineverse.exchange.server import serve
 with serve(store=sys.argv[1]) as server:
     print("ready", flush=True)
@@ -404,33 +397,21 @@ with serve(store=sys.argv[1]) as server:
 """
 
 
-def start(store: Path) -> subprocess.Popen[str]:
-    if not store.exists():
-        serve(cupboard(), store=store).close()
-    process = subprocess.Popen([sys.executable, "-c", KILLED, str(store)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    return process
-
-
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_what_was_acknowledged_survives_a_killed_server(
-    tmp_path: Path, load: Callable[..., LiveModel]
+    tmp_path: Path, load: Callable[..., LiveModel], start: Callable[..., Any]
 ) -> None:
     store = tmp_path / "home.db"
-    process = start(store)
-    try:
-        model = load()
-        for i in range(20):
-            add(model, f"a{i}")
-        os.kill(process.pid, signal.SIGKILL)
-        process.communicate()
-        process = start(store)
-        assert model.exchange.wait_for(lambda: model.exchange.is_online, LONG)
-        model.transact(lambda edit: edit.add_frame("after", "world"))
-        fresh = load()
-        assert {f"a{i}" for i in range(20)} | {"after"} <= set(fresh.frames)
-        assert document_hash(fresh) == document_hash(model)
-    finally:
-        process.kill()
-        process.communicate()
+    serve(cupboard(), store=store).close()
+    process = start(SERVER, str(store))
+    model = load()
+    for i in range(20):
+        add(model, f"a{i}")
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    start(SERVER, str(store))
+    assert model.exchange.wait_for(lambda: model.exchange.is_online, LONG)
+    model.transact(lambda edit: edit.add_frame("after", "world"))
+    fresh = load()
+    assert {f"a{i}" for i in range(20)} | {"after"} <= set(fresh.frames)
+    assert document_hash(fresh) == document_hash(model)

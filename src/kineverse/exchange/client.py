@@ -16,15 +16,15 @@ from typing import Any, TypeVar
 
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
 from kineverse._version import __version__
-from kineverse.errors import ConflictError, EditError, KineverseError, OfflineError
+from kineverse.errors import ConflictError, EditError, OfflineError
 from kineverse.formats import entries_from_bytes, entry_to_bytes, operation_from_bytes
 from kineverse.formats.resources import add_resolver, remove_resolver
 from kineverse.model.changes import find_moved_tags
 from kineverse.model.commits.net_changes import NetChanges, PlacedEntry
 from kineverse.model.edit import Edit
 from kineverse.model.history import HistoryEntry
-from kineverse.model.operation import RATES
 from kineverse.model.model import EditContext, Model
+from kineverse.model.operation import RATES
 from kineverse.model.read_recorder import ABSENT, Read
 from kineverse.symbols import Symbol
 
@@ -33,7 +33,7 @@ from .address import Address
 from .connection import Connection
 from .meshes import FetchedFiles, find_known_files, put_contents
 from .transport import Channel
-from .views import LOAD_THE_WHOLE, is_partial
+from .views import EVERY_FRAME, LOAD_THE_WHOLE, is_partial
 
 _LOG = logging.getLogger(__name__)
 
@@ -60,7 +60,8 @@ def load_live(
         Names of frames and of coordinates of a part, which is closed: their forward kinematics, Jacobians,
         constraints and rates are those of the whole. By default the model is whole.
     bodies
-        Whether bodies are wanted: by default in the whole, and not in a part.
+        Whether bodies are wanted: by default in the whole, and not in a part. Alone, False is for all frames
+        with what they need.
 
     Raises
     ------
@@ -75,15 +76,18 @@ def load_live(
         Without the extra ``exchange``.
     """
     is_part = frames is not None or symbols is not None
+    if bodies is None:
+        bodies = not is_part
+    check_flag("bodies", bodies)
     wish = protocol.Join(
         protocol.PROTOCOL,
         __version__,
         "",
         "",
-        as_entries("frames=", frames or (), str, "names of frames"),
+        as_entries("frames=", frames or (), str, "names of frames") if is_part else EVERY_FRAME,
         tuple(map(str, symbols or ())),
-        not is_part if bodies is None else check_flag("bodies", bodies),
-        is_part or bodies is False,
+        bodies,
+        is_part or not bodies,
     )
     return LiveModel(Connection(Address.parse(source)), wish)
 
@@ -326,13 +330,12 @@ class LiveModel(Model):
         """Ask for what was missed, and adopt it."""
         connection = self.exchange
         with self._following:
-            is_behind = True
-            while is_behind:
+            while True:
                 try:
                     answer = connection.ask_missed(self._view)
                 except OfflineError:
                     return  # when the server is back, it says so
-                if isinstance(answer, protocol.Refused):
+                if answer is None:
                     self._join_again()
                     return
                 connection.epoch = answer.epoch
@@ -340,7 +343,8 @@ class LiveModel(Model):
                     commit = protocol.decode_commit(published.commit)
                     if commit.revision > connection.revision:
                         self._adopt_commit(published, commit)
-                is_behind = bool(answer.commits) and connection.revision < answer.revision
+                if connection.revision >= answer.revision or not answer.commits:
+                    break
             if connection.revision < answer.revision:
                 self._pass_by(answer.revision, answer.chain)
             connection.note_presence(True)

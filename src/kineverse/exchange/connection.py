@@ -154,11 +154,13 @@ class Connection:
         """Join and return the model, or the part that is wished for."""
         return self.ask(replace(wish, client=self.client, who=self.who), protocol.Joined)
 
-    def ask_missed(self, view: str) -> protocol.Missed | protocol.Refused:
-        """Ask for the commits after the present revision."""
+    def ask_missed(self, view: str) -> protocol.Missed | None:
+        """Ask for the commits after the present revision; None if the server does not know this state."""
         answer = self._ask(protocol.Since(self.client, self.who, view, *self.position), _ASK_TIMEOUT)
-        if isinstance(answer, (protocol.Missed, protocol.Refused)):
+        if isinstance(answer, protocol.Missed):
             return answer
+        if isinstance(answer, protocol.Refused) and answer.reason == "stale":
+            return None
         raise refusal_error(answer, self.address)
 
     def fetch_part(self, sha256: str, offset: int) -> bytes | None:
@@ -253,7 +255,7 @@ class Connection:
         key, end = self.key("edit" if changes_model else "ask"), time.monotonic() + min(timeout, _ROUTING)
         while True:
             try:
-                return protocol.decode_answer(self.transport.ask(key, data, timeout))  # type: ignore[no-any-return]
+                return protocol.decode_answer(self.transport.ask(key, data, timeout))
             except NoAnswerError:
                 # For moments after a connection was made it is not known who answers.
                 if not self.is_online or time.monotonic() >= end:

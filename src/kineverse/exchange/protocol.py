@@ -9,7 +9,7 @@ Commits are published under ``kineverse/NAME/log``, and those that concern a par
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Final, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -135,8 +135,8 @@ class Join(_Message, frozen=True, tag="join"):
     library: Text  # version of Kineverse
     client: Id
     who: Text
-    frames: Tags = ()
-    symbols: Tags = ()
+    frames: tuple[Text, ...] = ()
+    symbols: tuple[Text, ...] = ()
     bodies: bool = True
     is_part: bool = False
 
@@ -369,14 +369,14 @@ def encode(message: Struct) -> bytes:
     return _ENCODE(message)
 
 
-class Decoder:
+class Decoder(Generic[M]):
     """Decoder of messages of a type, which refuses all others with one error."""
 
-    def __init__(self, kind: object, what: str) -> None:
+    def __init__(self, kind: Any, what: str) -> None:
         self._decode = msgspec.msgpack.Decoder(kind).decode
         self._what = what
 
-    def __call__(self, data: bytes) -> M:  # type: ignore[type-var]
+    def __call__(self, data: bytes) -> M:
         """Return the message in some bytes.
 
         Raises
@@ -392,12 +392,12 @@ class Decoder:
             raise FormatError(f"{self._what} that is no message of this protocol: {error}.") from None
 
 
-decode_request = Decoder(Request, "A request")
-decode_answer = Decoder(Answer, "An answer")
-decode_commit = Decoder(Commit, "A commit")
-decode_published = Decoder(Published, "A commit")
-decode_beat = Decoder(Beat, "A sign of life")
-decode_seen = Decoder(Seen, "A sign of life")
+decode_request: Decoder[Request] = Decoder(Request, "A request")
+decode_answer: Decoder[Answer] = Decoder(Answer, "An answer")
+decode_commit: Decoder[Commit] = Decoder(Commit, "A commit")
+decode_published: Decoder[Published] = Decoder(Published, "A commit")
+decode_beat: Decoder[Beat] = Decoder(Beat, "A sign of life")
+decode_seen: Decoder[Seen] = Decoder(Seen, "A sign of life")
 
 
 class _Tagged(Struct, frozen=True):

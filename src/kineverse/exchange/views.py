@@ -57,6 +57,8 @@ from .protocol import Changes, Placed
 Key = tuple[str, str]
 """Cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix."""
 
+EVERY_FRAME: Final = ("",)
+"""Frames of a wish for all frames."""
 LOAD_THE_WHOLE: Final = "To move it, or to run it again, load the whole model; or replace it by a new one."
 
 _ABOUT, _TAG, _BELOW = "about", "tag", "below"
@@ -97,8 +99,8 @@ class Wish:
         """
         frames = model.frames
         for name in self.frames:
-            if name.endswith("/"):
-                if not any(known.startswith(name) for known in frames):
+            if _is_prefix(name):
+                if name and not any(known.startswith(name) for known in frames):
                     prefixes = {known[: i + 1] for known in frames for i, c in enumerate(known) if c == "/"}
                     raise UnknownNameError(
                         f"There is no frame below {name!r}. {suggest(name, prefixes, 'prefix')}"
@@ -175,7 +177,7 @@ class Coupling:
         keys: set[Key] = set()
         wished: dict[str, None] = {}
         for name in wish.frames:
-            if name.endswith("/"):
+            if _is_prefix(name):
                 keys.add((_BELOW, name))
                 wished |= dict.fromkeys(known for known in frames if known.startswith(name))
             else:
@@ -242,6 +244,11 @@ def _paths_of(expressions: Iterable[Expression]) -> frozenset[str]:
         if expression.nodes:  # else the gradient has the speeds of these
             found.update(symbol.path for symbol in gradient_keys(expression))
     return frozenset(found)
+
+
+def _is_prefix(name: str) -> bool:
+    """Return whether a name of a wish stands for all frames with names that begin so."""
+    return not name or name.endswith("/")
 
 
 def close(model: Model, wish: Wish) -> set[Cell]:
@@ -453,5 +460,6 @@ class Views:
             if change.kind == ARTICULATIONS and change.after is not None:
                 keys.add((FRAMES, change.after.child))
             elif change.kind == FRAMES and change.before is None:
+                keys.add((_BELOW, ""))
                 keys.update((_BELOW, change.name[: i + 1]) for i, c in enumerate(change.name) if c == "/")
         return keys
