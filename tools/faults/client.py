@@ -34,7 +34,7 @@ class Client:
         self.name, self.edits = name, edits
         self.kind = kind
         self.add = add_constraints if kind == "1" else add_chain
-        self.unknown, self.longest = 0, 0.0
+        self.unknown, self.committed, self.longest = 0, 0, 0.0
         self.random = Random(seed)
         self.model = load(kind)
         self.stopped = threading.Event()
@@ -55,6 +55,7 @@ class Client:
             self.unknown -= 1
             self.longest = max(self.longest, time.monotonic() - begin)
             if isinstance(answer, protocol.Committed):
+                self.committed += 1
                 tell(
                     client=connection.client,
                     number=edit.number,
@@ -73,13 +74,15 @@ class Client:
 
     def _try(self, act: Callable[[], object], *, slow: float = 1.0) -> str:
         """Edit, and return how that ended."""
-        unknown = self.unknown
+        unknown, committed = self.unknown, self.committed
         try:
             act()
             outcome = "made"
         except ConflictError:
             outcome = "conflict"
-        except OfflineError:
+        except OfflineError as error:
+            if self.committed > committed:
+                raise AssertionError("an edit was acknowledged, and raised an error") from error
             outcome = "unknown" if self.unknown > unknown else "offline"
         except EditError as error:
             outcome = "failed" if "has failed" in str(error) else "refused"
@@ -146,14 +149,17 @@ def main() -> None:
     clients = [
         Client(f"{name}{k}", kind, f"{seed} {name}{k}", edits) for k, kind in enumerate(sys.argv[4:])
     ]
-    for client in clients:
+    for client in clients if edits <= 0 else ():
         client.thread.start()
     tell(reply="ready")
     for words in commands():
         if words[0] == "stop":
             for client in clients:
-                if client.edits <= 0:
+                if edits <= 0:
                     client.stopped.set()
+                else:  # when all are there
+                    client.thread.start()
+            for client in clients:
                 client.thread.join()
             tell(reply=[(client.outcomes, client.longest) for client in clients])
         elif words[0] == "longest":

@@ -349,9 +349,12 @@ def try_clocks(seconds: float, seed: int) -> dict[str, int]:
 
 
 def _stop(clients: Iterable[Process]) -> Counter[str]:
+    """Let clients stop, after the edits that they have to make, and return how these ended."""
     found: Counter[str] = Counter()
     for client in clients:
-        for outcomes, _ in client.ask("stop"):
+        client.tell("stop")
+    for client in clients:
+        for outcomes, _ in client.wait_for_reply(3600):
             found.update(outcomes)
     return found
 
@@ -392,10 +395,7 @@ def try_edits(edits: int, clients: int, seed: int) -> dict[str, int]:
         ]
         for process in processes:
             process.wait_for_reply()
-        found: Counter[str] = Counter()
-        for process in processes:
-            for outcomes, _ in process.ask("stop", timeout=3600):
-                found.update(outcomes)
+        found = _stop(processes)
         end = check_replicas(server, processes)
         server.close()
         check(check_store(store, processes) == end, "the store has another model")
@@ -434,5 +434,5 @@ def try_freezing(seconds: float, seed: int) -> dict[str, int]:
         found.update(_stop(clients))
         end = check_replicas(server, [*clients, slow])
         server.close()
-        check(check_store(store, clients) == end, "the store has another model")
+        check(check_store(store, [*clients, slow]) == end, "the store has another model")
     return found

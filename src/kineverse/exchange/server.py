@@ -289,9 +289,7 @@ class Server:
             commit = protocol.Commit(
                 last.revision, log.last, last.client, last.number, last.who, last.time, changes, files
             )
-            published = protocol.Published(authority.epoch, authority.chain, protocol.encode(commit))
-            log.add(last.revision, published)
-            commits.append((view.id, published))
+            commits.append((view.id, log.add(authority.epoch, authority.chain, commit)))
         return commits
 
     def _note(self, edit: protocol.Edit | protocol.Undo, result: Result) -> None:
@@ -362,16 +360,16 @@ class Server:
             if join.is_part:
                 view = self._views.add(Wish(join.frames, join.symbols, join.bodies))
                 entries, part = view.entries, view.id
-                self._logs.setdefault(part, _ViewLog(authority.revision))
+                link = self._logs.setdefault(part, _ViewLog(authority.revision)).link
             else:
-                view, entries, part = None, tuple(authority.model.history.sequence), ""
+                view, entries, part, link = None, tuple(authority.model.history.sequence), "", b""
             revision, chain, epoch = authority.revision, authority.chain, authority.epoch
             self._forget_client(join.client)
             self._clients[join.client] = _Client(join.who, view, revision)
         files = self._files.find(entries)
         # Without folders, which are of no use elsewhere.
         document = pack_document([entry_to_bytes(entry, entries) for entry in entries])
-        return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files)
+        return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files, link)
 
     def _list_missed(self, since: protocol.Since) -> protocol.Answer:
         authority = self._authority
@@ -570,14 +568,18 @@ class _ViewLog:
 
     def __init__(self, revision: int) -> None:
         self._begin = self.last = revision
+        self.link = protocol.NO_CHAIN
         self._commits: deque[tuple[int, protocol.Published]] = deque()
 
-    def add(self, revision: int, published: protocol.Published) -> None:
-        """Add a commit, and forget the oldest if there are many."""
-        self._commits.append((revision, published))
-        self.last = revision
+    def add(self, epoch: str, chain: bytes, commit: protocol.Commit) -> protocol.Published:
+        """Add a commit, forget the oldest if there are many, and return what is published."""
+        data = protocol.encode(commit)
+        self.last, self.link = commit.revision, protocol.chain(self.link, data)
+        published = protocol.Published(epoch, chain, data, self.link)
+        self._commits.append((commit.revision, published))
         if len(self._commits) > _MOST_MISSED:
             self._begin = self._commits.popleft()[0]
+        return published
 
     def find_after(self, revision: int) -> list[protocol.Published] | None:
         """Return the commits after a revision; None if some of them are forgotten."""
