@@ -24,7 +24,7 @@ from .served import NAME
 
 
 PAUSE = 0.02
-"""Time between two edits of one who edits at random until it is stopped [s]."""
+"""Longest time between two edits of one who edits until it is stopped [s]."""
 
 
 class Client:
@@ -53,7 +53,10 @@ class Client:
             begin = time.monotonic()
             answer = ask(edit)
             self.unknown -= 1
-            self.longest = max(self.longest, time.monotonic() - begin)
+            took = time.monotonic() - begin
+            self.longest = max(self.longest, took)
+            if took > 0.3:
+                tell(slow=took, edit=repr(edit)[:300], answer=repr(answer)[:300])
             if isinstance(answer, protocol.Committed):
                 self.committed += 1
                 tell(
@@ -94,7 +97,7 @@ class Client:
     def _make_chains(self) -> None:
         """Count on, add and remove chains until it is stopped."""
         model, mine, number = self.model, list[str](), 0
-        while not self.stopped.is_set():
+        while not self.stopped.wait(self.random.uniform(0, PAUSE)):
             if self.random.random() < 0.3 and not self.model._wish.is_part:
                 outcome = self._try(lambda: model.transact(count_on, attempts=3))
                 tell(counted=outcome)

@@ -25,7 +25,7 @@ from .processes import commands, tell
 from .served import NAME
 
 THREADS = 4
-LEARNED = 150
+LEARNED = 100
 """Random edits by which real messages are learned."""
 TOO_LATE = 20.0
 _BLOB = "blob:"
@@ -200,11 +200,23 @@ class Sender:
         """Publish mutated commits and signs of life to the clients of the server."""
         random = Random(self.seed)
         known = [*self.published]
-        for _ in range(count):
-            end, data = random.choice(known[-50:] if random.random() < 0.5 else known)
+        for number in range(count):
+            end, data = random.choice(known)
             self.outcomes[end] += 1
+            if number % 10 == 0:
+                status = protocol.encode(protocol.GetStatus())
+                found: Any = protocol.decode_answer(
+                    self.transport.ask(f"kineverse/{NAME}/ask", status, TOO_LATE)
+                )
+                revision = found.revision
+            if end != "beat" and random.random() < 0.8:  # as the next commit, or all will leave it out
+                tree = _open(msgspec.msgpack.decode(data))
+                tree[2][_BLOB][:2] = revision + random.choice((1, 1, 2)), 0 if end == "view/*" else revision
+                data = _write(tree)
+            if random.random() < 0.7:
+                data = mutate(data, random.choice(known)[1], random)
             end = end.replace("*", random.choice(self.views))
-            self.transport.publish(f"kineverse/{NAME}/{end}", mutate(data, random.choice(known)[1], random))
+            self.transport.publish(f"kineverse/{NAME}/{end}", data)
             time.sleep(0.001)
 
 

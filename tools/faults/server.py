@@ -236,27 +236,25 @@ def try_messages(requests: int, publications: int, seed: int, senders: int = 2) 
             for outcome, number in enemy.wait_for_reply(3600).items():
                 found[outcome] = max(found[outcome], number) if outcome == "longest ms" else found[outcome] + number
         (_, longest), = client.ask("stop")
-        check(longest < 0.5, f"while nonsense was sent, an edit of another client took {longest:.2f} s")
+        check(longest < 0.5, f"while nonsense was sent, an edit of another client took {longest:.2f} s: "
+            f"{[told for told in client.told if 'slow' in told]}")
         found["longest of others ms"] = round(1e3 * longest)
         check_replicas(server, [client, follower])
         _check_presence(1 + len(KINDS))
+        busy = start(running, "client", "r", f"{seed}", -1, *KINDS)
         for enemy in enemies:
             enemy.tell("publish", publications // senders)
         for enemy in enemies:
             found.update({f"published {end}": number for end, number in enemy.wait_for_reply(3600).items()})
-        last = load("whole")  # an edit that all follow
-        try:
-            with last.edit() as edit:
-                edit.add_frame("last", "world")
-        finally:
-            last.close()
-        check_replicas(server, [client, follower])
+        busy.ask("stop")
+        clients = [client, follower, busy]
+        check_replicas(server, clients)
         server.close()
-        check_store(store, [client])
+        check_store(store, clients)
     return dict(found)
 
 
-# -- disks, files, clocks and names --------------------------------------------------------------------------
+# -- disks, files and names --------------------------------------------------------------------------
 
 
 def try_full_disks(rounds: int, seed: int) -> dict[str, int]:
@@ -330,24 +328,6 @@ def try_damages(count: int, seed: int) -> dict[str, int]:
     return dict(found)
 
 
-def try_clocks(seconds: float, seed: int) -> dict[str, int]:
-    """Let the clock of a server jump: only the times that it tells depend on it."""
-    with folder() as path, ExitStack() as running:
-        store = path / "home.db"
-        make_store(store)
-        server = start(running, "served", store, "jump")
-        clients = [_start_client(running, f"{seed}", k) for k in range(2)]
-        time.sleep(seconds)
-        _wait_for_edits(*clients)
-        _check_presence(len(clients) * len(KINDS))
-        outcomes = _stop(clients)
-        check(outcomes.keys() <= {"made", "conflict"}, f"edits were {outcomes}")
-        end = check_replicas(server, clients)
-        server.close()
-        check(check_store(store, clients) == end, "the store has another model")
-        return dict(outcomes)
-
-
 def _stop(clients: Iterable[Process]) -> Counter[str]:
     """Let clients stop, after the edits that they have to make, and return how these ended."""
     found: Counter[str] = Counter()
@@ -382,12 +362,15 @@ def try_twice() -> None:
 # -- many edits, and processes that stand still --------------------------------------------------------------
 
 
-def try_edits(edits: int, clients: int, seed: int) -> dict[str, int]:
-    """Make random edits in processes of two clients each; in the end all have the same model."""
+def try_edits(edits: int, clients: int, seed: int, how: str = "") -> dict[str, int]:
+    """Make random edits in processes of two clients each; in the end all have the same model.
+
+    ``jump``: the clock of the server jumps, and nothing but the times that it tells depends on it.
+    """
     with folder() as path, ExitStack() as running:
         store = path / "home.db"
         make_store(store)
-        server = start(running, "served", store)
+        server = start(running, "served", store, how)
         kinds = [("whole", "0"), ("whole", "1"), ("whole", "whole")]
         processes = [
             begin(running, "client", f"p{k}", seed, edits // clients, *kinds[k % len(kinds)])
@@ -396,6 +379,7 @@ def try_edits(edits: int, clients: int, seed: int) -> dict[str, int]:
         for process in processes:
             process.wait_for_reply()
         found = _stop(processes)
+        _check_presence(clients)
         end = check_replicas(server, processes)
         server.close()
         check(check_store(store, processes) == end, "the store has another model")
@@ -404,7 +388,7 @@ def try_edits(edits: int, clients: int, seed: int) -> dict[str, int]:
 
 
 def try_freezing(seconds: float, seed: int) -> dict[str, int]:
-    """Let a client and then the server stand still: others go on, and all have the same afterwards."""
+    """Let a client, which has slow hooks, and then the server stand still: others go on, and all catch up."""
     found: dict[str, int] = {}
     with folder() as path, ExitStack() as running:
         store = path / "home.db"
@@ -412,9 +396,7 @@ def try_freezing(seconds: float, seed: int) -> dict[str, int]:
         server = start(running, "served", store)
         clients = [_start_client(running, f"{seed}", k) for k in range(2)]
         frozen, other = clients
-        slow = start(running, "client", "slow", seed, 0, *KINDS)
-        slow.ask("stop")
-        slow.ask("hook", 0.3)
+        frozen.ask("hook", 0.3)
         _wait_for_edits(*clients)
         frozen.freeze()
         time.sleep(seconds)
@@ -432,7 +414,41 @@ def try_freezing(seconds: float, seed: int) -> dict[str, int]:
         server.thaw()
         _wait_for_edits(*clients)
         found.update(_stop(clients))
-        end = check_replicas(server, [*clients, slow])
+        end = check_replicas(server, clients)
         server.close()
-        check(check_store(store, [*clients, slow]) == end, "the store has another model")
+        check(check_store(store, clients) == end, "the store has another model")
     return found
+
+
+# -- the command ---------------------------------------------------------------------------------------------
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--kills", type=int, default=200, help="how many killed servers (200)")
+    parser.add_argument("--edits", type=int, default=24_000, help="how many random edits (24 000)")
+    parser.add_argument("--messages", type=int, default=1_000_000, help="how many mutated messages (1 000 000)")
+    parser.add_argument("--rounds", type=int, default=50, help="how many full disks; damaged stores: ten times (50)")
+    parser.add_argument("--seed", type=int, default=1, help="of edits, damages and times (1)")
+
+
+def run(given: argparse.Namespace) -> Iterator[str]:
+    """Yield what was tried."""
+    seed = given.seed
+    if given.rounds:
+        try_twice()
+        yield "a second server of a store and one of a name: refused"
+        yield f"{10 * given.rounds} damaged stores: {_say(try_damages(10 * given.rounds, seed))}"
+        yield f"{given.rounds} full disks: {_say(try_full_disks(given.rounds, seed))}"
+        yield f"a client and a server that stand still: {_say(try_freezing(3.0, seed))}"
+    if given.kills:
+        yield f"{given.kills} killed servers: {_say(try_kills(given.kills, seed))}"
+    if given.edits:
+        yield f"{given.edits // 10} edits and a clock that jumps: {_say(try_edits(given.edits // 10, 8, seed, 'jump'))}"
+        yield f"{given.edits} edits by 8 clients: {_say(try_edits(given.edits, 8, seed))}"
+    if given.messages:
+        found = try_messages(given.messages, given.messages // 50, seed)
+        yield f"{given.messages} messages, and {given.messages // 50} to clients: {_say(found)}"
+
+
+def _say(found: dict[str, int]) -> str:
+    return ", ".join(f"{name} {number}" for name, number in sorted(found.items()))
