@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -25,7 +26,9 @@ def _name(page: Path) -> str:
 def test_the_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
-    run(page)
+    with tempfile.TemporaryDirectory(prefix="kv-") as sockets:  # short, as paths of sockets have to be
+        monkeypatch.setenv("KINEVERSE_RUNTIME_DIR", sockets)
+        run(page)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)

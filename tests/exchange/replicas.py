@@ -79,7 +79,7 @@ class Replica:
         self.model = kv.Model([operation_from_bytes(blob) for blob in blobs], authority.revision)
         self.revision, self.chain = authority.revision, authority.chain
 
-    def draft(self, act: Act, *, strict: bool = False) -> protocol.Edit:
+    def draft(self, act: Act, *, strict: bool = False) -> protocol.EditRequest:
         """Return the request for an edit; the model stays as it is."""
         with self.model.edit() as edit:
             start = edit.savepoint()
@@ -94,17 +94,17 @@ class Replica:
         changes = protocol.Changes(tuple(put), net.replaced, net.rerun, net.moved, net.removed)
         return self.request(changes, strict=strict)
 
-    def request(self, changes: protocol.Changes, *, strict: bool = False) -> protocol.Edit:
+    def request(self, changes: protocol.Changes, *, strict: bool = False) -> protocol.EditRequest:
         """Return the request for changes, with the next number."""
         self.number += 1
-        return protocol.Edit(
+        return protocol.EditRequest(
             self.client, self.number, f"client {self.client[0]}", self.revision, self.chain, changes, strict
         )
 
-    def undo(self, revision: int) -> protocol.Undo:
+    def undo(self, revision: int) -> protocol.UndoRequest:
         """Return the request to take back a commit."""
         self.number += 1
-        return protocol.Undo(self.client, self.number, f"client {self.client[0]}", revision)
+        return protocol.UndoRequest(self.client, self.number, f"client {self.client[0]}", revision)
 
     def follow(self, results: Sequence[Result]) -> None:
         """Adopt what was published."""
@@ -114,7 +114,7 @@ class Replica:
 
     def adopt(self, data: bytes) -> None:
         """Adopt one commit."""
-        commit: protocol.Commit = protocol.decode_commit(data)
+        commit: protocol.CommitMessage = protocol.decode_commit(data)
         assert commit.previous == self.revision
         changes = commit.changes
         put = [

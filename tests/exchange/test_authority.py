@@ -508,8 +508,8 @@ def test_undo_by_model_and_by_store(is_restarted: bool) -> None:
 
 
 def changed(
-    request: protocol.Edit, change: Callable[[dict[str, Any]], object], which: int = 0
-) -> protocol.Edit:
+    request: protocol.EditRequest, change: Callable[[dict[str, Any]], object], which: int = 0
+) -> protocol.EditRequest:
     """Return a request with another content of a blob."""
     operations = list(request.changes.put)
     value = msgspec.msgpack.decode(operations[which].blob)
@@ -518,11 +518,11 @@ def changed(
     return with_changes(request, put=tuple(operations))
 
 
-def with_changes(request: protocol.Edit, **changes: Any) -> protocol.Edit:
+def with_changes(request: protocol.EditRequest, **changes: Any) -> protocol.EditRequest:
     return dataclass_like(request, changes=dataclass_like(request.changes, **changes))  # type: ignore[no-any-return]
 
 
-def lie_about_writes(replica: Replica) -> protocol.Edit:
+def lie_about_writes(replica: Replica) -> protocol.EditRequest:
     request = replica.draft(lambda edit: edit.apply(Twice("n", "a"), "n"))
     return changed(request, lambda value: value["writes"]["data"].update(n=77.0))
 
@@ -543,21 +543,23 @@ def test_a_trace_counts_more_than_the_writes_and_the_reads() -> None:
     assert (authority.model.data["m"], authority.model.data["n"]) == (10.0, 10.0)
 
 
-def frozen_without_reads(replica: Replica) -> protocol.Edit:
+def frozen_without_reads(replica: Replica) -> protocol.EditRequest:
     request = replica.draft(lambda edit: edit.apply(Capped("n", "b"), "n"))
     return changed(request, lambda value: value.pop("reads"))
 
 
-def twice(replica: Replica) -> protocol.Edit:
+def twice(replica: Replica) -> protocol.EditRequest:
     request = replica.draft(lambda edit: edit.write("n", 1, "n"))
     return with_changes(request, put=request.changes.put * 2)
 
 
-def lone(replica: Replica, act: Act = lambda edit: edit.write("n", 1, "n"), **changes: Any) -> protocol.Edit:
+def lone(
+    replica: Replica, act: Act = lambda edit: edit.write("n", 1, "n"), **changes: Any
+) -> protocol.EditRequest:
     return with_changes(replica.draft(act), **changes)
 
 
-LIES: dict[str, tuple[Callable[[Replica], protocol.Edit], str]] = {
+LIES: dict[str, tuple[Callable[[Replica], protocol.EditRequest], str]] = {
     "a frozen operation without reads": (frozen_without_reads, "malformed"),
     "a tag twice": (twice, "refused"),
     "no blob": (lambda replica: lone(replica, put=(Placed(b"\xc1", "", True),)), "malformed"),
@@ -675,7 +677,7 @@ def test_damaged_edits_end_in_an_answer(data: Any) -> None:
         decoded: Any = protocol.decode_request(bytes(message))
     except kv.errors.FormatError:
         return
-    if isinstance(decoded, protocol.Edit):
+    if isinstance(decoded, protocol.EditRequest):
         accepted(ask(authority, decoded)[0])
         assert content(Authority(store).model) == content(authority.model)
 

@@ -193,7 +193,7 @@ def test_transact_calls_again_after_a_conflict(server: Server, load: Callable[..
 
 def test_an_edit_asked_twice_is_answered_alike(server: Server, load: Callable[..., LiveModel]) -> None:
     model = load()
-    proposed: list[protocol.Edit] = []
+    proposed: list[protocol.EditRequest] = []
     with model._transaction(lambda edit: proposed.extend(model._propose(edit, False))) as edit:
         edit.add_frame("shelf", "world")
     answers = {model.exchange.ask_edit(proposed[0]) for _ in range(3)}
@@ -303,7 +303,7 @@ def test_a_replica_that_missed_commits_catches_up(
     adopt = LiveModel._adopt_commit
     lost = [2, 3]
 
-    def lose(self: LiveModel, published: protocol.Published, commit: protocol.Commit) -> None:
+    def lose(self: LiveModel, published: protocol.Published, commit: protocol.CommitMessage) -> None:
         if self is model and commit.revision in lost:
             lost.remove(commit.revision)
         else:
@@ -383,7 +383,7 @@ def test_nonsense_is_answered_with_one_error(
 
 def test_another_protocol_is_one_error(server: Server, load: Callable[..., LiveModel]) -> None:
     model = load()
-    other = protocol.Join(protocol.PROTOCOL + 1, "9.9", "", "")
+    other = protocol.JoinRequest(protocol.PROTOCOL + 1, "9.9", "", "")
     with pytest.raises(kv.errors.FormatError, match="Update the older one"):
         model.exchange.join(other)
 

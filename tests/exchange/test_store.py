@@ -90,7 +90,7 @@ def test_the_log_is_read_backwards() -> None:
 
 def test_names_digests_and_places_of_files_are_kept(path: Path) -> None:
     one, sha256 = Expected(1).up_to(1)[0], "ab" * 32
-    files = (protocol.FileContent("cup", 0, sha256, 5),)
+    files = (protocol.MeshContent("cup", 0, sha256, 5),)
     with opened(path) as store:
         store.name = "home"
         store.commit([replace(one, put=[("cup", 0, b"blob")], removed=(), files=files)])

@@ -24,7 +24,7 @@ from kineverse.exchange.store import Replaced, Store, StoredCommit, StoreError
 PAGE = 4096
 GAP = 1 << 20
 CLIENT = "0123456789abcdef" * 2
-Files = tuple[protocol.FileContent, ...]
+Files = tuple[protocol.MeshContent, ...]
 Operations = dict[str, tuple[int, bytes, Files]]
 """Place, blob and files of each operation by its tag."""
 
@@ -52,7 +52,7 @@ def make_commit(seed: int, revision: int, chain: bytes, operations: Operations) 
             place = last = last + GAP
         content = random.randbytes(random.choice((20, 900, 9000)))
         sha256 = random.randbytes(32).hex()
-        files = (protocol.FileContent(tag, 0, sha256, revision),) if random.random() < 0.3 else ()
+        files = (protocol.MeshContent(tag, 0, sha256, revision),) if random.random() < 0.3 else ()
         operations[tag] = place, msgspec.msgpack.encode((tag, content)), files
         put.append((tag, *operations[tag]))
     places = None

@@ -187,7 +187,8 @@ def load_model(
     options = {"root": arguments.root, "strict": arguments.strict, "loops": arguments.loops}
     if find_scheme(source) is None:
         return kv.load(source, prefix, **options)
-    live = arguments.live = kv.load(source, **options)  # kept, as meshes come from its server
+    live: kv.Model = kv.load(source, **options)
+    arguments.opened.enter_context(live)  # until the command ends, as meshes come from the server
     if prefix is None:
         return live if follow else live.copy()
     copy = kv.Model()

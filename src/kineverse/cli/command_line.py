@@ -10,7 +10,7 @@ import re
 import signal
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from traceback import walk_tb
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, cast
@@ -154,7 +154,7 @@ def _run(words: Sequence[str]) -> int:
             return 0
         arguments = _parse_arguments(words)
         try:
-            with _log_warnings_to(sys.stderr, arguments.verbose):
+            with _log_warnings_to(sys.stderr, arguments.verbose), ExitStack() as arguments.opened:
                 status: int = arguments.run(arguments)
         except KineverseError as error:
             print(f"kineverse: {name_options(format_error(error), arguments)}", file=sys.stderr)

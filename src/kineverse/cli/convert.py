@@ -40,6 +40,7 @@ To check that OUT moves like IN: kineverse diff IN OUT --values
 examples:
   kineverse convert robot.sdf robot.urdf
   kineverse convert robot.urdf robot.kv.json --prefix left --force
+  kineverse convert live:home home.kv.json
   kineverse convert kitchen - | gzip > kitchen.kv.json.gz
   kineverse convert pr2 pr2.xml
   kineverse convert garage.kv.json garage.urdf --strict --leave-out garage/lock

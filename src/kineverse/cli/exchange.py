@@ -221,9 +221,9 @@ def _run_watch(arguments: argparse.Namespace) -> int:
         raise InvalidValueError("--count is a number of commits from 1.")
     arrived: SimpleQueue[Diff] = SimpleQueue()
     with handle_interrupts(), _join(arguments, frames=arguments.frames) as model:
+        connection, is_online, shown, last = model.exchange, True, 0, model.version
         model.listen(arrived.put)
-        connection, is_online, shown = model.exchange, True, 0
-        print_line(f"{connection.address} is at revision {model.version}   (Ctrl-C ends)")
+        print_line(f"{connection.address} is at revision {last}   (Ctrl-C ends)")
         while arguments.count is None or shown < arguments.count:
             try:
                 diff = arrived.get(timeout=_PAUSE)
@@ -232,6 +232,9 @@ def _run_watch(arguments: argparse.Namespace) -> int:
                     is_online = connection.is_online
                     print_notes([f"the server {'is back' if is_online else 'has gone'}"])
                 continue
+            if diff.version <= last:  # of a part that was asked for again, as its server was started again
+                continue
+            last = diff.version
             print(_format_commit(diff, _find_row(connection, diff.version), arguments.json), flush=True)
             shown += 1
     return 0

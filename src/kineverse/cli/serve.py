@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import gc
 
+from kineverse.errors import InvalidValueError
 from kineverse.formats.reader_warnings import collect_warnings
 
 from .arguments import print_notes, require
@@ -53,6 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until interrupted."""
     require("kineverse serve", {"exchange": True})
+    if arguments.durable and not arguments.store:
+        raise InvalidValueError("--durable is about what a store keeps. Name one: --store FILE.")
     from kineverse.exchange.server import serve  # for start-up time
 
     with collect_warnings() as remarks, show_activity("reading the model"):

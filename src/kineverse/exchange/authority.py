@@ -26,7 +26,7 @@ from kineverse.model.history import History, HistoryEntry, TouchedEntry
 from . import protocol
 from .conflicts import KEPT, ConflictFoundError, EditConflict, Revisions
 from .meshes import put_contents
-from .protocol import Commit, Committed, FileContent, Placed, Published, Refused
+from .protocol import CommitMessage, Committed, MeshContent, Placed, Published, Refused
 from .store import Replaced, Store, StoredCommit
 from .stored_undo import computes, find_inverse
 from .views import LOAD_THE_WHOLE, is_partial
@@ -37,8 +37,8 @@ _LONGEST_TAG: Final = 4096
 _LONGEST_MESSAGE: Final = 1000
 
 EditAnswer: TypeAlias = Committed | Refused
-FindFiles: TypeAlias = Callable[[Sequence[HistoryEntry], Sequence[FileContent]], tuple[FileContent, ...]]
-Watch: TypeAlias = Callable[[Model, Diff, Commit], Any]
+FindFiles: TypeAlias = Callable[[Sequence[HistoryEntry], Sequence[MeshContent]], tuple[MeshContent, ...]]
+Watch: TypeAlias = Callable[[Model, Diff, CommitMessage], Any]
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ class Result:
 class _Made:
     """Commit that the model has made: its message, what it touched and replaced, and if places are new."""
 
-    commit: Commit
+    commit: CommitMessage
     data: bytes
     touched: list[TouchedEntry]
     replaced: tuple[Replaced, ...]
@@ -70,7 +70,7 @@ class _RefusedError(Exception):
     """Edit that is not made, with its answer."""
 
     def __init__(self, answer: Refused) -> None:
-        super().__init__(answer.message)
+        super().__init__(answer)
         self.answer = answer
 
 
@@ -140,7 +140,7 @@ class Authority:
         entries = source.history.sequence
         placed = tuple(Placed(entry_to_bytes(entry, entries), at_end=True) for entry in entries)
         files = self._find_files(entries, ())
-        request = protocol.Edit("0" * 32, 0, who, 0, self.chain, protocol.Changes(placed), files=files)
+        request = protocol.EditRequest("0" * 32, 0, who, 0, self.chain, protocol.Changes(placed), files=files)
         (result,) = self.process([request])
         if isinstance(result.answer, Refused):
             kind = FormatError if result.answer.reason in ("failed", "malformed") else EditError
@@ -150,7 +150,7 @@ class Authority:
 
     # -- requests ------------------------------------------------------------------------------------------
 
-    def process(self, requests: Sequence[protocol.Edit | protocol.Undo]) -> list[Result]:
+    def process(self, requests: Sequence[protocol.ChangeRequest]) -> list[Result]:
         """Make edits, store their commits in one transaction, and return the results in order.
 
         An edit is made whole or not at all, and others are made if one is refused. If the store fails, all of
@@ -167,7 +167,7 @@ class Authority:
                 if answer is not None:
                     results.append(Result(answer))
                     continue
-                if isinstance(request, protocol.Undo):
+                if isinstance(request, protocol.UndoRequest):
                     self._persist()  # it may need all commits of the store
                 results.append(self._answer(request))
                 self._keep_answer(key, results[-1].answer)
@@ -216,12 +216,12 @@ class Authority:
         if len(self._answers) > ANSWERS:
             self._answers.popitem(last=False)
 
-    def _answer(self, request: protocol.Edit | protocol.Undo) -> Result:
+    def _answer(self, request: protocol.ChangeRequest) -> Result:
         """Make one edit, if it can be made."""
         seconds: dict[str, float] = {}
         try:
             with no_collection():
-                if isinstance(request, protocol.Undo):
+                if isinstance(request, protocol.UndoRequest):
                     made = self._undo(request, seconds)
                 else:
                     made = self._make(request, seconds)
@@ -248,7 +248,7 @@ class Authority:
             return Result(Committed(self.revision, self.chain), seconds=seconds)
         return self._note(request, made, seconds)
 
-    def _make(self, request: protocol.Edit, seconds: dict[str, float]) -> _Made | None:
+    def _make(self, request: protocol.EditRequest, seconds: dict[str, float]) -> _Made | None:
         """Make an edit of a client; None if it does nothing."""
         begin = perf_counter()
         self._check_base(request)
@@ -276,7 +276,7 @@ class Authority:
         seconds["check"] = perf_counter() - begin
         return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net), seconds)
 
-    def _check_base(self, request: protocol.Edit) -> None:
+    def _check_base(self, request: protocol.EditRequest) -> None:
         """Check that the client knows the present model, or one of the last."""
         base, now = request.base, self.revision
         if request.strict and base < now:
@@ -335,7 +335,7 @@ class Authority:
 
     def _fold(
         self,
-        request: protocol.Edit | protocol.Undo,
+        request: protocol.ChangeRequest,
         act: Callable[[Edit], None],
         own: Iterable[str],
         seconds: dict[str, float],
@@ -360,7 +360,7 @@ class Authority:
                 Placed(entry_to_bytes(placed.entry, history.sequence), placed.after or "", placed.at_end)
                 for placed in net.put
             ]
-            commit = Commit(
+            commit = CommitMessage(
                 revision=self.revision + 1,
                 previous=self.revision,
                 client=request.client,
@@ -368,7 +368,9 @@ class Authority:
                 who=request.who,
                 time=self._clock(),
                 changes=protocol.Changes(tuple(put), net.replaced, net.rerun, net.moved, net.removed),
-                files=self._find_files(entries, request.files if isinstance(request, protocol.Edit) else ()),
+                files=self._find_files(
+                    entries, request.files if isinstance(request, protocol.EditRequest) else ()
+                ),
             )
             data = protocol.encode(commit)
             if len(data) > protocol.MAX_BYTES or len(put) > protocol.MAX_OPERATIONS:
@@ -390,7 +392,7 @@ class Authority:
         after = history.sequence[index - 1].tag if index else ""
         return Replaced(tag, entry_to_bytes(entry, history.sequence), after, entry.place)
 
-    def _note(self, request: protocol.Edit | protocol.Undo, made: _Made, seconds: dict[str, float]) -> Result:
+    def _note(self, request: protocol.ChangeRequest, made: _Made, seconds: dict[str, float]) -> Result:
         """Note a commit that the model has made, to be stored and published."""
         history, revision = self.model.history, self.revision
         self.chain = protocol.chain(self.chain, made.data)
@@ -419,7 +421,7 @@ class Authority:
 
     # -- undo ----------------------------------------------------------------------------------------------
 
-    def _undo(self, request: protocol.Undo, seconds: dict[str, float]) -> _Made | None:
+    def _undo(self, request: protocol.UndoRequest, seconds: dict[str, float]) -> _Made | None:
         """Take back a commit: by the model if it has it, else by what the store has kept of it."""
         revision, kept = request.revision, self.model.history.commits
         if not 0 < revision <= self.revision:

@@ -50,36 +50,16 @@ def load_live(
     symbols: Iterable[Symbol | str] | None = None,
     bodies: bool | None = None,
 ) -> LiveModel:
-    """Connect to a model server and return its model, or a part of it.
+    """Connect to a model server and return its model, or a part of it; see :func:`kineverse.load`.
 
-    Parameters
-    ----------
-    source
-        Address ``live:NAME``, or ``live:tcp/host:port/NAME``.
-    frames, symbols
-        Names of frames and of coordinates of a part, which is closed: their forward kinematics, Jacobians,
-        constraints and rates are those of the whole. By default the model is whole.
-    bodies
-        Whether bodies are wanted: by default in the whole, and not in a part. Alone, False is for all frames
-        with what they need.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such server, or its model has no such frame or coordinate; the message lists
-        similar ones.
-    OfflineError
-        If nobody answers at a given endpoint.
-    FormatError
-        If the server is of another version.
-    MissingDependencyError
-        Without the extra ``exchange``.
+    An unknown server, frame or coordinate is an UnknownNameError with similar names, an endpoint where nobody
+    answers an OfflineError, and a server of another version a FormatError.
     """
     is_part = frames is not None or symbols is not None
     if bodies is None:
         bodies = not is_part
     check_flag("bodies", bodies)
-    wish = protocol.Join(
+    wish = protocol.JoinRequest(
         protocol.PROTOCOL,
         __version__,
         "",
@@ -96,7 +76,7 @@ def include_live(edit: Edit, source: str, prefix: str | None = None, **others: A
     """Append the present operations of a server's model to an edit of another one, and return their tags."""
     connection = Connection(Address.parse(source))
     try:
-        joined = connection.join(protocol.Join(protocol.PROTOCOL, __version__, "", ""))
+        joined = connection.join(protocol.JoinRequest(protocol.PROTOCOL, __version__, "", ""))
     finally:
         connection.close()
     return [edit.link(entry) for entry in entries_from_bytes(joined.document, prefix)]
@@ -111,7 +91,7 @@ class LiveModel(Model):
     server is away, reading goes on and edits raise; afterwards the model catches up.
     """
 
-    def __init__(self, connection: Connection, wish: protocol.Join) -> None:
+    def __init__(self, connection: Connection, wish: protocol.JoinRequest) -> None:
         self.exchange = connection
         self._wish = wish
         self._following = threading.RLock()
@@ -197,7 +177,7 @@ class LiveModel(Model):
         number = connection.next_number()
         wanted = as_count("revision", revision, 1)
         self._finish_edit(
-            connection.ask_edit(protocol.Undo(connection.client, number, connection.who, wanted))
+            connection.ask_edit(protocol.UndoRequest(connection.client, number, connection.who, wanted))
         )
 
     def wait(self, version: int, timeout: float | None = None) -> bool:
@@ -228,13 +208,13 @@ class LiveModel(Model):
     def _ask_for_edit(self, strict: bool) -> Iterator[Edit]:
         connection = self.exchange
         connection.check_online()
-        proposed: list[protocol.Edit] = []
+        proposed: list[protocol.EditRequest] = []
         with self._transaction(lambda edit: proposed.extend(self._propose(edit, strict))) as edit:
             yield edit
         for request in proposed:
             self._finish_edit(connection.ask_edit(request))
 
-    def _propose(self, edit: Edit, strict: bool) -> list[protocol.Edit]:
+    def _propose(self, edit: Edit, strict: bool) -> list[protocol.EditRequest]:
         """Return an open edit as a request; none if it does nothing."""
         changes, connection = edit.net(), self.exchange
         if changes.is_empty:
@@ -247,7 +227,7 @@ class LiveModel(Model):
             for placed in changes.put
         )
         return [
-            protocol.Edit(
+            protocol.EditRequest(
                 connection.client,
                 connection.next_number(),
                 connection.who,
@@ -313,7 +293,7 @@ class LiveModel(Model):
             elif commit.revision > self._last:
                 self._adopt_commit(published, commit)
 
-    def _adopt_commit(self, published: protocol.Published, commit: protocol.Commit) -> None:
+    def _adopt_commit(self, published: protocol.Published, commit: protocol.CommitMessage) -> None:
         connection = self.exchange
         link = protocol.chain(self._link, published.commit)
         if link != (published.link if self._wish.is_part else published.chain):
@@ -444,7 +424,7 @@ def _check_part(model: LiveModel, changes: NetChanges) -> None:
             )
 
 
-def _decode_changes(commit: protocol.Commit) -> NetChanges:
+def _decode_changes(commit: protocol.CommitMessage) -> NetChanges:
     changes = commit.changes
     put = []
     for placed in changes.put:

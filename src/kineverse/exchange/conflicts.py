@@ -41,7 +41,7 @@ class ConflictFoundError(Exception):
     """Edit in conflict with a later commit."""
 
     def __init__(self, conflict: EditConflict) -> None:
-        super().__init__(conflict.message)
+        super().__init__(conflict)
         self.conflict = conflict
 
 

@@ -9,8 +9,8 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterable
+from contextlib import closing, suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -20,10 +20,12 @@ from msgspec.structs import replace
 
 from kineverse._checks import as_count
 from kineverse.errors import DuplicateNameError, FormatError, OfflineError, UnknownNameError
+from kineverse.symbols import Symbol
 
 from . import protocol
 from .address import Address
 from .meshes import MAX_PART
+from .state import StatePublisher, StateReader
 from .store import Store
 from .transport import NoAnswerError, Transport
 
@@ -32,6 +34,7 @@ PATIENCE = 10.0
 _ASK_TIMEOUT = 5.0
 _PAUSE = 0.005
 _ROUTING = 0.5
+_SETTLING = 1.0  # time in which sources announce themselves to a server that has started [s]
 
 A = TypeVar("A")
 
@@ -64,6 +67,9 @@ class Connection:
         self.epoch, self.revision, self.chain = "", 0, protocol.NO_CHAIN
         self.is_online, self.is_closed = True, False
         self.sources: tuple[protocol.SourceStatus, ...] = ()
+        self._publishers: list[tuple[StatePublisher, float]] = []
+        self._readers: list[StateReader] = []
+        self._heard, self._settled = "", 0.0
         self._numbers = count(1)
         self._told = -1
         self._changed = threading.Condition()
@@ -80,6 +86,10 @@ class Connection:
         """End the connection; the model can still be read. A second call has no effect."""
         self.is_closed = True
         self.note_presence(False)
+        for reader in self._readers:
+            reader.close()
+        for publisher, _ in list(self._publishers):
+            publisher.close()
         self.transport.close()
 
     # -- questions to the server ---------------------------------------------------------------------------
@@ -92,7 +102,7 @@ class Connection:
         """Return the last commits, newest first, from before a revision if one is given."""
         most = as_count("most", most, 1)
         asked = protocol.GetHistory(most) if before is None else protocol.GetHistory(most, before)
-        return self.ask(asked, protocol.History).rows
+        return self.ask(asked, protocol.CommitList).rows
 
     def backup(self, path: str | os.PathLike[str]) -> Store:
         """Write a copy of the server's store into a new file, checked, and return it, closed.
@@ -125,6 +135,91 @@ class Connection:
         finally:
             part.unlink(missing_ok=True)
 
+    # -- state ---------------------------------------------------------------------------------------------
+
+    def publisher(
+        self, source: str, coordinates: Iterable[Symbol | str], *, offset: float = 0.0
+    ) -> StatePublisher:
+        """Return a new source of state, which the readers of all clients find. It ends with this connection.
+
+        Parameters
+        ----------
+        source
+            Name of the source: letters, digits, ``_``, ``.`` and ``-``.
+        coordinates
+            Symbols, or their names, of the values in a vector; also names that the model does not have.
+        offset
+            What is to be added to its stamps to get the time of the server [s].
+
+        Raises
+        ------
+        OfflineError
+            If the server is away.
+        DuplicateNameError
+            If another process of this computer sends under the same name.
+        InvalidValueError
+            If a source cannot have that name.
+        """
+        self.check_online()
+        publisher = StatePublisher(
+            self.address.name,
+            source,
+            coordinates,
+            server=self.transport,
+            direct=not self.address.endpoint,
+            announce=self._announce,
+        )
+        self._publishers.append((publisher, offset))
+        self._announce(publisher)
+        return publisher
+
+    def reader(self, coordinates: Iterable[Symbol | str] = ()) -> StateReader:
+        """Return a reader of the newest state of all sources, those that come later included.
+
+        Parameters
+        ----------
+        coordinates
+            Symbols, or their names, of the vectors that it fills.
+
+        Raises
+        ------
+        OfflineError
+            If the server is away.
+        DuplicateNameError
+            If a coordinate is given twice.
+        """
+        self.check_online()
+        reader = StateReader(
+            self.address.name, coordinates, server=self.transport, direct=not self.address.endpoint
+        )
+        reader.follow(self.status().sources)
+        self._readers.append(reader)
+        return reader
+
+    def _announce(self, publisher: StatePublisher) -> None:
+        """Tell the server of a source, or that it has ended; one who is away is told when it is back."""
+        offset = next(offset for known, offset in self._publishers if known is publisher)
+        if publisher.is_closed:
+            self._publishers.remove((publisher, offset))
+        endpoint = "" if publisher.is_closed else publisher.endpoint
+        announced = protocol.Announce(self.client, publisher.source, endpoint, publisher.coordinates, offset)
+        with suppress(OfflineError):
+            self.ask(announced, protocol.Done)
+
+    def _take_sources(self, beat: protocol.Beat) -> None:
+        """Follow the sources that the server knows; one that has just started does not know them all yet."""
+        now, listed = time.monotonic(), {status.source for status in beat.sources}
+        if beat.epoch != self._heard:
+            self._heard, self._settled = beat.epoch, now + _SETTLING
+        kept = [] if now > self._settled else [one for one in self.sources if one.source not in listed]
+        self.sources = (*kept, *beat.sources)
+        for publisher, _ in list(self._publishers):
+            if publisher.source not in listed:
+                self._announce(publisher)
+        self._readers = [reader for reader in self._readers if not reader.is_closed]
+        for reader in self._readers:
+            reader.follow(self.sources)
+
     # -- for the live model --------------------------------------------------------------------------------
 
     @property
@@ -150,7 +245,7 @@ class Connection:
                 f"The server of {self.address} is away. The model can be read, and edited when it is back."
             )
 
-    def join(self, wish: protocol.Join) -> protocol.Joined:
+    def join(self, wish: protocol.JoinRequest) -> protocol.Joined:
         """Join and return the model, or the part that is wished for."""
         return self.ask(replace(wish, client=self.client, who=self.who), protocol.Joined)
 
@@ -190,7 +285,7 @@ class Connection:
 
     def hear(self, beat: protocol.Beat) -> None:
         """Take the sources of state from a sign of life, and tell the server what this client has."""
-        self.sources = beat.sources
+        self._take_sources(beat)
         seen = protocol.Seen(self.client, self.revision)
         if self.revision != self._told:
             self._told = self.revision
@@ -218,7 +313,7 @@ class Connection:
             return answer
         raise refusal_error(answer, self.address)
 
-    def ask_edit(self, edit: protocol.Edit | protocol.Undo) -> protocol.Committed | protocol.Refused:
+    def ask_edit(self, edit: protocol.ChangeRequest) -> protocol.Committed | protocol.Refused:
         """Ask for an edit until it is answered: under its number it is done once.
 
         Raises
@@ -245,7 +340,7 @@ class Connection:
     def _ask(self, request: protocol.Request, timeout: float) -> protocol.Answer:
         if self.is_closed:
             raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
-        changes_model = isinstance(request, (protocol.Edit, protocol.Undo))
+        changes_model = isinstance(request, (protocol.EditRequest, protocol.UndoRequest))
         data = protocol.encode(request)
         if len(data) > protocol.MAX_BYTES:
             raise FormatError(

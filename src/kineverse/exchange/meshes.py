@@ -21,7 +21,7 @@ from kineverse.model.body import Body, Mesh
 from kineverse.model.history import HistoryEntry
 from kineverse.model.operation import BODIES
 
-from .protocol import FileContent
+from .protocol import MeshContent
 from .store import Store
 
 MAX_PART = 1 << 24
@@ -36,8 +36,8 @@ class ServedFiles:
         self._paths = store.paths()
 
     def find(
-        self, entries: Iterable[HistoryEntry], named: Iterable[FileContent] = ()
-    ) -> tuple[FileContent, ...]:
+        self, entries: Iterable[HistoryEntry], named: Iterable[MeshContent] = ()
+    ) -> tuple[MeshContent, ...]:
         """Return the digests of meshes whose files are here: found on disk, or named and known already."""
         by_place = {(file.tag, file.index): (file.sha256, file.size) for file in named}
         result = []
@@ -50,7 +50,7 @@ class ServedFiles:
                         self._paths[known[0]] = os.fspath(locate_mesh(mesh))
                         self._store.add_path(known[0], self._paths[known[0]])
                 if known is not None and known[0] in self._paths:
-                    result.append(FileContent(entry.tag, index, *known))
+                    result.append(MeshContent(entry.tag, index, *known))
         return tuple(result)
 
     def read(self, sha256: str, offset: int) -> bytes | None:
@@ -95,17 +95,17 @@ class FetchedFiles:
         return content
 
 
-def find_known_files(entries: Iterable[HistoryEntry]) -> tuple[FileContent, ...]:
+def find_known_files(entries: Iterable[HistoryEntry]) -> tuple[MeshContent, ...]:
     """Return the digests of meshes that are known in some operations."""
     return tuple(
-        FileContent(entry.tag, index, *mesh.content)
+        MeshContent(entry.tag, index, *mesh.content)
         for entry in entries
         for index, mesh in enumerate(_meshes(entry.writes))
         if mesh.content is not None
     )
 
 
-def put_contents(entries: Iterable[HistoryEntry], files: Iterable[FileContent]) -> None:
+def put_contents(entries: Iterable[HistoryEntry], files: Iterable[MeshContent]) -> None:
     """Put the digests of meshes into the operations that they belong to."""
     by_tag: dict[str, dict[int, tuple[str, int]]] = {}
     for file in files:

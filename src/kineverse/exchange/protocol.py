@@ -67,7 +67,7 @@ class Changes(_Message, frozen=True):
     removed: Tags = ()
 
 
-class FileContent(_Message, frozen=True):
+class MeshContent(_Message, frozen=True):
     """Digest and size of the file of a mesh, by the operation and the place among its meshes."""
 
     tag: Name
@@ -76,7 +76,7 @@ class FileContent(_Message, frozen=True):
     size: Number
 
 
-class Commit(_Message, frozen=True):
+class CommitMessage(_Message, frozen=True):
     """Commit of an edit, as it is kept in the log and published.
 
     ``previous`` is the revision of the last commit before it that the reader has got: of the log, or of its
@@ -90,7 +90,7 @@ class Commit(_Message, frozen=True):
     who: Text
     time: Seconds  # seconds since 1970 on the clock of the server
     changes: Changes
-    files: tuple[FileContent, ...] = ()
+    files: tuple[MeshContent, ...] = ()
 
 
 class Published(_Message, frozen=True):
@@ -108,7 +108,7 @@ class Published(_Message, frozen=True):
 # -- requests ------------------------------------------------------------------------------------------------
 
 
-class Edit(_Message, frozen=True, tag="edit"):
+class EditRequest(_Message, frozen=True, tag="edit"):
     """Edit of a client, made at the revision ``base`` with its chain; asked twice, it is answered alike.
 
     A ``strict`` edit is refused if anything has changed since its base.
@@ -121,10 +121,10 @@ class Edit(_Message, frozen=True, tag="edit"):
     chain: Chain
     changes: Changes
     strict: bool = False
-    files: tuple[FileContent, ...] = ()
+    files: tuple[MeshContent, ...] = ()
 
 
-class Undo(_Message, frozen=True, tag="undo"):
+class UndoRequest(_Message, frozen=True, tag="undo"):
     """Take back the commit of a revision, as an edit like any other."""
 
     client: Id
@@ -133,7 +133,7 @@ class Undo(_Message, frozen=True, tag="undo"):
     revision: Revision
 
 
-class Join(_Message, frozen=True, tag="join"):
+class JoinRequest(_Message, frozen=True, tag="join"):
     """Ask for the model, or for the part of it that frames and symbols need."""
 
     protocol: int
@@ -197,7 +197,10 @@ class Announce(_Message, frozen=True, tag="announce"):
     offset: Seconds = 0.0
 
 
-Request: TypeAlias = Edit | Undo | Join | Since | GetStatus | GetHistory | GetFile | GetBackup | Announce
+ChangeRequest: TypeAlias = EditRequest | UndoRequest
+Request: TypeAlias = (
+    ChangeRequest | JoinRequest | Since | GetStatus | GetHistory | GetFile | GetBackup | Announce
+)
 
 # -- answers -------------------------------------------------------------------------------------------------
 
@@ -237,7 +240,7 @@ class Joined(_Message, frozen=True, tag="joined"):
     chain: Chain
     view: str
     document: bytes
-    files: tuple[FileContent, ...] = ()
+    files: tuple[MeshContent, ...] = ()
     link: Link = b""
 
 
@@ -323,7 +326,7 @@ class HistoryRow(_Message, frozen=True):
     rerun: tuple[str, ...]
 
 
-class History(_Message, frozen=True, tag="history"):
+class CommitList(_Message, frozen=True, tag="history"):
     """Commits, newest first."""
 
     rows: tuple[HistoryRow, ...]
@@ -341,7 +344,7 @@ class Done(_Message, frozen=True, tag="done"):
     time: Seconds
 
 
-Answer: TypeAlias = Committed | Refused | Joined | Missed | Status | History | FilePart | Done
+Answer: TypeAlias = Committed | Refused | Joined | Missed | Status | CommitList | FilePart | Done
 
 # -- signals -------------------------------------------------------------------------------------------------
 
@@ -400,7 +403,7 @@ class Decoder(Generic[M]):
 
 decode_request: Decoder[Request] = Decoder(Request, "A request")
 decode_answer: Decoder[Answer] = Decoder(Answer, "An answer")
-decode_commit: Decoder[Commit] = Decoder(Commit, "A commit")
+decode_commit: Decoder[CommitMessage] = Decoder(CommitMessage, "A commit")
 decode_published: Decoder[Published] = Decoder(Published, "A commit")
 decode_beat: Decoder[Beat] = Decoder(Beat, "A sign of life")
 decode_seen: Decoder[Seen] = Decoder(Seen, "A sign of life")

@@ -224,7 +224,7 @@ class Server:
             for request in waiting:
                 try:
                     decoded = protocol.decode_request(request.payload)
-                    if not isinstance(decoded, (protocol.Edit, protocol.Undo)):
+                    if not isinstance(decoded, (protocol.EditRequest, protocol.UndoRequest)):
                         raise FormatError("This is no edit, and is asked under another key.")
                 except FormatError as error:
                     self._refuse(request, "malformed", error)
@@ -235,7 +235,7 @@ class Server:
             if edits:
                 self._process(edits, given)
 
-    def _process(self, edits: Sequence[protocol.Edit | protocol.Undo], requests: Sequence[Question]) -> None:
+    def _process(self, edits: Sequence[protocol.ChangeRequest], requests: Sequence[Question]) -> None:
         epoch = self._authority.epoch
         try:
             with self._lock:
@@ -286,13 +286,13 @@ class Server:
             log = self._logs[view.id]
             put = {*map(protocol.tag_of, changes.put)}
             files = self._files.find([entry for entry in view.entries if entry.tag in put])
-            commit = protocol.Commit(
+            commit = protocol.CommitMessage(
                 last.revision, log.last, last.client, last.number, last.who, last.time, changes, files
             )
             commits.append((view.id, log.add(authority.epoch, authority.chain, commit)))
         return commits
 
-    def _note(self, edit: protocol.Edit | protocol.Undo, result: Result) -> None:
+    def _note(self, edit: protocol.ChangeRequest, result: Result) -> None:
         now = time.time()
         with self._lock:
             for stage, seconds in result.seconds.items():
@@ -328,7 +328,7 @@ class Server:
 
     def _answer(self, question: protocol.Request) -> protocol.Answer:
         match question:
-            case protocol.Join():
+            case protocol.JoinRequest():
                 return self._join(question)
             case protocol.Since():
                 return self._list_missed(question)
@@ -348,7 +348,7 @@ class Server:
             case _:
                 raise FormatError("This is an edit, and is asked under another key.")
 
-    def _join(self, join: protocol.Join) -> protocol.Answer:
+    def _join(self, join: protocol.JoinRequest) -> protocol.Answer:
         if join.protocol != protocol.PROTOCOL:
             return protocol.Refused(
                 "protocol",
@@ -425,7 +425,7 @@ class Server:
                 refusals=tuple(self._refusals),
             )
 
-    def _list_history(self, question: protocol.GetHistory) -> protocol.History:
+    def _list_history(self, question: protocol.GetHistory) -> protocol.CommitList:
         with self._lock:
             found = self._store.last_commits(question.most, question.before)
         rows = []
@@ -445,7 +445,7 @@ class Server:
                     changes.rerun,
                 )
             )
-        return protocol.History(tuple(rows))
+        return protocol.CommitList(tuple(rows))
 
     def _read_backup(self, question: protocol.GetBackup) -> protocol.Answer:
         with self._lock:
@@ -571,7 +571,7 @@ class _ViewLog:
         self.link = protocol.NO_CHAIN
         self._commits: deque[tuple[int, protocol.Published]] = deque()
 
-    def add(self, epoch: str, chain: bytes, commit: protocol.Commit) -> protocol.Published:
+    def add(self, epoch: str, chain: bytes, commit: protocol.CommitMessage) -> protocol.Published:
         """Add a commit, forget the oldest if there are many, and return what is published."""
         data = protocol.encode(commit)
         self.last, self.link = commit.revision, protocol.chain(self.link, data)

@@ -15,7 +15,7 @@ import secrets
 import struct
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -57,9 +57,14 @@ class StatePublisher:
         Connection to the model server, by which its other clients are reached.
     direct
         Whether the server is on this computer, so that a socket beside it can be found.
+    announce
+        Function that tells the server of this source: called with it when there are other coordinates, and
+        when it is closed.
 
     Attributes
     ----------
+    source, is_closed
+        Name of the source, and whether it has ended.
     endpoint
         Where it listens, to be announced to the server; :data:`THROUGH_SERVER` without a socket of its own.
         The stream then ends with the server, and goes on when that is back.
@@ -80,7 +85,9 @@ class StatePublisher:
         *,
         server: Transport | None = None,
         direct: bool = True,
+        announce: Callable[[StatePublisher], None] = lambda _: None,
     ) -> None:
+        self.source, self.is_closed, self._announce = source, False, announce
         self._layout = _Layout.make(coordinates)
         self._key = _key(name, check_server_name(source, "source"))
         self._run, self._number, self._lock = secrets.randbits(64), 0, threading.Lock()
@@ -115,6 +122,7 @@ class StatePublisher:
             If one is given twice.
         """
         self._layout = _Layout.make(coordinates)
+        self._announce(self)
 
     def put(self, values: ArrayLike, stamp: float | None = None) -> None:
         """Send a vector; it waits for nobody.
@@ -156,13 +164,16 @@ class StatePublisher:
                 transport.publish(self._key, message)
 
     def close(self) -> None:
-        """End the stream, and give the name of the source back."""
-        self._transports = []
+        """End the stream, and give the name of the source back. A second call has no effect."""
+        if self.is_closed:
+            return
+        self.is_closed, self._transports = True, []
         for requests in self._asked:
             requests.close()
         if self._own is not None and self._claim is not None:
             self._own.close()
             self._claim.release()
+        self._announce(self)
 
     def __enter__(self) -> StatePublisher:
         return self
@@ -207,6 +218,7 @@ class StateReader:
         direct: bool = True,
     ) -> None:
         self.coordinates: tuple[str, ...] = _Layout.make(coordinates).names
+        self.is_closed = False
         self._name, self._server, self._direct = name, server, direct
         self._streams: dict[str, _Stream] = {}  # replaced, never changed
         self._news = threading.Condition()
@@ -285,7 +297,10 @@ class StateReader:
         return {source: stream.lost for source, stream in self._streams.items()}
 
     def wait(self, timeout: float) -> bool:
-        """Wait until a vector comes in [s]; return True if one has since the last call."""
+        """Wait until a vector comes in [s]; return True if one has since the last call.
+
+        A reader of some coordinates waits for vectors with any of them.
+        """
         with self._news:
             self._news.wait_for(lambda: self._arrived != self._noticed, timeout)
             before, self._noticed = self._noticed, self._arrived
@@ -294,6 +309,7 @@ class StateReader:
     def close(self) -> None:
         """Read nothing more."""
         self.follow(())
+        self.is_closed = True
 
     def __enter__(self) -> StateReader:
         return self
@@ -422,7 +438,8 @@ class _Stream:
         self._run, self._number = run, number
         self.received += 1
         self.latest = _Vector(layout, values, stamp, time.monotonic())
-        self._reader._notify()
+        if len(layout.targets) or not self._reader.coordinates:
+            self._reader._notify()
 
     def _ask(self, digest: int, transport: Transport) -> _Layout | None:
         """Return the layout that the source has now if it is that of the digest."""

@@ -58,7 +58,7 @@ class Replaced(msgspec.Struct, frozen=True, array_like=True):
 
 
 _NO_FILES: Final = _ENCODE(())
-_decode_files = msgspec.msgpack.Decoder(tuple[protocol.FileContent, ...]).decode
+_decode_files = msgspec.msgpack.Decoder(tuple[protocol.MeshContent, ...]).decode
 _decode_replaced = msgspec.msgpack.Decoder(tuple[Replaced, ...]).decode
 
 
@@ -79,7 +79,7 @@ class StoredCommit:
     removed: Sequence[str] = ()
     places: Sequence[tuple[str, int]] | None = None
     replaced: tuple[Replaced, ...] = ()
-    files: Sequence[protocol.FileContent] = ()
+    files: Sequence[protocol.MeshContent] = ()
 
 
 class Store:
@@ -140,7 +140,7 @@ class Store:
         """The digest of all commits."""
         return self._contents.chain
 
-    def operations(self) -> list[tuple[int, bytes, tuple[protocol.FileContent, ...]]]:
+    def operations(self) -> list[tuple[int, bytes, tuple[protocol.MeshContent, ...]]]:
         """Return the places, blobs and files of all operations, in order."""
         rows = self._rows("SELECT place, blob, files FROM operations ORDER BY place")
         return [(place, blob, _decode_files(files)) for place, blob, files in rows]
@@ -318,7 +318,7 @@ class _Contents:
 
 
 def _files_by_tag(commit: StoredCommit) -> dict[str, bytes]:
-    found: dict[str, list[protocol.FileContent]] = {}
+    found: dict[str, list[protocol.MeshContent]] = {}
     for file in commit.files:
         found.setdefault(file.tag, []).append(file)
     return {tag: _ENCODE(files) for tag, files in found.items()}

@@ -16,7 +16,7 @@ from kineverse.model.read_recorder import ABSENT, Read, differs
 
 from . import protocol
 from .conflicts import ConflictFoundError, EditConflict
-from .protocol import Commit
+from .protocol import CommitMessage
 from .store import Replaced, Store
 
 _PLACE = attrgetter("place")
@@ -30,10 +30,10 @@ def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
     that (ConflictFoundError).
     """
     data, replaced = store.commit_of(revision)
-    commit: Commit = protocol.decode_commit(data)
+    commit: CommitMessage = protocol.decode_commit(data)
     changes = commit.changes
     messages = store.last_commits(store.revision - revision, store.revision + 1)
-    later: list[Commit] = [protocol.decode_commit(one) for one in messages]  # the newest first
+    later: list[CommitMessage] = [protocol.decode_commit(one) for one in messages]  # the newest first
     put: list[PlacedEntry] = []
     removed = {old.tag for old in replaced if old.blob is None}
     gone = {*removed, *changes.moved}
@@ -62,7 +62,7 @@ def is_frozen(entry: HistoryEntry) -> bool:
 
 
 def _check_unchanged(
-    history: History, revision: int, tag: str, was_removed: bool, later: Sequence[Commit]
+    history: History, revision: int, tag: str, was_removed: bool, later: Sequence[CommitMessage]
 ) -> None:
     for one in later:
         of = one.changes
@@ -72,9 +72,13 @@ def _check_unchanged(
         raise _conflict(later[0], tag, "", f"is after another {tag!r} than that of revision {revision}")
 
 
-def _check_unread(store: Store, history: History, entry: HistoryEntry, later: Sequence[Commit]) -> None:
+def _check_unread(
+    store: Store, history: History, entry: HistoryEntry, later: Sequence[CommitMessage]
+) -> None:
     """Check that a frozen operation finds what it has read; it does not know that itself."""
-    then: dict[Cell, tuple[Any, Commit]] = {}  # value before the first commit that touched it, and that
+    then: dict[
+        Cell, tuple[Any, CommitMessage]
+    ] = {}  # value before the first commit that touched it, and that
     for one in later[::-1]:
         _, replaced = store.commit_of(one.revision)
         old: dict[Cell, Any] = {}
@@ -94,7 +98,7 @@ def _check_unread(store: Store, history: History, entry: HistoryEntry, later: Se
             raise _conflict(one, entry.tag, path, f"has changed {path}, from which {entry.tag!r} was made")
 
 
-def _conflict(later: Commit, tag: str, path: str, what: str) -> ConflictFoundError:
+def _conflict(later: CommitMessage, tag: str, path: str, what: str) -> ConflictFoundError:
     message = f"Revision {later.revision}, by {later.who}, {what}. Undo it first."
     return ConflictFoundError(EditConflict(message, tag, path, later.revision, later.who))
 

@@ -13,9 +13,11 @@ import json
 import os
 import re
 import tempfile
+import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import Any, Final, TypeVar
 
 from kineverse._extras import install_command
@@ -97,17 +99,26 @@ class Channel(_Owner):
     The oldest is dropped where too much waits, so a slow reader holds up nobody.
     """
 
+    def __init__(self, owned: Any) -> None:
+        super().__init__(owned)
+        self._lock = threading.Lock()  # two threads in the object at once are an error of Zenoh
+
     def _wait(self, read: Callable[[Any], Value]) -> Value | None:
         """Return what is read from the next thing that arrives, None after the end."""
         try:
             with _call:
-                return read(self._owned.handler.recv())
+                with self._lock:
+                    channel = self._owned.handler
+                try:
+                    return read(channel.recv())
+                finally:
+                    del channel
         except (NoAnswerError, _zenoh().ZError):
             return None
 
     def close(self) -> None:
         """End the subscription: those who wait go on, and get nothing more."""
-        with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
+        with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call, self._lock:
             self._owned.undeclare()
 
 
@@ -160,7 +171,8 @@ class Questions(Channel):
             return []
         result, late = [first], time.monotonic() + seconds
         with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
-            channel = self._owned.handler
+            with self._lock:
+                channel = self._owned.handler
             while len(result) < most and time.monotonic() <= late:
                 query = channel.try_recv()
                 if query is None:
@@ -336,6 +348,7 @@ def _ring(most: int) -> Any:
     return _zenoh().handlers.RingChannel(most)
 
 
+@cache
 def _zenoh() -> Any:
     try:
         import zenoh
