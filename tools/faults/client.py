@@ -1,4 +1,4 @@
-"""Clients of a model server in a process of their own, which edit as users do and tell what was acknowledged."""
+"""Clients of a model server in a process of their own, which edit as users do and tell what they hear."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from kineverse.formats import document_hash
 from .edits import PARTS, add_chain, add_constraints, count_on, do_something, remove_chain
 from .processes import commands, tell
 from .served import NAME
-
 
 PAUSE = 0.02
 """Longest time between two edits of one who edits until it is stopped [s]."""
@@ -149,9 +148,7 @@ def main() -> None:
     name, seed, edits = sys.argv[1], sys.argv[2], int(sys.argv[3])
     threading.excepthook = lambda what: tell(violation=f"{what.thread}: {what.exc_value!r}")
     logging.disable(logging.CRITICAL)  # servers that are killed are no news
-    clients = [
-        Client(f"{name}{k}", kind, f"{seed} {name}{k}", edits) for k, kind in enumerate(sys.argv[4:])
-    ]
+    clients = [Client(f"{name}{k}", kind, f"{seed} {name}{k}", edits) for k, kind in enumerate(sys.argv[4:])]
     for client in clients if edits <= 0 else ():
         client.thread.start()
     tell(reply="ready")
@@ -180,7 +177,7 @@ def main() -> None:
         elif words[0] == "hook":  # one that takes long
             seconds = float(words[1])
             for client in clients:
-                client.model.listen(lambda _: time.sleep(seconds))
+                client.model.listen(lambda _, seconds=seconds: time.sleep(seconds))  # type: ignore[misc]
             tell(reply="ready")
 
 

@@ -125,7 +125,12 @@ def do_something(edit: Edit, random: Random, new: str) -> None:
         edit.add_frame("part/base", "world", kv.translation(1, 0, 0))
         return
     tag, other = random.choice(tags), random.choice(tags)
-    name, frame, parent, k = random.choice("abcd"), random.choice(frames), random.choice(frames), random.randrange(30)
+    name, frame, parent, k = (
+        random.choice("abcd"),
+        random.choice(frames),
+        random.choice(frames),
+        random.randrange(30),
+    )
     below = f"{random.choice(('part', 'more'))}/{random.randrange(6)}"
     steps: list[tuple[float, Callable[[], object]]] = [
         (2, lambda: edit.write(name, k / 4, new)),
@@ -136,7 +141,12 @@ def do_something(edit: Edit, random: Random, new: str) -> None:
         (3, lambda: edit.add_frame(below, parent, kv.translation(k, 0, kv.position("q")), tag=new)),
         (2, lambda: edit.attach(frame, parent, kv.translation(0, 0, k), new)),
         (1, lambda: edit.apply(Above(below, frame), new)),
-        (1, lambda: edit.constrain(f"range {k}", 0, kv.position(random.choice(("q", "part/lid"))), 1 + k, new)),
+        (
+            1,
+            lambda: edit.constrain(
+                f"range {k}", 0, kv.position(random.choice(("q", "part/lid"))), 1 + k, new
+            ),
+        ),
         (4 if len(tags) < MOST_OPERATIONS else 20, lambda: edit.remove(tag)),
         (1, lambda: (edit.remove(tag), edit.insert(history.entries[tag].operation, tag, before=other))),
         (1, lambda: edit.insert(SetData(name, k / 4), new, before=tag)),

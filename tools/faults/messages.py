@@ -12,9 +12,9 @@ from typing import Any
 from uuid import uuid4
 
 import msgspec
+from fuzz import bytes_mutation, json_trees
 
 import kineverse as kv
-from fuzz import bytes_mutation, json_trees
 from kineverse.exchange import protocol
 from kineverse.exchange.address import Address
 from kineverse.exchange.transport import NoAnswerError, Transport
@@ -29,7 +29,19 @@ LEARNED = 100
 """Random edits by which real messages are learned."""
 TOO_LATE = 20.0
 _BLOB = "blob:"
-_WORDS = ("edit", "undo", "join", "since", "status", "history", "file", "announce", "world", "part/lid", "counter")
+_WORDS = (
+    "edit",
+    "undo",
+    "join",
+    "since",
+    "status",
+    "history",
+    "file",
+    "announce",
+    "world",
+    "part/lid",
+    "counter",
+)
 
 
 # -- messages as trees, with the blobs in them ---------------------------------------------------------------

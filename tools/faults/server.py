@@ -15,7 +15,6 @@ import kineverse as kv
 from kineverse.errors import DuplicateNameError, FormatError, KineverseError, UnknownNameError
 from kineverse.exchange import protocol
 from kineverse.exchange.authority import Authority
-from kineverse.exchange.client import LiveModel
 from kineverse.exchange.server import serve
 from kineverse.exchange.store import Store
 from kineverse.formats import document_hash, operation_from_bytes
@@ -61,7 +60,8 @@ class Log:
             self._note_chains(commit)
             changes = commit.changes
             put = [
-                PlacedEntry(operation_from_bytes(one.blob), one.after or None, one.at_end) for one in changes.put
+                PlacedEntry(operation_from_bytes(one.blob), one.after or None, one.at_end)
+                for one in changes.put
             ]
             self.model.adopt(
                 NetChanges(tuple(put), changes.replaced, changes.rerun, changes.moved, changes.removed)
@@ -71,7 +71,9 @@ class Log:
         known = {*commit.changes.replaced, *commit.changes.rerun}
         put = [tag for tag in map(protocol.tag_of, commit.changes.put) if tag not in known]
         for tags, into in ((put, self.added), (commit.changes.removed, self.removed)):
-            parts = Counter(tag.rpartition("/")[0] for tag in tags if tag.startswith("part/") and tag[-2] == "/")
+            parts = Counter(
+                tag.rpartition("/")[0] for tag in tags if tag.startswith("part/") and tag[-2] == "/"
+            )
             for name, parts_there in parts.items():
                 check(parts_there == 3, f"revision {commit.revision} has {parts_there} of 3 frames of {name}")
                 check(name not in into, f"{name} is at revision {commit.revision}, and was so before")
@@ -102,7 +104,9 @@ def check_store(path: Path, clients: Iterable[Process], killed: int = 0) -> tupl
             made += told.get("counted") == "made"
             unknown += told.get("counted") == "unknown"
         counted = count(model) if counts else made
-        check(made <= counted <= made + unknown, f"{made} to {made + unknown} were counted, and {counted} are")
+        check(
+            made <= counted <= made + unknown, f"{made} to {made + unknown} were counted, and {counted} are"
+        )
         return model.version, document_hash(model)
     finally:
         store.close()
@@ -171,22 +175,20 @@ def try_kills(rounds: int, seed: int, processes: int = 3) -> dict[str, int]:
                     name = processes + len(gone)
                     clients.append(_start_client(running, f"{seed}.{found['servers']}", name))
                 server.kill()
-                begin_time = time.monotonic()
-                before = {client.what: len(client.told) for client in clients}
+                killed = time.monotonic()
                 server = start(running, "served", store)
-                wait_until(
-                    lambda before=before: any(_has_edited(one, before[one.what]) for one in clients),
-                    LONG,
-                    "an edit after the start of a server",
-                )
-                found["ms"] = max(found["ms"], round(1e3 * (time.monotonic() - begin_time)))
+                _wait_for_edits(*clients, all_of_them=False)
+                found["longest ms"] = max(found["longest ms"], round(1e3 * (time.monotonic() - killed)))
                 found["servers"] += 1
             _wait_for_edits(*clients)
             _check_presence(len(clients) * len(KINDS))
             found += _stop(clients)
             end = check_replicas(server, clients)
             server.kill()
-            check(check_store(store, [*clients, *gone], len(gone) * len(KINDS)) == end, "the store has another model")
+            check(
+                check_store(store, [*clients, *gone], len(gone) * len(KINDS)) == end,
+                "the store has another model",
+            )
             found["clients"] += len(gone)
             found["revisions"] += end[0]
     return dict(found)
@@ -234,10 +236,15 @@ def try_messages(requests: int, publications: int, seed: int, senders: int = 2) 
             enemy.tell("ask", requests // senders)
         for enemy in enemies:
             for outcome, number in enemy.wait_for_reply(3600).items():
-                found[outcome] = max(found[outcome], number) if outcome == "longest ms" else found[outcome] + number
-        (_, longest), = client.ask("stop")
-        check(longest < 0.5, f"while nonsense was sent, an edit of another client took {longest:.2f} s: "
-            f"{[told for told in client.told if 'slow' in told]}")
+                found[outcome] = (
+                    max(found[outcome], number) if outcome == "longest ms" else found[outcome] + number
+                )
+        ((_, longest),) = client.ask("stop")
+        check(
+            longest < 0.5,
+            f"while nonsense was sent, an edit of another client took {longest:.2f} s: "
+            f"{[told for told in client.told if 'slow' in told]}",
+        )
         found["longest of others ms"] = round(1e3 * longest)
         check_replicas(server, [client, follower])
         _check_presence(1 + len(KINDS))
@@ -269,7 +276,9 @@ def try_full_disks(rounds: int, seed: int) -> dict[str, int]:
         for _ in range(rounds):
             server.ask("room", random.uniform(0, 1.1))
             begin = len(client.told)
-            wait_until(lambda begin=begin: "failed" in _outcomes(client, begin), LONG, "an edit that is refused")
+            wait_until(
+                lambda begin=begin: "failed" in _outcomes(client, begin), LONG, "an edit that is refused"
+            )
             server.ask("any-room")
             _wait_for_edits(client)
         found = Counter(_outcomes(client, 0))
@@ -286,13 +295,11 @@ def _outcomes(client: Process, since: int) -> list[str]:
     return [told[name] for told in client.told[since:] for name in names if name in told]
 
 
-def _wait_for_edits(*clients: Process) -> None:
-    """Wait until each client has got an edit made from now on."""
-    for client in clients:
-        since = len(client.told)
-        wait_until(
-            lambda client=client, since=since: _has_edited(client, since), LONG, f"an edit of {client.what}"
-        )
+def _wait_for_edits(*clients: Process, all_of_them: bool = True) -> None:
+    """Wait until the clients, or one of them, have got an edit made from now on."""
+    since = [len(client.told) for client in clients]
+    enough = all if all_of_them else any
+    wait_until(lambda: enough(map(_has_edited, clients, since)), LONG, f"an edit of {clients[0].what}")
 
 
 def try_damages(count: int, seed: int) -> dict[str, int]:
@@ -429,8 +436,12 @@ def try_freezing(seconds: float, seed: int) -> dict[str, int]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kills", type=int, default=200, help="how many killed servers (200)")
     parser.add_argument("--edits", type=int, default=24_000, help="how many random edits (24 000)")
-    parser.add_argument("--messages", type=int, default=1_000_000, help="how many mutated messages (1 000 000)")
-    parser.add_argument("--rounds", type=int, default=50, help="how many full disks; damaged stores: ten times (50)")
+    parser.add_argument(
+        "--messages", type=int, default=1_000_000, help="how many mutated messages (1 000 000)"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=50, help="how many full disks; damaged stores: ten times (50)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of edits, damages and times (1)")
 
 
@@ -446,7 +457,7 @@ def run(given: argparse.Namespace) -> Iterator[str]:
     if given.kills:
         yield f"{given.kills} killed servers: {_say(try_kills(given.kills, seed))}"
     if given.edits:
-        yield f"{given.edits // 10} edits and a clock that jumps: {_say(try_edits(given.edits // 10, 8, seed, 'jump'))}"
+        yield f"a clock that jumps, {given.edits // 10} edits: {_say(try_edits(given.edits // 10, 8, seed, 'jump'))}"
         yield f"{given.edits} edits by 8 clients: {_say(try_edits(given.edits, 8, seed))}"
     if given.messages:
         found = try_messages(given.messages, given.messages // 50, seed)
