@@ -457,7 +457,8 @@ def run(given: argparse.Namespace) -> Iterator[str]:
     if given.kills:
         yield f"{given.kills} killed servers: {_say(try_kills(given.kills, seed))}"
     if given.edits:
-        yield f"a clock that jumps, {given.edits // 10} edits: {_say(try_edits(given.edits // 10, 8, seed, 'jump'))}"
+        few = given.edits // 10
+        yield f"{few} edits and a clock that jumps: {_say(try_edits(few, 8, seed, 'jump'))}"
         yield f"{given.edits} edits by 8 clients: {_say(try_edits(given.edits, 8, seed))}"
     if given.messages:
         found = try_messages(given.messages, given.messages // 50, seed)

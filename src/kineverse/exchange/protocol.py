@@ -231,7 +231,7 @@ class Refused(_Message, frozen=True, tag="refused"):
 
 
 class Joined(_Message, frozen=True, tag="joined"):
-    """The model or a part of it, as a document in msgpack; ``view`` and ``link`` are id and digest of the part."""
+    """The model or a part of it, as a document in msgpack; ``view`` and ``link`` identify the part."""
 
     name: str
     library: Text
