@@ -97,7 +97,8 @@ class LiveModel(Model):
         self._following = threading.RLock()
         self._deliveries: SimpleQueue[bool] = SimpleQueue()
         self._announced = 0  # last revision that concerns this model, as the last sign of life had it
-        self._last = 0  # last revision that was adopted; later ones concern nothing of a part
+        # The last revision that was adopted, and its digest; later ones concern nothing of a part.
+        self._last, self._link = 0, b""
         log = None if wish.is_part else connection.transport.subscribe(connection.key("log"))
         try:
             joined = connection.join(wish)
