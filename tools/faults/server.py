@@ -32,6 +32,8 @@ LONG = 20.0
 """Time in which a client notices that a server is back, and all have the same [s]."""
 SOON = 3.0
 """Time in which a server forgets clients that are gone [s]."""
+HELD_UP = 0.5
+"""Longest time that an edit takes whatever others do [s]."""
 ROUNDS_TOGETHER = 20
 """Kills of one store, before the next one."""
 
@@ -219,7 +221,9 @@ def _check_presence(wanted: int) -> None:
 # -- messages ------------------------------------------------------------------------------------------------
 
 
-def try_messages(requests: int, publications: int, seed: int, senders: int = 2) -> dict[str, int]:
+def try_messages(
+    requests: int, publications: int, seed: int, senders: int = 2, most: float = HELD_UP
+) -> dict[str, int]:
     """Send mutated messages to a server and its clients; return how they were answered."""
     found: Counter[str] = Counter()
     with folder() as path, ExitStack() as running:
@@ -241,7 +245,7 @@ def try_messages(requests: int, publications: int, seed: int, senders: int = 2) 
                 )
         ((_, longest),) = client.ask("stop")
         check(
-            longest < 0.5,
+            longest < most,
             f"while nonsense was sent, an edit of another client took {longest:.2f} s: "
             f"{[told for told in client.told if 'slow' in told]}",
         )
@@ -397,7 +401,7 @@ def try_edits(edits: int, clients: int, seed: int, how: str = "") -> dict[str, i
         return dict(found)
 
 
-def try_freezing(seconds: float, seed: int) -> dict[str, int]:
+def try_freezing(seconds: float, seed: int, most: float = HELD_UP) -> dict[str, int]:
     """Let a client, which has slow hooks, and then the server stand still: others go on, and all catch up."""
     found: dict[str, int] = {}
     with folder() as path, ExitStack() as running:
@@ -413,11 +417,11 @@ def try_freezing(seconds: float, seed: int) -> dict[str, int]:
         ((_, longest), *_) = other.ask("longest")
         frozen.thaw()
         found["longest of others ms"] = round(1e3 * longest)
-        check(longest < 0.5, f"while a client stood still, an edit of another took {longest:.2f} s")
+        check(longest < most, f"while a client stood still, an edit of another took {longest:.2f} s")
         _wait_for_edits(*clients)
         server.freeze()
         begin_time = time.monotonic()
-        wait_until(lambda: not other.ask("online"), seconds, "a client that notices a frozen server")
+        wait_until(lambda: not other.ask("online"), LONG, "a client that notices a frozen server")
         found["noticed after ms"] = round(1e3 * (time.monotonic() - begin_time))
         check(min(other.ask("read")) > 0, "there is nothing to read")
         time.sleep(max(0.0, seconds - (time.monotonic() - begin_time)))
