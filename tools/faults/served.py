@@ -18,6 +18,19 @@ def jump(seed: int) -> None:
     time.time = lambda: clock() + chance.choice((0, -3.2e7, 3.2e7, chance.uniform(-100, 100)))
 
 
+def answer_late() -> None:
+    """Wait between what is stored and its answer, so that many are killed there."""
+    from kineverse.exchange.transport import Question
+
+    answer = Question.answer
+
+    def wait_and_answer(self: Question, payload: bytes) -> None:
+        time.sleep(random.uniform(0, 0.01))
+        answer(self, payload)
+
+    Question.answer = wait_and_answer  # type: ignore[method-assign]
+
+
 def set_limit(size: int) -> None:
     """Let all files have at most a size [byte]; 0: any size."""
     import resource
@@ -30,6 +43,8 @@ def main() -> None:
     path, how = Path(sys.argv[1]), sys.argv[2:]
     if "jump" in how:
         jump(1)
+    if "late" in how:
+        answer_late()
     from kineverse.exchange.server import serve
     from kineverse.formats import document_hash
 

@@ -102,6 +102,8 @@ def check_store(path: Path, clients: Iterable[Process], killed: int = 0) -> tupl
                 check(told["chain"] in log.added, f"{told['chain']} was acknowledged, and was not added")
             elif told.get("removed") == "made":
                 check(told["chain"] in log.removed, f"{told['chain']} was acknowledged, and is there")
+            elif told.get("added") in ("conflict", "failed"):
+                check(told["chain"] not in log.added, f"{told['chain']} was refused, and was added")
             counts |= "counted" in told
             made += told.get("counted") == "made"
             unknown += told.get("counted") == "unknown"
@@ -178,7 +180,7 @@ def try_kills(rounds: int, seed: int, processes: int = 3) -> dict[str, int]:
                     clients.append(_start_client(running, f"{seed}.{found['servers']}", name))
                 server.kill()
                 killed = time.monotonic()
-                server = start(running, "served", store)
+                server = start(running, "served", store, random.choice(("", "late")))
                 _wait_for_edits(*clients, all_of_them=False)
                 found["longest ms"] = max(found["longest ms"], round(1e3 * (time.monotonic() - killed)))
                 found["servers"] += 1
