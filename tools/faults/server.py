@@ -171,16 +171,17 @@ def try_kills(rounds: int, seed: int, processes: int = 3) -> dict[str, int]:
             server = start(running, "served", store)
             clients = [_start_client(running, f"{seed}.{found['servers']}", k) for k in range(processes)]
             gone: list[Process] = []
-            for _ in range(min(ROUNDS_TOGETHER, rounds - found["servers"])):
+            for number in range(min(ROUNDS_TOGETHER, rounds - found["servers"])):
                 time.sleep(random.uniform(0, 0.8))
-                if random.random() < 0.4:
+                if number % 2 == 0:
                     clients[0].kill()
                     gone.append(clients.pop(0))
-                    name = processes + len(gone)
-                    clients.append(_start_client(running, f"{seed}.{found['servers']}", name))
+                    clients.append(
+                        _start_client(running, f"{seed}.{found['servers']}", processes + len(gone))
+                    )
                 server.kill()
                 killed = time.monotonic()
-                server = start(running, "served", store, random.choice(("", "late")))
+                server = start(running, "served", store, ("late", "")[number % 2])
                 _wait_for_edits(*clients, all_of_them=False)
                 found["longest ms"] = max(found["longest ms"], round(1e3 * (time.monotonic() - killed)))
                 found["servers"] += 1
