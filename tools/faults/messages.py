@@ -193,9 +193,7 @@ class Sender:
             key, data = self.make_request(random)
             begin = time.monotonic()
             try:
-                answer: object = protocol.decode_answer(
-                    self.transport.ask(f"kineverse/{NAME}/{key}", data, TOO_LATE)
-                )
+                answer = self._ask(key, data)
             except (NoAnswerError, kv.errors.FormatError):
                 tell(violation=f"{number} of {seed} to {key}: {traceback.format_exc()} {data[:5000].hex()}")
                 return
@@ -208,6 +206,19 @@ class Sender:
                 tell(violation=f"{number} of {seed} to {key}: {answer} {data[:5000].hex()}")
                 return
 
+    def _ask(self, key: str, data: bytes) -> protocol.Answer:
+        """Return an answer, asked for again if the connection was lost, as clients do."""
+        late = time.monotonic() + TOO_LATE
+        while True:
+            try:
+                answer = self.transport.ask(f"kineverse/{NAME}/{key}", data, TOO_LATE)
+                return protocol.decode_answer(answer)
+            except NoAnswerError:
+                self.outcomes["asked again"] += 1
+                if time.monotonic() > late:
+                    raise
+                time.sleep(0.01)
+
     def publish(self, count: int) -> None:
         """Publish mutated commits and signs of life to the clients of the server."""
         random = Random(self.seed)
@@ -217,9 +228,7 @@ class Sender:
             self.outcomes[end] += 1
             if number % 10 == 0:
                 status = protocol.encode(protocol.GetStatus())
-                found: Any = protocol.decode_answer(
-                    self.transport.ask(f"kineverse/{NAME}/ask", status, TOO_LATE)
-                )
+                found: Any = self._ask("ask", status)
                 revision = found.revision
             if end != "beat" and random.random() < 0.8:  # as the next commit, or all will leave it out
                 tree = _open(msgspec.msgpack.decode(data))
