@@ -493,14 +493,13 @@ class Server:
                     self._present.add(client)
                 else:
                     self._present.discard(client)
-                    self._forget(client)
 
     def _forget_absent(self) -> None:
-        """Forget those who have asked without a sign of life, or ended before they were answered."""
+        """Forget those without a sign of life at two beats; it may come after a question, or be lost shortly."""
         with self._lock:
             sources = {source.client for source in self._sources.values()}
             absent = {*self._clients, *self._backups, *sources} - self._present
-            for client in absent & self._absent:  # a sign may come after a question
+            for client in absent & self._absent:
                 self._forget(client)
             self._absent = absent
 
