@@ -495,7 +495,7 @@ class Server:
                     self._present.discard(client)
 
     def _forget_absent(self) -> None:
-        """Forget those without a sign of life at two beats; it may come after a question, or be lost shortly."""
+        """Forget those without a sign of life at two beats: it may come late, or be lost shortly."""
         with self._lock:
             sources = {source.client for source in self._sources.values()}
             absent = {*self._clients, *self._backups, *sources} - self._present
