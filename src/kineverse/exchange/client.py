@@ -14,6 +14,8 @@ from contextlib import AbstractContextManager, contextmanager
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
+from msgspec.structs import replace
+
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
 from kineverse._version import __version__
 from kineverse.errors import ConflictError, EditError, OfflineError
@@ -163,8 +165,21 @@ class LiveModel(Model):
             except ConflictError as error:
                 if not left:
                     raise
-                self.wait(error.revision)
+                self.exchange.wait_to_follow(error.revision)
         raise AssertionError
+
+    def adopt(self, changes: NetChanges) -> None:
+        """Make the net changes of an edit of an equal model, in an edit that the server is asked for.
+
+        Operations that read what they change, and are not among them, are run again.
+
+        Raises
+        ------
+        EditError, OfflineError
+            As :meth:`edit`; also if the changes do not belong to this model.
+        """
+        with self.edit() as edit:
+            edit.adopt(changes)
 
     def undo(self, revision: int) -> None:
         """Take back the commit of a revision, also one from before this process has joined.
@@ -173,10 +188,18 @@ class LiveModel(Model):
         ------
         ConflictError
             If a later commit has changed what it would change.
+        EditError
+            If there is no such revision, or this thread edits the model.
+        OfflineError
+            If the server is away.
         """
         connection = self.exchange
-        number = connection.next_number()
         wanted = as_count("revision", revision, 1)
+        if wanted > protocol.MAX_REVISION:
+            raise EditError(f"There is no revision {wanted}; the model is at revision {self.version}.")
+        self._check_not_edited()
+        connection.check_online()
+        number = connection.next_number()
         self._finish_edit(
             connection.ask_edit(protocol.UndoRequest(connection.client, number, connection.who, wanted))
         )
@@ -185,17 +208,27 @@ class LiveModel(Model):
         """Wait until the model is at a version or a later one; False if it is not after a time [s].
 
         A listener is called after the model has its version, so hooks of that version may still run.
+
+        Raises
+        ------
+        EditError
+            If this thread edits the model.
+        OfflineError
+            If the connection was closed, or is meanwhile, and the model does not have the version.
         """
-        wanted = as_count("version", version, 0)
-        if self._edit is not None and self._lock.acquire(blocking=False):  # this thread edits
-            self._lock.release()
-            raise EditError("A model gets no commits while it is edited: wait after the edit.")
-        if self._wish.is_part and self.exchange.is_online and self.exchange.revision < wanted:
-            self._close_gap()  # the commits may be none of its
-        return self.exchange.wait_for(
-            lambda: self.exchange.revision >= wanted,
+        wanted, connection = as_count("version", version, 0), self.exchange
+        self._check_not_edited()
+        if connection.revision < wanted:
+            connection.check_open()
+            if self._wish.is_part and connection.is_online:
+                self._close_gap()  # the commits may be none of its
+        is_over = connection.wait_for(
+            lambda: connection.revision >= wanted or connection.is_closed,
             None if timeout is None else as_tolerance(timeout, "A timeout"),
         )
+        if connection.revision < wanted:
+            connection.check_open()
+        return is_over
 
     def close(self) -> None:
         """End the connection; reading goes on. A second call has no effect, and a script need not call it."""
@@ -206,6 +239,12 @@ class LiveModel(Model):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _check_not_edited(self) -> None:
+        """Raise an EditError if this thread edits the model, which gets no commits meanwhile."""
+        if self._edit is not None and self._lock.acquire(blocking=False):
+            self._lock.release()
+            raise EditError("A model gets no commits while it is edited: do that after the edit.")
 
     @contextmanager
     def _ask_for_edit(self, strict: bool) -> Iterator[Edit]:
@@ -342,7 +381,7 @@ class LiveModel(Model):
     def _join_again(self) -> None:
         """Take the model anew, as one commit, if the server does not know the state that this one is in."""
         connection = self.exchange
-        joined = connection.join(self._wish)
+        joined = connection.join(replace(self._wish, again=True))
         self._adopt(_find_changes(self._history.sequence, _entries(joined)), joined.revision)
         if joined.view != self._view:
             self._view = joined.view
@@ -455,7 +494,7 @@ def _call_hooks(deliveries: SimpleQueue[bool], model: weakref.ref[LiveModel]) ->
         target = model()
         if target is None:
             return
-        target._listeners.deliver()
+        target._listeners.deliver(BaseException)  # sys.exit() would end this thread, and nobody would know
         del target
 
 

@@ -18,8 +18,14 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from kineverse._checks import as_count
-from kineverse.errors import DuplicateNameError, FormatError, OfflineError, UnknownNameError
+from kineverse._checks import as_count, finite_number
+from kineverse.errors import (
+    DuplicateNameError,
+    FormatError,
+    InvalidValueError,
+    OfflineError,
+    UnknownNameError,
+)
 from kineverse.symbols import Symbol
 
 from . import protocol
@@ -27,7 +33,7 @@ from .address import Address
 from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
-from .transport import NoAnswerError, Transport
+from .transport import NoAnswerError, Transport, check_process
 
 PATIENCE = 10.0
 """Time that an edit waits for a server that went away, before it is given up [s]."""
@@ -158,9 +164,12 @@ class Connection:
         DuplicateNameError
             If another process of this computer sends under the same name.
         InvalidValueError
-            If a source cannot have that name.
+            If a source cannot have that name, or the offset is not a finite number.
         """
         self.check_online()
+        seconds = finite_number(offset)
+        if seconds is None:
+            raise InvalidValueError(f"The offset of a source is a time in seconds, not {offset!r}.")
         publisher = StatePublisher(
             self.address.name,
             source,
@@ -169,8 +178,12 @@ class Connection:
             direct=not self.address.endpoint,
             announce=self._announce,
         )
-        self._publishers.append((publisher, offset))
-        self._announce(publisher)
+        self._publishers.append((publisher, seconds))
+        try:
+            self._announce(publisher)
+        except BaseException:
+            publisher.close()
+            raise
         return publisher
 
     def reader(self, coordinates: Iterable[Symbol | str] = ()) -> StateReader:
@@ -213,12 +226,12 @@ class Connection:
             self._heard, self._settled = beat.epoch, now + _SETTLING
         kept = [] if now > self._settled else [one for one in self.sources if one.source not in listed]
         self.sources = (*kept, *beat.sources)
-        for publisher, _ in list(self._publishers):
-            if publisher.source not in listed:
-                self._announce(publisher)
         self._readers = [reader for reader in self._readers if not reader.is_closed]
         for reader in self._readers:
             reader.follow(self.sources)
+        for publisher, _ in list(self._publishers):
+            if publisher.source not in listed:
+                self._announce(publisher)
 
     # -- for the live model --------------------------------------------------------------------------------
 
@@ -236,10 +249,17 @@ class Connection:
         """Return the number of a new edit of this client."""
         return next(self._numbers)
 
+    def check_open(self) -> None:
+        """Raise an OfflineError if the connection was closed, or is that of the parent of a fork."""
+        check_process()
+        if self.is_closed:
+            raise OfflineError(
+                f"The connection to {self.address} was closed, or its model was not kept; load it again."
+            )
+
     def check_online(self) -> None:
         """Raise an OfflineError if the server is away."""
-        if self.is_closed:
-            raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+        self.check_open()
         if not self.is_online:
             raise OfflineError(
                 f"The server of {self.address} is away. The model can be read, and edited when it is back."
@@ -296,6 +316,10 @@ class Connection:
         with self._changed:
             return self._changed.wait_for(is_done, timeout)
 
+    def wait_to_follow(self, revision: int) -> None:
+        """Wait until the model is at a revision, as long as the server is there."""
+        self.wait_for(lambda: self.revision >= revision or not self.is_online, None)
+
     def ask(self, request: protocol.Request, kind: type[A], timeout: float = _ASK_TIMEOUT) -> A:
         """Ask once and return the answer, which is of a kind.
 
@@ -338,8 +362,7 @@ class Connection:
             raise refusal_error(answer, self.address)
 
     def _ask(self, request: protocol.Request, timeout: float) -> protocol.Answer:
-        if self.is_closed:
-            raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+        self.check_open()
         changes_model = isinstance(request, (protocol.EditRequest, protocol.UndoRequest))
         data = protocol.encode(request)
         if len(data) > protocol.MAX_BYTES:

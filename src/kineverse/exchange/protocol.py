@@ -27,7 +27,8 @@ MAX_LISTED: Final = 10_000
 Id: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{32}$", max_length=32)]
 Name: TypeAlias = Annotated[str, Meta(min_length=1, max_length=4096)]
 Text: TypeAlias = Annotated[str, Meta(max_length=1 << 16)]
-Revision: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
+MAX_REVISION: Final = (1 << 62) - 1
+Revision: TypeAlias = Annotated[int, Meta(ge=0, le=MAX_REVISION)]
 Number: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
 Seconds: TypeAlias = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Chain: TypeAlias = Annotated[bytes, Meta(min_length=32, max_length=32)]
@@ -134,7 +135,10 @@ class UndoRequest(_Message, frozen=True, tag="undo"):
 
 
 class JoinRequest(_Message, frozen=True, tag="join"):
-    """Ask for the model, or for the part of it that frames and symbols need."""
+    """Ask for the model, or for the part of it that frames and symbols need.
+
+    One who has had the part, ``again``, gets what is left of it; otherwise unknown names are refused.
+    """
 
     protocol: int
     library: Text  # version of Kineverse
@@ -144,6 +148,7 @@ class JoinRequest(_Message, frozen=True, tag="join"):
     symbols: tuple[Text, ...] = ()
     bodies: bool = True
     is_part: bool = False
+    again: bool = False
 
 
 class Since(_Message, frozen=True, tag="since"):
@@ -164,7 +169,7 @@ class GetHistory(_Message, frozen=True, tag="history"):
     """Ask for the last commits, newest first, from a revision on backwards."""
 
     most: Annotated[int, Meta(ge=1, le=MAX_LISTED)] = 20
-    before: Revision = (1 << 62) - 1
+    before: Revision = MAX_REVISION
 
 
 class GetFile(_Message, frozen=True, tag="file"):

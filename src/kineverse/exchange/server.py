@@ -262,10 +262,11 @@ class Server:
         self._note_time("answer", begin)
 
     def _begin_again(self) -> None:
-        """Follow a model that was loaded again from its store: parts are asked for anew."""
-        self._views, self._logs = Views(self._authority.model), {}
-        self._token.close()
+        """Follow a model that was loaded again from its store: parts are asked for anew, and clients join."""
+        self._views, self._logs, self._clients = Views(self._authority.model), {}, {}
+        before = self._token
         self._token = self._transport.alive(self._key(f"alive/{self._authority.epoch}"))
+        before.close()  # later, so that clients do not take the server for gone
 
     def _follow_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
         try:
@@ -358,7 +359,7 @@ class Server:
         authority = self._authority
         with self._lock:
             if join.is_part:
-                view = self._views.add(Wish(join.frames, join.symbols, join.bodies))
+                view = self._views.add(Wish(join.frames, join.symbols, join.bodies), again=join.again)
                 entries, part = view.entries, view.id
                 link = self._logs.setdefault(part, _ViewLog(authority.revision)).link
             else:

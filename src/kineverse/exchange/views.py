@@ -405,14 +405,16 @@ class Views:
         """Return the view of an identifier, if it is followed."""
         return self._views.get(view)
 
-    def add(self, wish: Wish) -> View:
+    def add(self, wish: Wish, *, again: bool = False) -> View:
         """Return the view of a wish; equal wishes share one. Each user releases it at the end.
 
-        Unknown names are refused as by :meth:`Wish.check`, unless others follow this view already.
+        Unknown names are refused as by :meth:`Wish.check`, unless others follow this view already, or one
+        asks for it ``again``.
         """
         known = self._views.get(wish.id)
         if known is None:
-            wish.check(self._model)
+            if not again:
+                wish.check(self._model)
             known = self._views[wish.id] = View(self._model, self._coupling, wish)
         known.users += 1
         return known
