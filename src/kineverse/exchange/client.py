@@ -99,6 +99,8 @@ class LiveModel(Model):
         self._following = threading.RLock()
         self._deliveries: SimpleQueue[bool] = SimpleQueue()
         self._announced = 0  # last revision that concerns this model, as the last sign of life had it
+        # The last revision that was adopted, and its digest; later ones concern nothing of a part.
+        self._last, self._link = 0, b""
         log = None if wish.is_part else connection.transport.subscribe(connection.key("log"))
         try:
             joined = connection.join(wish)
@@ -218,6 +220,8 @@ class LiveModel(Model):
         self._check_not_edited()
         if connection.revision < wanted:
             connection.check_open()
+            if self._wish.is_part and connection.is_online:
+                self._close_gap()  # the commits may be none of its
         is_over = connection.wait_for(
             lambda: connection.revision >= wanted or connection.is_closed,
             None if timeout is None else as_tolerance(timeout, "A timeout"),
@@ -300,7 +304,7 @@ class LiveModel(Model):
 
     def _start(self, log: Channel | None, joined: protocol.Joined) -> None:
         connection, model = self.exchange, weakref.ref(self)
-        connection.accept(joined)
+        self._accept(joined)
         self._view = joined.view
         transport = connection.transport
         self._pump(log or transport.subscribe(connection.key(f"view/{joined.view}")), LiveModel._receive)
@@ -326,15 +330,15 @@ class LiveModel(Model):
         commit = protocol.decode_commit(published.commit)
         with self._following:
             connection = self.exchange
-            if published.epoch != connection.epoch or commit.previous > connection.revision:
+            if published.epoch != connection.epoch or commit.previous > self._last:
                 self._close_gap()
-            elif commit.revision > connection.revision:
+            elif commit.revision > self._last:
                 self._adopt_commit(published, commit)
 
     def _adopt_commit(self, published: protocol.Published, commit: protocol.CommitMessage) -> None:
         connection = self.exchange
-        is_whole = not self._wish.is_part
-        if is_whole and protocol.chain(connection.chain, published.commit) != published.chain:
+        link = protocol.chain(self._link, published.commit)
+        if link != (published.link if self._wish.is_part else published.chain):
             self._join_again()
             return
         try:
@@ -343,6 +347,7 @@ class LiveModel(Model):
             _LOG.exception("A commit of %s cannot be adopted; its model is joined again.", connection.address)
             self._join_again()
             return
+        self._last, self._link = commit.revision, link
         connection.advance(commit.revision, published.chain)
 
     def _close_gap(self) -> None:
@@ -352,15 +357,15 @@ class LiveModel(Model):
             while True:
                 try:
                     answer = connection.ask_missed(self._view)
+                    if answer is None:
+                        self._join_again()
+                        return
                 except OfflineError:
                     return  # when the server is back, it says so
-                if answer is None:
-                    self._join_again()
-                    return
                 connection.epoch = answer.epoch
                 for published in answer.commits:
                     commit = protocol.decode_commit(published.commit)
-                    if commit.revision > connection.revision:
+                    if commit.revision > self._last:
                         self._adopt_commit(published, commit)
                 if connection.revision >= answer.revision or not answer.commits:
                     break
@@ -383,20 +388,26 @@ class LiveModel(Model):
             self._pump(
                 connection.transport.subscribe(connection.key(f"view/{joined.view}")), LiveModel._receive
             )
-        connection.accept(joined)
+        self._accept(joined)
+
+    def _accept(self, joined: protocol.Joined) -> None:
+        """Take over where the model is that the server has sent."""
+        self._last = joined.revision
+        self._link = joined.link if self._wish.is_part else joined.chain
+        self.exchange.accept(joined)
 
     def _hear(self, data: bytes) -> None:
         """Note a sign of life: what it tells of and has not come until the next one was lost."""
         beat = protocol.decode_beat(data)
         connection = self.exchange
         with self._following:
-            last = beat.views.get(self._view, 0) if self._wish.is_part else beat.revision
-            is_forgotten = self._wish.is_part and self._view not in beat.views
-            if beat.epoch != connection.epoch or connection.revision < self._announced or is_forgotten:
+            last = beat.views.get(self._view) if self._wish.is_part else beat.revision
+            is_lost = last is None or connection.revision > beat.revision  # to the server, or to a false sign
+            if beat.epoch != connection.epoch or is_lost or self._last < self._announced:
                 self._close_gap()
-            elif self._wish.is_part and last <= connection.revision < beat.revision:
+            elif last is not None and last <= self._last and connection.revision < beat.revision:
                 self._pass_by(beat.revision, beat.chain)
-            self._announced = last
+            self._announced = last or 0
         connection.hear(beat)
 
     def _notice(self, sign: tuple[str, bool]) -> None:

@@ -32,6 +32,7 @@ Revision: TypeAlias = Annotated[int, Meta(ge=0, le=MAX_REVISION)]
 Number: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
 Seconds: TypeAlias = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Chain: TypeAlias = Annotated[bytes, Meta(min_length=32, max_length=32)]
+Link: TypeAlias = Annotated[bytes, Meta(max_length=32)]
 Sha256: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", max_length=64)]
 Tags: TypeAlias = Annotated[tuple[Name, ...], Meta(max_length=MAX_OPERATIONS)]
 
@@ -94,11 +95,15 @@ class CommitMessage(_Message, frozen=True):
 
 
 class Published(_Message, frozen=True):
-    """Commit as bytes with the digest of all commits up to it, and the run of the server that made it."""
+    """Commit as bytes with the digest of all commits up to it, and the run of the server that made it.
+
+    ``link`` is the digest of the commits of a part up to this one, since it is followed; empty for the whole.
+    """
 
     epoch: Id
     chain: Chain
     commit: bytes
+    link: Link = b""
 
 
 # -- requests ------------------------------------------------------------------------------------------------
@@ -231,7 +236,7 @@ class Refused(_Message, frozen=True, tag="refused"):
 
 
 class Joined(_Message, frozen=True, tag="joined"):
-    """The model or a part of it, as a document in msgpack; ``view`` is the id of the part."""
+    """The model or a part of it, as a document in msgpack; ``view`` and ``link`` identify the part."""
 
     name: str
     library: Text
@@ -241,6 +246,7 @@ class Joined(_Message, frozen=True, tag="joined"):
     view: str
     document: bytes
     files: tuple[MeshContent, ...] = ()
+    link: Link = b""
 
 
 class Missed(_Message, frozen=True, tag="missed"):

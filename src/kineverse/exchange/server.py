@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
@@ -158,8 +158,10 @@ class Server:
         self._sources: dict[str, protocol.SourceStatus] = {}
         self._backups: dict[str, TemporaryDirectory[str]] = {}
         self._clients: dict[str, _Client] = {}
+        self._present: set[str] = set()  # clients whose signs of life are there
+        self._absent: set[str] = set()  # those that were not, at the last beat
         self._refusals: deque[protocol.Refusal] = deque(maxlen=_KEPT_REFUSALS)
-        self._times: dict[str, deque[float]] = {}
+        self._times: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_KEPT_TIMES))
         self._accepted: deque[float] = deque(maxlen=100_000)
         self._edits = 0
         self._lock = threading.RLock()  # of the model, the views and the lists above
@@ -245,7 +247,7 @@ class Server:
                 published = [result.published for result in results if result.published is not None]
                 if self._authority.epoch != epoch:
                     self._begin_again()
-                for_parts = self._commit_views(results)
+                for_parts = self._follow_views(results)
         except Exception as error:  # a defect of this package must not end the server
             _LOG.exception("Edits could not be processed.")
             for request in requests:
@@ -270,6 +272,14 @@ class Server:
         self._token = self._transport.alive(self._key(f"alive/{self._authority.epoch}"))
         before.close()  # later, so that clients do not take the server for gone
 
+    def _follow_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
+        try:
+            return self._commit_views(results)
+        except Exception:  # a defect of this package; the edits are made, and clients of parts join again
+            _LOG.exception("Parts of the model could not follow it.")
+            self._views, self._logs = Views(self._authority.model), {}
+            return []
+
     def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
         """Return the commits of parts, by the ids of their views."""
         made = [result.watched for result in results if result.watched is not None]
@@ -284,25 +294,23 @@ class Server:
             commit = protocol.CommitMessage(
                 last.revision, log.last, last.client, last.number, last.who, last.time, changes, files
             )
-            published = protocol.Published(authority.epoch, authority.chain, protocol.encode(commit))
-            log.add(last.revision, published)
-            commits.append((view.id, published))
+            commits.append((view.id, log.add(authority.epoch, authority.chain, commit)))
         return commits
 
     def _note(self, edit: protocol.ChangeRequest, result: Result) -> None:
         now = time.time()
         with self._lock:
             for stage, seconds in result.seconds.items():
-                self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(seconds)
+                self._times[stage].append(seconds)
             if isinstance(result.answer, protocol.Refused):
                 self._refusals.append(protocol.Refusal(now, edit.who, result.answer.message))
                 _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
             elif result.published is not None:
                 self._edits += 1
-                self._accepted.append(now)
+                self._accepted.append(time.monotonic())
 
     def _note_time(self, stage: str, begin: float) -> None:
-        self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(time.perf_counter() - begin)
+        self._times[stage].append(time.perf_counter() - begin)
 
     def _refuse(self, request: Question, reason: protocol.Reason, error: Exception) -> None:
         request.answer(protocol.encode(protocol.Refused(reason, str(error)[:_LONGEST_MESSAGE])))
@@ -357,16 +365,16 @@ class Server:
             if join.is_part:
                 view = self._views.add(Wish(join.frames, join.symbols, join.bodies), again=join.again)
                 entries, part = view.entries, view.id
-                self._logs.setdefault(part, _ViewLog(authority.revision))
+                link = self._logs.setdefault(part, _ViewLog(authority.revision)).link
             else:
-                view, entries, part = None, tuple(authority.model.history.sequence), ""
+                view, entries, part, link = None, tuple(authority.model.history.sequence), "", b""
             revision, chain, epoch = authority.revision, authority.chain, authority.epoch
             self._forget_client(join.client)
             self._clients[join.client] = _Client(join.who, view, revision)
         files = self._files.find(entries)
         # Without folders, which are of no use elsewhere.
         document = pack_document([entry_to_bytes(entry, entries) for entry in entries])
-        return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files)
+        return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files, link)
 
     def _list_missed(self, since: protocol.Since) -> protocol.Answer:
         authority = self._authority
@@ -374,7 +382,8 @@ class Server:
             epoch, revision, chain = authority.epoch, authority.revision, authority.chain
             if since.view:
                 log = self._logs.get(since.view) if since.client in self._clients else None
-                found = None if log is None else log.find_after(since.revision)
+                is_known = authority.knows(since.revision, since.chain)
+                found = log.find_after(since.revision) if log is not None and is_known else None
             else:
                 stored = self._store.commits_after(since.revision, since.chain, _MOST_MISSED)
                 found = (
@@ -409,7 +418,7 @@ class Server:
                 operations=len(authority.model.history.sequence),
                 frames=len(authority.model.frames),
                 edits=self._edits,
-                rate=sum(now - then < _MINUTE for then in self._accepted) / _MINUTE,
+                rate=sum(ticks - then < _MINUTE for then in self._accepted) / _MINUTE,
                 stages=tuple(
                     protocol.StageTime(name, float(middle), float(high)) for name, (middle, high) in stages
                 ),
@@ -484,13 +493,26 @@ class Server:
     def _watch_clients(self, presence: Iterable[tuple[str, bool]]) -> None:
         for key, is_there in presence:
             client = key.rpartition("/")[2]
-            if is_there:
-                continue  # it is known once it has joined
             with self._lock:
-                self._forget_client(client)
-                self._drop_backup(client)
-                for name in [s.source for s in self._sources.values() if s.client == client]:
-                    del self._sources[name]
+                if is_there:
+                    self._present.add(client)
+                else:
+                    self._present.discard(client)
+
+    def _forget_absent(self) -> None:
+        """Forget those without a sign of life at two beats: it may come late, or be lost shortly."""
+        with self._lock:
+            sources = {source.client for source in self._sources.values()}
+            absent = {*self._clients, *self._backups, *sources} - self._present
+            for client in absent & self._absent:
+                self._forget(client)
+            self._absent = absent
+
+    def _forget(self, client: str) -> None:
+        self._forget_client(client)
+        self._drop_backup(client)
+        for name in [s.source for s in self._sources.values() if s.client == client]:
+            del self._sources[name]
 
     def _forget_client(self, client: str) -> None:
         known = self._clients.pop(client, None)
@@ -509,6 +531,7 @@ class Server:
 
     def _beat(self) -> None:
         while not self._closed.wait(BEAT):
+            self._forget_absent()
             self._publish_beat()
 
     def _publish_beat(self) -> None:
@@ -549,14 +572,18 @@ class _ViewLog:
 
     def __init__(self, revision: int) -> None:
         self._begin = self.last = revision
+        self.link = protocol.NO_CHAIN
         self._commits: deque[tuple[int, protocol.Published]] = deque()
 
-    def add(self, revision: int, published: protocol.Published) -> None:
-        """Add a commit, and forget the oldest if there are many."""
-        self._commits.append((revision, published))
-        self.last = revision
+    def add(self, epoch: str, chain: bytes, commit: protocol.CommitMessage) -> protocol.Published:
+        """Add a commit, forget the oldest if there are many, and return what is published."""
+        data = protocol.encode(commit)
+        self.last, self.link = commit.revision, protocol.chain(self.link, data)
+        published = protocol.Published(epoch, chain, data, self.link)
+        self._commits.append((commit.revision, published))
         if len(self._commits) > _MOST_MISSED:
             self._begin = self._commits.popleft()[0]
+        return published
 
     def find_after(self, revision: int) -> list[protocol.Published] | None:
         """Return the commits after a revision; None if some of them are forgotten."""

@@ -422,8 +422,8 @@ class Views:
     def release(self, view: View) -> None:
         """Follow a view no longer for one of its users."""
         view.users -= 1
-        if view.users <= 0:
-            self._views.pop(view.id, None)
+        if view.users <= 0 and self._views.get(view.id) is view:
+            del self._views[view.id]
 
     def commit(self, *diffs: Diff) -> list[tuple[View, Changes]]:
         """Return the views that commits have changed, each with the changes for its replicas.
