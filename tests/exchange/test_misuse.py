@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -270,7 +271,10 @@ def test_arguments_of_another_kind_are_one_error(server: Server, load: Callable[
 def test_a_source_whose_model_is_gone_says_so(server: Server, sockets: Path) -> None:
     model = kv.load("live:home")
     source = model.exchange.publisher("encoders", ["hinge"])
+    gone, connection = weakref.ref(model), model.exchange
     del model
-    gc.collect()
+    gc.collect()  # a thread that follows the server may still have it for a moment
+    assert connection.wait_for(lambda: connection.is_closed, LONG)
+    assert gone() is None
     with pytest.raises(kv.errors.OfflineError, match="was closed"):
         source.put([0.5])
