@@ -33,7 +33,7 @@ from .address import Address
 from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
-from .transport import NoAnswerError, Transport, check_process
+from .transport import NoAnswerError, Transport, check_not_forked
 
 PATIENCE = 10.0
 """Time that an edit waits for a server that went away, before it is given up [s]."""
@@ -252,7 +252,7 @@ class Connection:
 
     def check_open(self) -> None:
         """Raise an OfflineError if the connection was closed, or is that of the parent of a fork."""
-        check_process()
+        check_not_forked()
         if self.is_closed:
             raise OfflineError(
                 f"The connection to {self.address} was closed, or its model was not kept; load it again."
