@@ -269,7 +269,7 @@ def test_arguments_of_another_kind_are_one_error(server: Server, load: Callable[
 
 
 def test_a_source_whose_model_is_gone_says_so(server: Server, sockets: Path) -> None:
-    model = kv.load("live:home")
+    model: Any = kv.load("live:home")
     source = model.exchange.publisher("encoders", ["hinge"])
     gone, connection = weakref.ref(model), model.exchange
     del model
