@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import kineverse as kv
-from kineverse.exchange.protocol import Changes
+from kineverse.exchange.protocol import Changes, decode_changes
 from kineverse.exchange.views import View
-from kineverse.formats.document import from_bytes, operation_from_bytes
-from kineverse.model import NetChanges, PlacedEntry
+from kineverse.formats.document import from_bytes
 
 
 def make_replica(view: View) -> kv.Model:
@@ -18,8 +17,7 @@ def make_replica(view: View) -> kv.Model:
 
 def adopt(replica: kv.Model, changes: Changes) -> None:
     """Make the changes of a view in a replica, as a client does."""
-    put = tuple(PlacedEntry(operation_from_bytes(p.blob), p.after or None, p.at_end) for p in changes.put)
-    replica.adopt(NetChanges(put, changes.replaced, changes.rerun, changes.moved, changes.removed))
+    replica.adopt(decode_changes(changes))
 
 
 def check_agreement(

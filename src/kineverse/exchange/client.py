@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
 from kineverse._version import __version__
 from kineverse.errors import ConflictError, EditError, OfflineError
-from kineverse.formats import entries_from_bytes, entry_to_bytes, operation_from_bytes
+from kineverse.formats import entries_from_bytes
 from kineverse.formats.resources import add_resolver, remove_resolver
 from kineverse.model.changes import find_moved_tags
 from kineverse.model.commits.net_changes import NetChanges, PlacedEntry
@@ -220,18 +220,13 @@ class LiveModel(Model):
             return []
         if self._wish.is_part:
             _check_part(self, changes)
-        sequence = self._history.sequence
-        put = tuple(
-            protocol.Placed(entry_to_bytes(placed.entry, sequence), placed.after or "", placed.at_end)
-            for placed in changes.put
-        )
         return [
             protocol.EditRequest(
                 connection.client,
                 connection.next_number(),
                 connection.who,
                 *connection.position,
-                protocol.Changes(put, changes.replaced, changes.rerun, changes.moved, changes.removed),
+                protocol.encode_changes(changes, self._history.sequence),
                 strict,
                 find_known_files(placed.entry for placed in changes.put),
             )
@@ -299,7 +294,9 @@ class LiveModel(Model):
             self._join_again()
             return
         try:
-            self._adopt(_decode_changes(commit), commit.revision)
+            changes = protocol.decode_changes(commit.changes)
+            put_contents((placed.entry for placed in changes.put), commit.files)
+            self._adopt(changes, commit.revision)
         except Exception:
             _LOG.exception("A commit of %s cannot be adopted; its model is joined again.", connection.address)
             self._join_again()
@@ -413,16 +410,6 @@ def _check_part(model: LiveModel, changes: NetChanges) -> None:
                 f"The edit needs more than this part of the model: {entry.tag!r} reads {missing[0]}. Name it "
                 f"when the part is loaded, or load the whole, {str(model.exchange.address)!r}."
             )
-
-
-def _decode_changes(commit: protocol.CommitMessage) -> NetChanges:
-    changes = commit.changes
-    put = []
-    for placed in changes.put:
-        entry = operation_from_bytes(placed.blob)
-        put.append(PlacedEntry(entry, placed.after or None, placed.at_end))
-    put_contents([placed.entry for placed in put], commit.files)
-    return NetChanges(tuple(put), changes.replaced, changes.rerun, changes.moved, changes.removed)
 
 
 def _pump(channel: Any, model: weakref.ref[LiveModel], method: Callable[[LiveModel, Any], None]) -> None:
