@@ -103,8 +103,8 @@ class Replica:
     def follow(self, results: Sequence[Result]) -> None:
         """Adopt what was published."""
         for result in results:
-            if result.published is not None:
-                self.adopt(result.published.commit)
+            if result.commit is not None:
+                self.adopt(result.commit.published.commit)
 
     def adopt(self, data: bytes) -> None:
         """Adopt one commit."""

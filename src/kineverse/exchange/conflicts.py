@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from kineverse.model.history import History, HistoryEntry, TouchedEntry
 from kineverse.model.operation import Cell
 from kineverse.model.read_recorder import ABSENT, Read, differs
 
+from .protocol import Reason, Refused
+
 KEPT: Final = 10_000
 """Number of revisions that edits may be behind; fewer if they are of more than a million values."""
 _MOST_CELLS: Final = 1_000_000
+_LONGEST_MESSAGE: Final = 1000
 
 # Flags are compared as wholes, because operations on them are slow.
 _WITH_VALUE = (Read.VALUE, Read.EXISTENCE | Read.VALUE)
@@ -26,36 +28,24 @@ _WITH_VALUE = (Read.VALUE, Read.EXISTENCE | Read.VALUE)
 Key = TypeVar("Key", bound=Hashable)
 
 
-@dataclass(frozen=True, slots=True)
-class EditConflict:
-    """Conflict of an edit with a later commit: operation and path, and revision and author of the commit."""
+class RefusedError(Exception):
+    """Edit that is not made, with its answer, whose message is one line."""
 
-    message: str
-    tag: str
-    path: str
-    revision: int
-    who: str
-
-
-class ConflictFoundError(Exception):
-    """Edit in conflict with a later commit."""
-
-    def __init__(self, conflict: EditConflict) -> None:
-        super().__init__(conflict)
-        self.conflict = conflict
-
-
-@dataclass(frozen=True, slots=True)
-class _Commit:
-    chain: bytes
-    who: str
+    def __init__(
+        self, reason: Reason, message: str, tag: str = "", path: str = "", revision: int = 0, who: str = ""
+    ) -> None:
+        super().__init__(message)
+        text = " ".join(message.split())
+        if len(text) > _LONGEST_MESSAGE:
+            text = f"{text[:_LONGEST_MESSAGE]} ..."
+        self.answer = Refused(reason, text, tag, path, revision, who)
 
 
 class Revisions:
     """Last revisions of all that commits have changed and read, since a revision."""
 
     def __init__(self, revision: int, chain: bytes) -> None:
-        self._commits = {revision: _Commit(chain, "")}
+        self._commits = {revision: (chain, "")}  # with the author
         self._tags: OrderedDict[str, int] = OrderedDict()
         self._moves: OrderedDict[str, int] = OrderedDict()
         self._values: OrderedDict[Cell, int] = OrderedDict()
@@ -72,13 +62,11 @@ class Revisions:
 
     def chain_at(self, revision: int) -> bytes | None:
         """Return the digest of all commits up to a revision; None if it is not known."""
-        commit = self._commits.get(revision)
-        return None if commit is None else commit.chain
+        return self._commits[revision][0] if revision in self._commits else None
 
     def who_made(self, revision: int) -> str:
         """Return who made a commit, empty if that is not known."""
-        commit = self._commits.get(revision)
-        return "" if commit is None else commit.who
+        return self._commits[revision][1] if revision in self._commits else ""
 
     def last_change(self, tag: str) -> int:
         """Return the last revision that has put, moved or removed an operation; 0 if none is known."""
@@ -92,7 +80,7 @@ class Revisions:
         self, revision: int, chain: bytes, who: str, touched: Iterable[TouchedEntry], history: History
     ) -> None:
         """Note a commit that has just been made, and forget those that are too long ago."""
-        self._commits[revision] = _Commit(chain, who)
+        self._commits[revision] = chain, who
         for before, now, is_given in touched:
             is_moved = before is not None and now is not None and before.place != now.place
             for cell, is_existence in _find_changes(before, now, is_moved, history):
@@ -127,64 +115,58 @@ class Revisions:
             while revisions and next(iter(revisions.values())) <= self.oldest:
                 revisions.popitem(last=False)
 
-    def find_conflict(
+    def check(
         self,
         base: int,
         put: Sequence[HistoryEntry],
         moved: Collection[str],
         removed: Sequence[str],
         history: History,
-    ) -> EditConflict | None:
-        """Return the first conflict of an edit with the commits after its base, a revision.
+    ) -> None:
+        """Raise a RefusedError if an edit is in conflict with a commit after its base, a revision.
 
         ``put`` are the entries that it puts, with what they read; ``moved`` and ``removed`` the tags of those
         that it moves and of others that it removes. ``history`` is that before the edit.
         """
         for tag in (*(entry.tag for entry in put), *removed):
             if self._tags.get(tag, 0) > base:
-                return self.conflict_about(
+                raise self.conflict_about(
                     tag, tag, "has changed" if tag in history.entries else "has removed"
                 )
         for entry in put:
             for cell, how in entry.reads.cells.items():
                 last = (self._values if how in _WITH_VALUE else self._existence).get(cell, 0)
                 if last > base:
-                    return self._conflict(last, entry.tag, "has changed", cell, "reads")
+                    raise self._conflict(last, entry.tag, "has changed", cell, "reads")
             for kind in entry.reads.listings:
                 last = self._names.get(kind, 0)
                 if last > base:
-                    return self._conflict(last, entry.tag, "has changed the names of", (kind, ""), "reads")
+                    raise self._conflict(last, entry.tag, "has changed the names of", (kind, ""), "reads")
         pairs: list[tuple[str, HistoryEntry | None]] = [(entry.tag, entry) for entry in put]
         for tag, now in (*pairs, *((tag, None) for tag in removed)):
             for cell, is_existence in _find_changes(history.entries.get(tag), now, tag in moved, history):
                 last = self._values.get(cell, 0)
                 if last > base:
-                    return self._conflict(last, tag, "has changed", cell, "writes")
+                    raise self._conflict(last, tag, "has changed", cell, "writes")
                 last = max(
                     self._read_values.get(cell, 0),
                     self._read_existence.get(cell, 0) if is_existence else 0,
                     self._listings.get(cell[0], 0) if is_existence else 0,
                 )
                 if last > base:
-                    return self._conflict(last, tag, "reads", cell, "changes")
-        return None
+                    raise self._conflict(last, tag, "reads", cell, "changes")
 
-    def conflict_about(self, tag: str, other: str, what: str) -> EditConflict:
+    def conflict_about(self, tag: str, other: str, what: str) -> RefusedError:
         """Return the conflict of an operation with the last commit of another one, or of itself."""
         revision = self._tags[other]
         who = self.who_made(revision)
-        return EditConflict(
-            f"Revision {revision}, by {who}, {what} the operation {other!r}. Try again.",
-            tag,
-            "",
-            revision,
-            who,
-        )
+        message = f"Revision {revision}, by {who}, {what} the operation {other!r}. Try again."
+        return RefusedError("conflict", message, tag, "", revision, who)
 
-    def _conflict(self, revision: int, tag: str, what: str, cell: Cell, how: str) -> EditConflict:
+    def _conflict(self, revision: int, tag: str, what: str, cell: Cell, how: str) -> RefusedError:
         path, who = "/".join(cell).rstrip("/"), self.who_made(revision)
         message = f"Revision {revision}, by {who}, {what} {path}, which {tag!r} {how}. Try again."
-        return EditConflict(message, tag, path, revision, who)
+        return RefusedError("conflict", message, tag, path, revision, who)
 
 
 def _put(revisions: OrderedDict[Key, int], key: Key, revision: int) -> None:

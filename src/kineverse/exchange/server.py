@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
 import numpy as np
+from msgspec.structs import replace
 
 from kineverse._checks import as_tolerance, check_flag
 from kineverse._version import __version__
@@ -27,7 +28,7 @@ from . import protocol
 from .address import Claim, check_endpoint
 from .authority import Authority, Result
 from .connection import describe_client
-from .meshes import MAX_PART, ServedFiles
+from .meshes import MAX_PART
 from .store import Store
 from .transport import Question, Questions, Transport
 from .views import View, Views, Wish
@@ -98,8 +99,7 @@ def serve(
         chosen = name or kept.name or (path.stem if path else "") or _name_of(given)
         claim = Claim(chosen)
         opened.callback(claim.release)
-        files = ServedFiles(kept)
-        authority = Authority(kept, find_files=files.find, watch=lambda _, diff, commit: (diff, commit))
+        authority = Authority(kept)
         if authority.revision and given:
             _LOG.warning("%s has a model already, which is served. Nothing else is read.", store)
         elif given:
@@ -107,7 +107,7 @@ def serve(
         kept.name = chosen
         transport = Transport.serve([claim.endpoint, *endpoints], claim.secret)
         opened.callback(transport.close)
-        return Server(chosen, authority, kept, files, transport, opened.pop_all())
+        return Server(chosen, authority, kept, transport, opened.pop_all())
 
 
 def _name_of(given: Sequence[Source]) -> str:
@@ -137,17 +137,10 @@ class Server:
     """
 
     def __init__(
-        self,
-        name: str,
-        authority: Authority,
-        store: Store,
-        files: ServedFiles,
-        transport: Transport,
-        opened: ExitStack,
+        self, name: str, authority: Authority, store: Store, transport: Transport, opened: ExitStack
     ) -> None:
         self.name = name
-        self._authority, self._store, self._files, self._transport = authority, store, files, transport
-        self._opened = opened
+        self._authority, self._store, self._transport, self._opened = authority, store, transport, opened
         self._since = time.time()
         self._views = Views(authority.model)
         self._logs: dict[str, _ViewLog] = {}
@@ -238,7 +231,6 @@ class Server:
         try:
             with self._lock:
                 results = self._authority.process(edits)
-                published = [result.published for result in results if result.published is not None]
                 if self._authority.epoch != epoch:
                     self._begin_again()
                 for_parts = self._commit_views(results)
@@ -248,8 +240,8 @@ class Server:
                 self._refuse(request, "failed", error)
             return
         begin = time.perf_counter()
-        for commit in published:
-            self._transport.publish(self._key("log"), protocol.encode(commit))
+        for commit in (result.commit for result in results if result.commit is not None):
+            self._transport.publish(self._key("log"), protocol.encode(commit.published))
         for view, commit in for_parts:
             self._transport.publish(self._key(f"view/{view}"), protocol.encode(commit))
         self._note_time("publish", begin)
@@ -267,18 +259,16 @@ class Server:
 
     def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
         """Return the commits of parts, by the ids of their views."""
-        made = [result.watched for result in results if result.watched is not None]
+        made = [result.commit for result in results if result.commit is not None]
         if not made:
             return []
-        authority, last = self._authority, made[-1][1]
+        authority, last = self._authority, made[-1].message
         commits = []
-        for view, changes in self._views.commit(*(diff for diff, _ in made)):
+        for view, changes in self._views.commit(*(commit.diff for commit in made)):
             log = self._logs[view.id]
             put = {*map(protocol.tag_of, changes.put)}
-            files = self._files.find([entry for entry in view.entries if entry.tag in put])
-            commit = protocol.CommitMessage(
-                last.revision, log.last, last.client, last.number, last.who, last.time, changes, files
-            )
+            files = authority.files.find([entry for entry in view.entries if entry.tag in put])
+            commit = replace(last, previous=log.last, changes=changes, files=files)
             published = protocol.Published(authority.epoch, authority.chain, protocol.encode(commit))
             log.add(last.revision, published)
             commits.append((view.id, published))
@@ -292,7 +282,7 @@ class Server:
             if isinstance(result.answer, protocol.Refused):
                 self._refusals.append(protocol.Refusal(now, edit.who, result.answer.message))
                 _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
-            elif result.published is not None:
+            elif result.commit is not None:
                 self._edits += 1
                 self._accepted.append(now)
 
@@ -329,7 +319,7 @@ class Server:
             case protocol.GetHistory():
                 return self._list_history(question)
             case protocol.GetFile():
-                data = self._files.read(question.sha256, question.offset)
+                data = self._authority.files.read(question.sha256, question.offset)
                 if data is None:
                     return protocol.Refused("unknown", f"There is no file with SHA-256 {question.sha256}.")
                 return protocol.FilePart(data)
@@ -358,7 +348,7 @@ class Server:
             revision, chain, epoch = authority.revision, authority.chain, authority.epoch
             self._forget_client(join.client)
             self._clients[join.client] = _Client(join.who, view, revision)
-        files = self._files.find(entries)
+        files = authority.files.find(entries)
         # Without folders, which are of no use elsewhere.
         document = pack_document([entry_to_bytes(entry, entries) for entry in entries])
         return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files)
