@@ -131,7 +131,7 @@ def view(name):
 def start(role, **streams):
     """Start the process of a role."""
     command = [sys.executable, __file__, role.__name__, f"door-{os.getpid()}", *sys.argv[1:]]
-    return Popen(command, text=True, **streams)
+    return Popen(command, encoding="utf-8", **streams)
 
 
 ROLES = (simulate, estimate_state, estimate_model, plan, view)

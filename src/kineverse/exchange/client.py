@@ -188,6 +188,8 @@ class LiveModel(Model):
         if self._edit is not None and self._lock.acquire(blocking=False):  # this thread edits
             self._lock.release()
             raise EditError("A model gets no commits while it is edited: wait after the edit.")
+        if self._wish.is_part and self.exchange.is_online and self.exchange.revision < wanted:
+            self._close_gap()  # the commits may be none of its
         return self.exchange.wait_for(
             lambda: self.exchange.revision >= wanted,
             None if timeout is None else as_tolerance(timeout, "A timeout"),

@@ -223,7 +223,8 @@ class Transport(_Owner):
             if secret:
                 folder = stack.enter_context(tempfile.TemporaryDirectory())
                 passwords = os.path.join(folder, "users")
-                with open(os.open(passwords, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
+                descriptor = os.open(passwords, os.O_CREAT | os.O_WRONLY, 0o600)
+                with open(descriptor, "w", encoding="utf-8") as file:
                     file.write(f"{_USER}:{secret}\n")
                 settings |= {**_credentials(secret), "transport/auth/usrpwd/dictionary_file": passwords}
             try:
