@@ -380,9 +380,8 @@ def _entries(joined: protocol.Joined) -> list[HistoryEntry]:
 def _find_changes(old: Sequence[HistoryEntry], new: Sequence[HistoryEntry]) -> NetChanges:
     """Return the changes between two sequences; operations that may read what changes are put as well."""
     known = {entry.tag: entry for entry in old}
-    tags = {entry.tag for entry in new}
-    before, after = [tag for tag in known if tag in tags], [entry.tag for entry in new if entry.tag in known]
-    moved = find_moved_tags(before, after)
+    tags = dict.fromkeys(entry.tag for entry in new)
+    moved = find_moved_tags([*known], [*tags])
     put, last = [], None
     for entry in new:
         is_equal = entry.tag in known and known[entry.tag].blob == entry.blob and entry.tag not in moved

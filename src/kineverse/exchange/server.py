@@ -31,7 +31,7 @@ from .connection import describe_client
 from .meshes import MAX_PART
 from .store import Store
 from .transport import Question, Questions, Transport
-from .views import View, Views, Wish
+from .views import MOST_MISSED, View, Views, Wish
 
 _LOG = logging.getLogger(__name__)
 
@@ -45,7 +45,6 @@ STAGES = ("receive", "decode", "check", "fold", "encode", "persist", "publish", 
 """Stages of an edit, in order; their times are in the status."""
 _KEPT_REFUSALS = 20
 _KEPT_TIMES = 1000
-_MOST_MISSED = 1000
 _LONGEST_MESSAGE = 10_000
 _MINUTE = 60.0
 _BACKUP = "store"
@@ -143,7 +142,6 @@ class Server:
         self._authority, self._store, self._transport, self._opened = authority, store, transport, opened
         self._since = time.time()
         self._views = Views(authority.model)
-        self._logs: dict[str, _ViewLog] = {}
         self._sources: dict[str, protocol.SourceStatus] = {}
         self._backups: dict[str, TemporaryDirectory[str]] = {}
         self._clients: dict[str, _Client] = {}
@@ -253,7 +251,7 @@ class Server:
 
     def _begin_again(self) -> None:
         """Follow a model that was loaded again from its store: parts are asked for anew."""
-        self._views, self._logs = Views(self._authority.model), {}
+        self._views = Views(self._authority.model)
         self._token.close()
         self._token = self._transport.alive(self._key(f"alive/{self._authority.epoch}"))
 
@@ -265,12 +263,11 @@ class Server:
         authority, last = self._authority, made[-1].message
         commits = []
         for view, changes in self._views.commit(*(commit.diff for commit in made)):
-            log = self._logs[view.id]
             put = {*map(protocol.tag_of, changes.put)}
             files = authority.files.find([entry for entry in view.entries if entry.tag in put])
-            commit = replace(last, previous=log.last, changes=changes, files=files)
+            commit = replace(last, previous=view.log.last, changes=changes, files=files)
             published = protocol.Published(authority.epoch, authority.chain, protocol.encode(commit))
-            log.add(last.revision, published)
+            view.log.add(last.revision, published)
             commits.append((view.id, published))
         return commits
 
@@ -342,7 +339,6 @@ class Server:
             if join.is_part:
                 view = self._views.add(Wish(join.frames, join.symbols, join.bodies))
                 entries, part = view.entries, view.id
-                self._logs.setdefault(part, _ViewLog(authority.revision))
             else:
                 view, entries, part = None, tuple(authority.model.history.sequence), ""
             revision, chain, epoch = authority.revision, authority.chain, authority.epoch
@@ -358,10 +354,10 @@ class Server:
         with self._lock:
             epoch, revision, chain = authority.epoch, authority.revision, authority.chain
             if since.view:
-                log = self._logs.get(since.view) if since.client in self._clients else None
-                found = None if log is None else log.find_after(since.revision)
+                view = self._views.get(since.view) if since.client in self._clients else None
+                found = None if view is None else view.log.find_after(since.revision)
             else:
-                stored = self._store.commits_after(since.revision, since.chain, _MOST_MISSED)
+                stored = self._store.commits_after(since.revision, since.chain, MOST_MISSED)
                 found = (
                     None
                     if stored is None
@@ -481,8 +477,6 @@ class Server:
         known = self._clients.pop(client, None)
         if known is not None and known.view is not None:
             self._views.release(known.view)
-            if self._views.get(known.view.id) is None:
-                self._logs.pop(known.view.id, None)
 
     def _note_seen(self, messages: Iterable[bytes]) -> None:
         for data in messages:
@@ -503,7 +497,7 @@ class Server:
                 authority.epoch,
                 authority.revision,
                 authority.chain,
-                {view: log.last for view, log in self._logs.items()},
+                {view.id: view.log.last for view in self._views},
                 tuple(self._sources.values()),
             )
         self._transport.publish(self._key("beat"), protocol.encode(beat))
@@ -527,24 +521,3 @@ class _Client:
     def note(self, revision: int) -> None:
         """Note a revision that the client has got."""
         self.revision, self.heard = revision, time.monotonic()
-
-
-class _ViewLog:
-    """Last commits of a part."""
-
-    def __init__(self, revision: int) -> None:
-        self._begin = self.last = revision
-        self._commits: deque[tuple[int, protocol.Published]] = deque()
-
-    def add(self, revision: int, published: protocol.Published) -> None:
-        """Add a commit, and forget the oldest if there are many."""
-        self._commits.append((revision, published))
-        self.last = revision
-        if len(self._commits) > _MOST_MISSED:
-            self._begin = self._commits.popleft()[0]
-
-    def find_after(self, revision: int) -> list[protocol.Published] | None:
-        """Return the commits after a revision; None if some of them are forgotten."""
-        if revision < self._begin:
-            return None
-        return [published for number, published in self._commits if number > revision]
