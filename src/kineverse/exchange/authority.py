@@ -13,6 +13,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from time import perf_counter
 from typing import Final, NamedTuple, TypeAlias
 
@@ -248,12 +249,12 @@ class Authority:
             if is_placed and not placed.at_end and after is not None and after not in put:
                 if after not in entries or after in gone:
                     raise self._missing_error(tag, after, base)
-                if self._revisions.last_move(after) > base:
+                if self._revisions.last("moved", after) > base:
                     raise self._revisions.conflict_about(tag, after, "has moved")
             put.add(tag)
 
     def _missing_error(self, tag: str, missing: str, base: int) -> RefusedError:
-        if self._revisions.last_change(missing) > base:
+        if self._revisions.last("changed", missing) > base:
             return self._revisions.conflict_about(tag, missing, "has removed")
         message = f"There is no operation {missing!r}. {suggest(missing, self.model.history.entries, 'tag')}"
         return RefusedError("refused", message, tag)
@@ -371,8 +372,8 @@ class Authority:
         try:
             edit.undo(revision)
         except EditError as error:
-            tag = max(self.model.history.commits[revision], key=self._revisions.last_change)
-            later = self._revisions.last_change(tag)
+            tag = max(self.model.history.commits[revision], key=partial(self._revisions.last, "changed"))
+            later = self._revisions.last("changed", tag)
             raise RefusedError(
                 "conflict", str(error), tag, "", later, self._revisions.who_made(later)
             ) from None

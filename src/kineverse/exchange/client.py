@@ -10,7 +10,7 @@ import logging
 import threading
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -74,11 +74,8 @@ def load_live(
 
 def include_live(edit: Edit, source: str, prefix: str | None = None, **others: Any) -> list[str]:
     """Append the present operations of a server's model to an edit of another one, and return their tags."""
-    connection = Connection(Address.parse(source))
-    try:
+    with closing(Connection(Address.parse(source))) as connection:
         joined = connection.join(protocol.JoinRequest(protocol.PROTOCOL, __version__, "", ""))
-    finally:
-        connection.close()
     return [edit.link(entry) for entry in entries_from_bytes(joined.document, prefix)]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from typing import Final, TypeVar
+from typing import Final, Literal, TypeAlias
 
 from kineverse.model.history import History, HistoryEntry, TouchedEntry
 from kineverse.model.operation import Cell
@@ -18,14 +18,14 @@ from kineverse.model.read_recorder import ABSENT, Read, differs
 from .protocol import Reason, Refused
 
 KEPT: Final = 10_000
-"""Number of revisions that edits may be behind; fewer if they are of more than a million values."""
-_MOST_CELLS: Final = 1_000_000
+"""Number of revisions that edits may be behind; fewer if they are of millions of values."""
+_MOST_NOTES: Final = 4_000_000
 _LONGEST_MESSAGE: Final = 1000
 
 # Flags are compared as wholes, because operations on them are slow.
 _WITH_VALUE = (Read.VALUE, Read.EXISTENCE | Read.VALUE)
 
-Key = TypeVar("Key", bound=Hashable)
+_What: TypeAlias = Literal["changed", "moved", "value", "comes", "read", "looked", "names", "listed"]
 
 
 class RefusedError(Exception):
@@ -46,19 +46,7 @@ class Revisions:
 
     def __init__(self, revision: int, chain: bytes) -> None:
         self._commits = {revision: (chain, "")}  # with the author
-        self._tags: OrderedDict[str, int] = OrderedDict()
-        self._moves: OrderedDict[str, int] = OrderedDict()
-        self._values: OrderedDict[Cell, int] = OrderedDict()
-        self._existence: OrderedDict[Cell, int] = OrderedDict()
-        self._names: dict[str, int] = {}
-        self._read_values: OrderedDict[Cell, int] = OrderedDict()
-        self._read_existence: OrderedDict[Cell, int] = OrderedDict()
-        self._listings: dict[str, int] = {}
-
-    @property
-    def oldest(self) -> int:
-        """The first revision that an edit may have as its base."""
-        return next(iter(self._commits))
+        self._last: OrderedDict[tuple[_What, Hashable], int] = OrderedDict()
 
     def chain_at(self, revision: int) -> bytes | None:
         """Return the digest of all commits up to a revision; None if it is not known."""
@@ -68,13 +56,14 @@ class Revisions:
         """Return who made a commit, empty if that is not known."""
         return self._commits[revision][1] if revision in self._commits else ""
 
-    def last_change(self, tag: str) -> int:
-        """Return the last revision that has put, moved or removed an operation; 0 if none is known."""
-        return self._tags.get(tag, 0)
+    def last(self, what: _What, key: Hashable) -> int:
+        """Return the last revision that has done something with a tag, cell or kind; 0 if none is known.
 
-    def last_move(self, tag: str) -> int:
-        """Return the last revision that has moved an operation; 0 if none is known."""
-        return self._moves.get(tag, 0)
+        Tags are *changed*, which is put, moved or removed, or *moved*. Of cells, the *value* is written, the
+        name *comes* or goes, the value is *read*, or it is *looked* if the name is there. Of kinds, *names*
+        come or go, or are *listed*.
+        """
+        return self._last.get((what, key), 0)
 
     def note(
         self, revision: int, chain: bytes, who: str, touched: Iterable[TouchedEntry], history: History
@@ -84,36 +73,30 @@ class Revisions:
         for before, now, is_given in touched:
             is_moved = before is not None and now is not None and before.place != now.place
             for cell, is_existence in _find_changes(before, now, is_moved, history):
-                _put(self._values, cell, revision)
+                self._note("value", cell, revision)
                 if is_existence:
-                    _put(self._existence, cell, revision)
-                    self._names[cell[0]] = revision
+                    self._note("comes", cell, revision)
+                    self._note("names", cell[0], revision)
             entry = now or before
             if entry is None or not is_given:
                 continue
-            _put(self._tags, entry.tag, revision)
+            self._note("changed", entry.tag, revision)
             if is_moved:
-                _put(self._moves, entry.tag, revision)
+                self._note("moved", entry.tag, revision)
             if now is not None:
                 for cell, how in now.reads.cells.items():
-                    _put(self._read_values if how in _WITH_VALUE else self._read_existence, cell, revision)
+                    self._note("read" if how in _WITH_VALUE else "looked", cell, revision)
                 for kind in now.reads.listings:
-                    self._listings[kind] = revision
-        while len(self._commits) > KEPT or (len(self._values) > _MOST_CELLS and len(self._commits) > 1):
-            self._forget()
+                    self._note("listed", kind, revision)
+        while len(self._commits) > KEPT or (len(self._last) > _MOST_NOTES and len(self._commits) > 1):
+            del self._commits[next(iter(self._commits))]
+            oldest = next(iter(self._commits))
+            while self._last and next(iter(self._last.values())) <= oldest:
+                self._last.popitem(last=False)
 
-    def _forget(self) -> None:
-        del self._commits[self.oldest]
-        for revisions in (
-            self._tags,
-            self._moves,
-            self._values,
-            self._existence,
-            self._read_values,
-            self._read_existence,
-        ):
-            while revisions and next(iter(revisions.values())) <= self.oldest:
-                revisions.popitem(last=False)
+    def _note(self, what: _What, key: Hashable, revision: int) -> None:
+        self._last[what, key] = revision
+        self._last.move_to_end((what, key))
 
     def check(
         self,
@@ -129,36 +112,34 @@ class Revisions:
         that it moves and of others that it removes. ``history`` is that before the edit.
         """
         for tag in (*(entry.tag for entry in put), *removed):
-            if self._tags.get(tag, 0) > base:
+            if self.last("changed", tag) > base:
                 raise self.conflict_about(
                     tag, tag, "has changed" if tag in history.entries else "has removed"
                 )
         for entry in put:
             for cell, how in entry.reads.cells.items():
-                last = (self._values if how in _WITH_VALUE else self._existence).get(cell, 0)
+                last = self.last("value" if how in _WITH_VALUE else "comes", cell)
                 if last > base:
                     raise self._conflict(last, entry.tag, "has changed", cell, "reads")
             for kind in entry.reads.listings:
-                last = self._names.get(kind, 0)
+                last = self.last("names", kind)
                 if last > base:
                     raise self._conflict(last, entry.tag, "has changed the names of", (kind, ""), "reads")
         pairs: list[tuple[str, HistoryEntry | None]] = [(entry.tag, entry) for entry in put]
         for tag, now in (*pairs, *((tag, None) for tag in removed)):
             for cell, is_existence in _find_changes(history.entries.get(tag), now, tag in moved, history):
-                last = self._values.get(cell, 0)
+                last = self.last("value", cell)
                 if last > base:
                     raise self._conflict(last, tag, "has changed", cell, "writes")
-                last = max(
-                    self._read_values.get(cell, 0),
-                    self._read_existence.get(cell, 0) if is_existence else 0,
-                    self._listings.get(cell[0], 0) if is_existence else 0,
-                )
+                last = self.last("read", cell)
+                if is_existence:
+                    last = max(last, self.last("looked", cell), self.last("listed", cell[0]))
                 if last > base:
                     raise self._conflict(last, tag, "reads", cell, "changes")
 
     def conflict_about(self, tag: str, other: str, what: str) -> RefusedError:
         """Return the conflict of an operation with the last commit of another one, or of itself."""
-        revision = self._tags[other]
+        revision = self.last("changed", other)
         who = self.who_made(revision)
         message = f"Revision {revision}, by {who}, {what} the operation {other!r}. Try again."
         return RefusedError("conflict", message, tag, "", revision, who)
@@ -167,11 +148,6 @@ class Revisions:
         path, who = "/".join(cell).rstrip("/"), self.who_made(revision)
         message = f"Revision {revision}, by {who}, {what} {path}, which {tag!r} {how}. Try again."
         return RefusedError("conflict", message, tag, path, revision, who)
-
-
-def _put(revisions: OrderedDict[Key, int], key: Key, revision: int) -> None:
-    revisions[key] = revision
-    revisions.move_to_end(key)
 
 
 def _find_changes(

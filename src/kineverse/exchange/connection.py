@@ -67,7 +67,7 @@ class Connection:
         self.epoch, self.revision, self.chain = "", 0, protocol.NO_CHAIN
         self.is_online, self.is_closed = True, False
         self.sources: tuple[protocol.SourceStatus, ...] = ()
-        self._publishers: list[tuple[StatePublisher, float]] = []
+        self._publishers: list[StatePublisher] = []
         self._readers: list[StateReader] = []
         self._heard, self._settled = "", 0.0
         self._numbers = count(1)
@@ -88,7 +88,7 @@ class Connection:
         self.note_presence(False)
         for reader in self._readers:
             reader.close()
-        for publisher, _ in list(self._publishers):
+        for publisher in list(self._publishers):
             publisher.close()
         self.transport.close()
 
@@ -168,8 +168,9 @@ class Connection:
             server=self.transport,
             direct=not self.address.endpoint,
             announce=self._announce,
+            offset=offset,
         )
-        self._publishers.append((publisher, offset))
+        self._publishers.append(publisher)
         self._announce(publisher)
         return publisher
 
@@ -198,13 +199,15 @@ class Connection:
 
     def _announce(self, publisher: StatePublisher) -> None:
         """Tell the server of a source, or that it has ended; one who is away is told when it is back."""
-        offset = next(offset for known, offset in self._publishers if known is publisher)
+        source, endpoint = publisher.source, publisher.endpoint
         if publisher.is_closed:
-            self._publishers.remove((publisher, offset))
-        endpoint = "" if publisher.is_closed else publisher.endpoint
-        announced = protocol.Announce(self.client, publisher.source, endpoint, publisher.coordinates, offset)
+            self._publishers.remove(publisher)
+            endpoint = ""
         with suppress(OfflineError):
-            self.ask(announced, protocol.Done)
+            self.ask(
+                protocol.Announce(self.client, source, endpoint, publisher.coordinates, publisher.offset),
+                protocol.Done,
+            )
 
     def _take_sources(self, beat: protocol.Beat) -> None:
         """Follow the sources that the server knows; one that has just started does not know them all yet."""
@@ -213,7 +216,7 @@ class Connection:
             self._heard, self._settled = beat.epoch, now + _SETTLING
         kept = [] if now > self._settled else [one for one in self.sources if one.source not in listed]
         self.sources = (*kept, *beat.sources)
-        for publisher, _ in list(self._publishers):
+        for publisher in list(self._publishers):
             if publisher.source not in listed:
                 self._announce(publisher)
         self._readers = [reader for reader in self._readers if not reader.is_closed]
@@ -286,10 +289,9 @@ class Connection:
     def hear(self, beat: protocol.Beat) -> None:
         """Take the sources of state from a sign of life, and tell the server what this client has."""
         self._take_sources(beat)
-        seen = protocol.Seen(self.client, self.revision)
         if self.revision != self._told:
             self._told = self.revision
-            self.transport.publish(self.key("seen"), protocol.encode(seen))
+            self.transport.publish(self.key("seen"), protocol.encode(protocol.Seen(self.client, self._told)))
 
     def wait_for(self, is_done: Callable[[], bool], timeout: float | None) -> bool:
         """Wait until something is so, which is looked at when the model or the connection changes."""

@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
 import numpy as np
-from msgspec.structs import replace
+from msgspec import structs
 
 from kineverse._checks import as_tolerance, check_flag
 from kineverse._version import __version__
@@ -146,7 +146,7 @@ class Server:
         self._backups: dict[str, TemporaryDirectory[str]] = {}
         self._clients: dict[str, _Client] = {}
         self._refusals: deque[protocol.Refusal] = deque(maxlen=_KEPT_REFUSALS)
-        self._times: dict[str, deque[float]] = {}
+        self._times: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_KEPT_TIMES))
         self._accepted: deque[float] = deque(maxlen=100_000)
         self._edits = 0
         self._lock = threading.RLock()  # of the model, the views and the lists above
@@ -265,7 +265,7 @@ class Server:
         for view, changes in self._views.commit(*(commit.diff for commit in made)):
             put = {*map(protocol.tag_of, changes.put)}
             files = authority.files.find([entry for entry in view.entries if entry.tag in put])
-            commit = replace(last, previous=view.log.last, changes=changes, files=files)
+            commit = structs.replace(last, previous=view.log.last, changes=changes, files=files)
             published = protocol.Published(authority.epoch, authority.chain, protocol.encode(commit))
             view.log.add(last.revision, published)
             commits.append((view.id, published))
@@ -275,7 +275,7 @@ class Server:
         now = time.time()
         with self._lock:
             for stage, seconds in result.seconds.items():
-                self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(seconds)
+                self._times[stage].append(seconds)
             if isinstance(result.answer, protocol.Refused):
                 self._refusals.append(protocol.Refusal(now, edit.who, result.answer.message))
                 _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
@@ -284,7 +284,7 @@ class Server:
                 self._accepted.append(now)
 
     def _note_time(self, stage: str, begin: float) -> None:
-        self._times.setdefault(stage, deque(maxlen=_KEPT_TIMES)).append(time.perf_counter() - begin)
+        self._times[stage].append(time.perf_counter() - begin)
 
     def _refuse(self, request: Question, reason: protocol.Reason, error: Exception) -> None:
         request.answer(protocol.encode(protocol.Refused(reason, str(error)[:_LONGEST_MESSAGE])))
@@ -358,23 +358,22 @@ class Server:
                 found = None if view is None else view.log.find_after(since.revision)
             else:
                 stored = self._store.commits_after(since.revision, since.chain, MOST_MISSED)
-                found = (
-                    None
-                    if stored is None
-                    else [protocol.Published(epoch, link, commit) for commit, link in stored]
-                )
-                if found is not None and since.client not in self._clients:
-                    self._clients[since.client] = _Client(since.who, None, since.revision)
+                found = stored and [protocol.Published(epoch, link, commit) for commit, link in stored]
             if found is None:
                 return protocol.Refused("stale", "The server does not know this state; join again.")
+            if since.client not in self._clients:
+                self._clients[since.client] = _Client(since.who, None, since.revision)
             self._clients[since.client].note(since.revision)
         return protocol.Missed(epoch, revision, chain, tuple(found))
 
     def _status(self) -> protocol.Status:
         authority, now, ticks = self._authority, time.time(), time.monotonic()
         with self._lock:
-            known = [(stage, self._times[stage]) for stage in STAGES if stage in self._times]
-            stages = [(stage, np.percentile([*times], (50, 95))) for stage, times in known]
+            stages = [
+                protocol.StageTime(stage, *np.percentile([*self._times[stage]], (50, 95)).tolist())
+                for stage in STAGES
+                if stage in self._times
+            ]
             return protocol.Status(
                 name=self.name,
                 library=__version__,
@@ -391,9 +390,7 @@ class Server:
                 frames=len(authority.model.frames),
                 edits=self._edits,
                 rate=sum(now - then < _MINUTE for then in self._accepted) / _MINUTE,
-                stages=tuple(
-                    protocol.StageTime(name, float(middle), float(high)) for name, (middle, high) in stages
-                ),
+                stages=tuple(stages),
                 clients=tuple(
                     protocol.ClientStatus(client, known.who, known.part, known.revision, ticks - known.heard)
                     for client, known in self._clients.items()
@@ -450,13 +447,8 @@ class Server:
     def _announce(self, announced: protocol.Announce) -> protocol.Done:
         with self._lock:
             if announced.endpoint:
-                self._sources[announced.source] = protocol.SourceStatus(
-                    announced.source,
-                    announced.endpoint,
-                    announced.coordinates,
-                    announced.offset,
-                    announced.client,
-                )
+                client, *described = structs.astuple(announced)
+                self._sources[announced.source] = protocol.SourceStatus(*described, client)
             else:
                 self._sources.pop(announced.source, None)
         self._publish_beat()

@@ -60,11 +60,13 @@ class StatePublisher:
     announce
         Function that tells the server of this source: called with it when there are other coordinates, and
         when it is closed.
+    offset
+        What is to be added to its stamps to get the time of the server [s].
 
     Attributes
     ----------
-    source, is_closed
-        Name of the source, and whether it has ended.
+    source, offset, is_closed
+        Name of the source, offset of its clock [s], and whether it has ended.
     endpoint
         Where it listens, to be announced to the server; :data:`THROUGH_SERVER` without a socket of its own.
         The stream then ends with the server, and goes on when that is back.
@@ -86,8 +88,9 @@ class StatePublisher:
         server: Transport | None = None,
         direct: bool = True,
         announce: Callable[[StatePublisher], None] = lambda _: None,
+        offset: float = 0.0,
     ) -> None:
-        self.source, self.is_closed, self._announce = source, False, announce
+        self.source, self.offset, self.is_closed, self._announce = source, offset, False, announce
         self._layout = _Layout.make(coordinates)
         self._key = _key(name, check_server_name(source, "source"))
         self._run, self._number, self._lock = secrets.randbits(64), 0, threading.Lock()

@@ -12,7 +12,6 @@ import hashlib
 import os
 import sqlite3
 import threading
-import uuid
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -216,20 +215,15 @@ class Store:
             self._contents = _load(self._db, self._path)
 
     def backup(self, path: Path) -> None:
-        """Write a copy of the store into a new file; it is complete, or there is none."""
+        """Write a copy of the store into a new file; after an error there is none."""
         if _check_path(path):
             raise StoreError(f"{path} exists already. Name a new file for the backup.")
-        part = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex}")
         try:
             with self._lock, _reporting(str(path)):
-                self._db.execute("VACUUM INTO ?", (str(part),))
-            with part.open("r+b") as file:
-                os.fsync(file.fileno())
-            part.rename(path)
-        except OSError as error:
-            raise StoreError(f"{path} cannot be written: {error.strerror}.") from None
-        finally:
-            part.unlink(missing_ok=True)
+                self._db.execute("VACUUM INTO ?", (str(path),))
+        except StoreError:
+            path.unlink(missing_ok=True)
+            raise
 
     def close(self) -> None:
         """Close the file."""
