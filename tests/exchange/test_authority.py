@@ -502,6 +502,18 @@ def test_undo_by_model_and_by_store(is_restarted: bool) -> None:
     assert other.model.snapshot() == authority.model.snapshot()
 
 
+def test_what_was_removed_before_a_restart_goes_back_to_its_place() -> None:
+    store, authority = started()
+    before = authority.model.history.tags
+    for client, tag in ("a", "exists"), ("b", "capped"):
+        replica = Replica(authority, client)
+        (result,) = authority.process([replica.draft(lambda edit, tag=tag: edit.remove(tag))])  # type: ignore[misc]
+        assert accepted(result.answer)
+    authority = Authority(store)
+    assert accepted(ask(authority, Replica(authority, "c").undo(2))[0])  # what it followed is gone
+    assert authority.model.history.tags == [tag for tag in before if tag != "capped"]
+
+
 # -- lies ----------------------------------------------------------------------------------------------------
 
 

@@ -79,12 +79,10 @@ class Authority:
         """Make the model by linking the operations of the store."""
         with no_collection():
             stored = self._store.operations()
-            entries = [operation_from_bytes(blob) for _, blob, _ in stored]
+            entries = [operation_from_bytes(blob).at(place) for place, blob, _ in stored]
             put_contents(entries, (file for *_, files in stored for file in files))
             self.model = Model(entries, self._store.revision)
         self.model.history.commits.clear()
-        # A model numbers its places anew; they are stored with the next commit.
-        self._are_places_new = bool(entries)
         self.chain = self._store.chain
         self.epoch = secrets.token_hex(16)
         self._start = self.revision
@@ -313,8 +311,7 @@ class Authority:
                 )
             touched = list(history.touched())
         self._seconds["encode"] = perf_counter() - begin
-        self._are_places_new |= history.sequence is not sequence
-        return self._note(commit, data, touched, replaced)
+        return self._note(commit, data, touched, replaced, history.sequence is not sequence)
 
     def _find_replaced(self, tag: str) -> Replaced:
         """Return what an edit will replace under a tag."""
@@ -327,19 +324,21 @@ class Authority:
         return Replaced(tag, entry_to_bytes(entry, history.sequence), after, entry.place)
 
     def _note(
-        self, commit: CommitMessage, data: bytes, touched: list[TouchedEntry], replaced: tuple[Replaced, ...]
+        self,
+        commit: CommitMessage,
+        data: bytes,
+        touched: list[TouchedEntry],
+        replaced: tuple[Replaced, ...],
+        are_places_new: bool,
     ) -> MadeCommit:
         """Note a commit that the model has made, to be stored and published."""
         history = self.model.history
         self.chain = protocol.chain(self.chain, data)
         self._revisions.note(commit.revision, self.chain, commit.who, touched, history)
-        put, files = (
-            [history.entries[entry.tag] for _, entry, _ in touched if entry is not None],
-            commit.files,
-        )
-        if self._are_places_new:
+        files = commit.files
+        put = [history.entries[entry.tag] for _, entry, _ in touched if entry is not None]
+        if are_places_new:
             put, files = history.sequence, self.files.find(history.sequence, files)
-            self._are_places_new = False
         self._batch.append(
             StoredCommit(
                 commit.revision,
