@@ -22,7 +22,7 @@ from kineverse.errors import EditError, FormatError, KineverseError, suggest
 from kineverse.formats import entry_to_bytes, operation_from_bytes
 from kineverse.formats.document import OpaqueOperation
 from kineverse.model import Diff, Edit, Model, NetChanges, PlacedEntry
-from kineverse.model.history import History, HistoryEntry, TouchedEntry
+from kineverse.model.history import History, HistoryEntry
 
 from . import protocol
 from .conflicts import KEPT, RefusedError, Revisions
@@ -280,7 +280,10 @@ class Authority:
     def _fold(
         self, request: protocol.ChangeRequest, act: Callable[[Edit], None], own: Iterable[str]
     ) -> MadeCommit | None:
-        """Make an edit, and the message of its commit; ``own`` is what it puts or removes itself."""
+        """Make an edit, and a commit of it to be stored and published; None if it does nothing.
+
+        ``own`` is what it puts or removes itself.
+        """
         history = self.model.history
         begin = perf_counter()
         sequence = history.sequence
@@ -311,33 +314,11 @@ class Authority:
                 )
             touched = list(history.touched())
         self._seconds["encode"] = perf_counter() - begin
-        return self._note(commit, data, touched, replaced, history.sequence is not sequence)
-
-    def _find_replaced(self, tag: str) -> Replaced:
-        """Return what an edit will replace under a tag."""
-        history = self.model.history
-        entry = history.entries.get(tag)
-        if entry is None:
-            return Replaced(tag, None, "", 0)
-        index = history.index(tag)
-        after = history.sequence[index - 1].tag if index else ""
-        return Replaced(tag, entry_to_bytes(entry, history.sequence), after, entry.place)
-
-    def _note(
-        self,
-        commit: CommitMessage,
-        data: bytes,
-        touched: list[TouchedEntry],
-        replaced: tuple[Replaced, ...],
-        are_places_new: bool,
-    ) -> MadeCommit:
-        """Note a commit that the model has made, to be stored and published."""
-        history = self.model.history
         self.chain = protocol.chain(self.chain, data)
         self._revisions.note(commit.revision, self.chain, commit.who, touched, history)
         files = commit.files
         put = [history.entries[entry.tag] for _, entry, _ in touched if entry is not None]
-        if are_places_new:
+        if history.sequence is not sequence:  # all have new places
             put, files = history.sequence, self.files.find(history.sequence, files)
         self._batch.append(
             StoredCommit(
@@ -353,6 +334,16 @@ class Authority:
             )
         )
         return MadeCommit(commit, Published(self.epoch, self.chain, data), self._diffs.pop())
+
+    def _find_replaced(self, tag: str) -> Replaced:
+        """Return what an edit will replace under a tag."""
+        history = self.model.history
+        entry = history.entries.get(tag)
+        if entry is None:
+            return Replaced(tag, None, "", 0)
+        index = history.index(tag)
+        after = history.sequence[index - 1].tag if index else ""
+        return Replaced(tag, entry_to_bytes(entry, history.sequence), after, entry.place)
 
     # -- undo ----------------------------------------------------------------------------------------------
 
