@@ -9,9 +9,9 @@ import argparse
 import sys
 import time
 
-from . import store
+from . import server, store
 
-TARGETS = {"store": store}
+TARGETS = {"store": store, "server": server}
 """Modules with ``add_arguments`` and ``run``, and a docstring that says what must hold."""
 
 

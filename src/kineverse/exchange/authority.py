@@ -96,6 +96,10 @@ class Authority:
         """The revision of the last commit, 0 for an empty model."""
         return self.model.version
 
+    def knows(self, revision: int, chain: bytes) -> bool:
+        """Return whether the model has been at a revision with this chain, in this run and not long ago."""
+        return self._revisions.chain_at(revision) == chain
+
     def fill(self, build: Callable[[Edit], None], who: str) -> None:
         """Make the first commit of an empty store, by an edit of an empty model; ``who`` is its author.
 
@@ -185,7 +189,8 @@ class Authority:
 
     def _answer(self, request: protocol.ChangeRequest) -> Result:
         """Make one edit, if it can be made."""
-        revision, self._seconds = self.revision, {}
+        revision = self.revision
+        self._seconds = dict[str, float]()
         try:
             with no_collection():
                 commit = (

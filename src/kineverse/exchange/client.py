@@ -14,6 +14,8 @@ from contextlib import AbstractContextManager, closing, contextmanager
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
+from msgspec.structs import replace
+
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
 from kineverse._version import __version__
 from kineverse.errors import ConflictError, EditError, OfflineError
@@ -94,6 +96,8 @@ class LiveModel(Model):
         self._following = threading.RLock()
         self._deliveries: SimpleQueue[bool] = SimpleQueue()
         self._announced = 0  # last revision that concerns this model, as the last sign of life had it
+        # The last revision that was adopted, and its digest; later ones concern nothing of a part.
+        self._last, self._link = 0, b""
         log = None if wish.is_part else connection.transport.subscribe(connection.key("log"))
         try:
             joined = connection.join(wish)
@@ -158,8 +162,21 @@ class LiveModel(Model):
             except ConflictError as error:
                 if not left:
                     raise
-                self.wait(error.revision)
+                self.exchange.wait_to_follow(error.revision)
         raise AssertionError
+
+    def adopt(self, changes: NetChanges) -> None:
+        """Make the net changes of an edit of an equal model, in an edit that the server is asked for.
+
+        Operations that read what they change, and are not among them, are run again.
+
+        Raises
+        ------
+        EditError, OfflineError
+            As :meth:`edit`; also if the changes do not belong to this model.
+        """
+        with self.edit() as edit:
+            edit.adopt(changes)
 
     def undo(self, revision: int) -> None:
         """Take back the commit of a revision, also one from before this process has joined.
@@ -168,10 +185,18 @@ class LiveModel(Model):
         ------
         ConflictError
             If a later commit has changed what it would change.
+        EditError
+            If there is no such revision, or this thread edits the model.
+        OfflineError
+            If the server is away.
         """
         connection = self.exchange
-        number = connection.next_number()
         wanted = as_count("revision", revision, 1)
+        if wanted > protocol.MAX_REVISION:
+            raise EditError(f"There is no revision {wanted}; the model is at revision {self.version}.")
+        self._check_not_edited()
+        connection.check_online()
+        number = connection.next_number()
         self._finish_edit(
             connection.ask_edit(protocol.UndoRequest(connection.client, number, connection.who, wanted))
         )
@@ -180,17 +205,27 @@ class LiveModel(Model):
         """Wait until the model is at a version or a later one; False if it is not after a time [s].
 
         A listener is called after the model has its version, so hooks of that version may still run.
+
+        Raises
+        ------
+        EditError
+            If this thread edits the model.
+        OfflineError
+            If the connection was closed, or is meanwhile, and the model does not have the version.
         """
-        wanted = as_count("version", version, 0)
-        if self._edit is not None and self._lock.acquire(blocking=False):  # this thread edits
-            self._lock.release()
-            raise EditError("A model gets no commits while it is edited: wait after the edit.")
-        if self._wish.is_part and self.exchange.is_online and self.exchange.revision < wanted:
-            self._close_gap()  # the commits may be none of its
-        return self.exchange.wait_for(
-            lambda: self.exchange.revision >= wanted,
+        wanted, connection = as_count("version", version, 0), self.exchange
+        self._check_not_edited()
+        if connection.revision < wanted:
+            connection.check_open()
+            if self._wish.is_part and connection.is_online:
+                self._close_gap()  # the commits may be none of its
+        is_over = connection.wait_for(
+            lambda: connection.revision >= wanted or connection.is_closed,
             None if timeout is None else as_tolerance(timeout, "A timeout"),
         )
+        if connection.revision < wanted:
+            connection.check_open()
+        return is_over
 
     def close(self) -> None:
         """End the connection; reading goes on. A second call has no effect, and a script need not call it."""
@@ -201,6 +236,12 @@ class LiveModel(Model):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _check_not_edited(self) -> None:
+        """Raise an EditError if this thread edits the model, which gets no commits meanwhile."""
+        if self._edit is not None and self._lock.acquire(blocking=False):
+            self._lock.release()
+            raise EditError("A model gets no commits while it is edited: do that after the edit.")
 
     @contextmanager
     def _ask_for_edit(self, strict: bool) -> Iterator[Edit]:
@@ -255,7 +296,7 @@ class LiveModel(Model):
 
     def _start(self, log: Channel | None, joined: protocol.Joined) -> None:
         connection, model = self.exchange, weakref.ref(self)
-        connection.accept(joined)
+        self._accept(joined)
         self._view = joined.view
         transport = connection.transport
         self._pump(log or transport.subscribe(connection.key(f"view/{joined.view}")), LiveModel._receive)
@@ -281,15 +322,15 @@ class LiveModel(Model):
         commit = protocol.decode_commit(published.commit)
         with self._following:
             connection = self.exchange
-            if published.epoch != connection.epoch or commit.previous > connection.revision:
+            if published.epoch != connection.epoch or commit.previous > self._last:
                 self._close_gap()
-            elif commit.revision > connection.revision:
+            elif commit.revision > self._last:
                 self._adopt_commit(published, commit)
 
     def _adopt_commit(self, published: protocol.Published, commit: protocol.CommitMessage) -> None:
         connection = self.exchange
-        is_whole = not self._wish.is_part
-        if is_whole and protocol.chain(connection.chain, published.commit) != published.chain:
+        link = protocol.chain(self._link, published.commit)
+        if link != (published.link if self._wish.is_part else published.chain):
             self._join_again()
             return
         try:
@@ -300,6 +341,7 @@ class LiveModel(Model):
             _LOG.exception("A commit of %s cannot be adopted; its model is joined again.", connection.address)
             self._join_again()
             return
+        self._last, self._link = commit.revision, link
         connection.advance(commit.revision, published.chain)
 
     def _close_gap(self) -> None:
@@ -309,15 +351,15 @@ class LiveModel(Model):
             while True:
                 try:
                     answer = connection.ask_missed(self._view)
+                    if answer is None:
+                        self._join_again()
+                        return
                 except OfflineError:
                     return  # when the server is back, it says so
-                if answer is None:
-                    self._join_again()
-                    return
                 connection.epoch = answer.epoch
                 for published in answer.commits:
                     commit = protocol.decode_commit(published.commit)
-                    if commit.revision > connection.revision:
+                    if commit.revision > self._last:
                         self._adopt_commit(published, commit)
                 if connection.revision >= answer.revision or not answer.commits:
                     break
@@ -333,26 +375,33 @@ class LiveModel(Model):
     def _join_again(self) -> None:
         """Take the model anew, as one commit, if the server does not know the state that this one is in."""
         connection = self.exchange
-        joined = connection.join(self._wish)
+        joined = connection.join(replace(self._wish, again=True))
         self._adopt(_find_changes(self._history.sequence, _entries(joined)), joined.revision)
         if joined.view != self._view:
             self._view = joined.view
             self._pump(
                 connection.transport.subscribe(connection.key(f"view/{joined.view}")), LiveModel._receive
             )
-        connection.accept(joined)
+        self._accept(joined)
+
+    def _accept(self, joined: protocol.Joined) -> None:
+        """Take over where the model is that the server has sent."""
+        self._last = joined.revision
+        self._link = joined.link if self._wish.is_part else joined.chain
+        self.exchange.accept(joined)
 
     def _hear(self, data: bytes) -> None:
         """Note a sign of life: what it tells of and has not come until the next one was lost."""
         beat = protocol.decode_beat(data)
         connection = self.exchange
         with self._following:
-            last = beat.views.get(self._view, 0) if self._wish.is_part else beat.revision
-            if beat.epoch != connection.epoch or connection.revision < self._announced:
+            last = beat.views.get(self._view) if self._wish.is_part else beat.revision
+            is_lost = last is None or connection.revision > beat.revision  # to the server, or to a false sign
+            if beat.epoch != connection.epoch or is_lost or self._last < self._announced:
                 self._close_gap()
-            elif self._wish.is_part and last <= connection.revision < beat.revision:
+            elif last is not None and last <= self._last and connection.revision < beat.revision:
                 self._pass_by(beat.revision, beat.chain)
-            self._announced = last
+            self._announced = last or 0
         connection.hear(beat)
 
     def _notice(self, sign: tuple[str, bool]) -> None:
@@ -428,7 +477,7 @@ def _call_hooks(deliveries: SimpleQueue[bool], model: weakref.ref[LiveModel]) ->
         target = model()
         if target is None:
             return
-        target._listeners.deliver()
+        target._listeners.deliver(BaseException)  # sys.exit() would end this thread, and nobody would know
         del target
 
 

@@ -18,8 +18,14 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from kineverse._checks import as_count
-from kineverse.errors import DuplicateNameError, FormatError, OfflineError, UnknownNameError
+from kineverse._checks import as_count, finite_number
+from kineverse.errors import (
+    DuplicateNameError,
+    FormatError,
+    InvalidValueError,
+    OfflineError,
+    UnknownNameError,
+)
 from kineverse.symbols import Symbol
 
 from . import protocol
@@ -27,7 +33,7 @@ from .address import Address
 from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
-from .transport import NoAnswerError, Transport
+from .transport import NoAnswerError, Transport, check_process
 
 PATIENCE = 10.0
 """Time that an edit waits for a server that went away, before it is given up [s]."""
@@ -142,25 +148,13 @@ class Connection:
     ) -> StatePublisher:
         """Return a new source of state, which the readers of all clients find. It ends with this connection.
 
-        Parameters
-        ----------
-        source
-            Name of the source: letters, digits, ``_``, ``.`` and ``-``.
-        coordinates
-            Symbols, or their names, of the values in a vector; also names that the model does not have.
-        offset
-            What is to be added to its stamps to get the time of the server [s].
-
-        Raises
-        ------
-        OfflineError
-            If the server is away.
-        DuplicateNameError
-            If another process of this computer sends under the same name.
-        InvalidValueError
-            If a source cannot have that name.
+        Parameters and errors are those of :class:`.StatePublisher`; the model need not have the coordinates.
+        A server that is away is an OfflineError, and an offset that is no finite number an InvalidValueError.
         """
         self.check_online()
+        seconds = finite_number(offset)
+        if seconds is None:
+            raise InvalidValueError(f"The offset of a source is a time in seconds, not {offset!r}.")
         publisher = StatePublisher(
             self.address.name,
             source,
@@ -168,26 +162,20 @@ class Connection:
             server=self.transport,
             direct=not self.address.endpoint,
             announce=self._announce,
-            offset=offset,
+            offset=seconds,
         )
         self._publishers.append(publisher)
-        self._announce(publisher)
+        try:
+            self._announce(publisher)
+        except BaseException:
+            publisher.close()
+            raise
         return publisher
 
     def reader(self, coordinates: Iterable[Symbol | str] = ()) -> StateReader:
         """Return a reader of the newest state of all sources, those that come later included.
 
-        Parameters
-        ----------
-        coordinates
-            Symbols, or their names, of the vectors that it fills.
-
-        Raises
-        ------
-        OfflineError
-            If the server is away.
-        DuplicateNameError
-            If a coordinate is given twice.
+        Coordinates and errors are those of :class:`.StateReader`. A server that is away is an OfflineError.
         """
         self.check_online()
         reader = StateReader(
@@ -216,12 +204,12 @@ class Connection:
             self._heard, self._settled = beat.epoch, now + _SETTLING
         kept = [] if now > self._settled else [one for one in self.sources if one.source not in listed]
         self.sources = (*kept, *beat.sources)
-        for publisher in list(self._publishers):
-            if publisher.source not in listed:
-                self._announce(publisher)
         self._readers = [reader for reader in self._readers if not reader.is_closed]
         for reader in self._readers:
             reader.follow(self.sources)
+        for publisher in list(self._publishers):
+            if publisher.source not in listed:
+                self._announce(publisher)
 
     # -- for the live model --------------------------------------------------------------------------------
 
@@ -239,10 +227,17 @@ class Connection:
         """Return the number of a new edit of this client."""
         return next(self._numbers)
 
+    def check_open(self) -> None:
+        """Raise an OfflineError if the connection was closed, or is that of the parent of a fork."""
+        check_process()
+        if self.is_closed:
+            raise OfflineError(
+                f"The connection to {self.address} was closed, or its model was not kept; load it again."
+            )
+
     def check_online(self) -> None:
         """Raise an OfflineError if the server is away."""
-        if self.is_closed:
-            raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+        self.check_open()
         if not self.is_online:
             raise OfflineError(
                 f"The server of {self.address} is away. The model can be read, and edited when it is back."
@@ -298,6 +293,10 @@ class Connection:
         with self._changed:
             return self._changed.wait_for(is_done, timeout)
 
+    def wait_to_follow(self, revision: int) -> None:
+        """Wait until the model is at a revision, as long as the server is there."""
+        self.wait_for(lambda: self.revision >= revision or not self.is_online, None)
+
     def ask(self, request: protocol.Request, kind: type[A], timeout: float = _ASK_TIMEOUT) -> A:
         """Ask once and return the answer, which is of a kind.
 
@@ -340,8 +339,7 @@ class Connection:
             raise refusal_error(answer, self.address)
 
     def _ask(self, request: protocol.Request, timeout: float) -> protocol.Answer:
-        if self.is_closed:
-            raise OfflineError(f"The connection to {self.address} was closed; load the model again.")
+        self.check_open()
         changes_model = isinstance(request, (protocol.EditRequest, protocol.UndoRequest))
         data = protocol.encode(request)
         if len(data) > protocol.MAX_BYTES:

@@ -31,10 +31,12 @@ MAX_LISTED: Final = 10_000
 Id: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{32}$", max_length=32)]
 Name: TypeAlias = Annotated[str, Meta(min_length=1, max_length=4096)]
 Text: TypeAlias = Annotated[str, Meta(max_length=1 << 16)]
-Revision: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
+MAX_REVISION: Final = (1 << 62) - 1
+Revision: TypeAlias = Annotated[int, Meta(ge=0, le=MAX_REVISION)]
 Number: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
 Seconds: TypeAlias = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Chain: TypeAlias = Annotated[bytes, Meta(min_length=32, max_length=32)]
+Link: TypeAlias = Annotated[bytes, Meta(max_length=32)]
 Sha256: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", max_length=64)]
 Tags: TypeAlias = Annotated[tuple[Name, ...], Meta(max_length=MAX_OPERATIONS)]
 
@@ -97,11 +99,15 @@ class CommitMessage(_Message, frozen=True):
 
 
 class Published(_Message, frozen=True):
-    """Commit as bytes with the digest of all commits up to it, and the run of the server that made it."""
+    """Commit as bytes with the digest of all commits up to it, and the run of the server that made it.
+
+    ``link`` is the digest of the commits of a part up to this one, since it is followed; empty for the whole.
+    """
 
     epoch: Id
     chain: Chain
     commit: bytes
+    link: Link = b""
 
 
 # -- requests ------------------------------------------------------------------------------------------------
@@ -133,7 +139,10 @@ class UndoRequest(_Message, frozen=True, tag="undo"):
 
 
 class JoinRequest(_Message, frozen=True, tag="join"):
-    """Ask for the model, or for the part of it that frames and symbols need."""
+    """Ask for the model, or for the part of it that frames and symbols need.
+
+    One who has had the part, ``again``, gets what is left of it; otherwise unknown names are refused.
+    """
 
     protocol: int
     library: Text  # version of Kineverse
@@ -143,6 +152,7 @@ class JoinRequest(_Message, frozen=True, tag="join"):
     symbols: tuple[Text, ...] = ()
     bodies: bool = True
     is_part: bool = False
+    again: bool = False
 
 
 class Since(_Message, frozen=True, tag="since"):
@@ -163,7 +173,7 @@ class GetHistory(_Message, frozen=True, tag="history"):
     """Ask for the last commits, newest first, from a revision on backwards."""
 
     most: Annotated[int, Meta(ge=1, le=MAX_LISTED)] = 20
-    before: Revision = (1 << 62) - 1
+    before: Revision = MAX_REVISION
 
 
 class GetFile(_Message, frozen=True, tag="file"):
@@ -230,7 +240,7 @@ class Refused(_Message, frozen=True, tag="refused"):
 
 
 class Joined(_Message, frozen=True, tag="joined"):
-    """The model or a part of it, as a document in msgpack; ``view`` is the id of the part."""
+    """The model or a part of it, as a document in msgpack; ``view`` and ``link`` identify the part."""
 
     name: str
     library: Text
@@ -240,6 +250,7 @@ class Joined(_Message, frozen=True, tag="joined"):
     view: str
     document: bytes
     files: tuple[MeshContent, ...] = ()
+    link: Link = b""
 
 
 class Missed(_Message, frozen=True, tag="missed"):

@@ -145,6 +145,8 @@ class Server:
         self._sources: dict[str, protocol.SourceStatus] = {}
         self._backups: dict[str, TemporaryDirectory[str]] = {}
         self._clients: dict[str, _Client] = {}
+        self._present: set[str] = set()  # clients whose signs of life are there
+        self._absent: set[str] = set()  # those that were not, at the last beat
         self._refusals: deque[protocol.Refusal] = deque(maxlen=_KEPT_REFUSALS)
         self._times: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_KEPT_TIMES))
         self._accepted: deque[float] = deque(maxlen=100_000)
@@ -231,15 +233,16 @@ class Server:
                 results = self._authority.process(edits)
                 if self._authority.epoch != epoch:
                     self._begin_again()
-                for_parts = self._commit_views(results)
+                for_parts = self._follow_views(results)
         except Exception as error:  # a defect of this package must not end the server
             _LOG.exception("Edits could not be processed.")
             for request in requests:
                 self._refuse(request, "failed", error)
             return
         begin = time.perf_counter()
-        for commit in (result.commit for result in results if result.commit is not None):
-            self._transport.publish(self._key("log"), protocol.encode(commit.published))
+        for result in results:
+            if result.commit is not None:
+                self._transport.publish(self._key("log"), protocol.encode(result.commit.published))
         for view, commit in for_parts:
             self._transport.publish(self._key(f"view/{view}"), protocol.encode(commit))
         self._note_time("publish", begin)
@@ -250,10 +253,19 @@ class Server:
         self._note_time("answer", begin)
 
     def _begin_again(self) -> None:
-        """Follow a model that was loaded again from its store: parts are asked for anew."""
-        self._views = Views(self._authority.model)
-        self._token.close()
+        """Follow a model that was loaded again from its store: parts are asked for anew, and clients join."""
+        self._views, self._clients = Views(self._authority.model), {}
+        before = self._token
         self._token = self._transport.alive(self._key(f"alive/{self._authority.epoch}"))
+        before.close()  # later, so that clients do not take the server for gone
+
+    def _follow_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
+        try:
+            return self._commit_views(results)
+        except Exception:  # a defect of this package; the edits are made, and clients of parts join again
+            _LOG.exception("Parts of the model could not follow it.")
+            self._views = Views(self._authority.model)
+            return []
 
     def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
         """Return the commits of parts, by the ids of their views."""
@@ -266,9 +278,7 @@ class Server:
             put = {*map(protocol.tag_of, changes.put)}
             files = authority.files.find([entry for entry in view.entries if entry.tag in put])
             commit = structs.replace(last, previous=view.log.last, changes=changes, files=files)
-            published = protocol.Published(authority.epoch, authority.chain, protocol.encode(commit))
-            view.log.add(last.revision, published)
-            commits.append((view.id, published))
+            commits.append((view.id, view.log.add(authority.epoch, authority.chain, commit)))
         return commits
 
     def _note(self, edit: protocol.ChangeRequest, result: Result) -> None:
@@ -281,7 +291,7 @@ class Server:
                 _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
             elif result.commit is not None:
                 self._edits += 1
-                self._accepted.append(now)
+                self._accepted.append(time.monotonic())
 
     def _note_time(self, stage: str, begin: float) -> None:
         self._times[stage].append(time.perf_counter() - begin)
@@ -337,28 +347,31 @@ class Server:
         authority = self._authority
         with self._lock:
             if join.is_part:
-                view = self._views.add(Wish(join.frames, join.symbols, join.bodies))
-                entries, part = view.entries, view.id
+                view = self._views.add(Wish(join.frames, join.symbols, join.bodies), again=join.again)
+                entries, part, link = view.entries, view.id, view.log.link
             else:
-                view, entries, part = None, tuple(authority.model.history.sequence), ""
+                view, entries, part, link = None, tuple(authority.model.history.sequence), "", b""
             revision, chain, epoch = authority.revision, authority.chain, authority.epoch
             self._forget_client(join.client)
             self._clients[join.client] = _Client(join.who, view, revision)
         files = authority.files.find(entries)
         # Without folders, which are of no use elsewhere.
         document = pack_document([entry_to_bytes(entry, entries) for entry in entries])
-        return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files)
+        return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files, link)
 
     def _list_missed(self, since: protocol.Since) -> protocol.Answer:
         authority = self._authority
         with self._lock:
             epoch, revision, chain = authority.epoch, authority.revision, authority.chain
+            found: list[protocol.Published] | None = None
             if since.view:
                 view = self._views.get(since.view) if since.client in self._clients else None
-                found = None if view is None else view.log.find_after(since.revision)
+                if view is not None and authority.knows(since.revision, since.chain):
+                    found = view.log.find_after(since.revision)
             else:
                 stored = self._store.commits_after(since.revision, since.chain, MOST_MISSED)
-                found = stored and [protocol.Published(epoch, link, commit) for commit, link in stored]
+                if stored is not None:
+                    found = [protocol.Published(epoch, link, commit) for commit, link in stored]
             if found is None:
                 return protocol.Refused("stale", "The server does not know this state; join again.")
             if since.client not in self._clients:
@@ -389,7 +402,7 @@ class Server:
                 operations=len(authority.model.history.sequence),
                 frames=len(authority.model.frames),
                 edits=self._edits,
-                rate=sum(now - then < _MINUTE for then in self._accepted) / _MINUTE,
+                rate=sum(ticks - then < _MINUTE for then in self._accepted) / _MINUTE,
                 stages=tuple(stages),
                 clients=tuple(
                     protocol.ClientStatus(client, known.who, known.part, known.revision, ticks - known.heard)
@@ -447,8 +460,13 @@ class Server:
     def _announce(self, announced: protocol.Announce) -> protocol.Done:
         with self._lock:
             if announced.endpoint:
-                client, *described = structs.astuple(announced)
-                self._sources[announced.source] = protocol.SourceStatus(*described, client)
+                self._sources[announced.source] = protocol.SourceStatus(
+                    announced.source,
+                    announced.endpoint,
+                    announced.coordinates,
+                    announced.offset,
+                    announced.client,
+                )
             else:
                 self._sources.pop(announced.source, None)
         self._publish_beat()
@@ -457,13 +475,26 @@ class Server:
     def _watch_clients(self, presence: Iterable[tuple[str, bool]]) -> None:
         for key, is_there in presence:
             client = key.rpartition("/")[2]
-            if is_there:
-                continue  # it is known once it has joined
             with self._lock:
-                self._forget_client(client)
-                self._drop_backup(client)
-                for name in [s.source for s in self._sources.values() if s.client == client]:
-                    del self._sources[name]
+                if is_there:
+                    self._present.add(client)
+                else:
+                    self._present.discard(client)
+
+    def _forget_absent(self) -> None:
+        """Forget those without a sign of life at two beats: it may come late, or be lost shortly."""
+        with self._lock:
+            sources = {source.client for source in self._sources.values()}
+            absent = {*self._clients, *self._backups, *sources} - self._present
+            for client in absent & self._absent:
+                self._forget(client)
+            self._absent = absent
+
+    def _forget(self, client: str) -> None:
+        self._forget_client(client)
+        self._drop_backup(client)
+        for name in [s.source for s in self._sources.values() if s.client == client]:
+            del self._sources[name]
 
     def _forget_client(self, client: str) -> None:
         known = self._clients.pop(client, None)
@@ -480,6 +511,7 @@ class Server:
 
     def _beat(self) -> None:
         while not self._closed.wait(BEAT):
+            self._forget_absent()
             self._publish_beat()
 
     def _publish_beat(self) -> None:

@@ -23,7 +23,14 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError, ShapeError
+from kineverse._checks import as_entries, as_tolerance, finite_number
+from kineverse.errors import (
+    DuplicateNameError,
+    InvalidValueError,
+    KineverseError,
+    OfflineError,
+    ShapeError,
+)
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol, parse_symbol_name
@@ -143,26 +150,28 @@ class StatePublisher:
             If there are more or fewer values than coordinates.
         InvalidValueError
             If a value, or the stamp, is NaN or infinite.
+        OfflineError
+            If the source has ended: a source ends with its model.
         """
+        if self.is_closed:
+            raise OfflineError(f"The source {self.source!r} was closed, or its model was. Make another one.")
         layout, now = self._layout, time.time()
         vector = np.asarray(values, dtype=_VALUE)
         if vector.shape != (len(layout.names),):
             raise ShapeError(
                 f"The vector has shape {vector.shape}, and the source {len(layout.names)} coordinates."
             )
-        if not np.isfinite(vector).all():
-            bad = [f"'{n}'" for n, v in zip(layout.names, vector, strict=True) if not math.isfinite(v)]
-            raise InvalidValueError(
-                f"The value of {', '.join(bad[:12])} is NaN or infinite; nothing is sent."
-            )
-        if stamp is None:
-            stamp = now
-        elif not math.isfinite(stamp):
+        finite = np.isfinite(vector)
+        if not finite.all():
+            bad = [f"'{layout.names[index]}'" for index in np.flatnonzero(~finite)[:12]]
+            raise InvalidValueError(f"The value of {', '.join(bad)} is NaN or infinite; nothing is sent.")
+        time_of_values = now if stamp is None else finite_number(stamp)
+        if time_of_values is None:
             raise InvalidValueError(f"The stamp of a vector is a time in seconds, not {stamp!r}.")
         body = vector.tobytes()
         with self._lock:
             self._number += 1
-            message = _HEADER.pack(layout.digest, self._run, self._number, stamp, now) + body
+            message = _HEADER.pack(layout.digest, self._run, self._number, time_of_values, now) + body
             for transport in self._transports:
                 transport.publish(self._key, message)
 
@@ -261,7 +270,11 @@ class StateReader:
         ------
         ShapeError
             If it has another shape.
+        InvalidValueError
+            If it is not of floating-point numbers, so that values would be rounded.
         """
+        if vector.dtype.kind != "f":
+            raise InvalidValueError(f"The vector has {vector.dtype}; values need floating-point numbers.")
         if vector.shape != (len(self.coordinates),):
             raise ShapeError(
                 f"The vector has shape {vector.shape}, and the reader {len(self.coordinates)} coordinates."
@@ -304,8 +317,9 @@ class StateReader:
 
         A reader of some coordinates waits for vectors with any of them.
         """
+        seconds = as_tolerance(timeout, "A timeout")
         with self._news:
-            self._news.wait_for(lambda: self._arrived != self._noticed, timeout)
+            self._news.wait_for(lambda: self._arrived != self._noticed, seconds)
             before, self._noticed = self._noticed, self._arrived
             return before != self._noticed
 
@@ -356,7 +370,8 @@ class _Layout:
 
     @classmethod
     def make(cls, coordinates: Iterable[Symbol | str], wanted: Sequence[str] = ()) -> _Layout:
-        names = tuple(map(str, coordinates))
+        given = as_entries("coordinates=", coordinates, (Symbol, str), "symbols, or their names")
+        names = tuple(map(str, given))
         symbols = tuple(Symbol(*parse_symbol_name(name)) for name in names)
         place: Mapping[str, int] = {name: index for index, name in enumerate(names)}
         if len(place) < len(names):

@@ -434,7 +434,7 @@ _REASONS = {
     sqlite3.SQLITE_FULL: "{path} cannot be written: the disk is full.",
     sqlite3.SQLITE_READONLY: "{path} cannot be written: this user may only read it.",
     sqlite3.SQLITE_CANTOPEN: "{path} cannot be opened: the file or its folder is not open to this user.",
-    sqlite3.SQLITE_IOERR: "{path} cannot be read or written: the disk refuses it.",
+    sqlite3.SQLITE_IOERR: "{path} cannot be read or written: the disk refuses it, or is full.",
 }
 
 

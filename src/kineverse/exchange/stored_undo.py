@@ -41,7 +41,7 @@ def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
         _check_unchanged(history, revision, old.tag, old.tag in changes.removed, later)
         if old.blob is not None:
             entry = operation_from_bytes(old.blob)
-            if computes(entry) and is_frozen(entry):
+            if computes(entry) and not _has_trace(entry):
                 _check_unread(store, history, entry, later)
             put.append(PlacedEntry(entry, _find_anchor(history, old, put, gone)))
     again = tuple(placed.entry.tag for placed in put if placed.entry.tag in history.entries)
@@ -51,14 +51,12 @@ def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
 
 def computes(entry: HistoryEntry) -> bool:
     """Return whether an operation depends on more of what it reads than on its being there."""
-    reads = entry.reads
-    has_trace = isinstance(entry.operation, OpaqueOperation) and entry.operation.trace is not None
-    return has_trace or bool(reads.listings) or any(how != Read.EXISTENCE for how in reads.cells.values())
+    kinds = {*entry.reads.cells.values()}
+    return _has_trace(entry) or bool(entry.reads.listings or kinds - {Read.EXISTENCE})
 
 
-def is_frozen(entry: HistoryEntry) -> bool:
-    """Return whether an operation of a document has no trace."""
-    return isinstance(entry.operation, OpaqueOperation) and entry.operation.trace is None
+def _has_trace(entry: HistoryEntry) -> bool:
+    return isinstance(entry.operation, OpaqueOperation) and entry.operation.trace is not None
 
 
 def _check_unchanged(

@@ -21,7 +21,7 @@ from functools import cache
 from typing import Any, Final, TypeVar
 
 from kineverse._extras import install_command
-from kineverse.errors import InvalidValueError, MissingDependencyError
+from kineverse.errors import InvalidValueError, MissingDependencyError, OfflineError
 
 from .address import check_endpoint
 
@@ -53,8 +53,11 @@ class _Entrances:
         self.left: list[Any] = []  # objects of Zenoh that nobody may end any more
         self._inside: list[None] = []  # append and pop are atomic
         self._ended = False
+        self.is_used = self.is_forked = False
         self.transports: weakref.WeakSet[Transport] = weakref.WeakSet()
         atexit.register(self._end)
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._forbid)
 
     def __enter__(self) -> None:
         self._inside.append(None)
@@ -64,6 +67,12 @@ class _Entrances:
 
     def __exit__(self, *_: object) -> None:
         self._inside.pop()
+
+    def _forbid(self) -> None:
+        """Begin no call in a forked process: the threads of Zenoh are not in it, its sockets are shared."""
+        if self.is_used:
+            self._ended = self.is_forked = True
+            self._inside.clear()
 
     def _end(self) -> None:
         for transport in list(self.transports):
@@ -75,6 +84,15 @@ class _Entrances:
 
 
 _call = _Entrances()
+
+
+def check_process() -> None:
+    """Raise an OfflineError in a process that was forked from one that had a connection."""
+    if _call.is_forked:
+        raise OfflineError(
+            "This process was forked from one that has used a model server, so it cannot use one. Start "
+            "processes by multiprocessing's method 'spawn' or 'forkserver', and load the model in them."
+        )
 
 
 class _Owner:
@@ -200,10 +218,12 @@ class Transport(_Owner):
     """
 
     def __init__(self, settings: dict[str, object]) -> None:
+        check_process()
         zenoh = _zenoh()
         config = zenoh.Config()
         for path, value in {**_SETTINGS, **settings}.items():
             config.insert_json5(path, json.dumps(value))
+        _call.is_used = True
         with _call:
             super().__init__((zenoh.open(config), zenoh.CancellationToken()))
         self._drop, self._block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK

@@ -52,7 +52,8 @@ from kineverse.model.rates import collect_symbols
 from kineverse.model.read_recorder import Read, Reads, unknown_name_error
 from kineverse.symbols import parse_symbol_name, symbol_name
 
-from .protocol import Changes, Placed, Published
+from .protocol import NO_CHAIN, Changes, CommitMessage, Placed, Published, encode
+from .protocol import chain as link_commits
 
 Key = tuple[str, str]
 """Cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix."""
@@ -367,14 +368,18 @@ class ViewLog:
 
     def __init__(self, revision: int) -> None:
         self._begin = self.last = revision
+        self.link = NO_CHAIN
         self._commits: deque[tuple[int, Published]] = deque()
 
-    def add(self, revision: int, published: Published) -> None:
-        """Add a commit, and forget the oldest if there are many."""
-        self._commits.append((revision, published))
-        self.last = revision
+    def add(self, epoch: str, chain: bytes, commit: CommitMessage) -> Published:
+        """Add a commit, forget the oldest if there are many, and return what is published."""
+        data = encode(commit)
+        self.last, self.link = commit.revision, link_commits(self.link, data)
+        published = Published(epoch, chain, data, self.link)
+        self._commits.append((commit.revision, published))
         if len(self._commits) > MOST_MISSED:
             self._begin = self._commits.popleft()[0]
+        return published
 
     def find_after(self, revision: int) -> list[Published] | None:
         """Return the commits after a revision; None if some of them are forgotten."""
@@ -401,14 +406,16 @@ class Views:
         """Return the view of an identifier, if it is followed."""
         return self._views.get(view)
 
-    def add(self, wish: Wish) -> View:
+    def add(self, wish: Wish, *, again: bool = False) -> View:
         """Return the view of a wish; equal wishes share one. Each user releases it at the end.
 
-        Unknown names are refused as by :meth:`Wish.check`, unless others follow this view already.
+        Unknown names are refused as by :meth:`Wish.check`, unless others follow this view already, or one
+        asks for it ``again``.
         """
         known = self._views.get(wish.id)
         if known is None:
-            wish.check(self._model)
+            if not again:
+                wish.check(self._model)
             known = self._views[wish.id] = View(self._model, self._coupling, wish)
         known.users += 1
         return known
@@ -416,7 +423,7 @@ class Views:
     def release(self, view: View) -> None:
         """Follow a view no longer for one of its users."""
         view.users -= 1
-        if not view.users and self._views.get(view.id) is view:
+        if view.users <= 0 and self._views.get(view.id) is view:
             del self._views[view.id]
 
     def commit(self, *diffs: Diff) -> list[tuple[View, Changes]]:

@@ -353,6 +353,7 @@ BENCHMARKS: Mapping[str, str] = {
     "memory": "the memory of a loaded robot",
     "document": "a robot in a kitchen, written down and read again; models of up to a million nodes",
     "edit": "models of 10 000 operations, and a robot with one joint replaced",
+    "exchange": "a model shared by processes: edits, state, joining, restoring, faults",
 }
 """Benchmarks in the order of running; each is a function ``measure_NAME`` of a module of this package."""
 _MODULES = {

@@ -98,6 +98,7 @@ def test_a_benchmark_measures_all_installed_peers_and_its_rows_are_documented(na
         others = {"loop": "casadi", "geometry": "mujoco", "tracking": "numpy,", "identification": "scipy"}
         others |= {"examples": "mink", "inverse_kinematics": "pink"}
         others["motion"] = "model.integrate"  # states beside vectors; nobody else has these constraints
+        others["exchange"] = "relay"
         peer = others.get(name, "pinocchio")
         assert any(peer in n or "pin" in n.split() for n in names)
         # There is no wheel of Bullet for every Python, and ripl-articulation is in no extra of ours.

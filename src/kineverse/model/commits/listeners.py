@@ -238,8 +238,8 @@ class Listeners:
             with self._lock:
                 self._waiting.append((commit.diff.version, heard))
 
-    def deliver(self) -> None:
-        """Call the listeners with the queued diffs. An exception of a listener is logged; the others go on.
+    def deliver(self, caught: type[BaseException] = Exception) -> None:
+        """Call the listeners with the queued diffs. What they raise of a kind is logged; the others go on.
 
         One thread delivers at a time, so diffs arrive in order. If another thread, or a callback that edits
         the model, posts a diff meanwhile, the delivering thread takes it over.
@@ -253,16 +253,16 @@ class Listeners:
             try:
                 for listener, part in heard:
                     if listener in self._listeners:
-                        _tell(listener, part, version)
+                        _tell(listener, part, version, caught)
             finally:
                 with self._lock:
                     self._delivering = False
 
 
-def _tell(listener: Listener, part: Diff, version: int) -> None:
+def _tell(listener: Listener, part: Diff, version: int, caught: type[BaseException]) -> None:
     try:
         listener.callback(part)
-    except Exception:
+    except caught:
         import logging  # for start-up time
 
         logging.getLogger(__name__).exception("A listener of the model raised at version %d.", version)

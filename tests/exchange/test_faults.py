@@ -1,0 +1,55 @@
+"""Faults of model servers, a little of each; ``make faults ARGS=server`` tries more."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("zenoh")
+pytest.importorskip("resource")
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from faults import server as faults
+
+BUSY = 5.0
+"""Longest time of an edit on a machine that does other things as well [s]."""
+
+
+def test_a_second_server_of_a_store_or_a_name_is_refused() -> None:
+    faults.try_twice()
+
+
+def test_a_damaged_store_is_refused_in_one_line() -> None:
+    assert faults.try_damages(15, 1)["refused"]
+
+
+def test_what_was_acknowledged_survives_kills_of_servers_and_clients() -> None:
+    """Each edit is there once and whole, and all replicas are equal."""
+    found = faults.try_kills(2, 1, processes=1)
+    assert found["servers"] == 2
+    assert found["clients"]
+    assert found["made"]
+
+
+def test_a_full_disk_refuses_edits_until_there_is_room() -> None:
+    assert faults.try_full_disks(2, 1)["failed"] >= 2
+
+
+def test_random_edits_end_in_the_same_model_everywhere_whatever_the_clock() -> None:
+    found = faults.try_edits(300, 4, 1, "jump")
+    assert found["made"] > 100
+    assert found["conflict"] > 5
+
+
+def test_nobody_is_held_up_by_a_process_that_stands_still() -> None:
+    found = faults.try_freezing(1.6, 1, most=BUSY)
+    assert found["made"] > 10
+
+
+def test_nonsense_is_refused_and_harms_nobody() -> None:
+    found = faults.try_messages(2000, 200, 1, senders=1, most=BUSY)
+    assert found["malformed"] > 500
+    assert found["Committed"] > 20
+    assert "failed" not in found

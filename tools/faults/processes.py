@@ -1,0 +1,159 @@
+"""Servers and clients as processes: they are told by lines of text, and tell by lines of JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+PATIENCE = 60.0
+"""Time after which a process that says nothing counts as a violation [s]."""
+
+
+class Process:
+    """Process of a module of this package; what it has told is kept, also after its end."""
+
+    def __init__(self, module: str, *arguments: object) -> None:
+        self.what = f"{module} {' '.join(map(str, arguments))}"
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", f"faults.{module}", *map(str, arguments)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        self.told: list[dict[str, Any]] = []
+        self._replies: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            with suppress(ValueError):  # the last line of one that was killed
+                told = json.loads(line)
+                if "reply" in told:
+                    self._replies.put(told)
+                else:
+                    self.told.append(told)
+        self._replies.put(None)
+
+    def wait_for_reply(self, timeout: float = PATIENCE) -> Any:
+        """Return the next reply, the first of which says that the process is ready."""
+        try:
+            told = self._replies.get(timeout=timeout)
+        except queue.Empty:
+            raise AssertionError(f"{self.what}: no reply within {timeout:g} s") from None
+        self.check()
+        if told is None:
+            raise AssertionError(f"{self.what}: has ended, with status {self._process.wait()}")
+        return told["reply"]
+
+    def ask(self, *words: object, timeout: float = PATIENCE) -> Any:
+        """Tell something and return the reply."""
+        self.tell(*words)
+        return self.wait_for_reply(timeout)
+
+    def tell(self, *words: object) -> None:
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):
+            self._process.stdin.write(f"{' '.join(map(str, words))}\n")
+            self._process.stdin.flush()
+
+    def check(self) -> None:
+        """Raise what the process has found wrong."""
+        for told in [*self.told]:
+            if "violation" in told:
+                raise AssertionError(f"{self.what}: {told['violation']}")
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._end()
+
+    def close(self) -> None:
+        """Let the process end by itself."""
+        self.tell("end")
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(5)
+        self.kill()
+
+    def _end(self) -> None:
+        self._process.wait()
+        self._reader.join()
+        for stream in (self._process.stdin, self._process.stdout):
+            with suppress(BrokenPipeError):
+                stream.close()  # type: ignore[union-attr]
+
+    def freeze(self) -> None:
+        os.kill(self._process.pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        os.kill(self._process.pid, signal.SIGCONT)
+
+
+def start(running: ExitStack, module: str, *arguments: object) -> Process:
+    """Start a process, which is ended with others, and return when it is ready."""
+    process = begin(running, module, *arguments)
+    process.wait_for_reply()
+    return process
+
+
+def begin(running: ExitStack, module: str, *arguments: object) -> Process:
+    """Start a process without waiting for it."""
+    process = Process(module, *arguments)
+    running.callback(process.kill)
+    return process
+
+
+@contextmanager
+def folder() -> Iterator[Path]:
+    """Temporary folder with one for sockets in it, for this process and those that it starts."""
+    known = os.environ.get("KINEVERSE_RUNTIME_DIR")
+    with TemporaryDirectory(prefix="kv-") as path:
+        os.environ["KINEVERSE_RUNTIME_DIR"] = str(Path(path, "run"))
+        try:
+            yield Path(path)
+        finally:
+            if known is None:
+                del os.environ["KINEVERSE_RUNTIME_DIR"]
+            else:
+                os.environ["KINEVERSE_RUNTIME_DIR"] = known
+
+
+_telling = threading.Lock()
+
+
+def tell(**told: Any) -> None:
+    """Tell the process that has started this one."""
+    line = f"{json.dumps(told)}\n"
+    with _telling:
+        sys.stdout.write(line)
+        sys.stdout.flush()
+
+
+def commands() -> Iterator[list[str]]:
+    """Yield what this process is told, until it has to end."""
+    for line in sys.stdin:
+        words = line.split()
+        if words == ["end"]:
+            return
+        yield words
+
+
+def wait_until(is_so: Any, timeout: float, what: str) -> None:
+    """Wait until something is so."""
+    late = time.monotonic() + timeout
+    while not is_so():
+        if time.monotonic() > late:
+            raise AssertionError(f"not within {timeout:g} s: {what}")
+        time.sleep(0.01)
