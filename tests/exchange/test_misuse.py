@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -248,10 +249,32 @@ def test_a_source_that_is_refused_leaves_the_others_alone(
     assert vector[0] == 0.5
 
 
+def test_arguments_of_another_kind_are_one_error(server: Server, load: Callable[..., LiveModel]) -> None:
+    connection = load().exchange
+    wrong: list[Callable[[], object]] = [
+        lambda: load(frames=["door"], symbols=[5]),
+        lambda: serve(5),  # type: ignore[arg-type]
+        lambda: serve(name="other", listen="tcp"),
+        lambda: serve(name="other", listen=None),  # type: ignore[arg-type]
+        lambda: serve(name="other", durable=True),
+        lambda: connection.history(before=-1),
+    ]
+    for call in wrong:
+        with pytest.raises(kv.errors.InvalidValueError):
+            call()
+    assert [*load(symbols="hinge").articulations] == ["hinge"]
+    with pytest.raises(kv.errors.FormatError, match="nonsense"):
+        load(symbols=["hinge:nonsense"])
+    assert len(connection.history(most=10**30, before=10**30)) == 1
+
+
 def test_a_source_whose_model_is_gone_says_so(server: Server, sockets: Path) -> None:
     model = kv.load("live:home")
     source = model.exchange.publisher("encoders", ["hinge"])
+    gone, connection = weakref.ref(model), model.exchange
     del model
-    gc.collect()
+    gc.collect()  # a thread that follows the server may still have it for a moment
+    assert connection.wait_for(lambda: connection.is_closed, LONG)
+    assert gone() is None
     with pytest.raises(kv.errors.OfflineError, match="was closed"):
         source.put([0.5])

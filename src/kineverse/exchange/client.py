@@ -67,7 +67,7 @@ def load_live(
         "",
         "",
         as_entries("frames=", frames or (), str, "names of frames") if is_part else EVERY_FRAME,
-        tuple(map(str, symbols or ())),
+        tuple(map(str, as_entries("symbols=", symbols or (), (Symbol, str), "symbols, or their names"))),
         bodies,
         is_part or not bodies,
     )

@@ -33,7 +33,7 @@ from .address import Address
 from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
-from .transport import NoAnswerError, Transport, check_process
+from .transport import NoAnswerError, Transport, check_not_forked
 
 PATIENCE = 10.0
 """Time that an edit waits for a server that went away, before it is given up [s]."""
@@ -106,8 +106,9 @@ class Connection:
 
     def history(self, most: int = 20, before: int | None = None) -> tuple[protocol.HistoryRow, ...]:
         """Return the last commits, newest first, from before a revision if one is given."""
-        most = as_count("most", most, 1)
-        asked = protocol.GetHistory(most) if before is None else protocol.GetHistory(most, before)
+        number = min(as_count("most", most, 1), protocol.MAX_LISTED)
+        end = protocol.MAX_REVISION if before is None else as_count("before", before, 0)
+        asked = protocol.GetHistory(number, min(end, protocol.MAX_REVISION))
         return self.ask(asked, protocol.CommitList).rows
 
     def backup(self, path: str | os.PathLike[str]) -> Store:
@@ -229,7 +230,7 @@ class Connection:
 
     def check_open(self) -> None:
         """Raise an OfflineError if the connection was closed, or is that of the parent of a fork."""
-        check_process()
+        check_not_forked()
         if self.is_closed:
             raise OfflineError(
                 f"The connection to {self.address} was closed, or its model was not kept; load it again."

@@ -16,9 +16,9 @@ from typing import TypeAlias
 import numpy as np
 from msgspec import structs
 
-from kineverse._checks import as_tolerance, check_flag
+from kineverse._checks import as_entries, as_tolerance, check_flag
 from kineverse._version import __version__
-from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
+from kineverse.errors import FormatError, InvalidValueError, KineverseError, UnknownNameError
 from kineverse.formats import entry_to_bytes
 from kineverse.formats.document.encoding import pack_document
 from kineverse.model.edit import Edit
@@ -83,15 +83,19 @@ def serve(
     Raises
     ------
     InvalidValueError
-        For an invalid name, or one that another server has.
+        For an invalid name or argument.
+    DuplicateNameError
+        If another server has the name.
     FormatError
         For a model that cannot be loaded, or a store that is damaged, in use or of another version.
     MissingDependencyError
         Without the extra ``exchange``.
     """
     check_flag("durable", durable)
-    given = [models] if isinstance(models, (str, os.PathLike, Model)) else list(models)
-    endpoints = [check_endpoint(endpoint) for endpoint in listen]
+    if durable and store is None:
+        raise InvalidValueError("Without a store= nothing is kept, so durable=True needs one.")
+    given = as_entries("models=", models, (str, os.PathLike, Model), "models, or their files and names")
+    endpoints = [check_endpoint(one) for one in as_entries("listen=", listen, str, "endpoints")]
     path = None if store is None else Path(store)
     with ExitStack() as opened:
         kept = opened.enter_context(closing(Store(path, durable=durable)))
@@ -307,7 +311,7 @@ class Server:
                 answer = self._answer(protocol.decode_request(request.payload))
             except UnknownNameError as error:
                 self._refuse(request, "unknown", error)
-            except FormatError as error:
+            except KineverseError as error:
                 self._refuse(request, "malformed", error)
             except Exception as error:  # a defect of this package must not end the server
                 _LOG.exception("A question could not be answered.")

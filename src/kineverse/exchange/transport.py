@@ -86,7 +86,7 @@ class _Entrances:
 _call = _Entrances()
 
 
-def check_process() -> None:
+def check_not_forked() -> None:
     """Raise an OfflineError in a process that was forked from one that had a connection."""
     if _call.is_forked:
         raise OfflineError(
@@ -218,7 +218,7 @@ class Transport(_Owner):
     """
 
     def __init__(self, settings: dict[str, object]) -> None:
-        check_process()
+        check_not_forked()
         zenoh = _zenoh()
         config = zenoh.Config()
         for path, value in {**_SETTINGS, **settings}.items():
