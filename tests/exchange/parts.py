@@ -5,21 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import kineverse as kv
-from kineverse.exchange.protocol import Changes
-from kineverse.exchange.views import View
-from kineverse.formats.document import from_bytes, operation_from_bytes
-from kineverse.model import NetChanges, PlacedEntry
+from kineverse.exchange.protocol import Changes, decode_changes
+from kineverse.exchange.views import Coupling, View, Wish
+from kineverse.formats.document import from_bytes, to_bytes
+from kineverse.model.model import Snapshot
+from kineverse.model.operation import Cell
+
+
+def close(model: kv.Model, wish: Wish) -> set[Cell]:
+    """Return the cells, by kind and name, that the part of a wish has."""
+    return {*Coupling(model.history).close(wish)[0]}
 
 
 def make_replica(view: View) -> kv.Model:
     """Return the part that a client gets when it joins."""
-    return from_bytes(view.document())
+    return from_bytes(to_bytes(Snapshot({}, view.entries, 0)))
 
 
 def adopt(replica: kv.Model, changes: Changes) -> None:
     """Make the changes of a view in a replica, as a client does."""
-    put = tuple(PlacedEntry(operation_from_bytes(p.blob), p.after or None, p.at_end) for p in changes.put)
-    replica.adopt(NetChanges(put, changes.replaced, changes.rerun, changes.moved, changes.removed))
+    replica.adopt(decode_changes(changes))
 
 
 def check_agreement(

@@ -9,7 +9,7 @@ import kineverse as kv
 from kineverse.exchange import protocol
 from kineverse.exchange.authority import Authority, Result
 from kineverse.formats import entry_to_bytes, operation_from_bytes
-from kineverse.model import Edit, NetChanges, PlacedEntry
+from kineverse.model import Edit
 from kineverse.model.read_recorder import ReadRecorder
 
 Act = Callable[[Edit], object]
@@ -84,14 +84,8 @@ class Replica:
         with self.model.edit() as edit:
             start = edit.savepoint()
             act(edit)
-            net = edit.net()
-            sequence = self.model.history.sequence
-            put = [
-                protocol.Placed(entry_to_bytes(one.entry, sequence), one.after or "", one.at_end)
-                for one in net.put
-            ]
+            changes = protocol.encode_changes(edit.net(), self.model.history.sequence)
             start.roll_back()
-        changes = protocol.Changes(tuple(put), net.replaced, net.rerun, net.moved, net.removed)
         return self.request(changes, strict=strict)
 
     def request(self, changes: protocol.Changes, *, strict: bool = False) -> protocol.EditRequest:
@@ -109,20 +103,14 @@ class Replica:
     def follow(self, results: Sequence[Result]) -> None:
         """Adopt what was published."""
         for result in results:
-            if result.published is not None:
-                self.adopt(result.published.commit)
+            if result.commit is not None:
+                self.adopt(result.commit.published.commit)
 
     def adopt(self, data: bytes) -> None:
         """Adopt one commit."""
         commit: protocol.CommitMessage = protocol.decode_commit(data)
         assert commit.previous == self.revision
-        changes = commit.changes
-        put = [
-            PlacedEntry(operation_from_bytes(one.blob), one.after or None, one.at_end) for one in changes.put
-        ]
-        self.model.adopt(
-            NetChanges(tuple(put), changes.replaced, changes.rerun, changes.moved, changes.removed)
-        )
+        self.model.adopt(protocol.decode_changes(commit.changes))
         self.revision, self.chain = commit.revision, protocol.chain(self.chain, data)
 
 

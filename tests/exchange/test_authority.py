@@ -39,7 +39,7 @@ def build(edit: Edit) -> None:
 
 def started() -> tuple[Store, Authority]:
     store = Store(None)
-    authority = Authority(store, clock=lambda: 1.0)
+    authority = Authority(store)
     authority.fill(build, "me")
     return store, authority
 
@@ -128,8 +128,8 @@ def test_replicas_store_and_log_have_the_model_of_the_server(turns: list[Any]) -
         (result,) = authority.process([request])
         if not accepted(result.answer):
             assert content(authority.model) == before
-            assert result.published is None
-        elif result.published is not None:
+            assert result.commit is None
+        elif result.commit is not None:
             log.append(result)
             assert authority.revision == result.answer.revision == _revision(result)
     replay = Replica(Authority(Store(None)))
@@ -146,8 +146,8 @@ def test_replicas_store_and_log_have_the_model_of_the_server(turns: list[Any]) -
 
 
 def _revision(result: Result) -> int:
-    assert result.published is not None
-    return int(protocol.decode_commit(result.published.commit).revision)
+    assert result.commit is not None
+    return int(result.commit.message.revision)
 
 
 @pytest.mark.parametrize("name", gallery.names())
@@ -169,7 +169,7 @@ def test_dependents_are_run_again_without_their_code() -> None:
     one, other = Replica(authority), Replica(authority, "b")
     results = authority.process([one.draft(put("a", 4.0)), other.draft(put("c", 2.5))])
     assert [accepted(result.answer) for result in results] == [True, True]
-    changes = protocol.decode_commit(results[0].published.commit).changes  # type: ignore[union-attr]
+    changes = results[0].commit.message.changes  # type: ignore[union-attr]
     assert (changes.replaced, changes.rerun) == (("a",), ("twice",))
     one.follow(results)
     assert one.model.data["twice"] == authority.model.data["twice"] == 8.0
@@ -404,7 +404,7 @@ def test_an_edit_that_is_asked_twice_is_made_once_and_answered_alike() -> None:
     request = replica.draft(lambda edit: edit.write("n", 1, "n"))
     refused = dataclass_like(request, number=9, base=5)
     results = authority.process([request, refused, request, refused])
-    assert [result.published is not None for result in results] == [True, False, False, False]
+    assert [result.commit is not None for result in results] == [True, False, False, False]
     assert results[0].answer == results[2].answer == authority.process([request])[0].answer
     assert results[1].answer == results[3].answer
     assert ask(Authority(store), request) == [results[0].answer]
@@ -452,20 +452,18 @@ def test_after_an_error_of_the_store_nothing_has_happened() -> None:
     assert content(replica.model) == content(authority.model) == content(Authority(store).model)
 
 
-def test_what_watches_commits_sees_each_as_it_is_made() -> None:
-    seen: list[Any] = []
-    store = Store(None)
-    authority = Authority(
-        store,
-        watch=lambda model, diff, commit: (
-            seen.append((model.version, diff.version, commit.revision)) or len(seen)
-        ),
-    )
-    authority.fill(build, "me")
+def test_each_commit_comes_with_its_message_and_its_diff() -> None:
+    _, authority = started()
     replica = Replica(authority)
     results = authority.process([replica.draft(put("a", 2.0)), replica.draft(put("c", 1.0))])
-    assert seen == [(n, n, n) for n in (1, 2, 3)]
-    assert [result.watched for result in results] == [2, 3]
+    commits = [result.commit for result in results if result.commit is not None]
+    assert [(one.message.revision, one.diff.version, one.diff.replaced) for one in commits] == [
+        (2, 2, ("a",)),
+        (3, 3, ("c",)),
+    ]
+    assert [protocol.decode_commit(one.published.commit) for one in commits] == [
+        one.message for one in commits
+    ]
 
 
 # -- undo ----------------------------------------------------------------------------------------------------
@@ -502,6 +500,18 @@ def test_undo_by_model_and_by_store(is_restarted: bool) -> None:
     assert again.reason == "conflict"
     assert again.revision == 9
     assert other.model.snapshot() == authority.model.snapshot()
+
+
+def test_what_was_removed_before_a_restart_goes_back_to_its_place() -> None:
+    store, authority = started()
+    before = authority.model.history.tags
+    for client, tag in ("a", "exists"), ("b", "capped"):
+        replica = Replica(authority, client)
+        (result,) = authority.process([replica.draft(lambda edit, tag=tag: edit.remove(tag))])  # type: ignore[misc]
+        assert accepted(result.answer)
+    authority = Authority(store)
+    assert accepted(ask(authority, Replica(authority, "c").undo(2))[0])  # what it followed is gone
+    assert authority.model.history.tags == [tag for tag in before if tag != "capped"]
 
 
 # -- lies ----------------------------------------------------------------------------------------------------

@@ -107,7 +107,6 @@ BAD = {
     "does not follow": lambda one: replace(one, chain=bytes(32)),
     "follow revision": lambda one: replace(one, revision=one.revision + 1),
     "not there": lambda one: replace(one, removed=["nothing"]),
-    "places": lambda one: replace(one, places=[]),
     "its place": lambda one: replace(one, put=[("a", 7, b"a"), ("b", 7, b"b")]),
     "client and number": lambda one: replace(one, number=1),
 }

@@ -55,16 +55,14 @@ def make_commit(seed: int, revision: int, chain: bytes, operations: Operations) 
         files = (protocol.MeshContent(tag, 0, sha256, revision),) if random.random() < 0.3 else ()
         operations[tag] = place, msgspec.msgpack.encode((tag, content)), files
         put.append((tag, *operations[tag]))
-    places = None
-    if random.random() < 0.05:
+    if random.random() < 0.05:  # all get new places
         order = sorted(operations, key=lambda tag: operations[tag][0])
-        places = [(tag, i * GAP) for i, tag in enumerate(order)]
-        operations.update({tag: (place, *operations[tag][1:]) for tag, place in places})
-        put = [(tag, *operations[tag]) for tag, *_ in put]
+        operations.update({tag: (i * GAP, *operations[tag][1:]) for i, tag in enumerate(order)})
+        put = [(tag, *operations[tag]) for tag in order]
     data = msgspec.msgpack.encode((revision, removed, put))
     chain = protocol.chain(chain, data)
     rows, files = [one[:3] for one in put], [file for *_, some in put for file in some]
-    return StoredCommit(revision, chain, CLIENT, revision, data, rows, removed, places, tuple(before), files)
+    return StoredCommit(revision, chain, CLIENT, revision, data, rows, removed, tuple(before), files)
 
 
 def commits(

@@ -6,8 +6,8 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
@@ -57,11 +57,17 @@ class ServerCommand(NamedTuple):
     run: Callable[[argparse.Namespace], int]
 
 
+def _add_server(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "server", metavar="NAME", help=f"name of a server, see ls; or its address, {SCHEME}tcp/HOST:PORT/NAME"
+    )
+
+
+def _add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="everything, as JSON")
+
+
 # -- what is there -------------------------------------------------------------------------------------------
-
-
-def _add_ls_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_json(parser)
 
 
 def _run_ls(arguments: argparse.Namespace) -> int:
@@ -100,7 +106,7 @@ LS = ServerCommand(
 examples:
   kineverse ls
   kineverse ls --json""",
-    _add_ls_arguments,
+    _add_json,
     _run_ls,
 )
 
@@ -384,27 +390,15 @@ examples:
 # -- parts of several ----------------------------------------------------------------------------------------
 
 
-def _add_server(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "server", metavar="NAME", help=f"name of a server, see ls; or its address, {SCHEME}tcp/HOST:PORT/NAME"
-    )
-
-
-def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="everything, as JSON")
-
-
 def _find_address(arguments: argparse.Namespace) -> Address:
     require(arguments.command.prog, {"exchange": True})
     name: str = arguments.server
     return Address.parse(name if name.startswith(SCHEME) else SCHEME + name)
 
 
-@contextmanager
-def _connect(arguments: argparse.Namespace) -> Iterator[Connection]:
+def _connect(arguments: argparse.Namespace) -> closing[Connection]:
     """Connect to a server for questions alone."""
-    with closing(Connection(_find_address(arguments))) as connection:
-        yield connection
+    return closing(Connection(_find_address(arguments)))
 
 
 def _join(arguments: argparse.Namespace, frames: Sequence[str] | None = None) -> LiveModel:

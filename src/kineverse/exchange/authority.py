@@ -13,88 +13,64 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from time import perf_counter
-from typing import Any, Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from kineverse._runtime import no_collection
 from kineverse.errors import EditError, FormatError, KineverseError, suggest
 from kineverse.formats import entry_to_bytes, operation_from_bytes
 from kineverse.formats.document import OpaqueOperation
 from kineverse.model import Diff, Edit, Model, NetChanges, PlacedEntry
-from kineverse.model.history import History, HistoryEntry, TouchedEntry
+from kineverse.model.history import History, HistoryEntry
 
 from . import protocol
-from .conflicts import KEPT, ConflictFoundError, EditConflict, Revisions
-from .meshes import put_contents
-from .protocol import CommitMessage, Committed, MeshContent, Placed, Published, Refused
+from .conflicts import KEPT, RefusedError, Revisions
+from .meshes import ServedFiles, put_contents
+from .protocol import CommitMessage, Committed, Published, Refused
 from .store import Replaced, Store, StoredCommit
 from .stored_undo import computes, find_inverse
 from .views import LOAD_THE_WHOLE, is_partial
 
+_LOG = logging.getLogger(__name__)
+
 ANSWERS: Final = 10_000
 """Number of answers that are kept in memory, to answer an edit that is asked twice alike."""
 _LONGEST_TAG: Final = 4096
-_LONGEST_MESSAGE: Final = 1000
 
 EditAnswer: TypeAlias = Committed | Refused
-FindFiles: TypeAlias = Callable[[Sequence[HistoryEntry], Sequence[MeshContent]], tuple[MeshContent, ...]]
-Watch: TypeAlias = Callable[[Model, Diff, CommitMessage], Any]
+
+
+class MadeCommit(NamedTuple):
+    """Commit of the model: its message, as it is published, and its diff."""
+
+    message: CommitMessage
+    published: Published
+    diff: Diff
 
 
 @dataclass(slots=True)
 class Result:
-    """Outcome of a request: the answer, and for a new commit what is published.
+    """Outcome of a request: the answer, and the commit if one was made.
 
-    ``watched`` is the result of ``watch`` for the commit. ``seconds`` has the times of the stages decode,
-    check, fold, encode and, of the whole batch, persist [s].
+    ``seconds`` has the times of the stages decode, check, fold, encode and, of the whole batch, persist [s].
     """
 
     answer: EditAnswer
-    published: Published | None = None
-    watched: Any = None
+    commit: MadeCommit | None = None
     seconds: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class _Made:
-    """Commit that the model has made: its message, what it touched and replaced, and if places are new."""
-
-    commit: CommitMessage
-    data: bytes
-    touched: list[TouchedEntry]
-    replaced: tuple[Replaced, ...]
-    are_places_new: bool
-
-
-class _RefusedError(Exception):
-    """Edit that is not made, with its answer."""
-
-    def __init__(self, answer: Refused) -> None:
-        super().__init__(answer)
-        self.answer = answer
 
 
 class Authority:
     """Model of a server with its store. One thread uses it.
 
-    ``clock`` returns the time [s since 1970]. ``find_files`` gets the entries that a commit puts and the
-    files that the client has named, and returns the files that the commit names. ``watch`` gets the model,
-    the diff and the commit, after each commit and before the next one. If it raises, the commit is taken
-    back, as after an error of the store. The version of ``model`` is the revision. ``epoch`` identifies this
+    The version of ``model`` is the revision, and ``files`` are those of its meshes. ``epoch`` identifies this
     run; after an error of the store there is another one, and another model. A store with operations that are
     no model is a FormatError.
     """
 
-    def __init__(
-        self,
-        store: Store,
-        clock: Callable[[], float] = time.time,
-        *,
-        find_files: FindFiles = lambda entries, named: (),
-        watch: Watch = lambda model, diff, commit: None,
-    ) -> None:
-        self._store, self._clock = store, clock
-        self._find_files, self._watch = find_files, watch
+    def __init__(self, store: Store) -> None:
+        self._store, self.files = store, ServedFiles(store)
         self._answers: OrderedDict[tuple[str, int], EditAnswer] = OrderedDict()
         self._batch: list[StoredCommit] = []
         self._load()
@@ -103,12 +79,10 @@ class Authority:
         """Make the model by linking the operations of the store."""
         with no_collection():
             stored = self._store.operations()
-            entries = [operation_from_bytes(blob) for _, blob, _ in stored]
+            entries = [operation_from_bytes(blob).at(place) for place, blob, _ in stored]
             put_contents(entries, (file for *_, files in stored for file in files))
             self.model = Model(entries, self._store.revision)
         self.model.history.commits.clear()
-        # A model numbers its places anew; they are stored with the next commit.
-        self._are_places_new = bool(entries)
         self.chain = self._store.chain
         self.epoch = secrets.token_hex(16)
         self._start = self.revision
@@ -138,9 +112,9 @@ class Authority:
         with source.edit() as edit:
             build(edit)
         entries = source.history.sequence
-        placed = tuple(Placed(entry_to_bytes(entry, entries), at_end=True) for entry in entries)
-        files = self._find_files(entries, ())
-        request = protocol.EditRequest("0" * 32, 0, who, 0, self.chain, protocol.Changes(placed), files=files)
+        net = NetChanges(tuple(PlacedEntry(entry, None, at_end=True) for entry in entries))
+        changes, files = protocol.encode_changes(net, entries), self.files.find(entries)
+        request = protocol.EditRequest("0" * 32, 0, who, 0, self.chain, changes, files=files)
         (result,) = self.process([request])
         if isinstance(result.answer, Refused):
             kind = FormatError if result.answer.reason in ("failed", "malformed") else EditError
@@ -170,25 +144,27 @@ class Authority:
                 if isinstance(request, protocol.UndoRequest):
                     self._persist()  # it may need all commits of the store
                 results.append(self._answer(request))
-                self._keep_answer(key, results[-1].answer)
+                self._answers[key] = results[-1].answer
+                if len(self._answers) > ANSWERS:
+                    self._answers.popitem(last=False)
                 new.append(key)
             begin = perf_counter()
             self._persist()
             seconds = perf_counter() - begin
         except Exception as error:
             if not isinstance(error, KineverseError | OSError):
-                logging.getLogger(__name__).exception("Edits were taken back.")
+                _LOG.exception("Edits were taken back.")
             for key in new:
                 self._answers.pop(key, None)
             self._is_lost = True
-            refused = Refused("failed", _one_line(f"The server has failed, and nothing was done. {error}"))
+            refused = RefusedError("failed", f"The server has failed, and nothing was done. {error}").answer
             try:
                 self._recover()
                 return [Result(self._find_answer((one.client, one.number)) or refused) for one in requests]
             except (KineverseError, OSError):  # it is tried again before the next edit
                 return [Result(refused) for _ in requests]
         for result in results:
-            if result.published is not None:
+            if result.commit is not None:
                 result.seconds["persist"] = seconds
         return results
 
@@ -211,50 +187,27 @@ class Authority:
         stored = self._store.find_answer(*key)
         return None if stored is None else Committed(*stored)
 
-    def _keep_answer(self, key: tuple[str, int], answer: EditAnswer) -> None:
-        self._answers[key] = answer
-        if len(self._answers) > ANSWERS:
-            self._answers.popitem(last=False)
-
     def _answer(self, request: protocol.ChangeRequest) -> Result:
         """Make one edit, if it can be made."""
-        seconds: dict[str, float] = {}
+        revision = self.revision
+        self._seconds = dict[str, float]()
         try:
             with no_collection():
-                if isinstance(request, protocol.UndoRequest):
-                    made = self._undo(request, seconds)
-                else:
-                    made = self._make(request, seconds)
-        except _RefusedError as refused:
-            return Result(refused.answer, seconds=seconds)
-        except ConflictFoundError as found:
-            return Result(_as_answer(found.conflict), seconds=seconds)
-        except EditError as error:
-            tag = next(iter(error.failures), "")
-            text = f"{tag!r}: {error.failures[tag]}" if tag else str(error)
-            return Result(Refused("refused", _one_line(text), tag), seconds=seconds)
-        except KineverseError as error:
-            return Result(Refused("refused", _one_line(str(error))), seconds=seconds)
-        except RecursionError:
-            message = "The edit has expressions or data that are nested too deeply."
-            return Result(Refused("refused", message), seconds=seconds)
-        except MemoryError:
-            return Result(Refused("refused", "There is not enough memory for the edit."), seconds=seconds)
-        except Exception as error:  # the edit is rolled back, and the server lives
-            logging.getLogger(__name__).exception("An edit of %r failed.", request.who)
-            message = f"The edit has failed in the server, with {type(error).__name__}: {error}"
-            return Result(Refused("failed", _one_line(message)), seconds=seconds)
-        if made is None:
-            return Result(Committed(self.revision, self.chain), seconds=seconds)
-        return self._note(request, made, seconds)
+                commit = (
+                    self._undo(request) if isinstance(request, protocol.UndoRequest) else self._make(request)
+                )
+        except Exception as error:
+            if self.revision > revision:  # what was made is not stored
+                raise
+            return Result(_as_answer(error, request.who), seconds=self._seconds)
+        return Result(Committed(self.revision, self.chain), commit, self._seconds)
 
-    def _make(self, request: protocol.EditRequest, seconds: dict[str, float]) -> _Made | None:
+    def _make(self, request: protocol.EditRequest) -> MadeCommit | None:
         """Make an edit of a client; None if it does nothing."""
         begin = perf_counter()
         self._check_base(request)
         changes, history = request.changes, self.model.history
-        put = tuple(map(_decode, changes.put))
-        put_contents([placed.entry for placed in put], request.files)
+        put = _decode(request)
         # What the client has run again on the present model is taken, so that loops are not closed once more.
         # What it has run again on an older one is run here.
         is_newest = request.base == self.revision
@@ -263,18 +216,14 @@ class Authority:
         put = tuple(placed for placed in put if placed.entry.tag not in dropped)
         rerun = tuple(tag for tag in changes.rerun if tag not in dropped)
         net = NetChanges(put, changes.replaced, rerun, changes.moved, changes.removed)
-        seconds["decode"] = perf_counter() - begin
+        self._seconds["decode"] = perf_counter() - begin
         begin = perf_counter()
         if not is_newest:
             entries = [placed.entry for placed in put]
-            found = self._revisions.find_conflict(
-                request.base, entries, changes.moved, changes.removed, history
-            )
-            if found is not None:
-                raise _RefusedError(_as_answer(found))
+            self._revisions.check(request.base, entries, changes.moved, changes.removed, history)
         self._check_tags(net, request.base)
-        seconds["check"] = perf_counter() - begin
-        return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net), seconds)
+        self._seconds["check"] = perf_counter() - begin
+        return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net))
 
     def _check_base(self, request: protocol.EditRequest) -> None:
         """Check that the client knows the present model, or one of the last."""
@@ -282,13 +231,13 @@ class Authority:
         if request.strict and base < now:
             who = self._revisions.who_made(now)
             message = f"Revision {now}, by {who}, has changed the model meanwhile. Try again."
-            raise _RefusedError(Refused("conflict", _one_line(message), revision=now, who=who))
+            raise RefusedError("conflict", message, revision=now, who=who)
         if base < self._start and self._store.commits_after(base, request.chain, KEPT) is not None:
             message = f"The server was started again after revision {base}. Try again at revision {now}."
-            raise _RefusedError(Refused("conflict", message, revision=now))
+            raise RefusedError("conflict", message, revision=now)
         if self._revisions.chain_at(base) != request.chain:
             message = f"Revision {base} is not known to the server, which is at revision {now}. Join again."
-            raise _RefusedError(Refused("stale", message))
+            raise RefusedError("stale", message)
 
     def _check_tags(self, changes: NetChanges, base: int) -> None:
         """Check that the operations are there that an edit replaces, removes, or puts others after."""
@@ -303,15 +252,15 @@ class Authority:
             if is_placed and not placed.at_end and after is not None and after not in put:
                 if after not in entries or after in gone:
                     raise self._missing_error(tag, after, base)
-                if self._revisions.last_move(after) > base:
-                    raise _RefusedError(_as_answer(self._revisions.conflict_about(tag, after, "has moved")))
+                if self._revisions.last("moved", after) > base:
+                    raise self._revisions.conflict_about(tag, after, "has moved")
             put.add(tag)
 
-    def _missing_error(self, tag: str, missing: str, base: int) -> _RefusedError:
-        if self._revisions.last_change(missing) > base:
-            return _RefusedError(_as_answer(self._revisions.conflict_about(tag, missing, "has removed")))
+    def _missing_error(self, tag: str, missing: str, base: int) -> RefusedError:
+        if self._revisions.last("changed", missing) > base:
+            return self._revisions.conflict_about(tag, missing, "has removed")
         message = f"There is no operation {missing!r}. {suggest(missing, self.model.history.entries, 'tag')}"
-        return _RefusedError(Refused("refused", _one_line(message), tag))
+        return RefusedError("refused", message, tag)
 
     # -- the fold ------------------------------------------------------------------------------------------
 
@@ -334,15 +283,11 @@ class Authority:
                 now.blob = given.blob
 
     def _fold(
-        self,
-        request: protocol.ChangeRequest,
-        act: Callable[[Edit], None],
-        own: Iterable[str],
-        seconds: dict[str, float],
-    ) -> _Made | None:
-        """Make an edit, and the message of its commit.
+        self, request: protocol.ChangeRequest, act: Callable[[Edit], None], own: Iterable[str]
+    ) -> MadeCommit | None:
+        """Make an edit, and a commit of it to be stored and published; None if it does nothing.
 
-        ``own`` are the operations that it puts or removes itself.
+        ``own`` is what it puts or removes itself.
         """
         history = self.model.history
         begin = perf_counter()
@@ -351,36 +296,49 @@ class Authority:
         with self.model.edit() as edit:
             act(edit)
             net = edit.net()
-            seconds["fold"] = perf_counter() - begin
+            self._seconds["fold"] = perf_counter() - begin
             if net.is_empty:
                 return None
             begin = perf_counter()
             entries = [placed.entry for placed in net.put]
-            put = [
-                Placed(entry_to_bytes(placed.entry, history.sequence), placed.after or "", placed.at_end)
-                for placed in net.put
-            ]
             commit = CommitMessage(
                 revision=self.revision + 1,
                 previous=self.revision,
                 client=request.client,
                 number=request.number,
                 who=request.who,
-                time=self._clock(),
-                changes=protocol.Changes(tuple(put), net.replaced, net.rerun, net.moved, net.removed),
-                files=self._find_files(
-                    entries, request.files if isinstance(request, protocol.EditRequest) else ()
-                ),
+                time=time.time(),
+                changes=protocol.encode_changes(net, history.sequence),
+                files=self.files.find(entries, getattr(request, "files", ())),
             )
             data = protocol.encode(commit)
-            if len(data) > protocol.MAX_BYTES or len(put) > protocol.MAX_OPERATIONS:
+            if len(data) > protocol.MAX_BYTES or len(entries) > protocol.MAX_OPERATIONS:
                 raise EditError(
-                    f"The edit leads to a commit of {len(put)} operations in {len(data)} bytes; the most is "
-                    f"{protocol.MAX_OPERATIONS} in {protocol.MAX_BYTES}. Make several smaller edits."
+                    f"The edit leads to a commit of {len(entries)} operations in {len(data)} bytes; the most "
+                    f"is {protocol.MAX_OPERATIONS} in {protocol.MAX_BYTES}. Make several smaller edits."
                 )
             touched = list(history.touched())
-        seconds["encode"] = perf_counter() - begin
-        return _Made(commit, data, touched, replaced, history.sequence is not sequence)
+        self._seconds["encode"] = perf_counter() - begin
+        self.chain = protocol.chain(self.chain, data)
+        self._revisions.note(commit.revision, self.chain, commit.who, touched, history)
+        files = commit.files
+        put = [history.entries[entry.tag] for _, entry, _ in touched if entry is not None]
+        if history.sequence is not sequence:  # all have new places
+            put, files = history.sequence, self.files.find(history.sequence, files)
+        self._batch.append(
+            StoredCommit(
+                commit.revision,
+                self.chain,
+                commit.client,
+                commit.number,
+                data,
+                [(entry.tag, entry.place, entry_to_bytes(entry, history.sequence)) for entry in put],
+                commit.changes.removed,
+                replaced,
+                files,
+            )
+        )
+        return MadeCommit(commit, Published(self.epoch, self.chain, data), self._diffs.pop())
 
     def _find_replaced(self, tag: str) -> Replaced:
         """Return what an edit will replace under a tag."""
@@ -392,73 +350,49 @@ class Authority:
         after = history.sequence[index - 1].tag if index else ""
         return Replaced(tag, entry_to_bytes(entry, history.sequence), after, entry.place)
 
-    def _note(self, request: protocol.ChangeRequest, made: _Made, seconds: dict[str, float]) -> Result:
-        """Note a commit that the model has made, to be stored and published."""
-        history, revision = self.model.history, self.revision
-        self.chain = protocol.chain(self.chain, made.data)
-        self._revisions.note(revision, self.chain, request.who, made.touched, history)
-        put = [entry for _, entry, _ in made.touched if entry is not None]
-        are_all_placed = made.are_places_new or self._are_places_new
-        self._are_places_new = False
-        self._batch.append(
-            StoredCommit(
-                revision,
-                self.chain,
-                request.client,
-                request.number,
-                made.data,
-                [(entry.tag, history.entries[entry.tag].place, entry.blob or b"") for entry in put],
-                made.commit.changes.removed,
-                [(entry.tag, entry.place) for entry in history.sequence] if are_all_placed else None,
-                made.replaced,
-                made.commit.files,
-            )
-        )
-        diff = self._diffs.pop()
-        watched = self._watch(self.model, diff, made.commit)
-        published = Published(self.epoch, self.chain, made.data)
-        return Result(Committed(revision, self.chain), published, watched, seconds)
-
     # -- undo ----------------------------------------------------------------------------------------------
 
-    def _undo(self, request: protocol.UndoRequest, seconds: dict[str, float]) -> _Made | None:
+    def _undo(self, request: protocol.UndoRequest) -> MadeCommit | None:
         """Take back a commit: by the model if it has it, else by what the store has kept of it."""
         revision, kept = request.revision, self.model.history.commits
         if not 0 < revision <= self.revision:
             message = f"There is no revision {revision}; the model is at revision {self.revision}."
-            raise _RefusedError(Refused("unknown", message))
+            raise RefusedError("unknown", message)
         if revision in kept:
-            return self._fold(request, lambda edit: self._take_back(edit, revision), kept[revision], seconds)
+            return self._fold(request, lambda edit: self._take_back(edit, revision), kept[revision])
         net = find_inverse(self._store, self.model.history, revision)
-        return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net), seconds)
+        return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net))
 
     def _take_back(self, edit: Edit, revision: int) -> None:
         try:
             edit.undo(revision)
         except EditError as error:
-            tag = max(self.model.history.commits[revision], key=self._revisions.last_change)
-            later = self._revisions.last_change(tag)
-            who = self._revisions.who_made(later)
-            raise ConflictFoundError(EditConflict(str(error), tag, "", later, who)) from None
+            tag = max(self.model.history.commits[revision], key=partial(self._revisions.last, "changed"))
+            later = self._revisions.last("changed", tag)
+            raise RefusedError(
+                "conflict", str(error), tag, "", later, self._revisions.who_made(later)
+            ) from None
 
 
-def _decode(placed: Placed) -> PlacedEntry:
-    """Return an operation that is put, decoded from its blob."""
+def _decode(request: protocol.EditRequest) -> tuple[PlacedEntry, ...]:
+    """Return the operations that an edit puts, decoded from their blobs."""
     try:
-        entry = operation_from_bytes(placed.blob)
+        put = protocol.decode_changes(request.changes).put
     except FormatError as error:
-        raise _RefusedError(Refused("malformed", _one_line(str(error)))) from None
-    if len(entry.tag) > _LONGEST_TAG:
-        message = f"A tag has {len(entry.tag)} letters; the most is {_LONGEST_TAG}."
-        raise _RefusedError(Refused("malformed", message))
-    operation = entry.operation
-    if is_partial(entry):
-        message = f"Of the operation {entry.tag!r} the client has only a part. {LOAD_THE_WHOLE}"
-        raise _RefusedError(Refused("refused", _one_line(message), entry.tag))
-    if isinstance(operation, OpaqueOperation) and operation.frozen and not computes(entry):
-        message = f"The operation {entry.tag!r} is frozen, and does not say by what it has read."
-        raise _RefusedError(Refused("malformed", _one_line(message), entry.tag))
-    return PlacedEntry(entry, placed.after or None, placed.at_end)
+        raise RefusedError("malformed", str(error)) from None
+    entries = [placed.entry for placed in put]
+    for entry in entries:
+        tag, operation = entry.tag, entry.operation
+        if len(tag) > _LONGEST_TAG:
+            raise RefusedError("malformed", f"A tag has {len(tag)} letters; the most is {_LONGEST_TAG}.")
+        if is_partial(entry):
+            message = f"Of the operation {tag!r} the client has only a part. {LOAD_THE_WHOLE}"
+            raise RefusedError("refused", message, tag)
+        if isinstance(operation, OpaqueOperation) and operation.frozen and not computes(entry):
+            message = f"The operation {tag!r} is frozen, and does not say by what it has read."
+            raise RefusedError("malformed", message, tag)
+    put_contents(entries, request.files)
+    return put
 
 
 def _unlinked(placed: PlacedEntry) -> PlacedEntry:
@@ -494,7 +428,7 @@ def _choose_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, histor
             continue
         if old is None or not is_same or not _reads_any(old, changed):
             message = f"The operation {entry.tag!r} is not one that the edit leads to be run again."
-            raise _RefusedError(Refused("refused", _one_line(message), entry.tag))
+            raise RefusedError("refused", message, entry.tag)
         changed |= old.writes.keys() | entry.writes.keys()
         taken.add(entry.tag)
     return taken
@@ -514,11 +448,22 @@ def _find_own(changes: NetChanges) -> list[str]:
     ]
 
 
-def _as_answer(conflict: EditConflict) -> Refused:
-    message = _one_line(conflict.message)
-    return Refused("conflict", message, conflict.tag, conflict.path, conflict.revision, conflict.who)
-
-
-def _one_line(text: str) -> str:
-    text = " ".join(text.split())
-    return text if len(text) <= _LONGEST_MESSAGE else f"{text[:_LONGEST_MESSAGE]} ..."
+def _as_answer(error: Exception, who: str) -> Refused:
+    """Return the answer to an edit that has failed and is rolled back."""
+    match error:
+        case RefusedError():
+            return error.answer
+        case EditError() if error.failures:
+            tag, failure = next(iter(error.failures.items()))
+            error = RefusedError("refused", f"{tag!r}: {failure}", tag)
+        case KineverseError():
+            error = RefusedError("refused", str(error))
+        case RecursionError():
+            error = RefusedError("refused", "The edit has expressions or data that are nested too deeply.")
+        case MemoryError():
+            error = RefusedError("refused", "There is not enough memory for the edit.")
+        case _:
+            _LOG.error("An edit of %r failed.", who, exc_info=error)
+            message = f"The edit has failed in the server, with {type(error).__name__}: {error}"
+            error = RefusedError("failed", message)
+    return error.answer

@@ -10,7 +10,7 @@ import logging
 import threading
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
 from kineverse._version import __version__
 from kineverse.errors import ConflictError, EditError, OfflineError
-from kineverse.formats import entries_from_bytes, entry_to_bytes, operation_from_bytes
+from kineverse.formats import entries_from_bytes
 from kineverse.formats.resources import add_resolver, remove_resolver
 from kineverse.model.changes import find_moved_tags
 from kineverse.model.commits.net_changes import NetChanges, PlacedEntry
@@ -76,11 +76,8 @@ def load_live(
 
 def include_live(edit: Edit, source: str, prefix: str | None = None, **others: Any) -> list[str]:
     """Append the present operations of a server's model to an edit of another one, and return their tags."""
-    connection = Connection(Address.parse(source))
-    try:
+    with closing(Connection(Address.parse(source))) as connection:
         joined = connection.join(protocol.JoinRequest(protocol.PROTOCOL, __version__, "", ""))
-    finally:
-        connection.close()
     return [edit.link(entry) for entry in entries_from_bytes(joined.document, prefix)]
 
 
@@ -263,18 +260,13 @@ class LiveModel(Model):
             return []
         if self._wish.is_part:
             _check_part(self, changes)
-        sequence = self._history.sequence
-        put = tuple(
-            protocol.Placed(entry_to_bytes(placed.entry, sequence), placed.after or "", placed.at_end)
-            for placed in changes.put
-        )
         return [
             protocol.EditRequest(
                 connection.client,
                 connection.next_number(),
                 connection.who,
                 *connection.position,
-                protocol.Changes(put, changes.replaced, changes.rerun, changes.moved, changes.removed),
+                protocol.encode_changes(changes, self._history.sequence),
                 strict,
                 find_known_files(placed.entry for placed in changes.put),
             )
@@ -342,7 +334,9 @@ class LiveModel(Model):
             self._join_again()
             return
         try:
-            self._adopt(_decode_changes(commit), commit.revision)
+            changes = protocol.decode_changes(commit.changes)
+            put_contents((placed.entry for placed in changes.put), commit.files)
+            self._adopt(changes, commit.revision)
         except Exception:
             _LOG.exception("A commit of %s cannot be adopted; its model is joined again.", connection.address)
             self._join_again()
@@ -432,9 +426,8 @@ def _entries(joined: protocol.Joined) -> list[HistoryEntry]:
 def _find_changes(old: Sequence[HistoryEntry], new: Sequence[HistoryEntry]) -> NetChanges:
     """Return the changes between two sequences; operations that may read what changes are put as well."""
     known = {entry.tag: entry for entry in old}
-    tags = {entry.tag for entry in new}
-    before, after = [tag for tag in known if tag in tags], [entry.tag for entry in new if entry.tag in known]
-    moved = find_moved_tags(before, after)
+    tags = dict.fromkeys(entry.tag for entry in new)
+    moved = find_moved_tags([*known], [*tags])
     put, last = [], None
     for entry in new:
         is_equal = entry.tag in known and known[entry.tag].blob == entry.blob and entry.tag not in moved
@@ -464,16 +457,6 @@ def _check_part(model: LiveModel, changes: NetChanges) -> None:
                 f"The edit needs more than this part of the model: {entry.tag!r} reads {missing[0]}. Name it "
                 f"when the part is loaded, or load the whole, {str(model.exchange.address)!r}."
             )
-
-
-def _decode_changes(commit: protocol.CommitMessage) -> NetChanges:
-    changes = commit.changes
-    put = []
-    for placed in changes.put:
-        entry = operation_from_bytes(placed.blob)
-        put.append(PlacedEntry(entry, placed.after or None, placed.at_end))
-    put_contents([placed.entry for placed in put], commit.files)
-    return NetChanges(tuple(put), changes.replaced, changes.rerun, changes.moved, changes.removed)
 
 
 def _pump(channel: Any, model: weakref.ref[LiveModel], method: Callable[[LiveModel, Any], None]) -> None:

@@ -73,7 +73,7 @@ class Connection:
         self.epoch, self.revision, self.chain = "", 0, protocol.NO_CHAIN
         self.is_online, self.is_closed = True, False
         self.sources: tuple[protocol.SourceStatus, ...] = ()
-        self._publishers: list[tuple[StatePublisher, float]] = []
+        self._publishers: list[StatePublisher] = []
         self._readers: list[StateReader] = []
         self._heard, self._settled = "", 0.0
         self._numbers = count(1)
@@ -94,7 +94,7 @@ class Connection:
         self.note_presence(False)
         for reader in self._readers:
             reader.close()
-        for publisher, _ in list(self._publishers):
+        for publisher in list(self._publishers):
             publisher.close()
         self.transport.close()
 
@@ -149,23 +149,8 @@ class Connection:
     ) -> StatePublisher:
         """Return a new source of state, which the readers of all clients find. It ends with this connection.
 
-        Parameters
-        ----------
-        source
-            Name of the source: letters, digits, ``_``, ``.`` and ``-``.
-        coordinates
-            Symbols, or their names, of the values in a vector; also names that the model does not have.
-        offset
-            What is to be added to its stamps to get the time of the server [s].
-
-        Raises
-        ------
-        OfflineError
-            If the server is away.
-        DuplicateNameError
-            If another process of this computer sends under the same name.
-        InvalidValueError
-            If a source cannot have that name, or the offset is not a finite number.
+        Parameters and errors are those of :class:`.StatePublisher`; the model need not have the coordinates.
+        A server that is away is an OfflineError, and an offset that is no finite number an InvalidValueError.
         """
         self.check_online()
         seconds = finite_number(offset)
@@ -178,8 +163,9 @@ class Connection:
             server=self.transport,
             direct=not self.address.endpoint,
             announce=self._announce,
+            offset=seconds,
         )
-        self._publishers.append((publisher, seconds))
+        self._publishers.append(publisher)
         try:
             self._announce(publisher)
         except BaseException:
@@ -190,17 +176,7 @@ class Connection:
     def reader(self, coordinates: Iterable[Symbol | str] = ()) -> StateReader:
         """Return a reader of the newest state of all sources, those that come later included.
 
-        Parameters
-        ----------
-        coordinates
-            Symbols, or their names, of the vectors that it fills.
-
-        Raises
-        ------
-        OfflineError
-            If the server is away.
-        DuplicateNameError
-            If a coordinate is given twice.
+        Coordinates and errors are those of :class:`.StateReader`. A server that is away is an OfflineError.
         """
         self.check_online()
         reader = StateReader(
@@ -212,13 +188,15 @@ class Connection:
 
     def _announce(self, publisher: StatePublisher) -> None:
         """Tell the server of a source, or that it has ended; one who is away is told when it is back."""
-        offset = next(offset for known, offset in self._publishers if known is publisher)
+        source, endpoint = publisher.source, publisher.endpoint
         if publisher.is_closed:
-            self._publishers.remove((publisher, offset))
-        endpoint = "" if publisher.is_closed else publisher.endpoint
-        announced = protocol.Announce(self.client, publisher.source, endpoint, publisher.coordinates, offset)
+            self._publishers.remove(publisher)
+            endpoint = ""
         with suppress(OfflineError):
-            self.ask(announced, protocol.Done)
+            self.ask(
+                protocol.Announce(self.client, source, endpoint, publisher.coordinates, publisher.offset),
+                protocol.Done,
+            )
 
     def _take_sources(self, beat: protocol.Beat) -> None:
         """Follow the sources that the server knows; one that has just started does not know them all yet."""
@@ -230,7 +208,7 @@ class Connection:
         self._readers = [reader for reader in self._readers if not reader.is_closed]
         for reader in self._readers:
             reader.follow(self.sources)
-        for publisher, _ in list(self._publishers):
+        for publisher in list(self._publishers):
             if publisher.source not in listed:
                 self._announce(publisher)
 
@@ -307,10 +285,9 @@ class Connection:
     def hear(self, beat: protocol.Beat) -> None:
         """Take the sources of state from a sign of life, and tell the server what this client has."""
         self._take_sources(beat)
-        seen = protocol.Seen(self.client, self.revision)
         if self.revision != self._told:
             self._told = self.revision
-            self.transport.publish(self.key("seen"), protocol.encode(seen))
+            self.transport.publish(self.key("seen"), protocol.encode(protocol.Seen(self.client, self._told)))
 
     def wait_for(self, is_done: Callable[[], bool], timeout: float | None) -> bool:
         """Wait until something is so, which is looked at when the model or the connection changes."""

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from itertools import count
 from pathlib import Path
 
 from msgspec.structs import replace
@@ -17,7 +19,7 @@ from kineverse.errors import FormatError
 from kineverse.formats.files import replace_file
 from kineverse.formats.resource_paths import locate_mesh
 from kineverse.formats.resources import FolderResolver, map_meshes, measure_content, meshes_of
-from kineverse.model.body import Body, Mesh
+from kineverse.model.body import Mesh
 from kineverse.model.history import HistoryEntry
 from kineverse.model.operation import BODIES
 
@@ -41,16 +43,15 @@ class ServedFiles:
         """Return the digests of meshes whose files are here: found on disk, or named and known already."""
         by_place = {(file.tag, file.index): (file.sha256, file.size) for file in named}
         result = []
-        for entry in entries:
-            for index, mesh in enumerate(_meshes(entry.writes)):
-                known = by_place.get((entry.tag, index)) or mesh.content
-                if known is None:
-                    known = measure_content(mesh)
-                    if known is not None and known[0] not in self._paths:
-                        self._paths[known[0]] = os.fspath(locate_mesh(mesh))
-                        self._store.add_path(known[0], self._paths[known[0]])
-                if known is not None and known[0] in self._paths:
-                    result.append(MeshContent(entry.tag, index, *known))
+        for tag, index, mesh in _meshes(entries):
+            known = by_place.get((tag, index)) or mesh.content
+            if known is None:
+                known = measure_content(mesh)
+                if known is not None and known[0] not in self._paths:
+                    self._paths[known[0]] = os.fspath(locate_mesh(mesh))
+                    self._store.add_path(known[0], self._paths[known[0]])
+            if known is not None and known[0] in self._paths:
+                result.append(MeshContent(tag, index, *known))
         return tuple(result)
 
     def read(self, sha256: str, offset: int) -> bytes | None:
@@ -98,9 +99,8 @@ class FetchedFiles:
 def find_known_files(entries: Iterable[HistoryEntry]) -> tuple[MeshContent, ...]:
     """Return the digests of meshes that are known in some operations."""
     return tuple(
-        MeshContent(entry.tag, index, *mesh.content)
-        for entry in entries
-        for index, mesh in enumerate(_meshes(entry.writes))
+        MeshContent(tag, index, *mesh.content)
+        for tag, index, mesh in _meshes(entries)
         if mesh.content is not None
     )
 
@@ -111,21 +111,20 @@ def put_contents(entries: Iterable[HistoryEntry], files: Iterable[MeshContent]) 
     for file in files:
         by_tag.setdefault(file.tag, {})[file.index] = file.sha256, file.size
     for entry in entries:
-        contents = by_tag.get(entry.tag)
-        if not contents:
-            continue
-        count = 0
-
-        def place(mesh: Mesh, contents: dict[int, tuple[str, int]] = contents) -> Mesh:
-            nonlocal count
-            count += 1
-            return replace(mesh, content=contents.get(count - 1, mesh.content))
-
-        for cell, value in entry.writes.items():
-            if cell[0] == BODIES and meshes_of(value):
-                entry.writes[cell] = map_meshes(value, place)
+        if entry.tag in by_tag:
+            contents = map(by_tag[entry.tag].get, count())
+            for cell, value in entry.writes.items():
+                if cell[0] == BODIES and meshes_of(value):
+                    entry.writes[cell] = map_meshes(value, partial(_with_content, contents))
 
 
-def _meshes(writes: Mapping[tuple[str, str], object]) -> list[Mesh]:
-    bodies = [value for (kind, _), value in writes.items() if kind == BODIES and isinstance(value, Body)]
-    return [mesh for body in bodies for mesh in meshes_of(body)]
+def _with_content(contents: Iterator[tuple[str, int] | None], mesh: Mesh) -> Mesh:
+    return replace(mesh, content=next(contents) or mesh.content)
+
+
+def _meshes(entries: Iterable[HistoryEntry]) -> Iterator[tuple[str, int, Mesh]]:
+    """Yield the meshes of operations, with the tag and the place of each."""
+    for entry in entries:
+        bodies = [value for (kind, _), value in entry.writes.items() if kind == BODIES]
+        for index, mesh in enumerate(mesh for body in bodies for mesh in meshes_of(body)):
+            yield entry.tag, index, mesh

@@ -9,12 +9,16 @@ Commits are published under ``kineverse/NAME/log``, and those that concern a par
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
 
 from kineverse.errors import FormatError
+from kineverse.formats import entry_to_bytes, operation_from_bytes
+from kineverse.model.commits.net_changes import NetChanges, PlacedEntry
+from kineverse.model.history import HistoryEntry
 
 PROTOCOL: Final = 1
 MAX_BYTES: Final = 1 << 26
@@ -424,6 +428,18 @@ _decode_tag = msgspec.msgpack.Decoder(_Tagged).decode
 def tag_of(placed: Placed) -> str:
     """Return the tag of an operation from a blob that was checked."""
     return _decode_tag(placed.blob).tag
+
+
+def encode_changes(net: NetChanges, sequence: Sequence[HistoryEntry]) -> Changes:
+    """Return net changes as a message; the sequence is that of the edited model."""
+    put = tuple(Placed(entry_to_bytes(one.entry, sequence), one.after or "", one.at_end) for one in net.put)
+    return Changes(put, net.replaced, net.rerun, net.moved, net.removed)
+
+
+def decode_changes(changes: Changes) -> NetChanges:
+    """Return the net changes in a message; a blob that is none is a FormatError."""
+    put = tuple(PlacedEntry(operation_from_bytes(p.blob), p.after or None, p.at_end) for p in changes.put)
+    return NetChanges(put, changes.replaced, changes.rerun, changes.moved, changes.removed)
 
 
 def chain(previous: bytes, commit: bytes) -> bytes:

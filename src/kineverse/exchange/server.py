@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
 import numpy as np
+from msgspec import structs
 
 from kineverse._checks import as_entries, as_tolerance, check_flag
 from kineverse._version import __version__
@@ -27,10 +28,10 @@ from . import protocol
 from .address import Claim, check_endpoint
 from .authority import Authority, Result
 from .connection import describe_client
-from .meshes import MAX_PART, ServedFiles
+from .meshes import MAX_PART
 from .store import Store
 from .transport import Question, Questions, Transport
-from .views import View, Views, Wish
+from .views import MOST_MISSED, View, Views, Wish
 
 _LOG = logging.getLogger(__name__)
 
@@ -44,7 +45,6 @@ STAGES = ("receive", "decode", "check", "fold", "encode", "persist", "publish", 
 """Stages of an edit, in order; their times are in the status."""
 _KEPT_REFUSALS = 20
 _KEPT_TIMES = 1000
-_MOST_MISSED = 1000
 _LONGEST_MESSAGE = 10_000
 _MINUTE = 60.0
 _BACKUP = "store"
@@ -102,8 +102,7 @@ def serve(
         chosen = name or kept.name or (path.stem if path else "") or _name_of(given)
         claim = Claim(chosen)
         opened.callback(claim.release)
-        files = ServedFiles(kept)
-        authority = Authority(kept, find_files=files.find, watch=lambda _, diff, commit: (diff, commit))
+        authority = Authority(kept)
         if authority.revision and given:
             _LOG.warning("%s has a model already, which is served. Nothing else is read.", store)
         elif given:
@@ -111,7 +110,7 @@ def serve(
         kept.name = chosen
         transport = Transport.serve([claim.endpoint, *endpoints], claim.secret)
         opened.callback(transport.close)
-        return Server(chosen, authority, kept, files, transport, opened.pop_all())
+        return Server(chosen, authority, kept, transport, opened.pop_all())
 
 
 def _name_of(given: Sequence[Source]) -> str:
@@ -141,20 +140,12 @@ class Server:
     """
 
     def __init__(
-        self,
-        name: str,
-        authority: Authority,
-        store: Store,
-        files: ServedFiles,
-        transport: Transport,
-        opened: ExitStack,
+        self, name: str, authority: Authority, store: Store, transport: Transport, opened: ExitStack
     ) -> None:
         self.name = name
-        self._authority, self._store, self._files, self._transport = authority, store, files, transport
-        self._opened = opened
+        self._authority, self._store, self._transport, self._opened = authority, store, transport, opened
         self._since = time.time()
         self._views = Views(authority.model)
-        self._logs: dict[str, _ViewLog] = {}
         self._sources: dict[str, protocol.SourceStatus] = {}
         self._backups: dict[str, TemporaryDirectory[str]] = {}
         self._clients: dict[str, _Client] = {}
@@ -244,7 +235,6 @@ class Server:
         try:
             with self._lock:
                 results = self._authority.process(edits)
-                published = [result.published for result in results if result.published is not None]
                 if self._authority.epoch != epoch:
                     self._begin_again()
                 for_parts = self._follow_views(results)
@@ -254,8 +244,9 @@ class Server:
                 self._refuse(request, "failed", error)
             return
         begin = time.perf_counter()
-        for commit in published:
-            self._transport.publish(self._key("log"), protocol.encode(commit))
+        for result in results:
+            if result.commit is not None:
+                self._transport.publish(self._key("log"), protocol.encode(result.commit.published))
         for view, commit in for_parts:
             self._transport.publish(self._key(f"view/{view}"), protocol.encode(commit))
         self._note_time("publish", begin)
@@ -267,7 +258,7 @@ class Server:
 
     def _begin_again(self) -> None:
         """Follow a model that was loaded again from its store: parts are asked for anew, and clients join."""
-        self._views, self._logs, self._clients = Views(self._authority.model), {}, {}
+        self._views, self._clients = Views(self._authority.model), {}
         before = self._token
         self._token = self._transport.alive(self._key(f"alive/{self._authority.epoch}"))
         before.close()  # later, so that clients do not take the server for gone
@@ -277,24 +268,21 @@ class Server:
             return self._commit_views(results)
         except Exception:  # a defect of this package; the edits are made, and clients of parts join again
             _LOG.exception("Parts of the model could not follow it.")
-            self._views, self._logs = Views(self._authority.model), {}
+            self._views = Views(self._authority.model)
             return []
 
     def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
         """Return the commits of parts, by the ids of their views."""
-        made = [result.watched for result in results if result.watched is not None]
+        made = [result.commit for result in results if result.commit is not None]
         if not made:
             return []
-        authority, last = self._authority, made[-1][1]
+        authority, last = self._authority, made[-1].message
         commits = []
-        for view, changes in self._views.commit(*(diff for diff, _ in made)):
-            log = self._logs[view.id]
+        for view, changes in self._views.commit(*(commit.diff for commit in made)):
             put = {*map(protocol.tag_of, changes.put)}
-            files = self._files.find([entry for entry in view.entries if entry.tag in put])
-            commit = protocol.CommitMessage(
-                last.revision, log.last, last.client, last.number, last.who, last.time, changes, files
-            )
-            commits.append((view.id, log.add(authority.epoch, authority.chain, commit)))
+            files = authority.files.find([entry for entry in view.entries if entry.tag in put])
+            commit = structs.replace(last, previous=view.log.last, changes=changes, files=files)
+            commits.append((view.id, view.log.add(authority.epoch, authority.chain, commit)))
         return commits
 
     def _note(self, edit: protocol.ChangeRequest, result: Result) -> None:
@@ -305,7 +293,7 @@ class Server:
             if isinstance(result.answer, protocol.Refused):
                 self._refusals.append(protocol.Refusal(now, edit.who, result.answer.message))
                 _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
-            elif result.published is not None:
+            elif result.commit is not None:
                 self._edits += 1
                 self._accepted.append(time.monotonic())
 
@@ -342,7 +330,7 @@ class Server:
             case protocol.GetHistory():
                 return self._list_history(question)
             case protocol.GetFile():
-                data = self._files.read(question.sha256, question.offset)
+                data = self._authority.files.read(question.sha256, question.offset)
                 if data is None:
                     return protocol.Refused("unknown", f"There is no file with SHA-256 {question.sha256}.")
                 return protocol.FilePart(data)
@@ -364,14 +352,13 @@ class Server:
         with self._lock:
             if join.is_part:
                 view = self._views.add(Wish(join.frames, join.symbols, join.bodies), again=join.again)
-                entries, part = view.entries, view.id
-                link = self._logs.setdefault(part, _ViewLog(authority.revision)).link
+                entries, part, link = view.entries, view.id, view.log.link
             else:
                 view, entries, part, link = None, tuple(authority.model.history.sequence), "", b""
             revision, chain, epoch = authority.revision, authority.chain, authority.epoch
             self._forget_client(join.client)
             self._clients[join.client] = _Client(join.who, view, revision)
-        files = self._files.find(entries)
+        files = authority.files.find(entries)
         # Without folders, which are of no use elsewhere.
         document = pack_document([entry_to_bytes(entry, entries) for entry in entries])
         return protocol.Joined(self.name, __version__, epoch, revision, chain, part, document, files, link)
@@ -380,29 +367,30 @@ class Server:
         authority = self._authority
         with self._lock:
             epoch, revision, chain = authority.epoch, authority.revision, authority.chain
+            found: list[protocol.Published] | None = None
             if since.view:
-                log = self._logs.get(since.view) if since.client in self._clients else None
-                is_known = authority.knows(since.revision, since.chain)
-                found = log.find_after(since.revision) if log is not None and is_known else None
+                view = self._views.get(since.view) if since.client in self._clients else None
+                if view is not None and authority.knows(since.revision, since.chain):
+                    found = view.log.find_after(since.revision)
             else:
-                stored = self._store.commits_after(since.revision, since.chain, _MOST_MISSED)
-                found = (
-                    None
-                    if stored is None
-                    else [protocol.Published(epoch, link, commit) for commit, link in stored]
-                )
-                if found is not None and since.client not in self._clients:
-                    self._clients[since.client] = _Client(since.who, None, since.revision)
+                stored = self._store.commits_after(since.revision, since.chain, MOST_MISSED)
+                if stored is not None:
+                    found = [protocol.Published(epoch, link, commit) for commit, link in stored]
             if found is None:
                 return protocol.Refused("stale", "The server does not know this state; join again.")
+            if since.client not in self._clients:
+                self._clients[since.client] = _Client(since.who, None, since.revision)
             self._clients[since.client].note(since.revision)
         return protocol.Missed(epoch, revision, chain, tuple(found))
 
     def _status(self) -> protocol.Status:
         authority, now, ticks = self._authority, time.time(), time.monotonic()
         with self._lock:
-            known = [(stage, self._times[stage]) for stage in STAGES if stage in self._times]
-            stages = [(stage, np.percentile([*times], (50, 95))) for stage, times in known]
+            stages = [
+                protocol.StageTime(stage, *np.percentile([*self._times[stage]], (50, 95)).tolist())
+                for stage in STAGES
+                if stage in self._times
+            ]
             return protocol.Status(
                 name=self.name,
                 library=__version__,
@@ -419,9 +407,7 @@ class Server:
                 frames=len(authority.model.frames),
                 edits=self._edits,
                 rate=sum(ticks - then < _MINUTE for then in self._accepted) / _MINUTE,
-                stages=tuple(
-                    protocol.StageTime(name, float(middle), float(high)) for name, (middle, high) in stages
-                ),
+                stages=tuple(stages),
                 clients=tuple(
                     protocol.ClientStatus(client, known.who, known.part, known.revision, ticks - known.heard)
                     for client, known in self._clients.items()
@@ -518,8 +504,6 @@ class Server:
         known = self._clients.pop(client, None)
         if known is not None and known.view is not None:
             self._views.release(known.view)
-            if self._views.get(known.view.id) is None:
-                self._logs.pop(known.view.id, None)
 
     def _note_seen(self, messages: Iterable[bytes]) -> None:
         for data in messages:
@@ -541,7 +525,7 @@ class Server:
                 authority.epoch,
                 authority.revision,
                 authority.chain,
-                {view: log.last for view, log in self._logs.items()},
+                {view.id: view.log.last for view in self._views},
                 tuple(self._sources.values()),
             )
         self._transport.publish(self._key("beat"), protocol.encode(beat))
@@ -565,28 +549,3 @@ class _Client:
     def note(self, revision: int) -> None:
         """Note a revision that the client has got."""
         self.revision, self.heard = revision, time.monotonic()
-
-
-class _ViewLog:
-    """Last commits of a part."""
-
-    def __init__(self, revision: int) -> None:
-        self._begin = self.last = revision
-        self.link = protocol.NO_CHAIN
-        self._commits: deque[tuple[int, protocol.Published]] = deque()
-
-    def add(self, epoch: str, chain: bytes, commit: protocol.CommitMessage) -> protocol.Published:
-        """Add a commit, forget the oldest if there are many, and return what is published."""
-        data = protocol.encode(commit)
-        self.last, self.link = commit.revision, protocol.chain(self.link, data)
-        published = protocol.Published(epoch, chain, data, self.link)
-        self._commits.append((commit.revision, published))
-        if len(self._commits) > _MOST_MISSED:
-            self._begin = self._commits.popleft()[0]
-        return published
-
-    def find_after(self, revision: int) -> list[protocol.Published] | None:
-        """Return the commits after a revision; None if some of them are forgotten."""
-        if revision < self._begin:
-            return None
-        return [published for number, published in self._commits if number > revision]

@@ -67,11 +67,13 @@ class StatePublisher:
     announce
         Function that tells the server of this source: called with it when there are other coordinates, and
         when it is closed.
+    offset
+        What is to be added to its stamps to get the time of the server [s].
 
     Attributes
     ----------
-    source, is_closed
-        Name of the source, and whether it has ended.
+    source, offset, is_closed
+        Name of the source, offset of its clock [s], and whether it has ended.
     endpoint
         Where it listens, to be announced to the server; :data:`THROUGH_SERVER` without a socket of its own.
         The stream then ends with the server, and goes on when that is back.
@@ -93,8 +95,9 @@ class StatePublisher:
         server: Transport | None = None,
         direct: bool = True,
         announce: Callable[[StatePublisher], None] = lambda _: None,
+        offset: float = 0.0,
     ) -> None:
-        self.source, self.is_closed, self._announce = source, False, announce
+        self.source, self.offset, self.is_closed, self._announce = source, offset, False, announce
         self._layout = _Layout.make(coordinates)
         self._key = _key(name, check_server_name(source, "source"))
         self._run, self._number, self._lock = secrets.randbits(64), 0, threading.Lock()
@@ -158,11 +161,10 @@ class StatePublisher:
             raise ShapeError(
                 f"The vector has shape {vector.shape}, and the source {len(layout.names)} coordinates."
             )
-        if not np.isfinite(vector).all():
-            bad = [f"'{n}'" for n, v in zip(layout.names, vector, strict=True) if not math.isfinite(v)]
-            raise InvalidValueError(
-                f"The value of {', '.join(bad[:12])} is NaN or infinite; nothing is sent."
-            )
+        finite = np.isfinite(vector)
+        if not finite.all():
+            bad = [f"'{layout.names[index]}'" for index in np.flatnonzero(~finite)[:12]]
+            raise InvalidValueError(f"The value of {', '.join(bad)} is NaN or infinite; nothing is sent.")
         time_of_values = now if stamp is None else finite_number(stamp)
         if time_of_values is None:
             raise InvalidValueError(f"The stamp of a vector is a time in seconds, not {stamp!r}.")

@@ -12,7 +12,6 @@ import hashlib
 import os
 import sqlite3
 import threading
-import uuid
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,8 +65,8 @@ _decode_replaced = msgspec.msgpack.Decoder(tuple[Replaced, ...]).decode
 class StoredCommit:
     """Commit to be stored: its message, its rows, and what its edit replaced.
 
-    ``put`` has tags, places and blobs, and ``files`` the digests of their meshes. ``places`` has the tags and
-    places of all operations after the commit if it gave them new places.
+    ``put`` has tags, places and blobs, and ``files`` the digests of their meshes. A commit that gives all
+    operations new places puts all of them.
     """
 
     revision: int
@@ -77,7 +76,6 @@ class StoredCommit:
     commit: bytes
     put: Sequence[tuple[str, int, bytes]] = ()
     removed: Sequence[str] = ()
-    places: Sequence[tuple[str, int]] | None = None
     replaced: tuple[Replaced, ...] = ()
     files: Sequence[protocol.MeshContent] = ()
 
@@ -217,20 +215,15 @@ class Store:
             self._contents = _load(self._db, self._path)
 
     def backup(self, path: Path) -> None:
-        """Write a copy of the store into a new file; it is complete, or there is none."""
+        """Write a copy of the store into a new file; after an error there is none."""
         if _check_path(path):
             raise StoreError(f"{path} exists already. Name a new file for the backup.")
-        part = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex}")
         try:
             with self._lock, _reporting(str(path)):
-                self._db.execute("VACUUM INTO ?", (str(part),))
-            with part.open("r+b") as file:
-                os.fsync(file.fileno())
-            part.rename(path)
-        except OSError as error:
-            raise StoreError(f"{path} cannot be written: {error.strerror}.") from None
-        finally:
-            part.unlink(missing_ok=True)
+                self._db.execute("VACUUM INTO ?", (str(path),))
+        except StoreError:
+            path.unlink(missing_ok=True)
+            raise
 
     def close(self) -> None:
         """Close the file."""
@@ -264,27 +257,14 @@ class Store:
         if (one.revision, one.chain) != (new.revision + 1, protocol.chain(new.chain, one.commit)):
             raise InvalidValueError(f"The commit {one.revision} does not follow revision {new.revision}.")
         files = _files_by_tag(one)
-        put, gone = one.put, {*one.removed, *(tag for tag, *_ in one.put if self._find(new, tag))}
-        if one.places is not None:  # rare, and then all rows are written
-            rows = self._db.execute("SELECT tag, blob, files FROM operations").fetchall()
-            blobs = {tag: blob for tag, blob, _ in rows}
-            gone |= blobs.keys()
-            again = {tag: blob for tag, _, blob in put}
-            files = {tag: known for tag, _, known in rows if tag not in again} | files
-            blobs |= again
-            if {tag for tag, _ in one.places} != blobs.keys() - {*one.removed}:
-                raise InvalidValueError(
-                    f"The commit {one.revision} does not give all operations their places."
-                )
-            put = [(tag, place, blobs[tag]) for tag, place in one.places]
-        for tag in gone:
+        for tag in {*one.removed, *(tag for tag, *_ in one.put if self._find(new, tag))}:
             known = self._find(new, tag)
             if known is None:
                 raise InvalidValueError(f"The commit {one.revision} removes {tag!r}, which is not there.")
             self._db.execute("DELETE FROM operations WHERE place = ?", (known[0],))
             new.total -= known[1]
             new.rows[tag] = None
-        for tag, place, blob in put:
+        for tag, place, blob in one.put:
             row = place, tag, blob, files.get(tag, _NO_FILES)
             self._db.execute("INSERT INTO operations VALUES (?, ?, ?, ?)", row)
             digest = _digest(*row)

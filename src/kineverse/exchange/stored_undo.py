@@ -15,7 +15,7 @@ from kineverse.model.operation import Cell
 from kineverse.model.read_recorder import ABSENT, Read, differs
 
 from . import protocol
-from .conflicts import ConflictFoundError, EditConflict
+from .conflicts import RefusedError
 from .protocol import CommitMessage
 from .store import Replaced, Store
 
@@ -27,7 +27,7 @@ def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
     """Return the changes that take back a commit of a store, which has all commits of a model.
 
     If a later commit has changed one of its operations, or what a frozen one had read, it is in conflict with
-    that (ConflictFoundError).
+    that (RefusedError).
     """
     data, replaced = store.commit_of(revision)
     commit: CommitMessage = protocol.decode_commit(data)
@@ -41,7 +41,7 @@ def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
         _check_unchanged(history, revision, old.tag, old.tag in changes.removed, later)
         if old.blob is not None:
             entry = operation_from_bytes(old.blob)
-            if computes(entry) and is_frozen(entry):
+            if computes(entry) and not _has_trace(entry):
                 _check_unread(store, history, entry, later)
             put.append(PlacedEntry(entry, _find_anchor(history, old, put, gone)))
     again = tuple(placed.entry.tag for placed in put if placed.entry.tag in history.entries)
@@ -51,14 +51,12 @@ def find_inverse(store: Store, history: History, revision: int) -> NetChanges:
 
 def computes(entry: HistoryEntry) -> bool:
     """Return whether an operation depends on more of what it reads than on its being there."""
-    reads = entry.reads
-    has_trace = isinstance(entry.operation, OpaqueOperation) and entry.operation.trace is not None
-    return has_trace or bool(reads.listings) or any(how != Read.EXISTENCE for how in reads.cells.values())
+    kinds = {*entry.reads.cells.values()}
+    return _has_trace(entry) or bool(entry.reads.listings or kinds - {Read.EXISTENCE})
 
 
-def is_frozen(entry: HistoryEntry) -> bool:
-    """Return whether an operation of a document has no trace."""
-    return isinstance(entry.operation, OpaqueOperation) and entry.operation.trace is None
+def _has_trace(entry: HistoryEntry) -> bool:
+    return isinstance(entry.operation, OpaqueOperation) and entry.operation.trace is not None
 
 
 def _check_unchanged(
@@ -76,9 +74,8 @@ def _check_unread(
     store: Store, history: History, entry: HistoryEntry, later: Sequence[CommitMessage]
 ) -> None:
     """Check that a frozen operation finds what it has read; it does not know that itself."""
-    then: dict[
-        Cell, tuple[Any, CommitMessage]
-    ] = {}  # value before the first commit that touched it, and that
+    # The value before the first commit that touched it, and that commit.
+    then: dict[Cell, tuple[Any, CommitMessage]] = {}
     for one in later[::-1]:
         _, replaced = store.commit_of(one.revision)
         old: dict[Cell, Any] = {}
@@ -98,9 +95,9 @@ def _check_unread(
             raise _conflict(one, entry.tag, path, f"has changed {path}, from which {entry.tag!r} was made")
 
 
-def _conflict(later: CommitMessage, tag: str, path: str, what: str) -> ConflictFoundError:
+def _conflict(later: CommitMessage, tag: str, path: str, what: str) -> RefusedError:
     message = f"Revision {later.revision}, by {later.who}, {what}. Undo it first."
-    return ConflictFoundError(EditConflict(message, tag, path, later.revision, later.who))
+    return RefusedError("conflict", message, tag, path, later.revision, later.who)
 
 
 def _find_anchor(history: History, old: Replaced, put: Sequence[PlacedEntry], gone: set[str]) -> str | None:

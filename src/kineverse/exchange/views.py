@@ -23,8 +23,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import defaultdict
-from collections.abc import Iterable, Mapping, Set
+from collections import defaultdict, deque
+from collections.abc import Collection, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -33,12 +33,12 @@ from typing import Any, Final
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.graph import gradient_keys
-from kineverse.formats.document import OpaqueOperation, entry_to_bytes, to_bytes
+from kineverse.formats.document import OpaqueOperation, entry_to_bytes
 from kineverse.formats.document.parameters import document_kind
 from kineverse.model.changes import Diff, find_moved_tags
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.history import History, HistoryEntry
-from kineverse.model.model import Model, Snapshot
+from kineverse.model.model import Model
 from kineverse.model.operation import (
     ARTICULATIONS,
     BODIES,
@@ -52,11 +52,14 @@ from kineverse.model.rates import collect_symbols
 from kineverse.model.read_recorder import Read, Reads, unknown_name_error
 from kineverse.symbols import parse_symbol_name, symbol_name
 
-from .protocol import Changes, Placed
+from .protocol import NO_CHAIN, Changes, CommitMessage, Placed, Published, encode
+from .protocol import chain as link_commits
 
 Key = tuple[str, str]
 """Cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix."""
 
+MOST_MISSED: Final = 1000
+"""Most commits that a replica catches up with; after more, it is made anew."""
 EVERY_FRAME: Final = ("",)
 """Frames of a wish for all frames."""
 LOAD_THE_WHOLE: Final = "To move it, or to run it again, load the whole model; or replace it by a new one."
@@ -111,14 +114,6 @@ class Wish:
             model.symbol(name)
 
 
-class Closure:
-    """Cells of a part, and the keys of commits that may change it."""
-
-    def __init__(self, cells: dict[Cell, None], keys: set[Key]) -> None:
-        self.cells = cells
-        self.keys = keys
-
-
 class Coupling:
     """Index of a model: what is about each coordinate, kept up to date by the changes of commits."""
 
@@ -169,8 +164,8 @@ class Coupling:
             known = self._paths[cell] = value, found
         return known[1]
 
-    def close(self, wish: Wish) -> Closure:
-        """Return the cells that a wish needs; what is not there any more is left out."""
+    def close(self, wish: Wish) -> tuple[dict[Cell, None], set[Key]]:
+        """Return the cells that a wish needs, as far as they are there, and the keys of commits to them."""
         head = self._history.head
         frames, bodies = head[FRAMES], head[BODIES]
         cells: dict[Cell, None] = {}
@@ -199,7 +194,7 @@ class Coupling:
             if kind == FRAMES:
                 cells |= dict.fromkeys((ARTICULATIONS, record) for record in self._find("child", name))
         keys.update(cells)
-        return Closure(cells, keys)
+        return cells, keys
 
     def _add_coordinates(self, waiting: list[str], cells: dict[Cell, None], keys: set[Key]) -> None:
         """Add everything about coordinates, and about those that it has in turn."""
@@ -251,20 +246,13 @@ def _is_prefix(name: str) -> bool:
     return not name or name.endswith("/")
 
 
-def close(model: Model, wish: Wish) -> set[Cell]:
-    """Return the cells, by kind and name, that the part of a wish has."""
-    return {*Coupling(model.history).close(wish).cells}
-
-
-def part_entries(
-    model: Model, cells: Set[Cell] | Mapping[Cell, Any], known: Mapping[str, HistoryEntry] | None = None
+def _part_entries(
+    history: History, cells: Collection[Cell], known: Mapping[str, HistoryEntry]
 ) -> list[HistoryEntry]:
-    """Return the operations of a part of a model in order, each with its blob.
+    """Return the operations of a part in order, each with its blob.
 
-    The cells are those of :func:`close`. Entries of an earlier part by tag may be given as ``known``; those
-    that have not changed are the same objects in the result.
+    Those that are as they are in an earlier part, ``known`` by tag, are the same objects.
     """
-    history, known = model.history, known or {}
     writers: dict[str, HistoryEntry] = {}
     for cell in cells:
         # Frames hold others at every place; of all other values the last one counts.
@@ -277,10 +265,7 @@ def part_entries(
 
 
 def _part_entry(
-    history: History,
-    entry: HistoryEntry,
-    cells: Set[Cell] | Mapping[Cell, Any],
-    known: HistoryEntry | None,
+    history: History, entry: HistoryEntry, cells: Collection[Cell], known: HistoryEntry | None
 ) -> HistoryEntry:
     writes: dict[Cell, Any] = {}
     reads = Reads()
@@ -326,7 +311,8 @@ def _is_same(known: HistoryEntry, kind: str, reads: Reads, writes: Mapping[Cell,
 class View:
     """Part of a model that clients follow, kept up to date by :class:`Views`.
 
-    ``id`` is that of the wish; ``users`` is the number of times that it was asked for and not released.
+    ``id`` is that of the wish; ``users`` is the number of times that it was asked for and not released;
+    ``log`` is for the commits that are made of its changes.
     """
 
     def __init__(self, model: Model, coupling: Coupling, wish: Wish) -> None:
@@ -335,6 +321,7 @@ class View:
         self.wish = wish
         self.id = wish.id
         self.users = 0
+        self.log = ViewLog(model.version)
         self._entries: dict[str, HistoryEntry] = {}
         self._keys: set[Key] = set()
         self._renew()
@@ -344,23 +331,17 @@ class View:
         """Operations of the part in order."""
         return tuple(self._entries.values())
 
-    def document(self) -> bytes:
-        """Return the part as a document in msgpack."""
-        return to_bytes(Snapshot({}, self.entries, 0))
+    def commit(self, keys: Set[Key], replaced: Set[str]) -> Changes | None:
+        """Bring the part to the model after a commit; return the changes for a replica, None without any.
 
-    def is_concerned(self, keys: Set[Key]) -> bool:
-        """Return whether a commit with some keys may change the part."""
-        return not self._keys.isdisjoint(keys)
-
-    def commit(self, replaced: Set[str]) -> Changes | None:
-        """Bring the part to the present model; return the changes for a replica, None if there are none.
-
-        Operations that changed count as replaced if their tags are among those given, which the commit itself
-        has replaced or moved; all others as run again.
+        The keys are of what has changed. Operations that changed count as replaced if their tags are among
+        those given, which the commit itself has replaced or moved; all others as run again.
         """
+        if self._keys.isdisjoint(keys):
+            return None
         old = self._entries
         new = self._renew()
-        moved = _find_moved(old, new)
+        moved = find_moved_tags([*old], [*new])
         put, after = [], ""
         again: dict[str, list[str]] = {"replaced": [], "rerun": []}
         for tag, entry in new.items():
@@ -375,16 +356,36 @@ class View:
         return Changes(tuple(put), tuple(again["replaced"]), tuple(again["rerun"]), moved, removed)
 
     def _renew(self) -> dict[str, HistoryEntry]:
-        closure = self._coupling.close(self.wish)
-        found = part_entries(self._model, closure.cells, self._entries)
+        cells, keys = self._coupling.close(self.wish)
+        found = _part_entries(self._model.history, cells, self._entries)
         self._entries = {entry.tag: entry for entry in found}
-        self._keys = closure.keys.union((_TAG, tag) for tag in self._entries)
+        self._keys = keys.union((_TAG, tag) for tag in self._entries)
         return self._entries
 
 
-def _find_moved(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
-    before, after = [tag for tag in old if tag in new], [tag for tag in new if tag in old]
-    return () if before == after else find_moved_tags(before, after)
+class ViewLog:
+    """Last commits of a part, as they were published."""
+
+    def __init__(self, revision: int) -> None:
+        self._begin = self.last = revision
+        self.link = NO_CHAIN
+        self._commits: deque[tuple[int, Published]] = deque()
+
+    def add(self, epoch: str, chain: bytes, commit: CommitMessage) -> Published:
+        """Add a commit, forget the oldest if there are many, and return what is published."""
+        data = encode(commit)
+        self.last, self.link = commit.revision, link_commits(self.link, data)
+        published = Published(epoch, chain, data, self.link)
+        self._commits.append((commit.revision, published))
+        if len(self._commits) > MOST_MISSED:
+            self._begin = self._commits.popleft()[0]
+        return published
+
+    def find_after(self, revision: int) -> list[Published] | None:
+        """Return the commits after a revision; None if some of them are forgotten."""
+        if revision < self._begin:
+            return None
+        return [published for number, published in self._commits if number > revision]
 
 
 class Views:
@@ -398,8 +399,8 @@ class Views:
     def _coupling(self) -> Coupling:
         return Coupling(self._model.history)
 
-    def __len__(self) -> int:
-        return len(self._views)
+    def __iter__(self) -> Iterator[View]:
+        return iter(self._views.values())
 
     def get(self, view: str) -> View | None:
         """Return the view of an identifier, if it is followed."""
@@ -439,13 +440,8 @@ class Views:
         for diff in diffs:
             keys |= self._find_keys(diff)
             replaced.update(diff.replaced)
-        result = []
-        for view in self._views.values():
-            if view.is_concerned(keys):
-                changes = view.commit(replaced)
-                if changes is not None:
-                    result.append((view, changes))
-        return result
+        changed = [(view, view.commit(keys, replaced)) for view in self]
+        return [(view, changes) for view, changes in changed if changes is not None]
 
     def _find_keys(self, diff: Diff) -> set[Key]:
         """Return the keys of a commit, and enter its changes into the index."""

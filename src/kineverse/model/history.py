@@ -11,6 +11,7 @@ import heapq
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from operator import attrgetter
 from typing import Any, TypeAlias
 
@@ -108,9 +109,11 @@ class History:
 
     def _fill(self, entries: Iterable[HistoryEntry]) -> None:
         cells, reading, head = self.cells, self.reading, self.head
+        entries = list(entries)
+        are_placed = all(one.place < other.place for one, other in pairwise(entries))
         for i, given in enumerate(entries):
             # New places, because the entries may come from several models.
-            entry = know_reads(self, given.at(i * _GAP))
+            entry = know_reads(self, given if are_placed else given.at(i * _GAP))
             self.entries[entry.tag] = entry
             self.sequence.append(entry)
             for cell, value in entry.writes.items():
