@@ -7,7 +7,9 @@ adopts only what the server publishes, its own edits included, so a refused edit
 from __future__ import annotations
 
 import logging
+import random
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
@@ -41,6 +43,9 @@ _LOG = logging.getLogger(__name__)
 
 _OWN_COMMIT = 0.05
 """Time in which the publication of an own edit is waited for before the server is asked for it [s]."""
+
+_BACK_OFF = 0.002
+"""Longest pause after the first conflict of a repeated edit [s]."""
 
 R = TypeVar("R")
 
@@ -133,7 +138,7 @@ class LiveModel(Model):
         check_flag("strict", strict)
         return EditContext(lambda: self._ask_for_edit(strict))
 
-    def transact(self, change: Callable[[Edit], R], *, attempts: int = 5, strict: bool = False) -> R:
+    def transact(self, change: Callable[[Edit], R], *, attempts: int = 10, strict: bool = False) -> R:
         """Edit the model by a function, which is called again on the newest model after a conflict.
 
         Parameters
@@ -155,14 +160,16 @@ class LiveModel(Model):
         ConflictError
             If the last attempt was in conflict as well.
         """
-        for left in reversed(range(as_count("attempts", attempts, 1))):
+        for done in range(as_count("attempts", attempts, 1)):
             try:
                 with self.edit(strict=strict) as edit:
                     return change(edit)
             except ConflictError as error:
-                if not left:
+                if done + 1 == attempts:
                     raise
                 self.exchange.wait_to_follow(error.revision)
+                # Clients that meet again and again give each other time.
+                time.sleep(random.uniform(0.0, _BACK_OFF * 2 ** min(done, 6)))
         raise AssertionError
 
     def adopt(self, changes: NetChanges) -> None:

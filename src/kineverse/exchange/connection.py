@@ -326,8 +326,10 @@ class Connection:
         end = time.monotonic() + PATIENCE
         while True:
             try:
-                answer = self._ask(edit, min(_ASK_TIMEOUT, max(end - time.monotonic(), _PAUSE)))
+                answer = self._ask(edit, _ASK_TIMEOUT)
             except OfflineError:
+                if self.is_online:  # it is still at work
+                    end = time.monotonic() + PATIENCE
                 if self.is_closed or time.monotonic() >= end:
                     raise OfflineError(
                         f"The server {self.address.name!r} has not answered for {PATIENCE:g} s. Whether the "

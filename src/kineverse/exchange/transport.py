@@ -30,7 +30,7 @@ LEASE: Final = 1.0
 
 _USER: Final = "kineverse"
 _MOST_QUESTIONS: Final = 10_000
-_END_SECONDS: Final = 0.2
+_END_SECONDS: Final = 0.6
 _OPEN_SECONDS: Final = 3.0  # for a server that is held up
 
 

@@ -93,7 +93,7 @@ class Constraint:
     @property
     def order(self) -> int:
         """Highest order of a symbol in the expression: 0 for limits on positions, 1 for limits on speeds."""
-        return max(s.order for s in self.expression.symbols)
+        return max((s.order for s in self.expression.symbols), default=0)
 
 
 def check_bound(bound: Expression, name: str) -> None:
