@@ -47,6 +47,7 @@ ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "InfeasibleError": ("none", ("row", "other"), (1.0, 2.0)),
     "ElementError": ("the element", "it is wrong"),
     "NotFiniteError": ("not finite", ("task",)),
+    "RefusedError": ("conflict", "it met another", "joint door"),
 }
 
 

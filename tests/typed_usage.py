@@ -60,6 +60,16 @@ with model.edit() as edit:
     edit.apply(kv.Fixed(name="stop", parent="wheel", child="stop", origin=np.eye(4)))
     edit.apply(kv.Floating(name="cup", parent="stop", child="cup"))
     edit.apply(kv.articulations.Ball(name="ball", parent="cup", child="ball"))
+
+
+def share() -> None:
+    """Share a model; checked, and not run."""
+    with contextlib.suppress(kv.ConflictError, kv.OfflineError), kv.exchange.serve(model) as server:
+        assert_type(server, kv.exchange.Server)
+        assert_type(kv.load("live:door", frames=["door"], bodies=True), kv.Model)
+        assert_type(kv.exchange.list_servers(), list[str])
+
+
 assert_type(model.fk("door"), kv.Expression)
 assert_type(model.jacobian("wheel"), kv.Expression)
 assert_type(model.constraints["door/range"], kv.Constraint)

@@ -30,6 +30,7 @@ class Process:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
+            encoding="utf-8",
             env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         )
         self.told: list[dict[str, Any]] = []

@@ -34,7 +34,7 @@ class RefusedError(Exception):
     def __init__(
         self, reason: Reason, message: str, tag: str = "", path: str = "", revision: int = 0, who: str = ""
     ) -> None:
-        super().__init__(message)
+        super().__init__(reason, message, tag, path, revision, who)
         text = " ".join(message.split())
         if len(text) > _LONGEST_MESSAGE:
             text = f"{text[:_LONGEST_MESSAGE]} ..."
