@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 
 from kineverse.errors import InvalidValueError
 from kineverse.formats.reader_warnings import collect_warnings
@@ -67,8 +66,6 @@ def run(arguments: argparse.Namespace) -> int:
             durable=arguments.durable,
         )
     with handle_interrupts(), server:
-        gc.collect()
-        gc.freeze()  # what was loaded stays, so a collection need not visit it
         model = server.snapshot()
         lines = [
             f"{server.name}: {format_contents(model)}, revision {server.revision}   (Ctrl-C ends)",
@@ -85,5 +82,5 @@ def run(arguments: argparse.Namespace) -> int:
             notes.append("whoever reaches the port can read and edit the model, without a password")
         print_notes(notes)
         print("\n".join(lines), flush=True)
-        server.wait()
+        server.run()
     return 0

@@ -72,6 +72,7 @@ class Authority:
     def __init__(self, store: Store) -> None:
         self._store, self.files = store, ServedFiles(store)
         self._answers: OrderedDict[tuple[str, int], EditAnswer] = OrderedDict()
+        self._numbers: dict[str, int] = {}  # highest number by client
         self._batch: list[StoredCommit] = []
         self._load()
 
@@ -184,6 +185,11 @@ class Authority:
         known = self._answers.get(key)
         if known is not None:
             return known
+        client, number = key
+        last = self._numbers[client] if client in self._numbers else self._store.last_number(client)
+        self._numbers[client] = max(last, number)
+        if number > last:
+            return None
         stored = self._store.find_answer(*key)
         return None if stored is None else Committed(*stored)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import threading
@@ -43,6 +44,7 @@ BEAT = 0.5
 """Time between two signs of life [s]."""
 STAGES = ("receive", "decode", "check", "fold", "encode", "persist", "publish", "answer")
 """Stages of an edit, in order; their times are in the status."""
+_COLLECTION = 5.0  # time between two collections of garbage [s]
 _KEPT_REFUSALS = 20
 _KEPT_TIMES = 1000
 _LONGEST_MESSAGE = 10_000
@@ -191,6 +193,20 @@ class Server:
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until the server is closed; False if it is not after a time [s]."""
         return self._closed.wait(None if timeout is None else as_tolerance(timeout, "A timeout"))
+
+    def run(self) -> None:
+        """Wait until the server is closed, in a process that does nothing else.
+
+        What is there stays, so the collector of garbage need not visit it, and it only runs now and then.
+        """
+        gc.disable()
+        while True:
+            gc.collect()
+            gc.freeze()
+            if self.wait(_COLLECTION):
+                break
+        gc.unfreeze()
+        gc.enable()
 
     def close(self) -> None:
         """Stop serving; what was acknowledged is kept. A second call has no effect."""

@@ -187,6 +187,10 @@ class Store:
         found = self._rows("SELECT revision, chain FROM log WHERE client = ? AND number = ?", client, number)
         return found[0] if found else None
 
+    def last_number(self, client: str) -> int:
+        """Return the highest number of a client's edits of which commits were made, -1 without any."""
+        return int(self._rows("SELECT coalesce(max(number), -1) FROM log WHERE client = ?", client)[0][0])
+
     def commits_after(self, revision: int, chain: bytes, most: int) -> list[tuple[bytes, bytes]] | None:
         """Return the commits after a revision, each with its chain.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import statistics
 import threading
@@ -63,8 +62,7 @@ class ServerProgram(Remote):
         start = perf_counter()
         self._server = serve(given, name=_NAME, store=store)
         self.seconds = perf_counter() - start
-        gc.collect()
-        gc.freeze()  # as the command does
+        _start(self._server.run)
 
     def times(self) -> tuple[float, float]:
         """Return the time until it served and the CPU time of the process [s]."""
