@@ -22,7 +22,7 @@ from . import exchange_programs as programs
 from .harness import Benchmark, BenchmarkResult, BenchmarkSettings, Contender
 from .workloads import find_benchmark_robot
 
-TO_HOOK, BY_RELAY = "to the hook", "by the relay"
+WHOLE, TO_HOOK, BY_RELAY = "with the user's code", "to the hook", "by the relay"
 EDITS = {
     "datum": ("datum", 1.2e-3),
     "frame": ("constant frame", 1.2e-3),
@@ -116,8 +116,8 @@ def _edits(one: Benchmark, scene: ProcessGroup) -> None:
     server, _ = scene.serve(), scene.start(programs.Relay, place)
     editor, follower = scene.start(programs.Editor, place), scene.start(programs.Subscriber, place)
 
-    def edit(kind: str) -> float:
-        return median(_delays(editor, follower, kind, _EDITS))
+    def edit(since: int, kind: str) -> float:
+        return median(_delays(editor, follower, kind, _EDITS, since=since))
 
     def relay(kind: str) -> float:
         starts = editor.relay(kind, _EDITS)
@@ -128,7 +128,7 @@ def _edits(one: Benchmark, scene: ProcessGroup) -> None:
         editor.stream(kind, _STREAMED // size, size)
         return float(server.times()[1] - before) / _STREAMED
 
-    ways = (edit, TO_HOOK), (relay, BY_RELAY)
+    ways = (partial(edit, 1), WHOLE), (partial(edit, 2), TO_HOOK), (relay, BY_RELAY)
     one.time(
         Contender(f"{name}, {how}", partial(sample, kind))
         for kind, (name, _) in EDITS.items()
@@ -148,10 +148,12 @@ def _delays(
     kind: str,
     count: int,
     pause: float = programs.PAUSE,
+    since: int = 1,
 ) -> list[float]:
+    """Return the times to the hook, since the edits began (1) or were asked for (2)."""
     made = editor.edit(kind, count, pause)
     heard = follower.heard([version for version, *_ in made])
-    return [end - start for end, (_, start, _) in zip(heard, made, strict=True)]
+    return [end - times[since] for end, times in zip(heard, made, strict=True)]
 
 
 def _faults(one: Benchmark, scene: ProcessGroup) -> None:
@@ -180,7 +182,7 @@ def _faults(one: Benchmark, scene: ProcessGroup) -> None:
         start = perf_counter()
         scene.stop(server)
         server = scene.serve()
-        return editor.edit("frame", 1)[0][2] - start
+        return editor.edit("frame", 1)[0][3] - start
 
     script, killed = "end of a script that closes nothing", "server killed, until an edit is acknowledged"
     _time(one, {script: (end_script, 1.0), killed: (restart, 2.0)})
@@ -244,7 +246,7 @@ def _growth(one: Benchmark, small: ProcessGroup) -> None:
         for _ in range(one.settings.processes * _EDITS):
             for objects, editor in editors.items():
                 for what, kind in (("append", "joint"), ("replace", "replace"), ("remove", "remove")):
-                    ((_, start, end),) = editor.edit(kind, 1)
+                    ((_, start, _, end),) = editor.edit(kind, 1)
                     times.setdefault(f"{what} a joint, {objects:,} objects", []).append(end - start)
     for name, seconds in times.items():
         one.note(name, "s", median(seconds))

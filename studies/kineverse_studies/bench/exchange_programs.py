@@ -115,11 +115,19 @@ class Editor(Remote):
 
     def __init__(self, relay: str = "") -> None:
         self._model, self._transport = load_live(_ADDRESS), _connect(relay)
-        self._number, self._tag = 0, ""
+        self._number, self._tag, self._asked = 0, "", 0.0
+        connection = self._model.exchange
+        ask = connection.ask_edit
 
-    def edit(self, kind: str, count: int, pause: float = PAUSE) -> list[tuple[int, float, float]]:
-        """Make edits, and return their versions, when they began and when they were acknowledged."""
-        made: list[tuple[int, float, float]] = []
+        def ask_edit(edit: protocol.ChangeRequest) -> protocol.Committed | protocol.Refused:
+            self._asked = perf_counter()
+            return ask(edit)
+
+        connection.ask_edit = ask_edit  # type: ignore[method-assign]
+
+    def edit(self, kind: str, count: int, pause: float = PAUSE) -> list[tuple[int, float, float, float]]:
+        """Make edits; return their versions, when they began, were asked for and were acknowledged."""
+        made: list[tuple[int, float, float, float]] = []
         while len(made) < count:
             time.sleep(pause)
             start = perf_counter()
@@ -128,7 +136,7 @@ class Editor(Remote):
                     self._put(edit, kind)
             except OfflineError:
                 continue
-            made.append((self._model.version, start, perf_counter()))
+            made.append((self._model.version, start, self._asked, perf_counter()))
         return made
 
     def relay(self, kind: str, count: int) -> list[float]:
