@@ -323,7 +323,7 @@ def test_without_the_extra_it_is_said_how_to_install_it(run: Run, monkeypatch: p
 # -- the server's process ------------------------------------------------------------------------------------
 
 
-def test_serve_prints_what_to_copy_and_ends_cleanly(run: Run, tmp_path: Path) -> None:
+def test_serve_prints_what_to_copy_and_ends_cleanly(run: Run, tmp_path: Path, hears_ctrl_c: None) -> None:
     store = tmp_path / "home.db"
     command = [sys.executable, "-m", "kineverse", "serve", "shelf_door", "--store", str(store)]
 
