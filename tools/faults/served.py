@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -49,6 +50,7 @@ def main() -> None:
     from kineverse.formats import document_hash
 
     with serve(store=path, name=NAME) as server:
+        threading.Thread(target=server.run, daemon=True).start()  # as the command does
         tell(reply="ready")
         for words in commands():
             if words[0] == "state":
