@@ -191,9 +191,7 @@ def load_model(
     arguments.opened.enter_context(live)  # until the command ends, as meshes come from the server
     if prefix is None:
         return live if follow else live.copy()
-    copy = kv.Model()
-    copy.include(source, prefix)
-    return copy
+    return kv.formats.from_bytes(kv.formats.to_bytes(live), prefix)
 
 
 ALTERNATIVE_UNITS = {"rad": ("deg",), "m": ("cm", "mm")}

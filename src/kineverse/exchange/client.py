@@ -79,7 +79,7 @@ def load_live(
     return LiveModel(Connection(Address.parse(source)), wish)
 
 
-def include_live(edit: Edit, source: str, prefix: str | None = None, **others: Any) -> list[str]:
+def include_live(edit: Edit, source: str, prefix: str | None = None) -> list[str]:
     """Append the present operations of a server's model to an edit of another one, and return their tags."""
     with closing(Connection(Address.parse(source))) as connection:
         joined = connection.join(protocol.JoinRequest(protocol.PROTOCOL, __version__, "", ""))

@@ -39,7 +39,7 @@ _LOG = logging.getLogger(__name__)
 Source: TypeAlias = str | os.PathLike[str] | Model
 
 MOST_TOGETHER, LONGEST_WAIT = 200, 0.002
-"""Most edits that are stored together, and the time in which they have to arrive [s]."""
+"""Most edits that are stored together, and the longest time for which waiting ones are collected [s]."""
 BEAT = 0.5
 """Time between two signs of life [s]."""
 STAGES = ("receive", "decode", "check", "fold", "encode", "persist", "publish", "answer")
