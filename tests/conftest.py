@@ -184,6 +184,14 @@ def hears_ctrl_c() -> Generator[None]:
 
 
 @pytest.fixture
+def sockets(monkeypatch: pytest.MonkeyPatch) -> Generator[Path]:
+    """Folder of sockets; its path is short, as a socket's has to be."""
+    with tempfile.TemporaryDirectory(prefix="kv-") as folder:
+        monkeypatch.setenv("KINEVERSE_RUNTIME_DIR", folder)
+        yield Path(folder)
+
+
+@pytest.fixture
 def published(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
     """Function to a file or folder of the published data, whose models are found by name in this test."""
     if published_data.FOLDER:

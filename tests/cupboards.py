@@ -16,6 +16,16 @@ def box(*size: float, at: tuple[float, float, float] = (0, 0, 0)) -> Body:
     return Body(visuals=(shape,), collisions=(shape,))
 
 
+def hinged_door() -> kv.Model:
+    """A door on a cupboard, without bodies."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("cupboard", "world", kv.translation(1, 0, 0))
+        hinge = {"axis": (0, 0, 1), "lower": 0.0, "upper": 1.5, "velocity": 1.0}
+        edit.apply(kv.Revolute(name="hinge", parent="cupboard", child="door", **hinge))
+    return model
+
+
 def cupboard() -> kv.Model:
     """A head 1 m up, before a cupboard at x = 2 with a door, behind which is a drawer; and a wall."""
     model = kv.Model()

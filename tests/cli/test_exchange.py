@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -17,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import kineverse as kv
+from cupboards import hinged_door
 from kineverse.cli import arguments
 from kineverse.exchange import LiveModel, Server, list_servers, serve
 from kineverse.formats import document_hash
@@ -30,24 +30,13 @@ Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(autouse=True)
-def runtime_folder(monkeypatch: pytest.MonkeyPatch) -> Generator[None]:
-    with tempfile.TemporaryDirectory(prefix="kv-") as folder:  # a short path, as a socket's has to be
-        monkeypatch.setenv("KINEVERSE_RUNTIME_DIR", folder)
-        yield
-
-
-def cupboard() -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        edit.add_frame("cupboard", "world", kv.translation(1, 0, 0))
-        hinge = {"axis": (0, 0, 1), "lower": 0.0, "upper": 1.5, "velocity": 1.0}
-        edit.apply(kv.Revolute(name="hinge", parent="cupboard", child="door", **hinge))
-    return model
+def own_sockets(sockets: Path) -> None:
+    """All servers of these tests are in a folder of their own."""
 
 
 @pytest.fixture
 def server() -> Generator[Server]:
-    with serve(cupboard(), name="home") as running:
+    with serve(hinged_door(), name="home") as running:
         yield running
 
 
@@ -85,7 +74,7 @@ def test_ls_lists_the_servers_of_the_user(run: Run) -> None:
     assert status == 0
     assert "kineverse serve kitchen" in out
     assert run("ls", "--json") == (0, "[]\n", "")
-    with serve(cupboard(), name="home") as home, serve(name="empty"):
+    with serve(hinged_door(), name="home") as home, serve(name="empty"):
         with kv.load("live:home") as model:  # type: ignore[attr-defined]
             place(model, "shelf", 1.0)
         status, out, err = run("ls")
@@ -190,7 +179,7 @@ def test_a_backup_is_served_as_it_was(run: Run, live: LiveModel, tmp_path: Path)
         assert copy.revision == 2
         assert document_hash(copy.snapshot()) == document_hash(kv.load(document)) != document_hash(live)
         run("undo", "copy", 2)
-        assert document_hash(copy.snapshot()) == document_hash(cupboard())
+        assert document_hash(copy.snapshot()) == document_hash(hinged_door())
     for path in (backup, document):
         assert "exists already" in fail(run, "dump", "home", path)
     assert "kineverse convert live:home" in fail(run, "dump", "home", tmp_path / "home.urdf")
@@ -199,7 +188,7 @@ def test_a_backup_is_served_as_it_was(run: Run, live: LiveModel, tmp_path: Path)
 
 def test_apply_adds_a_file_whole_or_not_at_all(run: Run, server: Server, tmp_path: Path) -> None:
     file, broken = tmp_path / "table.kv.json", tmp_path / "broken.urdf"
-    cupboard().save(file)
+    hinged_door().save(file)
     broken.write_text("<robot name='x'><link")
     before = document_hash(server.snapshot())
     assert "'frame cupboard' is taken. Put a prefix" in fail(run, "apply", "home", file)

@@ -1,10 +1,9 @@
-"""What the tests of model servers share: a folder of sockets of their own, and processes that they end."""
+"""What the tests of model servers share: processes that they end, and models that they close."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,9 @@ import pytest
 
 import kineverse as kv
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # for what they share with the search for faults
+
 Start = Callable[..., "subprocess.Popen[str]"]
-
-
-@pytest.fixture
-def sockets(monkeypatch: pytest.MonkeyPatch) -> Generator[Path]:
-    """Folder of sockets; its path is short, as a socket's has to be."""
-    with tempfile.TemporaryDirectory(prefix="kv-") as folder:
-        monkeypatch.setenv("KINEVERSE_RUNTIME_DIR", folder)
-        yield Path(folder)
 
 
 @pytest.fixture

@@ -16,38 +16,6 @@ Act = Callable[[Edit], object]
 
 
 @dataclass(frozen=True)
-class Twice(kv.Operation):
-    """Writes twice a datum: it has a trace."""
-
-    name: str
-    source: str
-
-    def apply(self, model: ReadRecorder) -> kv.model.Writes:
-        return kv.model.Writes(data={self.name: 2 * model.data[self.source]})
-
-
-@dataclass(frozen=True)
-class Capped(kv.Operation):
-    """Decides by a datum: it is frozen."""
-
-    name: str
-    source: str
-
-    def apply(self, model: ReadRecorder) -> kv.model.Writes:
-        return kv.model.Writes(data={self.name: min(model.data[self.source], 2)})
-
-
-@dataclass(frozen=True)
-class Count(kv.Operation):
-    """Counts the frames: it is frozen."""
-
-    name: str
-
-    def apply(self, model: ReadRecorder) -> kv.model.Writes:
-        return kv.model.Writes(data={self.name: len(model.frames)})
-
-
-@dataclass(frozen=True)
 class Exists(kv.Operation):
     """Looks whether a datum is there."""
 
@@ -56,17 +24,6 @@ class Exists(kv.Operation):
 
     def apply(self, model: ReadRecorder) -> kv.model.Writes:
         return kv.model.Writes(data={self.name: int(self.source in model.data)})
-
-
-@dataclass(frozen=True)
-class Watch(kv.Operation):
-    """Puts a frame where another one is: it has a trace."""
-
-    name: str
-    frame: str
-
-    def apply(self, model: ReadRecorder) -> kv.model.Writes:
-        return kv.model.Writes(frames={self.name: ("world", kv.translation(model.fk(self.frame)[:3, 3]))})
 
 
 class Replica:

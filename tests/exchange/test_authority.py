@@ -7,9 +7,10 @@ from typing import Any
 
 import msgspec
 import pytest
+from faults.edits import Above, Capped, Count, Twice
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from replicas import Act, Capped, Count, Exists, Replica, Twice, Watch, content
+from replicas import Act, Exists, Replica, content
 
 import kineverse as kv
 from hypothesis_profiles import attempts
@@ -33,7 +34,7 @@ def build(edit: Edit) -> None:
     edit.apply(Exists("exists", "a"), "exists")
     edit.add_frame("f", "world", kv.translation(kv.position("f"), 0, 0), tag="f")
     edit.add_frame("g", "f", kv.translation(0, 1, 0), tag="g")
-    edit.apply(Watch("w", "g"), "watch")
+    edit.apply(Above("w", "g"), "watch")
     edit.constrain("range", 0, kv.position("f"), 1, "range")
 
 
@@ -89,7 +90,7 @@ def do(edit: Edit, kind: int, i: int, k: int, new: str) -> None:
         8: lambda: (edit.remove(tag), edit.insert(history.entries[tag].operation, tag, before=other)),
         9: lambda: edit.insert(SetData(name, k / 4), new, before=tag),
         10: lambda: edit.replace(tag, history.operation(tag)),
-        11: lambda: edit.apply(Watch(f"f{i % 4}", frame), new),
+        11: lambda: edit.apply(Above(f"f{i % 4}", frame), new),
     }
     point = edit.savepoint()
     try:
@@ -679,7 +680,7 @@ def test_lies_are_refused_and_change_nothing(name: str) -> None:
 def test_damaged_edits_end_in_an_answer(data: Any) -> None:
     store, authority = DAMAGED
     replica = Replica(authority)
-    request = replica.draft(both(put("a", 2.0), lambda edit: edit.apply(Watch("x", "g"), "x")))
+    request = replica.draft(both(put("a", 2.0), lambda edit: edit.apply(Above("x", "g"), "x")))
     message = bytearray(protocol.encode(request))
     for _ in range(data.draw(st.integers(1, 4))):
         message[data.draw(st.integers(0, len(message) - 1))] = data.draw(st.integers(0, 255))

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 
 pytest.importorskip("zenoh")
 pytest.importorskip("resource")
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from faults import server as faults
 

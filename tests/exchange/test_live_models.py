@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
+from cupboards import hinged_door
 from kineverse.exchange import protocol
 from kineverse.exchange.client import LiveModel
 from kineverse.exchange.server import Server, serve
@@ -26,18 +27,9 @@ pytest.importorskip("zenoh")
 LONG = 10.0  # longest time that anything is waited for [s]
 
 
-def cupboard() -> kv.Model:
-    model = kv.Model()
-    with model.edit() as edit:
-        edit.add_frame("cupboard", "world", kv.translation(1, 0, 0))
-        hinge = {"axis": (0, 0, 1), "lower": 0.0, "upper": 1.5, "velocity": 1.0}
-        edit.apply(kv.Revolute(name="hinge", parent="cupboard", child="door", **hinge))
-    return model
-
-
 @pytest.fixture
 def server(sockets: Path) -> Iterator[Server]:
-    with serve(cupboard(), name="home") as running:
+    with serve(hinged_door(), name="home") as running:
         yield running
 
 
@@ -73,7 +65,7 @@ def test_an_edit_of_one_process_is_in_all_replicas(server: Server, load: Callabl
 
 
 def test_a_live_model_answers_like_any_model(server: Server, load: Callable[..., LiveModel]) -> None:
-    live, model = load(), cupboard()
+    live, model = load(), hinged_door()
     assert live.degrees_of_freedom == model.degrees_of_freedom
     assert live.speeds == model.speeds
     assert live.constraints_for(live.degrees_of_freedom).keys() == model.constraints.keys()
@@ -271,7 +263,7 @@ def test_reading_goes_on_without_the_server_and_it_catches_up(
     tmp_path: Path, load: Callable[..., LiveModel]
 ) -> None:
     store = tmp_path / "home.db"
-    with serve(cupboard(), store=store) as server:
+    with serve(hinged_door(), store=store) as server:
         model, part = load(), load(frames=["door"])
         add(model, "shelf")
         revision = server.revision
@@ -322,7 +314,7 @@ def test_undo_takes_back_commits_of_others_and_of_before(
     tmp_path: Path, load: Callable[..., LiveModel]
 ) -> None:
     store = tmp_path / "home.db"
-    with serve(cupboard(), store=store):
+    with serve(hinged_door(), store=store):
         model = load()
         add(model, "shelf", 1.0)
         replace(model, "shelf", 2.0)
@@ -358,7 +350,7 @@ def test_copies_are_local_and_a_model_can_be_included(
 
 
 def test_a_store_with_a_model_keeps_it(tmp_path: Path, load: Callable[..., LiveModel]) -> None:
-    with serve(cupboard(), store=tmp_path / "home.db") as server:
+    with serve(hinged_door(), store=tmp_path / "home.db") as server:
         before = document_hash(server.snapshot())
     with serve("kitchen", store=tmp_path / "home.db") as server:
         assert document_hash(server.snapshot()) == before
@@ -402,7 +394,7 @@ def test_what_was_acknowledged_survives_a_killed_server(
     tmp_path: Path, load: Callable[..., LiveModel], start: Callable[..., Any]
 ) -> None:
     store = tmp_path / "home.db"
-    serve(cupboard(), store=store).close()
+    serve(hinged_door(), store=store).close()
     process = start(SERVER, str(store))
     model = load()
     for i in range(20):

@@ -6,7 +6,6 @@ import contextlib
 import os
 import shutil
 import sqlite3
-import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -14,15 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from faults.store import Expected, put_image, take_image, try_damages, try_kills
 
 from kineverse.errors import FormatError, InvalidValueError
 from kineverse.exchange import protocol
 from kineverse.exchange import store as stores
 from kineverse.exchange.store import Store, StoredCommit, StoreError
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from faults.store import Expected, put_image, take_image, try_damages, try_kills
 
 
 @contextlib.contextmanager
