@@ -2,7 +2,8 @@
 
 A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
 the system's Chromium. Without one it is skipped, or with ``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that
-needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. A test that reads
+needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. A test of zig as
+compiler runs if ziglang is installed, or if ``KINEVERSE_TEST_ZIG`` is a folder that holds it. A test that reads
 data of other people asks for the fixture ``published``, a function from a path below ``KINEVERSE_TEST_DATA``, which
 gives it the marker ``data``; without the data it is skipped. The summary has a line for each cause. What is
 slow for what it checks carries the marker ``long``: it runs with ``--long``, or if it is asked for by its name.
@@ -66,6 +67,8 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.pop(name, None)
     folder = tempfile.mkdtemp(prefix="kineverse-tests-")
     os.environ["KINEVERSE_CACHE_DIR"] = folder
+    # Tests with a cache of their own share zig's runtime, which takes seconds to build.
+    os.environ["ZIG_GLOBAL_CACHE_DIR"] = os.path.join(folder, "zig")
     # A worker has one core. BLAS would take all of them for small matrices, and have them wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # At the very end, when the compilers in the background are gone; they were started after this.
@@ -173,6 +176,14 @@ def chromium() -> str:
     if path is None:
         pytest.skip("There is no Chromium: install the package 'chromium'.")
     return path
+
+
+@pytest.fixture
+def no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Hide every C compiler, that of an installed package too."""
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path / "no programs"))
+    monkeypatch.setitem(sys.modules, "ziglang", None)
 
 
 @pytest.fixture

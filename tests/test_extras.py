@@ -99,6 +99,16 @@ def test_requirements_of_each_extra_are_in_the_metadata(extra):
     ]
 
 
+def test_the_compiler_is_installed_only_where_it_is_asked_for():
+    (requirement,) = EXTRAS["compiler"]
+    assert "ziglang" in requirement
+    assert [
+        name for name, lines in EXTRAS.items() if "ziglang" in str(lines) or "compiler" in str(lines)
+    ] == ["compiler"]
+    for file in (ROOT / "requirements").glob("*.txt"):
+        assert "ziglang" not in file.read_text("utf-8"), file
+
+
 def test_studies_have_the_version_of_the_package_and_need_it():
     assert STUDIES["version"] == __version__
     assert STUDIES["dependencies"] == [f"{DISTRIBUTION}=={__version__}"]

@@ -249,7 +249,7 @@ def main() -> int:
     if len(given.kinds) not in (0, 2):
         parser.error("two kinds make a pair")
     if not collision_library.prepare(wait=True):
-        parser.error("this needs a C compiler")
+        parser.error(f"this needs compiled C, and {collision_library.error}")
     chosen = [tuple(given.kinds)] if given.kinds else list(itertools.combinations_with_replacement(KINDS, 2))
     off = 0
     print(

@@ -187,6 +187,10 @@ def build_for(machine: str, source: str, folder: Path) -> str:
     if machine == "by lane":
         source = source.replace("__SSE2__", "NOT_DEFINED")
     library = str(folder / "library.so")
-    command = compiler.arguments(("-O2", f"-march={machine.replace('by lane', 'x86-64')}"), library)
-    subprocess.run(command, input=source.encode(), check=True, capture_output=True)
+    processor = machine.replace("by lane", "x86-64")
+    if compiler.is_zig:
+        processor = processor.replace("-", "_")
+    command = compiler.arguments(("-O2", f"-march={processor}"), library)
+    environment = compiler.environment(str(folder))
+    subprocess.run(command, input=source.encode(), check=True, capture_output=True, env=environment)
     return library

@@ -264,7 +264,10 @@ def another_library(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     found = toolchain()
     assert found is not None
     path = tmp_path_factory.mktemp("another") / "library.so"
-    subprocess.run(found.arguments((), str(path)), input=b"int nothing_of_use = 1;", check=True)
+    environment = found.environment(str(path.parent))
+    subprocess.run(
+        found.arguments((), str(path)), input=b"int nothing_of_use = 1;", check=True, env=environment
+    )
     return path.read_bytes()
 
 

@@ -175,11 +175,8 @@ def test_tier_interpreter_never_compiles() -> None:
     assert not f.wait(0.0)
 
 
-def test_functions_stay_interpreted_without_a_compiler(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.delenv("CC", raising=False)
+@pytest.mark.usefixtures("no_compiler")
+def test_functions_stay_interpreted_without_a_compiler(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, "kineverse.compile"):
         for factor in (1.5, 2.5):
             f = kv.compile(a * b * factor, wait=True)
@@ -189,7 +186,7 @@ def test_functions_stay_interpreted_without_a_compiler(
             assert f.batch([[2.0, 3.0]] * 70).tolist() == [6.0 * factor] * 70
         with pytest.raises(kv.errors.CompileError, match="no C compiler"):
             kv.compile(a * b, tier="c")
-    assert [r.getMessage() for r in caplog.records if "No C compiler" in r.getMessage()] != []
+    assert "[compiler]'" in caplog.text
     assert [r.name for r in caplog.records] == ["kineverse.compile.toolchain"]  # below the others' logger
     assert compiler_information().compiler is None
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import kineverse as kv
 from kineverse._extras import install_command
-from kineverse.compilation.toolchain import NO_COMPILER, toolchain
+from kineverse.compilation.toolchain import no_compiler, toolchain
 from kineverse.errors import (
     CompileError,
     DuplicateNameError,
@@ -324,7 +324,7 @@ def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> No
         modules = ", ".join(MODULES[extra] for extra in missing)
         sentences.append(f"{what} needs the {noun} {names} ({modules}): {install_command(*missing)}")
     if compiler and toolchain() is None:
-        sentences.append(f"{what} needs a C compiler, and {NO_COMPILER}")
+        sentences.append(f"{what} needs a C compiler, and {no_compiler()}")
     if sentences:
         raise (MissingDependencyError if missing else CompileError)(". ".join(sentences))
 

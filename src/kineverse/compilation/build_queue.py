@@ -253,7 +253,7 @@ class _Worker:
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,
-                    env={**os.environ, "TMPDIR": build_folder, "LC_ALL": "C"},
+                    env=build.compiler.environment(build_folder),
                     # The compiler starts processes of its own; in a session of their own they can be ended
                     # together, and do not receive the user's Ctrl-C.
                     start_new_session=True,

@@ -21,9 +21,9 @@ from .interruption import watch_signals
 from .program import Program
 from .toolchain import (
     FLOATING_POINT_FLAGS,
-    NO_COMPILER,
     NO_UNDEFINED_FLAGS,
     Toolchain,
+    no_compiler,
     optimisation_level,
     toolchain,
 )
@@ -79,7 +79,7 @@ class ProgramLibrary(Generic[Code]):
         self._toolchain: Toolchain | None = toolchain()
         self._flags = (level or "", *flags, *NO_UNDEFINED_FLAGS)
         if self._toolchain is None:
-            self.error = NO_COMPILER
+            self.error = no_compiler()
         elif level is None:
             self.error = f"{program.instructions} operations are too many for a C compiler"
         else:
@@ -164,7 +164,7 @@ class SourceLibrary:
             return None
         compiler = toolchain()
         if compiler is None:
-            self.error = NO_COMPILER
+            self.error = no_compiler()
             return None
         version = (self._source, self._flags, compiler.identity)
         key = hashlib.sha256(repr(version).encode()).hexdigest()[:40]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
 import logging
 import os
 import platform
@@ -17,9 +18,11 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from msgspec import Struct
+
+from kineverse._extras import install_command
 
 logger = logging.getLogger("kineverse.compile.toolchain")
 
@@ -27,13 +30,13 @@ logger = logging.getLogger("kineverse.compile.toolchain")
 # no contraction to fused operations; no constant folding of functions by the compiler (-frounding-math),
 # which rounds them better than the C library.
 FLOATING_POINT_FLAGS = ("-march=native", "-ffp-contract=off", "-fno-math-errno", "-frounding-math")
-NO_COMPILER = (
-    "there is no C compiler (cc, gcc or clang) on the PATH. Install one, such as by 'apt install gcc'"
-)
-"""Reason, and remedy."""
-
 # Undefined names fail when a library is linked and not when a function is called.
 NO_UNDEFINED_FLAGS = ("-Wl,-z,defs",) if sys.platform.startswith("linux") else ()
+
+# Of zig, without debugging information, which makes libraries larger by half and more, and without checks for
+# undefined behaviour, which zig adds to code that is not optimised.
+_ZIG_FLAGS = ("-g0", "-s", "-fno-sanitize=undefined")
+_ZIG_FOLDERS = ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
 
 _CPU_LINES = (
     "vendor_id", "cpu family", "model", "stepping", "flags",
@@ -47,10 +50,20 @@ class Toolchain(Struct, frozen=True):
     command: tuple[str, ...]  # absolute path of the compiler, and its constant arguments
     identity: str  # digest of compiler, processor and platform
 
+    @property
+    def is_zig(self) -> bool:
+        """True for zig, which spells some flags otherwise and keeps files of its own."""
+        return _is_zig(self.command)
+
     def arguments(self, flags: Sequence[str], output: str) -> list[str]:
         """Return the command line that compiles C from standard input to a shared library."""
         always = ("-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden", "-w")
         return [*self.command, *FLOATING_POINT_FLAGS, *always, *flags, "-x", "c", "-", "-o", output, "-lm"]
+
+    def environment(self, folder: str) -> dict[str, str]:
+        """Return the environment variables for the compiler, whose temporary files are put in a folder."""
+        own = _zig_folders(folder) if self.is_zig else {}
+        return {**os.environ, **own, "TMPDIR": folder, "LC_ALL": "C"}
 
     def version(self) -> str:
         """Return the first line of the compiler's version text."""
@@ -69,26 +82,38 @@ class Toolchain(Struct, frozen=True):
         return next((unit for macro, unit in units.items() if f" {macro} " in macros), "none")
 
     def _ask(self, *arguments: str) -> str:
+        import tempfile  # for start-up time
+
         try:
-            answer = subprocess.run(
-                [*self.command, *arguments],
-                capture_output=True,
-                encoding="utf-8",
-                errors="replace",
-                timeout=20,
-                stdin=subprocess.DEVNULL,
-            )
+            with tempfile.TemporaryDirectory(prefix="kineverse-") as folder:
+                answer = subprocess.run(
+                    [*self.command, *arguments],
+                    capture_output=True,
+                    encoding="utf-8",
+                    errors="replace",
+                    timeout=20,
+                    stdin=subprocess.DEVNULL,
+                    env={**os.environ, **dict.fromkeys(_ZIG_FOLDERS, folder)},
+                )
         except (OSError, subprocess.TimeoutExpired):
             return ""
         return answer.stdout
 
 
 def toolchain() -> Toolchain | None:
-    """Return the compiler named by ``CC``, else ``cc``, ``gcc`` or ``clang``.
+    """Return the compiler named by ``CC``, else ``cc``, ``gcc``, ``clang``, or zig of the package ziglang.
 
     None if there is none, which is logged once.
     """
     return _find(os.environ.get("CC", ""), os.environ.get("PATH", os.defpath))
+
+
+def no_compiler() -> str:
+    """Return the reason why nothing can be compiled without a compiler, and the remedies."""
+    return (
+        "there is no C compiler (cc, gcc or clang) on the PATH. Install one, such as by 'apt install gcc', "
+        f"or the extra 'compiler' (ziglang, 411 MB): {install_command('compiler')}"
+    )
 
 
 def optimisation_level(instructions: int) -> str | None:
@@ -122,25 +147,63 @@ def vector_optimisation_level(instructions: int) -> str | None:
 
 @functools.lru_cache(maxsize=16)
 def _find(preferred: str, path: str) -> Toolchain | None:
-    for candidate in (preferred, "cc", "gcc", "clang"):
-        try:
-            words = shlex.split(candidate)
-        except ValueError as error:
-            logger.warning("CC is %r, which is no command (%s), and is ignored.", candidate, error)
-            continue
-        found = shutil.which(words[0], path=path) if words else None
+    for words in _candidates(preferred):
+        found = shutil.which(words[0], path=path)
         if found:
             command = (os.path.abspath(found), *words[1:])
-            return Toolchain(command, _identity(command))
-    logger.warning("No C compiler (cc, gcc, clang) was found: functions stay with CasADi's interpreter.")
+            if _is_zig(command):
+                command += _ZIG_FLAGS
+            return Toolchain(command, _identity(command, path))
+    logger.warning("Functions stay with CasADi's interpreter: %s.", no_compiler())
     return None
 
 
-def _identity(command: tuple[str, ...]) -> str:
-    program = os.path.realpath(command[0])
-    file = os.stat(program)
-    compiler = (program, file.st_size, file.st_mtime_ns, command[1:], FLOATING_POINT_FLAGS)
-    parts = (compiler, platform.system(), platform.machine(), _cpu())
+def _candidates(preferred: str) -> Iterator[list[str]]:
+    """Yield the command lines of compilers that may exist, the best one first."""
+    try:
+        words = shlex.split(preferred)
+    except ValueError as error:
+        logger.warning("CC is %r, which is no command (%s), and is ignored.", preferred, error)
+    else:
+        if words:
+            yield words
+    yield from (["cc"], ["gcc"], ["clang"])
+    # The program itself, not the module: an update of the package changes the identity.
+    package = importlib.util.find_spec("ziglang")
+    for folder in (package and package.submodule_search_locations) or ():
+        yield [os.path.join(folder, "zig.exe" if os.name == "nt" else "zig"), "cc"]
+
+
+def _is_zig(command: Sequence[str]) -> bool:
+    """Return True for zig's compiler, be it called by its path or as ``python -m ziglang cc``."""
+    return any(os.path.basename(word) in ("zig", "zig.exe", "ziglang") for word in command)
+
+
+def _zig_folders(folder: str) -> dict[str, str]:
+    """Return variables that name zig's folders: one for what it keeps, and the given one for the rest.
+
+    Otherwise both are in the home folder, which need not be writable and where nobody removes them.
+    """
+    kept = os.environ.get(_ZIG_FOLDERS[0])
+    if not kept:
+        from .cache import private_subfolder  # for start-up time
+
+        kept = str(private_subfolder("zig").path)
+        if not os.listdir(kept):
+            _announce_runtime(kept)
+    return dict(zip(_ZIG_FOLDERS, (kept, folder), strict=True))
+
+
+@functools.cache
+def _announce_runtime(folder: str) -> None:
+    logger.info("The first compilation takes up to 10 s longer: zig builds its runtime, in %s.", folder)
+
+
+def _identity(command: tuple[str, ...], path: str) -> str:
+    # Further words can be programs as well, as in "ccache gcc".
+    programs = [os.path.realpath(found) for word in command if (found := shutil.which(word, path=path))]
+    files = [(program, (file := os.stat(program)).st_size, file.st_mtime_ns) for program in programs]
+    parts = (files, command[1:], FLOATING_POINT_FLAGS, platform.system(), platform.machine(), _cpu())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation.c_library import SourceLibrary, struct_fields
-from kineverse.compilation.toolchain import NO_COMPILER
+from kineverse.compilation.toolchain import no_compiler
 from kineverse.errors import CompileError
 
 from . import broadphase
@@ -86,7 +86,7 @@ class ObjectPlacement:
 
     def __init__(self, table: ObjectTable) -> None:
         if not collision_library.prepare(wait=True):
-            reason = collision_library.error or NO_COMPILER
+            reason = collision_library.error or no_compiler()
             raise CompileError(f"Distances in other compiled code need compiled C, and {reason}.")
         self._table = table
         self._struct = _Struct.from_buffer_copy(_bind_table(table).struct)

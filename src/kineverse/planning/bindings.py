@@ -11,7 +11,7 @@ import numpy as np
 
 from kineverse.compilation.c_library import SourceLibrary, struct_fields
 from kineverse.compilation.interruption import WATCH, raise_signal
-from kineverse.compilation.toolchain import NO_COMPILER, NO_UNDEFINED_FLAGS
+from kineverse.compilation.toolchain import NO_UNDEFINED_FLAGS, no_compiler
 from kineverse.compilation.vector_program import vector_header
 from kineverse.control.contact_constraints import row_library
 from kineverse.errors import CompileError
@@ -107,7 +107,7 @@ def planning_functions() -> Any:
     library = _library()
     if not library.prepare(wait=True):
         raise CompileError(
-            f"Planning needs compiled C, and {library.error or NO_COMPILER}. Inverse kinematics "
+            f"Planning needs compiled C, and {library.error or no_compiler()}. Inverse kinematics "
             "('kineverse reach') and controllers work without it."
         )
     return library.code

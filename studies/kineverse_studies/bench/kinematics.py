@@ -78,7 +78,8 @@ def _table_compile_times(times: int) -> list[float]:
             program = Program([array(numbers)], ())
             flags = (optimisation_level(program.instructions) or "", *NO_UNDEFINED_FLAGS)
             command = compiler.arguments(flags, str(Path(folder, "library.so")))
-            subprocess.run(command, input=program.source().encode(), check=True)
+            environment = compiler.environment(folder)
+            subprocess.run(command, input=program.source().encode(), check=True, env=environment)
             samples.append(perf_counter() - start)
     return samples
 

@@ -127,10 +127,8 @@ def test_a_benchmark_without_its_extra_is_left_out(tiny, without):
     assert line.endswith("[geometry]'")
 
 
-def test_a_benchmark_that_needs_a_compiler_is_left_out_without_one(tiny, monkeypatch, tmp_path):
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setenv("PATH", str(tmp_path))
-
+@pytest.mark.usefixtures("no_compiler")
+def test_a_benchmark_that_needs_a_compiler_is_left_out_without_one(tiny, monkeypatch):
     def measure(settings):
         require("Planning", {}, compiler=True)
 
@@ -140,9 +138,8 @@ def test_a_benchmark_that_needs_a_compiler_is_left_out_without_one(tiny, monkeyp
     assert result.missing[0].startswith("planning is left out: Planning needs a C compiler")
 
 
-def test_a_missing_compiler_is_reported(tiny, monkeypatch, tmp_path):
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setenv("PATH", str(tmp_path))
+@pytest.mark.usefixtures("no_compiler")
+def test_a_missing_compiler_is_reported(tiny):
     (result,) = run_benchmarks(["batch"], tiny)
     assert any("no C compiler" in line for line in result.missing)
     assert not any("casadi" in m.name for m in result.measurements)

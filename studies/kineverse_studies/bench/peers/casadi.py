@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from kineverse.compilation import compiler_information
+from kineverse.compilation.toolchain import Toolchain, no_compiler, toolchain
 from kineverse.errors import CompileError
 from kineverse.lie import Array
 from kineverse_studies.bench.harness import Contender, time_calls
@@ -28,15 +28,21 @@ def make_casadi_function(robot: BenchmarkRobot) -> Any:
     return ca.Function("pose_and_jacobian", [inputs], ca.cse(outputs))
 
 
-def compile_map(function: Any, rows: int, folder: Path) -> Any:
+def compile_map(function: Any, rows: int, folder: Path, compiler: Toolchain) -> Any:
     mapped = function.map(rows)
     generator = ca.CodeGenerator("map.c")
     generator.add(mapped)
     source, library = folder / "map.c", folder / "map.so"
     source.write_text(generator.dump(), encoding="utf-8")
-    compiler = compiler_information().compiler or "cc"
-    command = [compiler, *COMPILER_FLAGS, str(source), "-o", str(library), "-lm"]
-    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", check=False)
+    command = [*compiler.command, *COMPILER_FLAGS, str(source), "-o", str(library), "-lm"]
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        check=False,
+        env=compiler.environment(str(folder)),
+    )
     if done.returncode:
         raise CompileError(f"CasADi's map cannot be compiled: {done.stderr.strip().splitlines()[0]}")
     return ca.external(mapped.name(), str(library))
@@ -125,11 +131,13 @@ def batch(robot: BenchmarkRobot, points: Array, folder: Path, missing: list[str]
 
     graph, arrays = NumpyGraph(function), outputs()
     yield contender("numpy, same graph", lambda: graph(points, arrays), arrays)
-    if compiler_information().compiler is None:
-        missing.append("casadi's map in C is missing: there is no C compiler")
+    compiler = toolchain()
+    if compiler is None:
+        missing.append(f"casadi's map in C is missing: {no_compiler()}")
         return
     mapped = outputs()
-    yield contender("casadi, map in C", BoundMap(compile_map(function, rows, folder), points, mapped), mapped)
+    compiled = compile_map(function, rows, folder, compiler)
+    yield contender("casadi, map in C", BoundMap(compiled, points, mapped), mapped)
 
 
 def loop(angles: Array) -> Iterator[Contender]:
