@@ -19,10 +19,3 @@ def test_sanitizers_find_nothing_in_a_batch_a_distance_a_plan_and_an_update() ->
         pytest.skip("gcc has no libasan and libubsan")
     result = subprocess.run([sys.executable, str(TOOL), "--short"], capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
-
-
-@pytest.mark.compiler
-def test_hand_written_c_has_no_warnings() -> None:
-    if TOOLS["find_libraries"]() is None:
-        pytest.skip("there is no gcc")
-    assert TOOLS["find_warnings"]() == []

@@ -16,15 +16,8 @@ from kineverse.compilation.toolchain import NO_COMPILER
 from kineverse.errors import CompileError
 
 from . import broadphase
-from .advancement_c import ADVANCE
-from .broadphase import Indices, ObjectTable, PairSelection, build_static_tree
-from .broadphase_c import SWEEP
-from .manifold_c import MANIFOLD
+from .broadphase import MEMORY_SLOTS, TREE_WIDTH, Indices, ObjectTable, PairSelection, build_static_tree
 from .mesh_files import Floats
-from .narrowphase_c import NARROW, SIMPLEX
-from .penetration_c import PENETRATION
-from .search_c import SEARCH
-from .support_c import SUPPORT
 
 _ARRAYS = (
     "body", "allowed", "active", "centre", "half", "radius",
@@ -72,7 +65,7 @@ class FacingPoints:
 
     Parallel faces are nearest at every point, and a query finds one of them. Faces that are parallel, up to
     an angle, have up to four further pairs of points, with the distance along the normal of the pair, see
-    :mod:`.manifold_c`. Meshes of triangles have none, nor has anything without a C compiler.
+    ``contact_manifold.h``. Meshes of triangles have none, nor has anything without a C compiler.
     """
 
     def __init__(self, margins: Floats, usual: float, angle: float = 0.02, apart: float = 0.1) -> None:
@@ -109,8 +102,8 @@ class CollisionLibrary(SourceLibrary):
     """Compiled broad and narrow phase, once it is built; shared by all scenes of the process."""
 
     def __init__(self) -> None:
-        text = SWEEP + SUPPORT + SIMPLEX + PENETRATION + NARROW + SEARCH + MANIFOLD + ADVANCE
-        super().__init__(text, _declare_signatures)
+        sizes = (f"-DMEMORY_BITS={MEMORY_SLOTS.bit_length() - 1}", f"-DTREE_WIDTH={TREE_WIDTH}")
+        super().__init__("geometry.c", _declare_signatures, ("-O3", *sizes))
 
     def place(self, table: ObjectTable, fresh: Floats) -> int:
         """Place objects as :func:`.broadphase.place_objects` does; ``fresh`` is contiguous."""
