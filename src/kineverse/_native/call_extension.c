@@ -2,6 +2,8 @@
 
    It does the same as compilation/evaluator.py, and saves four fifths of the time of a call. */
 
+#include "definitions.h"
+
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 #include <structmember.h>
@@ -9,9 +11,7 @@
 #include <numpy/arrayobject.h>
 #include <string.h>
 
-typedef int (*Compute)(const double **, double **, long long *, double *, int);
-
-static int compute(Compute function, const double *x, double **results, int lengthy) {
+static int compute(Function function, const double *x, double **results, int lengthy) {
   const double *arguments[1] = {x};
   int failed;
   if (lengthy) {
@@ -63,7 +63,7 @@ static int checked(PyObject *check, PyObject *vector, PyObject *arrays) {
 typedef struct {
   PyObject_HEAD
   vectorcallfunc vectorcall;
-  Compute function;
+  Function function;
   npy_intp n;
   int outputs, single, lengthy;
   int *dimensions;
@@ -116,7 +116,7 @@ static void call_dealloc(PyObject *object) {
   Py_TYPE(object)->tp_free(object);
 }
 
-static PyObject *call_new(PyTypeObject *type, PyObject *args, PyObject *names __attribute__((unused))) {
+static PyObject *call_new(PyTypeObject *type, PyObject *args, PyObject *names UNUSED) {
   PyObject *address, *shapes, *convert, *check, *library;
   Py_ssize_t n;
   int single, lengthy;
@@ -132,7 +132,7 @@ static PyObject *call_new(PyTypeObject *type, PyObject *args, PyObject *names __
   Call *self = (Call *)type->tp_alloc(type, 0);
   if (!self) return NULL;
   self->vectorcall = call_vectorcall;
-  self->function = (Compute)address_of(address);
+  self->function = (Function)address_of(address);
   self->n = n;
   self->outputs = (int)outputs;
   self->single = single;
@@ -174,7 +174,7 @@ static PyTypeObject CallType = {
 typedef struct {
   PyObject_HEAD
   vectorcallfunc vectorcall;
-  Compute function;
+  Function function;
   double *x;
   npy_intp n;
   int lengthy;
@@ -213,7 +213,7 @@ static void evaluator_dealloc(PyObject *object) {
   Py_TYPE(object)->tp_free(object);
 }
 
-static PyObject *evaluator_new(PyTypeObject *type, PyObject *args, PyObject *names __attribute__((unused))) {
+static PyObject *evaluator_new(PyTypeObject *type, PyObject *args, PyObject *names UNUSED) {
   PyObject *address, *input, *outputs, *convert, *check, *library;
   int lengthy;
   if (!PyArg_ParseTuple(args, "OO!O!pOOO", &address, &PyArray_Type, &input, &PyTuple_Type, &outputs, &lengthy,
@@ -222,7 +222,7 @@ static PyObject *evaluator_new(PyTypeObject *type, PyObject *args, PyObject *nam
   Evaluator *self = (Evaluator *)type->tp_alloc(type, 0);
   if (!self) return NULL;
   self->vectorcall = evaluator_vectorcall;
-  self->function = (Compute)address_of(address);
+  self->function = (Function)address_of(address);
   self->x = (double *)PyArray_DATA((PyArrayObject *)input);
   self->n = PyArray_SIZE((PyArrayObject *)input);
   self->lengthy = lengthy;

@@ -1,5 +1,7 @@
 /* Rows of a quadratic program that keep near pairs of bodies apart. */
 
+#include "definitions.h"
+
 #include <stdint.h>
 
 typedef struct {
@@ -19,7 +21,7 @@ static void add(double *row, const double *twist, int64_t n, const double *p, co
     for (int64_t j = 0; j < n; j++) row[j] += sign * wrench[i] * twist[i * n + j];
 }
 
-__attribute__((visibility("default"))) void write_rows(const Rows *r) {
+EXPORTED void write_rows(const Rows *r) {
   const int64_t n = r->n;
   for (int64_t k = 0; k < r->used; k++) {
     const int32_t a = r->owners[2 * k], b = r->owners[2 * k + 1];

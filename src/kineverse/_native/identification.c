@@ -4,7 +4,7 @@
 
 /* How many numbers of memory a stage needs: covariances with their inverses, two answers with what their
    observations say apart, and observations three times, which is more than any sum needs. */
-EXPORT int64_t memory_of(const Problem *p) {
+EXPORTED int64_t memory_of(const Problem *p) {
   int64_t apart = p->joints * (1 + p->joints);
   return p->widths + 2 * answer_size(p) + p->count * (NOISE + 2 * apart + 3 * OBSERVATION);
 }
@@ -68,7 +68,7 @@ static double *refine_from(Problem *p, Answer *a, Apart *apart, double *noise, d
 }
 
 /* As levenberg_marquardt in least_squares.py. */
-EXPORT void solve(const Problem *problem, double *memory, double *answer) {
+EXPORTED void solve(const Problem *problem, double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
   memory = begin_stage(&p, memory, answer, &a);
@@ -76,8 +76,8 @@ EXPORT void solve(const Problem *problem, double *memory, double *answer) {
 }
 
 /* As maximum_likelihood in marginal_likelihood.py, from several starts. */
-EXPORT void likeliest(const Problem *problem, int64_t starts, const Motion *motions, const double *values,
-                      double *memory, double *answer) {
+EXPORTED void likeliest(const Problem *problem, int64_t starts, const Motion *motions, const double *values,
+                        double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
   Apart apart;
@@ -96,7 +96,7 @@ EXPORT void likeliest(const Problem *problem, int64_t starts, const Motion *moti
 }
 
 /* As maximise_marginal_likelihood in marginal_likelihood.py. */
-EXPORT void refine(const Problem *problem, double *memory, double *answer) {
+EXPORTED void refine(const Problem *problem, double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
   Apart apart;
@@ -107,7 +107,7 @@ EXPORT void refine(const Problem *problem, double *memory, double *answer) {
 }
 
 /* As continue_from in marginal_likelihood.py. */
-EXPORT void carry_on(const Problem *problem, double *memory, double *answer) {
+EXPORTED void carry_on(const Problem *problem, double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
   Apart apart;
@@ -122,9 +122,9 @@ EXPORT void carry_on(const Problem *problem, double *memory, double *answer) {
 /* As laplace_evidence in marginal_likelihood.py, for several sizes of the noise; the rest is for the last. The
    covariance of the errors is the sum of two parts, times the square of a factor each; without parts it is as
    it is. */
-EXPORT void rate(const Problem *problem, int64_t sizes, const double *factors, const double *parts,
-                 double *memory, double *answer, double *logs, double *values, double *covariances,
-                 double *information) {
+EXPORTED void rate(const Problem *problem, int64_t sizes, const double *factors, const double *parts,
+                   double *memory, double *answer, double *logs, double *values, double *covariances,
+                   double *information) {
   Answer a;
   Apart apart;
   int64_t numbers = problem->count * problem->rows * problem->rows;

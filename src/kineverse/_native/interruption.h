@@ -1,5 +1,6 @@
 /* End of work that lasts: when its time is up, and when a signal such as Ctrl-C arrives. */
 #pragma once
+#include "definitions.h"
 
 #include <math.h>
 #include <time.h>
@@ -15,7 +16,7 @@ typedef struct {
 
 static Signals *signals;
 
-__attribute__((visibility("default"))) void kineverse_watch_signals(Signals *s) { signals = s; }
+EXPORTED void kineverse_watch_signals(Signals *s) { signals = s; }
 
 /* Work that is over when its time is up, or a handler has raised an exception. Times of a clock [s]. */
 typedef struct {
@@ -58,4 +59,4 @@ static __attribute__((noinline)) int look_at_clock(Watch *w) {
 }
 
 /* As look_at_clock, for loops whose rounds take microseconds: it looks in one round of 32. */
-static inline __attribute__((unused)) int is_over(Watch *w) { return w->over || ((++w->calls & 31) == 0 && look_at_clock(w)); }
+static inline UNUSED int is_over(Watch *w) { return w->over || ((++w->calls & 31) == 0 && look_at_clock(w)); }

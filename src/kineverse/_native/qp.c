@@ -1,5 +1,7 @@
 /* Checks of quadratic programs: in C they take 1 µs of a control step of 30 µs, in numpy 5 µs. */
 
+#include "definitions.h"
+
 #include <math.h>
 #include <stdint.h>
 
@@ -10,7 +12,7 @@ typedef struct {
 } Rows;
 
 /* Squared violation of the hard entries, relative to 1 plus the square of [x; A x]; NaN where anything is. */
-__attribute__((visibility("default"))) double violation(const Rows *r) {
+EXPORTED double violation(const Rows *r) {
   double square = 0.0, sum = 0.0;
   for (int64_t k = 0; k < r->n + r->m; k++) {
     if (k >= r->n) {
@@ -28,7 +30,7 @@ __attribute__((visibility("default"))) double violation(const Rows *r) {
   return square < INFINITY ? sum / (1.0 + square) : NAN;
 }
 
-__attribute__((visibility("default"))) void bound(const Rows *r, double limit) {
+EXPORTED void bound(const Rows *r, double limit) {
   for (int64_t k = 0; k < r->n + r->m; k++) {
     r->low[k] = r->lower[k] < -limit ? -limit : r->lower[k];
     r->high[k] = r->upper[k] > limit ? limit : r->upper[k];

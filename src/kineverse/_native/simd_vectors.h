@@ -6,6 +6,7 @@
    for instructions without a notation in the vector extension. Machines without these intrinsics compute
    lane by lane. No program uses all functions. */
 #pragma once
+#include "definitions.h"
 
 #include <math.h>
 #include <stdlib.h>
@@ -69,11 +70,8 @@ typedef UnsignedBits U __attribute__((vector_size(REGISTER)));
 typedef Real Unaligned __attribute__((vector_size(REGISTER), aligned(sizeof(Real)), may_alias));
 typedef Real Aligned __attribute__((vector_size(REGISTER), may_alias));
 
-#define UNUSED __attribute__((unused))
-#define INLINE static inline __attribute__((always_inline, unused))
 #define NOINLINE __attribute__((noinline))
 #define APART static __attribute__((noinline, cold, unused))
-#define EXPORTED __attribute__((visibility("default")))
 #define UNROLLED _Pragma("GCC unroll 16")
 
 INLINE V splat(Real x) {

@@ -119,8 +119,8 @@ static double beyond(const Problem *p, int64_t g, const Work *w, const double *t
 
 /* Update x, η, log evidence of groups and Λ, which lie one after the other; nis and dof of groups are
    results. Groups of which nothing is seen stay. Returns the number of rounds; below 0, it gave up. */
-API int64_t update(const Problem *p, double *belief, const double *seen, const uint8_t *mask,
-                   const double *whitening, const double *log_scale, double *nis, double *dof) {
+EXPORTED int64_t update(const Problem *p, double *belief, const double *seen, const uint8_t *mask,
+                        const double *whitening, const double *log_scale, double *nis, double *dof) {
   const int64_t n = p->directions, groups = p->groups;
   double *x = belief, *eta = x + p->coordinates, *evidence = eta + n, *information = evidence + groups;
   Work works[groups];
@@ -203,7 +203,7 @@ API int64_t update(const Problem *p, double *belief, const double *seen, const u
 
 /* Move x on, and add variances to the covariance, of each coordinate, where these are the tangent; then to
    the most probable place inside the bounds. Returns 0, or less if it gave up. */
-API int64_t predict(const Problem *p, double *belief, const double *moved, const double *grown) {
+EXPORTED int64_t predict(const Problem *p, double *belief, const double *moved, const double *grown) {
   const int64_t total = p->coordinates;
   double *x = belief, *eta = x + total, *information = eta + total + p->groups;
   for (int64_t g = 0; g < p->groups; g++) {
@@ -247,7 +247,7 @@ API int64_t predict(const Problem *p, double *belief, const double *moved, const
 }
 
 /* The number of the first pose that is seen and not rigid; -1 if all are. */
-API int64_t first_broken(const Problem *p, const double *seen, const uint8_t *mask, double rigid) {
+EXPORTED int64_t first_broken(const Problem *p, const double *seen, const uint8_t *mask, double rigid) {
   for (int64_t i = 0; i < p->observations; i++) {
     const double *t = seen + p->seen[i];
     if (!mask[i] || !p->is_pose[i]) continue;

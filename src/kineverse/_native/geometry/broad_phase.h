@@ -2,14 +2,12 @@
 
    MEMORY_BITS and TREE_WIDTH are given by the command line of the compiler, see geometry/bindings.py. */
 #pragma once
+#include "../definitions.h"
 
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
-
-/* Compiled function of one vector. */
-typedef int (*Compute)(const double **, double **, long long *, double *, int);
 
 /* Measured pair: the travel of both at that time, and the result. */
 typedef struct {
@@ -46,7 +44,6 @@ typedef struct {
   double *boxes;                  /* corners of the boxes of bodies; NULL for a sweep */
 } Neighbours;
 
-#define EXPORT __attribute__((visibility("default")))
 
 /* Slot of a pair, which another pair may have overwritten. */
 static inline Memory *memory_of(const Table *t, int64_t i, int64_t j) {
@@ -71,7 +68,7 @@ static inline double larger(double x, double y) { return x > y ? x : y; }
 /* Difference of the reach of neighbours to that of a query. */
 #define SPARE 0.06
 
-EXPORT int64_t place(Table *t, const double *fresh) {
+EXPORTED int64_t place(Table *t, const double *fresh) {
   int64_t outcome = PLACED;
   for (int64_t k = 0; k < 12 * t->moving; k++)
     if (!(fabs(fresh[k]) <= FURTHEST)) return k / 12; /* also for NaN */
@@ -205,7 +202,7 @@ static void square_gaps(const Table *t, int64_t one, int64_t first, int64_t end)
 
 /* Returns the number of pairs; only the first `room` of them are written. Of two moving objects, the one with
    the smaller lower end finds the other. Pairs of static objects are skipped. */
-EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_t room) {
+EXPORTED int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_t room) {
   sort(t, t->order, t->moving);
   Answer answer = {reach, pairs, lows, room, 0};
   const int64_t n = t->moving;

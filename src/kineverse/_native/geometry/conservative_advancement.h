@@ -17,7 +17,7 @@ typedef struct {
   const uint8_t *selected; /* pairs of bodies */
   Placed *placed;          /* the samples of one object after those of another */
   double *boxes;           /* corners of the boxes that stand still, and a row of gaps */
-  Compute compute;
+  Function compute;
   double *inputs, *outputs;
   const int64_t *columns; /* of the coordinates among the inputs; -1 for none */
   int64_t coordinates, first;
@@ -25,7 +25,7 @@ typedef struct {
 } Motion;
 
 /* Computes the poses at configurations. */
-EXPORT int64_t trace(const Motion *m, const double *rows, int64_t n) {
+EXPORTED int64_t trace(const Motion *m, const double *rows, int64_t n) {
   const double *arguments[1] = {m->inputs};
   double *results[1] = {m->outputs};
   for (int64_t k = 0; k < n; k++) {
@@ -40,7 +40,7 @@ EXPORT int64_t trace(const Motion *m, const double *rows, int64_t n) {
 
 /* Computes boxes and travel from the poses. Returns the number of samples up to one whose poses are not
    finite or whose travel is too long. */
-EXPORT int64_t settle(const Table *t, const Motion *m, int64_t n) {
+EXPORTED int64_t settle(const Table *t, const Motion *m, int64_t n) {
   for (int64_t p = 0; p < m->moved; p++) {
     const double *c = t->centre + 3 * m->moving[p], *h = t->half + 3 * m->moving[p];
     Placed *s = m->placed + m->room * p;
@@ -140,7 +140,7 @@ static void swept_box(const Placed *s, int64_t from, int64_t end, double *low, d
 /* Returns the first of some samples, from one on, with a pair within the limit or one that is left to coal;
    -1 without any. If the least distance is asked for, `limit` and `least` shrink to it instead. The table is
    as before afterwards. */
-EXPORT int64_t advance(const Table *t, Motion *m, int64_t from, int64_t count) {
+EXPORTED int64_t advance(const Table *t, Motion *m, int64_t from, int64_t count) {
   int64_t end = count;
   const int64_t s = m->still;
   double *gap = m->boxes + 6 * s;

@@ -90,7 +90,7 @@ typedef struct {
 
 /* Adds further facing points of near pairs to the `kept` results of a query, which are sorted. Returns the
    number of results: -1 without memory; more than there is room for if nothing was added. */
-EXPORT int64_t extend(Table *t, Query *q, const Facing *facing) {
+EXPORTED int64_t extend(Table *t, Query *q, const Facing *facing) {
   const int64_t kept = q->kept;
   int64_t found = 0, room = 0;
   FacingPoint *points = NULL;
@@ -149,8 +149,8 @@ EXPORT int64_t extend(Table *t, Query *q, const Facing *facing) {
 
 /* Places the moving objects where a function of some inputs puts them, searches, and adds facing points,
    unless `facing` is NULL. Returns the number of results, or -1 if something is left for single steps. */
-EXPORT int64_t search_at(
-    Table *t, Query *q, const Facing *facing, Compute compute, const double *inputs, double *poses) {
+EXPORTED int64_t search_at(
+    Table *t, Query *q, const Facing *facing, Function compute, const double *inputs, double *poses) {
   if (compute(&inputs, &poses, NULL, NULL, 0) || place(t, poses) != PLACED) return -1;
   const int64_t found = search(t, q);
   if (found < 0 || found > q->room || q->kept < 0) return -1;

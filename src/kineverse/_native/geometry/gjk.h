@@ -88,7 +88,7 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
 
 /* Measures pairs of objects, and records bounds of their distances. Remembered pairs are not
    measured again. */
-EXPORT void measure(
+EXPORTED void measure(
     Table *t, const int32_t *pairs, int64_t n, double limit, double *distances, double *witnesses) {
   for (int64_t k = 0; k < n; k++) {
     const int64_t i = pairs[2 * k], j = pairs[2 * k + 1];
@@ -111,7 +111,7 @@ EXPORT void measure(
 
 /* Returns 0 only if two objects are certainly further apart than a limit. The search begins in a direction
    from the one to the other, in the world, and leaves there the one that it ends with; 0 for none. */
-EXPORT int64_t is_within(const Table *t, int64_t i, int64_t j, double limit, double *direction) {
+EXPORTED int64_t is_within(const Table *t, int64_t i, int64_t j, double limit, double *direction) {
   if (lower_bound(t, i, j) > limit) return 0;
   if (t->corner_count[i] < 0 || t->corner_count[j] < 0) return 1;
   const Pair pair = pair_of(t, i, j);

@@ -67,7 +67,7 @@ static inline int64_t slot_of(const int64_t *known, int64_t slots, int64_t key) 
 
 /* Writes the indices of the pairs within a radius, nearest first, of each pair of bodies the nearest, or
    `all`; `order` has room for all. Returns their number, -1 without memory. */
-EXPORT int64_t rank(
+EXPORTED int64_t rank(
     const Table *t, const int32_t *pairs, int64_t n, const double *distances, double radius, int64_t all,
     int64_t *order) {
   int64_t kept = 0, slots = 2;
@@ -92,7 +92,7 @@ EXPORT int64_t rank(
 }
 
 /* Writes pairs in an order; the first body of each precedes the second in the model. */
-EXPORT void gather(
+EXPORTED void gather(
     const Table *t, const int32_t *pairs, const double *distances, const double *witnesses,
     const int64_t *order, int64_t n, int32_t *pieces, int32_t *bodies, double *distance, double *witness) {
   for (int64_t k = 0; k < n; k++) {
@@ -178,7 +178,7 @@ static int64_t answer_query(Table *t, Query *q) {
 /* Measures, ranks and gathers the pairs that may be within `reach`. Returns the number of measured pairs, and
    writes the number `kept`: -1 if some pairs are left to coal, or the buffers are too short. Minus the number
    of neighbours is returned if that is more than there is room for. */
-EXPORT int64_t search(Table *t, Query *q) {
+EXPORTED int64_t search(Table *t, Query *q) {
   const uint8_t *allowed = t->allowed, *active = t->active;
   if (q->allowed) t->allowed = q->allowed, t->active = q->active;
   const int64_t found = answer_query(t, q);

@@ -16,7 +16,6 @@
 #define W 2
 #endif
 #define PARTS (LANES / W)
-#define INLINE static inline __attribute__((always_inline))
 
 typedef struct { double x[3]; } Vector;
 

@@ -108,7 +108,7 @@ static double widest(const Problem *p, int64_t columns, const double *values, co
 }
 
 /* The inverse of C + diag(s^2); returns the root of the determinant. */
-FAST double widened(const double *covariance, int n, const double *deviations, double *inverse) {
+INLINE double widened(const double *covariance, int n, const double *deviations, double *inverse) {
   double total[36];
   for (int i = 0; i < n * n; i++) total[i] = covariance[i];
   for (int i = 0; i < n; i++) total[(n + 1) * i] += deviations[i] * deviations[i];

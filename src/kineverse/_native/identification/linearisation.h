@@ -2,7 +2,6 @@
 #pragma once
 #include "small_matrices.h"
 
-#define EXPORT __attribute__((visibility("default")))
 /* At most so many parameters; what a family has not is 0, so that rows of a fixed length are vectors. */
 #define MOST 12
 
@@ -42,8 +41,8 @@ typedef struct {
 } Observation;
 
 /* A twist along or about an axis, as it moves the child at the end of a lever. */
-FAST void column(const double *axis, int about, const double *lever, double *J, int64_t stride,
-                 const int rows) {
+INLINE void column(const double *axis, int about, const double *lever, double *J, int64_t stride,
+                   const int rows) {
   double top[3];
   if (about) cross(axis, lever, top);
   for (int i = 0; i < 3; i++) J[i * stride] = about ? top[i] : axis[i];
@@ -54,7 +53,7 @@ FAST void column(const double *axis, int about, const double *lever, double *J, 
 static int64_t size_of(const Problem *p) { return p->lefts + p->rights + p->pitches; }
 
 /* The child's pose in the parent at joint values, and its derivatives. */
-FAST void place(const Problem *p, const Motion *m, Observation *o, const int rows) {
+INLINE void place(const Problem *p, const Motion *m, Observation *o, const int rows) {
   int64_t joints = p->joints, at = 0;
   double twist[6] = {0}, G[9], PJ[9], way[3], whole[3], axis[3];
   for (int64_t j = 0; j < joints; j++) twist[p->joint[j]] = o->values[j];
@@ -101,7 +100,7 @@ FAST void place(const Problem *p, const Motion *m, Observation *o, const int row
 static void place_one(const Problem *p, const Motion *m, Observation *o) { place(p, m, o, (int)p->rows); }
 
 /* S = Σ_B + M Σ_A Mᵀ with M = (I, -[h]x; 0, I). */
-FAST void combine(const Problem *p, Observation *o, const int rows) {
+INLINE void combine(const Problem *p, Observation *o, const int rows) {
   if (p->known) return;
   const double *h = o->lever, *A = o->of_parent;
   double half[36];
@@ -123,7 +122,7 @@ FAST void combine(const Problem *p, Observation *o, const int rows) {
 }
 
 /* J_a' W and J_a' W J_a; returns log |S + J_a P^-1 J_a'| - log |S|, with joint values as believed. */
-FAST double weigh(const Problem *p, Observation *o, const int rows) {
+INLINE double weigh(const Problem *p, Observation *o, const int rows) {
   int joints = (int)p->joints;
   for (int i = 0; i < joints; i++)
     for (int r = 0; r < rows; r++) {
@@ -149,7 +148,7 @@ FAST double weigh(const Problem *p, Observation *o, const int rows) {
 }
 
 /* The covariance of the k-th observation in other axes. */
-FAST void noise_in(const Noise *noise, int64_t k, const double *R, const int rows, double *turned) {
+INLINE void noise_in(const Noise *noise, int64_t k, const double *R, const int rows, double *turned) {
   const double *covariance = noise->covariance + noise->stride * k;
   if (noise->round)
     for (int i = 0; i < rows * rows; i++) turned[i] = covariance[i];
@@ -157,7 +156,7 @@ FAST void noise_in(const Noise *noise, int64_t k, const double *R, const int row
 }
 
 /* The square of an error in other axes, by the k-th covariance. */
-FAST double square_in(const Noise *noise, int64_t k, const double *R, const double *error, const int rows) {
+INLINE double square_in(const Noise *noise, int64_t k, const double *R, const double *error, const int rows) {
   double turned[6];
   if (noise->round) return squared(error, noise->inverse + noise->stride * k, rows);
   turn_back(R, error, rows, turned);
@@ -165,7 +164,7 @@ FAST double square_in(const Noise *noise, int64_t k, const double *R, const doub
 }
 
 /* Linearise one observation; return its cost. */
-FAST double look(const Problem *p, const Motion *m, int64_t k, Observation *o, const int rows) {
+INLINE double look(const Problem *p, const Motion *m, int64_t k, Observation *o, const int rows) {
   place(p, m, o, rows);
   const double *A = p->parent + 16 * k, *B = p->child + 16 * k, *h = o->lever;
   double R[9], S[9], T[9], offset[3], error[6], cost;
@@ -203,7 +202,7 @@ FAST double look(const Problem *p, const Motion *m, int64_t k, Observation *o, c
   return p->marginal ? cost + spread + 2.0 * log(root) : cost;
 }
 
-FAST double look_at_rows(const Problem *p, const Motion *m, Observation *all, const int rows) {
+INLINE double look_at_rows(const Problem *p, const Motion *m, Observation *all, const int rows) {
   double cost = 0.0;
   for (int64_t k = 0; k < p->count; k++) cost += look(p, m, k, all + k, rows);
   return cost;
@@ -237,8 +236,8 @@ static void keep(const Problem *p, const Observation *o, double *pose, double *b
 }
 
 /* As GroupMotion.linearise in families.py. */
-EXPORT void at(const Problem *p, int64_t count, const Motion *m, const double *values, double *poses,
-               double *by_parameters, double *by_joints) {
+EXPORTED void at(const Problem *p, int64_t count, const Motion *m, const double *values, double *poses,
+                 double *by_parameters, double *by_joints) {
   Observation o;
   for (int64_t k = 0; k < count; k++) {
     memcpy(o.values, values + p->joints * k, p->joints * sizeof(double));

@@ -48,8 +48,8 @@ static double bend(const Problem *p, const Motion *m, const Observation *o, int 
 }
 
 /* Take half the slope of the width of one observation off what the parameters are pushed by. */
-FAST void widen(const Problem *p, const Motion *m, const Observation *o, const double *left, double *right,
-                const int rows) {
+INLINE void widen(const Problem *p, const Motion *m, const Observation *o, const double *left, double *right,
+                  const int rows) {
   int joints = (int)p->joints, bent = 0;
   double q[3] = {0}, by_arm[3], by_turn[3] = {0}, by_axis[18], own[6], c[3];
   if (!p->known) {

@@ -18,7 +18,7 @@ static void advance(const Problem *p, const Motion *m, const double *step, Motio
 }
 
 /* Eliminate the joint values of an observation: W - W J_a (J_a' W J_a + P)^-1 J_a' W is what is left. */
-FAST int eliminate(const Problem *p, Observation *o, double damping, double *left, const int rows) {
+INLINE int eliminate(const Problem *p, Observation *o, double damping, double *left, const int rows) {
   int joints = (int)p->joints;
   for (int i = 0; i < rows * rows; i++) left[i] = o->weights[i];
   if (!joints) return 1;
@@ -42,8 +42,8 @@ FAST int eliminate(const Problem *p, Observation *o, double damping, double *lef
 }
 
 /* Add what one observation says about the parameters. */
-FAST void gather(const Problem *p, Observation *o, const double *left, double *normal, double *right,
-                 const int rows) {
+INLINE void gather(const Problem *p, Observation *o, const double *left, double *normal, double *right,
+                   const int rows) {
   int joints = (int)p->joints, n = (int)size_of(p);
   double pushed[6], rotated[6 * MOST];
   for (int r = 0; r < rows; r++) {
@@ -98,8 +98,8 @@ static void believe(const Problem *p, const Motion *m, double *normal, double *r
 }
 
 /* Move joint value and parent of an observation as a step of the parameters tells; returns the gain. */
-FAST double follow(const Problem *p, const Observation *o, const double *step, Observation *q,
-                   const int rows) {
+INLINE double follow(const Problem *p, const Observation *o, const double *step, Observation *q,
+                     const int rows) {
   int joints = (int)p->joints, n = (int)size_of(p);
   double left[6], gain = 0.0;
   for (int r = 0; r < rows; r++) {
@@ -146,8 +146,8 @@ FAST double follow(const Problem *p, const Observation *o, const double *step, O
   return gain;
 }
 
-FAST int move_rows(const Problem *p, const Motion *m, Observation *all, double damping, Motion *to,
-              Observation *next, double *gain, const int rows) {
+INLINE int move_rows(const Problem *p, const Motion *m, Observation *all, double damping, Motion *to,
+                     Observation *next, double *gain, const int rows) {
   int n = (int)size_of(p);
   double normal[MOST * MOST] = {0}, right[MOST] = {0}, step[MOST] = {0}, packed[MOST * MOST], left[36];
   for (int64_t k = 0; k < p->count; k++) {

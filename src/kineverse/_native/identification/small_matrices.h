@@ -1,47 +1,47 @@
 /* Rotations and small matrices. */
 #pragma once
+#include "../definitions.h"
 
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
-#define FAST static inline __attribute__((always_inline))
 #define TAU 6.283185307179586
 
-FAST void times33(const double *a, const double *b, double *c) {
+INLINE void times33(const double *a, const double *b, double *c) {
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++)
       c[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
 }
 
-FAST void transposed_times33(const double *a, const double *b, double *c) {
+INLINE void transposed_times33(const double *a, const double *b, double *c) {
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++) c[3 * i + j] = a[i] * b[j] + a[3 + i] * b[3 + j] + a[6 + i] * b[6 + j];
 }
 
-FAST void times_transposed33(const double *a, const double *b, double *c) {
+INLINE void times_transposed33(const double *a, const double *b, double *c) {
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++)
       c[3 * i + j] = a[3 * i] * b[3 * j] + a[3 * i + 1] * b[3 * j + 1] + a[3 * i + 2] * b[3 * j + 2];
 }
 
-FAST void apply(const double *a, const double *v, double *w) {
+INLINE void apply(const double *a, const double *v, double *w) {
   for (int i = 0; i < 3; i++) w[i] = a[3 * i] * v[0] + a[3 * i + 1] * v[1] + a[3 * i + 2] * v[2];
 }
 
-FAST void apply_transposed(const double *a, const double *v, double *w) {
+INLINE void apply_transposed(const double *a, const double *v, double *w) {
   for (int i = 0; i < 3; i++) w[i] = a[i] * v[0] + a[3 + i] * v[1] + a[6 + i] * v[2];
 }
 
-FAST void cross(const double *a, const double *b, double *c) {
+INLINE void cross(const double *a, const double *b, double *c) {
   c[0] = a[1] * b[2] - a[2] * b[1];
   c[1] = a[2] * b[0] - a[0] * b[2];
   c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
 /* I + s [v]x + c [v]x^2 */
-FAST void series(const double *v, double s, double c, double *r) {
+INLINE void series(const double *v, double s, double c, double *r) {
   double square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++) r[3 * i + j] = c * v[i] * v[j] + (i == j ? 1.0 - c * square : 0.0);
@@ -49,7 +49,7 @@ FAST void series(const double *v, double s, double c, double *r) {
   r[3] += s * v[2]; r[6] -= s * v[1]; r[7] += s * v[0];
 }
 
-FAST void exponential(const double *v, double *r) {
+INLINE void exponential(const double *v, double *r) {
   double square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], angle = sqrt(square);
   if (square < 1e-10) series(v, 1.0 - square / 6.0, 0.5 - square / 24.0, r);
   else series(v, sin(angle) / angle, (1.0 - cos(angle)) / square, r);
@@ -96,7 +96,7 @@ static void straighten(double *R) {
 
 /* The lower factor of a positive definite matrix in its place, with the reciprocals of its diagonal; returns
    the product of the diagonal, or 0 if it is none. */
-FAST double factorise(double *a, const int n) {
+INLINE double factorise(double *a, const int n) {
   double product = 1.0;
   for (int j = 0; j < n; j++) {
     for (int k = 0; k < j; k++)
@@ -176,7 +176,7 @@ static void singular_values(double *a, int rows, int n, double *values) {
   }
 }
 
-FAST double invert_size(const double *a, const int n, double *inverse) {
+INLINE double invert_size(const double *a, const int n, double *inverse) {
   double l[36], root;
   for (int i = 0; i < n * n; i++) l[i] = a[i];
   root = factorise(l, n);
@@ -209,7 +209,7 @@ static double invert(const double *a, int n, double *inverse) {
 }
 
 /* e' W e */
-FAST double squared(const double *e, const double *W, const int n) {
+INLINE double squared(const double *e, const double *W, const int n) {
   double sum = 0.0;
   for (int i = 0; i < n; i++)
     for (int j = 0; j < n; j++) sum += e[i] * W[n * i + j] * e[j];
@@ -217,7 +217,7 @@ FAST double squared(const double *e, const double *W, const int n) {
 }
 
 /* A covariance in the axes whose columns are R's. */
-FAST void turn(const double *covariance, const double *R, const int n, double *turned) {
+INLINE void turn(const double *covariance, const double *R, const int n, double *turned) {
   for (int i = 0; i < n; i += 3)
     for (int j = 0; j <= i; j += 3) {
       double block[9], half[9], whole[9];
@@ -232,6 +232,6 @@ FAST void turn(const double *covariance, const double *R, const int n, double *t
 }
 
 /* An error in other axes. */
-FAST void turn_back(const double *R, const double *error, const int n, double *turned) {
+INLINE void turn_back(const double *R, const double *error, const int n, double *turned) {
   for (int i = 0; i < n; i += 3) apply(R, error + i, turned + i);
 }

@@ -273,7 +273,7 @@ EXPORTED int kineverse_valid(const Checker *c, const float *rows, long long coun
 
 /* Write 1 for every edge that is free: sampled if `least` is 0, else certain between the samples too. */
 EXPORTED int kineverse_edges(const Checker *c, const float *from, const float *to, long long count, double resolution,
-                           double least, unsigned char *valid) {
+                             double least, unsigned char *valid) {
   Work w;
   if (work_begin(&w, c, INFINITY)) return -1;
   for (long long k = 0; k < count && !is_over(&w.watch); k++) {
@@ -307,7 +307,7 @@ static void certify_short_edges(const Checker *c, Work *w, const float *points, 
 /* Find the first collision on a polyline (count, n): return the number of its edge and write the fraction of the
    way along it, or return -1; -2 without memory, and -3 if the time is up. */
 EXPORTED long long kineverse_certify(const Checker *c, const float *points, long long count, double resolution,
-                                   double least, double seconds, double *where) {
+                                     double least, double seconds, double *where) {
   Work w;
   if (work_begin(&w, c, seconds)) return -2;
   const int n = (int)c->coordinates;

@@ -4,7 +4,7 @@
 
 /* Project configurations (count, n) in place; write 1 for those that arrive within limits. */
 EXPORTED int kineverse_project(const Checker *c, const Projection *p, float *rows, long long count,
-                             unsigned char *arrived) {
+                               unsigned char *arrived) {
   Search s = {.checker = c, .projection = p, .range = 1.0, .resolution = 1.0, .seconds = INFINITY};
   Walk k;
   const int n = (int)c->coordinates;
@@ -224,7 +224,7 @@ static void polish_block(Polish *w, double *rows, long long count, long long ste
 /* Bring configurations (count, n) in place onto the manifold, within limits, by at most some steps; write the residuals
    that are left. */
 EXPORTED int kineverse_polish(const Checker *c, const Projection *p, double *rows, long long count, long long steps,
-                            double *residuals) {
+                              double *residuals) {
   Polish w;
   if (polish_begin(&w, c, p)) return -1;
   for (long long k = 0; k < count && !is_over(&w.watch); k += D)
@@ -286,7 +286,7 @@ static long long subdivide(Polish *w, double *points, long long count, long long
    most `deviation`. Return the new number of points, at most `room`, or -1 if one of them does not arrive within some
    steps, or there is no room. */
 EXPORTED long long kineverse_refine(const Checker *c, const Projection *p, double *points, long long count,
-                                  long long room, long long steps, double deviation) {
+                                    long long room, long long steps, double deviation) {
   const int n = (int)c->coordinates;
   Polish w;
   if (polish_begin(&w, c, p)) return -1;

@@ -520,7 +520,7 @@ static long long search_roadmap(Query *s, float *path, long long room) {
    path those from a start to the node nearest to a goal are written, and the status says why. Coordinates with a
    period go on from where the start has them, so that they may end full turns away from a goal. */
 EXPORTED long long kineverse_roadmap(Roadmap *r, const float *starts, long long start_count, const float *goals,
-                                   long long goal_count, float *path, long long room) {
+                                     long long goal_count, float *path, long long room) {
   const int n = (int)r->checker->coordinates;
   Query s = {.r = r, .begin = now()};
   Random seed = (Random)r->seed * 0x2545f4914f6cdd1dULL + (Random)r->drawn;

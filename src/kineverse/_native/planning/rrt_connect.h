@@ -231,7 +231,7 @@ static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out
 /* Search a path from any start to any goal; write its configurations (room, n) and return their number. Without a
    path those from a start to the node nearest to a goal are written, and the status says why. */
 EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long long start_count, const float *goals,
-                                       long long goal_count, float *path, long long room) {
+                                         long long goal_count, float *path, long long room) {
   const Checker *c = s->checker;
   const int n = (int)c->coordinates;
   const double begin = now();
@@ -319,7 +319,7 @@ end:
    `patience` tries in a row have brought less than a hundredth each, or the time is up. Return the new number of
    points. */
 EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, long long room, long long patience,
-                                    double least) {
+                                      double least) {
   const Checker *c = s->checker;
   const int n = (int)c->coordinates;
   const double begin = now();

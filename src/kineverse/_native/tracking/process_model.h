@@ -2,13 +2,10 @@
 #pragma once
 #include "quadratic_program.h"
 
-#define API __attribute__((visibility("default")))
 #define WIDE 64 /* numbers of an observation */
 
-typedef int (*Compute)(const double **, double **, long long *, double *, int);
-
 typedef struct {
-  Compute compute;
+  Function compute;
   int64_t observations, groups, coordinates, directions, known;
   /* Of each observation: whether it is a pose, its size, and where its numbers are. */
   const int64_t *is_pose, *size, *value, *slope, *seen, *white;
@@ -16,7 +13,7 @@ typedef struct {
      which of its coordinates is one of them, or -1; likewise its coordinates, and what is seen of it. */
   const int64_t *first, *place, *own, *first_x, *place_x, *first_watch, *watch;
   /* Rates and steps of the groups that are moved by others' speeds, and which rates change on the way. */
-  const Compute *rates, *step;
+  const Function *rates, *step;
   const int64_t *first_bend;
   const double *bend;
   const double *period, *lower, *upper;
@@ -26,7 +23,7 @@ typedef struct {
 #define LONGEST 0.1 /* of a step of Runge and Kutta */
 #define MOST_STEPS 100000
 
-static int call(Compute compute, const double *input, double *one, double *two, double *three) {
+static int call(Function compute, const double *input, double *one, double *two, double *three) {
   const double *arguments[1] = {input};
   double *results[3] = {one, two, three};
   return compute(arguments, results, NULL, NULL, 0);

@@ -1,5 +1,6 @@
 /* Quadratic program with bounds on single unknowns. */
 #pragma once
+#include "../definitions.h"
 
 #include <math.h>
 #include <stdint.h>
