@@ -38,7 +38,9 @@ LIBRARIES = {
         geometry.collision_library,
         planning._library,
     )
-} | {"call_extension.c": (f"-I{sysconfig.get_path('include')}", f"-I{np.get_include()}")}
+} | {
+    "call_extension.c": ("-DMOST_OUTPUTS=256", f"-I{sysconfig.get_path('include')}", f"-I{np.get_include()}")
+}
 
 
 def texts_of(source: str) -> Iterator[tuple[str, int, str]]:

@@ -71,8 +71,6 @@ typedef struct {
   PyObject *convert, *check, *library;
 } Call;
 
-#define MOST_OUTPUTS 256
-
 static PyObject *call_vectorcall(PyObject *object, PyObject *const *args, size_t count, PyObject *names) {
   Call *self = (Call *)object;
   if (PyVectorcall_NARGS(count) != 1 || names) {

@@ -122,7 +122,8 @@ class ProgramLibrary(Generic[Code]):
 class SourceLibrary:
     """The compiled functions of a hand-written file, see :func:`.read_source`, loaded when they are ready.
 
-    Until then, and without a compiler, the callers compute the same in numpy.
+    Until then, and without a compiler, the callers compute the same in numpy. The source is compiled with the
+    constants as macros.
     """
 
     def __init__(
@@ -130,8 +131,14 @@ class SourceLibrary:
         file: str,
         declare: Callable[[Any], None],
         flags: tuple[str, ...] = ("-O3",),
+        **constants: float,
     ) -> None:
-        self.file, self.flags, self._declare = file, (*flags, *NO_UNDEFINED_FLAGS), declare
+        self.file, self._declare = file, declare
+        self.flags = (
+            *flags,
+            *(f"-D{name}={value}" for name, value in constants.items()),
+            *NO_UNDEFINED_FLAGS,
+        )
         self._code: Any = None
         self._build: BuildJob | None = None
         self.error: str | None = None

@@ -25,8 +25,7 @@ from .cache import LibraryCache, library_cache
 from .evaluator import Evaluator
 from .toolchain import toolchain
 
-# The capacity of the extension for outputs.
-MOST_OUTPUTS = 256
+MOST_OUTPUTS = 256  # largest number of outputs of a function
 _EXTENSION_NAME = "kineverse_native"
 
 
@@ -63,7 +62,7 @@ class CallExtension:
         headers = sysconfig.get_path("include")
         if not os.path.exists(os.path.join(headers, "Python.h")):
             return False
-        flags = ("-O2", f"-I{headers}", f"-I{np.get_include()}")
+        flags = ("-O2", f"-DMOST_OUTPUTS={MOST_OUTPUTS}", f"-I{headers}", f"-I{np.get_include()}")
         self._build = request(key, compiler, lambda: source, flags, self._built, urgent)
         return self._build is not None
 

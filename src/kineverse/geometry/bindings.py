@@ -16,14 +16,17 @@ from kineverse.compilation.toolchain import NO_COMPILER
 from kineverse.errors import CompileError
 
 from . import broadphase
-from .broadphase import MEMORY_SLOTS, TREE_WIDTH, Indices, ObjectTable, PairSelection, build_static_tree
+from .broadphase import Indices, ObjectTable, PairSelection, build_static_tree
 from .mesh_files import Floats
+from .narrowphase import ACCURACY
 
 _ARRAYS = (
     "body", "allowed", "active", "centre", "half", "radius",
     "poses", "travel", "position", "low", "high", "bounds", "order", "sorted_boxes",
     "corners", "corner_count", "edges", "radii", "round", "tip", "memory",
 )  # fmt: skip
+
+_CONSTANTS = ("TREE_WIDTH", "FURTHEST", "LONGEST_TRAVEL", "PLACED", "TRAVEL_EXCEEDED")
 
 _SEVERAL, _MANY = 2, 16
 """Objects of a body from which on near pairs are found by the boxes of bodies, and pairs of bodies for each
@@ -102,8 +105,11 @@ class CollisionLibrary(SourceLibrary):
     """Compiled broad and narrow phase, once it is built; shared by all scenes of the process."""
 
     def __init__(self) -> None:
-        sizes = (f"-DMEMORY_BITS={MEMORY_SLOTS.bit_length() - 1}", f"-DTREE_WIDTH={TREE_WIDTH}")
-        super().__init__("geometry.c", _declare_signatures, ("-O3", *sizes))
+        constants = {name: getattr(broadphase, name) for name in _CONSTANTS}
+        memory_bits = broadphase.MEMORY_SLOTS.bit_length() - 1
+        super().__init__(
+            "geometry.c", _declare_signatures, **constants, ACCURACY=ACCURACY, MEMORY_BITS=memory_bits
+        )
 
     def place(self, table: ObjectTable, fresh: Floats) -> int:
         """Place objects as :func:`.broadphase.place_objects` does; ``fresh`` is contiguous."""

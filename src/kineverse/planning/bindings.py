@@ -26,7 +26,7 @@ LINK = np.dtype([*_BOUNDS, *_integers("pose first coarse first_shape shapes exac
 SHAPE = np.dtype([("pose", np.float64, 12), ("object", np.int64)])
 COARSE = np.dtype([("sphere", np.float32, 4), *_integers("first count")])
 
-MOST_COORDINATES = 64  # largest number of coordinates, as in edges.h
+MOST_COORDINATES = 64  # largest number of coordinates
 BOX, CYLINDER, CAPSULE, SPHERE, HULL = range(5)  # kinds of obstacles
 FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY, TOO_LONG = range(5)  # outcomes of a search
 
@@ -127,5 +127,8 @@ def _ensure_whole(result: int, function: Any, arguments: tuple[Any, ...]) -> int
 
 
 _library = SourceLibrary(
-    "planning.c", _declare_signatures, ("-O3", "-ffp-contract=fast", "-fno-rounding-math")
+    "planning.c",
+    _declare_signatures,
+    ("-O3", "-ffp-contract=fast", "-fno-rounding-math"),
+    MOST_COORDINATES=MOST_COORDINATES,
 )

@@ -1,6 +1,4 @@
-/* Broad phase, with lists of neighbours for queries that are asked at one state after another.
-
-   MEMORY_BITS and TREE_WIDTH are given by the command line of the compiler, see geometry/bindings.py. */
+/* Broad phase, with lists of neighbours for queries that are asked at one state after another. */
 #pragma once
 #include "../definitions.h"
 
@@ -60,11 +58,6 @@ static inline double square(double x) { return x * x; }
 /* Faster than fmax, which handles NaN; there is none here. */
 static inline double larger(double x, double y) { return x > y ? x : y; }
 
-/* Constants of broadphase.py; lengths in [m]. */
-#define FURTHEST 1e12
-#define LONGEST_TRAVEL 1e4
-#define PLACED -1
-#define TRAVEL_EXCEEDED -2
 /* Difference of the reach of neighbours to that of a query. */
 #define SPARE 0.06
 

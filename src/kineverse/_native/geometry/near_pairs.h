@@ -2,9 +2,6 @@
 #pragma once
 #include "gjk.h"
 
-/* Largest error of a distance [m]. */
-#define ACCURACY 1e-4
-
 typedef struct {
   double distance;
   int64_t bodies;

@@ -2,8 +2,7 @@
 #pragma once
 #include "mirrored_values.h"
 
-/* Parameters, means of joint values, and a point that slides, at most; rows of a fixed length are vectors. */
-#define UNKNOWNS 16
+/* Unknowns are the parameters, the means of joint values, and a point that slides. */
 #define ATOM 1e-10
 
 /* Joint values, their covariances and the information, as observations and widths tell together. */

@@ -2,8 +2,7 @@
 #pragma once
 #include "small_matrices.h"
 
-/* At most so many parameters; what a family has not is 0, so that rows of a fixed length are vectors. */
-#define MOST 12
+/* Rows have a fixed length, MOST, so that they are vectors; what a family has not is 0. */
 
 typedef struct { double left_R[9], left_p[3], right_R[9], right_p[3], pitch; } Motion;
 

@@ -2,8 +2,6 @@
 #pragma once
 #include "collision.h"
 
-#define MOST_COORDINATES 64
-
 INLINE V ramp(void) {
   V r;
   for (int i = 0; i < W; i++) r[i] = (float)i;

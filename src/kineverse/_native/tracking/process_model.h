@@ -2,8 +2,7 @@
 #pragma once
 #include "quadratic_program.h"
 
-#define WIDE 64 /* numbers of an observation */
-
+/* An observation has WIDE numbers at most. */
 typedef struct {
   Function compute;
   int64_t observations, groups, coordinates, directions, known;

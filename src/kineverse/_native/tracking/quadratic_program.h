@@ -1,4 +1,4 @@
-/* Quadratic program with bounds on single unknowns. */
+/* Quadratic program with bounds on single unknowns, of which there are MOST at most. */
 #pragma once
 #include "../definitions.h"
 
@@ -6,7 +6,6 @@
 #include <stdint.h>
 #include <string.h>
 
-#define MOST 64 /* unknowns */
 #define LEAST 1e-12
 
 /* The lower triangle L with L Lᵀ = a, in place; 0 if a is not positive. */

@@ -83,7 +83,7 @@ def _declare(code: Any) -> None:
         function.restype = None
 
 
-library = SourceLibrary("identification.c", _declare, _FLAGS)
+library = SourceLibrary("identification.c", _declare, _FLAGS, MOST=_PARAMETERS, UNKNOWNS=_UNKNOWNS)
 """Compiled functions, shared by the whole process."""
 
 

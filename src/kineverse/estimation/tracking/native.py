@@ -58,7 +58,9 @@ def _declare(code: Any) -> None:
 
 
 # With -O3 the compiler takes three times as long, for the same speed.
-native_library = SourceLibrary("tracking.c", _declare, ("-O2",))
+native_library = SourceLibrary(
+    "tracking.c", _declare, ("-O2",), MOST=_MAX_UNKNOWNS, WIDE=_MAX_MEASUREMENT_SIZE
+)
 """Compiled update, shared by all trackers of the process."""
 
 
