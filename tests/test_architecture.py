@@ -21,6 +21,7 @@ from inventory.size import count_lines, find_importers, find_modules  # noqa: E4
 
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 LARGEST, SMALLEST, MOST_FILES = 650, 100, 26
+MOST_LINES_OF_C = 12  # in a string: declarations, and calls of what is generated
 LARGE = {"kineverse.expressions.expression"}
 """Modules above the largest size: one class that behaves like an array."""
 
@@ -79,6 +80,30 @@ def _modules() -> dict[str, Path]:
 def test_the_package_does_not_import_its_studies() -> None:
     sources = sorted((ROOT / "src").rglob("*.py"))
     assert [path for path in sources if "kineverse_studies" in path.read_text("utf-8")] == []
+
+
+def test_hand_written_c_is_in_files() -> None:
+    """Python has C only where it is made of expressions, in pieces. ``kineverse._native`` has the rest."""
+    pieces = [
+        f"{path}:{node.lineno}"
+        for path in sorted((ROOT / "src").rglob("*.py"))
+        for node in _strings_of(ast.parse(path.read_text("utf-8")))
+        if _is_c(node.value) and node.value.count("\n") >= MOST_LINES_OF_C
+    ]
+    assert pieces == []
+    files = [path.read_text("utf-8") for path in sorted((ROOT / "src/kineverse/_native").rglob("*.[ch]"))]
+    assert all(_is_c(text) for text in files if text.count("\n") >= MOST_LINES_OF_C)
+
+
+def _strings_of(module: ast.Module) -> list[ast.Constant]:
+    """Return the strings of a module but those that stand alone, which document what is above them."""
+    alone = {id(node.value) for node in ast.walk(module) if isinstance(node, ast.Expr)}
+    strings = [node for node in ast.walk(module) if isinstance(node, ast.Constant) and id(node) not in alone]
+    return [node for node in strings if isinstance(node.value, str)]
+
+
+def _is_c(text: str) -> bool:
+    return bool(re.search(r"\b(void|int|double|float|struct|static)\b.*[;{]$", text, re.MULTILINE))
 
 
 @pytest.mark.parametrize("package", ["formats", "geometry", "view"])

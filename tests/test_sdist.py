@@ -1,9 +1,10 @@
-"""A source distribution has all that the repository has: documentation, changelog, examples, and tests that run."""
+"""A source distribution has all that the repository has, and a wheel all that the package has."""
 
 import shutil
 import subprocess
 import sys
 import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,9 @@ def tracked():
     return {name for name in said.stdout.splitlines() if (ROOT / name).exists()}
 
 
-def test_the_source_distribution_is_complete(tracked, tmp_path):
+@pytest.fixture
+def tree(tracked, tmp_path):
+    """A copy of the repository with empty files."""
     for name in tracked:
         target = tmp_path / "tree" / name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -30,11 +33,27 @@ def test_the_source_distribution_is_complete(tracked, tmp_path):
             shutil.copy(ROOT / name, target)
         else:
             target.touch()
-    program = "from setuptools.build_meta import build_sdist; build_sdist('dist')"
-    subprocess.run([sys.executable, "-c", program], cwd=tmp_path / "tree", capture_output=True, check=True)
-    (archive,) = (tmp_path / "tree" / "dist").glob("*.tar.gz")
-    with tarfile.open(archive) as opened:
+    return tmp_path / "tree"
+
+
+def build(tree, kind):
+    program = f"from setuptools.build_meta import build_{kind}; build_{kind}('dist')"
+    subprocess.run([sys.executable, "-c", program], cwd=tree, capture_output=True, check=True)
+    (archive,) = (tree / "dist").iterdir()
+    return archive
+
+
+def test_the_source_distribution_is_complete(tracked, tree):
+    with tarfile.open(build(tree, "sdist")) as opened:
         found = {member.name.partition("/")[2] for member in opened.getmembers() if member.isfile()}
     assert tracked - found == set()
     made = {"PKG-INFO", "setup.cfg"}
     assert {name for name in found - tracked - made if ".egg-info/" not in name} == set()
+
+
+def test_a_wheel_has_all_files_of_the_package_and_no_compiled_ones(tracked, tree):
+    archive = build(tree, "wheel")
+    assert archive.name.endswith("-py3-none-any.whl")
+    with zipfile.ZipFile(archive) as opened:
+        found = {name for name in opened.namelist() if name.startswith("kineverse/")}
+    assert found == {name.removeprefix("src/") for name in tracked if name.startswith("src/kineverse/")}

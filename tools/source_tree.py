@@ -17,25 +17,21 @@ WIDTH = 118
 
 
 def tree() -> str:
-    """Return one paragraph for each package: its name, its subject and its modules."""
+    """Return one paragraph for each folder: its name, its subject, and its modules or files of C."""
     return _draw(ROOT / "src" / "kineverse") + _draw(ROOT / "studies" / "kineverse_studies")
 
 
 def _draw(source: Path) -> str:
     lines: list[str] = []
-    folders = [source, *sorted(p.parent for p in source.rglob("__init__.py") if p.parent != source)]
+    files = (p for p in source.rglob("*") if p.name == "__init__.py" or p.suffix in (".c", ".h"))
+    folders = sorted({source, *(p.parent for p in files)})
     for folder in folders:
         depth = len(folder.relative_to(source).parts)
         indent = "  " * depth
-        subject = (ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or "").partition(
-            "\n"
-        )[0]
-        subject = re.sub(r"^Layer \d: ", "", subject).rstrip(".")
-        if subject[1:2].islower():
-            subject = subject[0].lower() + subject[1:]
-        lines.append(f"{indent}{folder.name}/  ({subject})")
+        lines.append(f"{indent}{folder.name}/  ({_subject(folder)})")
         modules = " ".join(
             sorted(p.stem for p in folder.glob("*.py") if p.stem not in ("__init__", "_version"))
+            or sorted(p.name for p in folder.glob("*.[ch]"))
         )
         lines += textwrap.wrap(
             modules,
@@ -45,6 +41,18 @@ def _draw(source: Path) -> str:
             break_on_hyphens=False,
         )
     return "\n".join(lines) + "\n"
+
+
+def _subject(folder: Path) -> str:
+    """Return the first line about a package, or about a library whose parts are in a folder."""
+    if (folder / "__init__.py").exists():
+        subject = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or ""
+    elif folder.with_suffix(".c").exists():
+        subject = folder.with_suffix(".c").read_text("utf-8").removeprefix("/* ").partition(" */")[0]
+    else:
+        subject = "hand-written C: a file for each library, with its parts in a folder"
+    subject = re.sub(r"^Layer \d: ", "", subject.partition("\n")[0]).rstrip(".")
+    return subject[0].lower() + subject[1:] if subject[1:2].islower() else subject
 
 
 if __name__ == "__main__":

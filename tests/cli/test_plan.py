@@ -74,12 +74,9 @@ def test_no_path_ends_with_status_1_and_the_reason(run):
 
 def test_without_a_compiler_it_says_what_works(run, monkeypatch):
     from kineverse.compilation.c_library import SourceLibrary
-    from kineverse.planning import bindings
 
-    bindings._library.cache_clear()
     monkeypatch.setattr(SourceLibrary, "prepare", lambda *_, **__: False)
     status, out, err = run("plan", ARM, "--to", "j0=1")
-    bindings._library.cache_clear()
     assert (status, out) == (2, "")
     assert "kineverse reach" in err
     assert "controllers work without it" in err

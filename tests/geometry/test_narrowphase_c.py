@@ -268,7 +268,7 @@ def test_measure_without_a_compiler_leaves_all_pairs_to_coal():
 def narrower():
     """Return the same C for a processor that takes two corners at a time."""
     library = CollisionLibrary()
-    library._flags = (*library._flags, "-U__AVX512F__", "-U__AVX2__")
+    library.flags = (*library.flags, "-U__AVX512F__", "-U__AVX2__")
     assert library.prepare(wait=True)
     return library
 

@@ -276,7 +276,7 @@ def test_missing_compiler_is_said_with_what_works_without(ball, monkeypatch):
         def prepare(self, wait: bool) -> bool:
             return False
 
-    monkeypatch.setattr(bindings, "_library", Missing)
+    monkeypatch.setattr(bindings, "_library", Missing())
     with pytest.raises(CompileError, match="Inverse kinematics"):
         Planner(ball.model)
 

@@ -59,7 +59,8 @@ def _rooms(folder: Path) -> dict[str, Any]:
     }
     below = [folder, *(p for p in sorted(folder.rglob("*")) if p.is_dir())]
     counts = {
-        p.relative_to(folder).as_posix(): sum(f.suffix in (".py", ".c") for f in p.iterdir()) for p in below
+        p.relative_to(folder).as_posix(): sum(f.suffix in (".py", ".c", ".h") for f in p.iterdir())
+        for p in below
     }
     return {
         "modules under 100 lines": sum(lines < SMALL for lines in inner.values()),

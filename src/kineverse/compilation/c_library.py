@@ -16,6 +16,7 @@ from typing import Any, Generic, TypeVar
 from weakref import WeakMethod
 
 from .build_queue import BuildJob, request
+from .c_source import read_source
 from .cache import library_cache
 from .interruption import watch_signals
 from .program import Program
@@ -119,18 +120,25 @@ class ProgramLibrary(Generic[Code]):
 
 
 class SourceLibrary:
-    """The compiled functions of a hand-written C source, loaded when they are ready.
+    """The compiled functions of a hand-written file, see :func:`.read_source`, loaded when they are ready.
 
-    Until then, and without a compiler, the callers compute the same in numpy.
+    Until then, and without a compiler, the callers compute the same in numpy. The source is compiled with the
+    constants as macros.
     """
 
     def __init__(
         self,
-        source: str,
+        file: str,
         declare: Callable[[Any], None],
-        flags: tuple[str, ...] = ("-O3", *NO_UNDEFINED_FLAGS),
+        flags: tuple[str, ...] = ("-O3",),
+        **constants: float,
     ) -> None:
-        self._source, self._declare, self._flags = source, declare, flags
+        self.file, self._declare = file, declare
+        self.flags = (
+            *flags,
+            *(f"-D{name}={value}" for name, value in constants.items()),
+            *NO_UNDEFINED_FLAGS,
+        )
         self._code: Any = None
         self._build: BuildJob | None = None
         self.error: str | None = None
@@ -166,13 +174,14 @@ class SourceLibrary:
         if compiler is None:
             self.error = no_compiler()
             return None
-        version = (self._source, self._flags, compiler.identity)
+        source = read_source(self.file)
+        version = (source, self.flags, compiler.identity)
         key = hashlib.sha256(repr(version).encode()).hexdigest()[:40]
         self._code = library_cache().load(key, self._load)
         if self._code is not None:
             return None
         # There are few of them, and without one its callers take up to a hundred times as long.
-        return request(key, compiler, lambda: self._source, self._flags, self._built, urgent=True)
+        return request(key, compiler, lambda: source, self.flags, self._built, urgent=True)
 
     def _built(self, build: BuildJob) -> None:
         if build.path is not None and self._code is None:

@@ -11,10 +11,9 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 from msgspec import Struct
 
+from .c_source import Scalar, read_source
 from .program import Program, c_literal
 from .schedule import CFunction, Instruction, Schedule, StraightLine, read_instructions, schedule
-from .simd import ROWS, vector_header
-from .simd_functions import Scalar
 
 # From so many operations on, a program is split: compile time grows faster than the length of a function.
 # From 250 to 4000, the time to run changes by 6 % and that to compile by 30 %, with no clear best.
@@ -139,7 +138,7 @@ SCALAR = Dialect(
     negation="!{}",
     guarded="{a} ? {b} : 0.0",
     is_true="({} != 0.0)",
-    circle="const double {s} = sin({a}), {c} = cos({a});",
+    circle="const double {s} UNUSED = sin({a}), {c} UNUSED = cos({a});",
     written="splat({})",
 )
 
@@ -173,7 +172,8 @@ def generate_parts(plan: Schedule, name: str, dialect: Dialect, scalar: Scalar =
     """
     type_ = dialect.type
     arguments = (
-        f"const {type_} *restrict x, const {type_} *restrict kept, {type_} *restrict store, V *restrict o"
+        f"const {type_} *restrict x UNUSED, const {type_} *restrict kept UNUSED, "
+        f"{type_} *restrict store UNUSED, V *restrict o UNUSED"
     )
     texts = []
     for number, part in enumerate(plan.parts):
@@ -219,7 +219,7 @@ class _Statements:
             self._truths.add(value)
             return (
                 f"const {dialect.mask} m{value} = {condition}; "
-                f"const {dialect.type} v{value} = {dialect.truth.format(f'm{value}')};"
+                f"const {dialect.type} v{value} UNUSED = {dialect.truth.format(f'm{value}')};"
             )
         if step.op == ca.OP_IF_ELSE_ZERO:
             known = step.arguments[0] in self._truths
@@ -251,64 +251,10 @@ class _Statements:
         return f"v{value}"
 
 
-_LOOP = r"""
-#define PADDED(n) (((n) + W - 1) / W * W)
-
-/* Compute rows of outputs from rows of inputs; return 1 if there is no memory. */
-EXPORTED int kineverse_batch(const double *in, double *const *out, long long rows, int streaming) {
-  static const int sizes[] = {SIZES};
-  /* Whole cache lines: inputs, outputs, store, rows that are padded, rows that wait to be streamed. */
-  const size_t vectors = PADDED(INPUTS) + PADDED(RESULTS) + STORED + PADDED(INPUTS) + 1 + RESULTS + OUTPUTS;
-  void *memory = malloc(vectors * sizeof(V) + OUTPUTS * sizeof(Output) + 64);
-  if (!memory) return 1;
-  V *x = (V *)(((size_t)memory + 63) & ~(size_t)63), *o = x + PADDED(INPUTS), *store = o + PADDED(RESULTS);
-  double *padded = (double *)(store + STORED), *pending = padded + W * (PADDED(INPUTS) + 1);
-  Output *outputs = (Output *)(pending + W * (RESULTS + OUTPUTS));
-  memset(x, 0, vectors * sizeof(V));
-  for (int k = 0; k < OUTPUTS; k++) {
-    output_begin(outputs + k, out[k], sizes[k], pending, streaming);
-    pending += W * (sizes[k] + 1);
-  }
-  /* The first entries are there because no table is empty. */
-  for (int k = 1; k <= CONSTANTS; k++) o[constant_place[k]] = splat(constant[k]);
-  const long long full = rows / W * W;
-  const int left = (int)(rows - full);
-  for (long long row = 0; row < rows; row += W) {
-    const double *from = in + row * INPUTS;
-    /* Vectors of the last row of a block reach beyond it. Behind the last row of all may be nothing: blocks
-       whose vectors reach there are read from a copy. */
-    if ((rows - row - W) * INPUTS < PADDED(INPUTS) - INPUTS) {
-      const int there = row == full ? left : W;
-      for (int i = 0; i < W; i++)
-        memcpy(padded + i * INPUTS, from + (i < there ? i : there - 1) * INPUTS, INPUTS * sizeof(double));
-      from = padded;
-    }
-    read_rows(from, INPUTS, x);
-    compute(x, 0, store, o);
-    if (row == full) break;
-    const V *results = o;
-    for (int k = 0; k < OUTPUTS; k++) {
-      output_write(outputs + k, results);
-      results += sizes[k];
-    }
-  }
-  const V *results = o;
-  for (int k = 0; k < OUTPUTS; k++) {
-    output_end(outputs + k);
-    for (int c = 0; c < sizes[k]; c++)
-      for (int i = 0; i < left; i++) outputs[k].next[(long long)i * sizes[k] + c] = results[c][i];
-    results += sizes[k];
-  }
-  stream_end();
-  free(memory);
-  return 0;
-}
-"""
-
-_TEXTS = vector_header("double") + ROWS
-
 # Raise the number when other source is generated from the same program and texts.
-BATCH_KIND = "batch 4 " + hashlib.sha256((_TEXTS + _LOOP + repr(VECTOR)).encode()).hexdigest()
+BATCH_KIND = "batch 5 " + hashlib.sha256(
+    (read_source("batch.c", {"program.h": ""}) + repr(VECTOR)).encode()
+).hexdigest()  # fmt: skip
 
 
 def generate_batch_source(program: Program) -> str:
@@ -333,13 +279,10 @@ def generate_batch_source(program: Program) -> str:
     }
     numbers = ", ".join(["0", *(c_literal(c) for _, c in constants)])
     places = ", ".join(["0", *(str(place) for place, _ in constants)])
-    return "\n".join(
-        [
-            _TEXTS,
-            *(f"#define {name} {value}" for name, value in definitions.items()),
-            generate_parts(plan, "compute", VECTOR),
-            f"static const double constant[] = {{{numbers}}};",
-            f"static const int constant_place[] = {{{places}}};",
-            _LOOP,
-        ]
-    )
+    lines = [
+        *(f"#define {name} {value}" for name, value in definitions.items()),
+        generate_parts(plan, "compute", VECTOR),
+        f"static const double constant[] = {{{numbers}}};",
+        f"static const int constant_place[] = {{{places}}};",
+    ]
+    return read_source("batch.c", {"program.h": "\n".join(lines)})

@@ -1,7 +1,7 @@
 """End of C that lasts: when its time is up, and when a signal such as Ctrl-C arrives.
 
 Python notes a signal and runs its handler when it is back in Python. So C that may last asks Python from
-time to time, with :data:`WATCH` in its source. What a handler raises is kept until C has returned.
+time to time, by ``interruption.h``. What a handler raises is kept until C has returned.
 """
 
 from __future__ import annotations
@@ -9,67 +9,6 @@ from __future__ import annotations
 import ctypes
 import threading
 from typing import Any
-
-WATCH = r"""
-#include <math.h>
-#include <time.h>
-
-/* Functions of Python, and the exception that a handler of signals has raised: type, value and traceback. */
-typedef struct {
-  int (*take_gil)(void);
-  void (*release_gil)(int);
-  int (*check_signals)(void);
-  void (*fetch)(void **, void **, void **);
-  void *type, *value, *traceback;
-} Signals;
-
-static Signals *signals;
-
-__attribute__((visibility("default"))) void kineverse_watch_signals(Signals *s) { signals = s; }
-
-/* Work that is over when its time is up, or a handler has raised an exception. Times of a clock [s]. */
-typedef struct {
-  double end, next; /* next: when signals are looked at again */
-  int calls, over;
-} Watch;
-
-enum { GOING_ON, LATE, INTERRUPTED };
-
-/* Nobody notices a delay of so many seconds, and to ask takes microseconds, or until other threads let us. */
-#define ASKING 0.05
-
-static double now(void) {
-  struct timespec t;
-  clock_gettime(CLOCK_MONOTONIC, &t);
-  return t.tv_sec + 1e-9 * t.tv_nsec;
-}
-
-static void watch_begin(Watch *w, double seconds) {
-  const double begin = now();
-  w->end = begin + seconds;
-  w->next = begin + ASKING;
-  w->calls = 0;
-  w->over = GOING_ON;
-}
-
-static __attribute__((noinline)) int look_at_clock(Watch *w) {
-  if (w->over) return w->over;
-  const double t = now();
-  if (t > w->end) w->over = LATE;
-  if (t <= w->next || !signals) return w->over;
-  const int gil = signals->take_gil();
-  if (signals->check_signals()) {
-    signals->fetch(&signals->type, &signals->value, &signals->traceback);
-    w->over = INTERRUPTED;
-  }
-  signals->release_gil(gil);
-  w->next = now() + ASKING;
-  return w->over;
-}
-
-/* As look_at_clock, for loops whose rounds take microseconds: it looks in one round of 32. */
-static inline int is_over(Watch *w) { return w->over || ((++w->calls & 31) == 0 && look_at_clock(w)); }
-"""
 
 
 class _Signals(ctypes.Structure):
@@ -85,7 +24,7 @@ _restore.argtypes, _restore.restype = (ctypes.c_void_p,) * 3, None
 
 
 def watch_signals(code: Any) -> None:
-    """Tell a loaded library, if its source has :data:`WATCH`, how to look for signals."""
+    """Tell a loaded library, if its source has ``interruption.h``, how to look for signals."""
     watch = getattr(code, "kineverse_watch_signals", None)
     if watch is not None:
         watch.argtypes, watch.restype = (ctypes.c_void_p,), None

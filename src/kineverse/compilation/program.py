@@ -21,7 +21,7 @@ from kineverse.expressions.implicit import explain_no_solution, implicit_nodes
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .simd_functions import Scalar
+from .c_source import Scalar
 
 CasadiFunction: TypeAlias = Any
 Check: TypeAlias = Callable[[Array, Array | Sequence[Array]], None]
@@ -32,13 +32,14 @@ FUNCTION_NAME = "kineverse_function"
 _PRELUDE = """
 #include <math.h>
 #define CASADI_SYMBOL_EXPORT __attribute__((visibility("default")))
-static inline double first_smaller(double x, double y) { return x <= y || y != y ? x : y; }
-static inline double first_larger(double x, double y) { return x >= y || y != y ? x : y; }
+#define UNUSED __attribute__((unused))
+static inline UNUSED double first_smaller(double x, double y) { return x <= y || y != y ? x : y; }
+static inline UNUSED double first_larger(double x, double y) { return x >= y || y != y ? x : y; }
 #define fmin(x, y) first_smaller(x, y)
 #define fmax(x, y) first_larger(x, y)
 """
 
-SINGLE_KIND = "single 2"  # raise the number when other source is generated from the same program
+SINGLE_KIND = "single 3"  # raise the number when other source is generated from the same program
 
 # From so many constants on, an output is initialised from a table: compile time grows with statements.
 _TABLE = 64

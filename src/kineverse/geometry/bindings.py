@@ -16,21 +16,17 @@ from kineverse.compilation.toolchain import no_compiler
 from kineverse.errors import CompileError
 
 from . import broadphase
-from .advancement_c import ADVANCE
 from .broadphase import Indices, ObjectTable, PairSelection, build_static_tree
-from .broadphase_c import SWEEP
-from .manifold_c import MANIFOLD
 from .mesh_files import Floats
-from .narrowphase_c import NARROW, SIMPLEX
-from .penetration_c import PENETRATION
-from .search_c import SEARCH
-from .support_c import SUPPORT
+from .narrowphase import ACCURACY
 
 _ARRAYS = (
     "body", "allowed", "active", "centre", "half", "radius",
     "poses", "travel", "position", "low", "high", "bounds", "order", "sorted_boxes",
     "corners", "corner_count", "edges", "radii", "round", "tip", "memory",
 )  # fmt: skip
+
+_CONSTANTS = ("TREE_WIDTH", "FURTHEST", "LONGEST_TRAVEL", "PLACED", "TRAVEL_EXCEEDED")
 
 _SEVERAL, _MANY = 2, 16
 """Objects of a body from which on near pairs are found by the boxes of bodies, and pairs of bodies for each
@@ -72,7 +68,7 @@ class FacingPoints:
 
     Parallel faces are nearest at every point, and a query finds one of them. Faces that are parallel, up to
     an angle, have up to four further pairs of points, with the distance along the normal of the pair, see
-    :mod:`.manifold_c`. Meshes of triangles have none, nor has anything without a C compiler.
+    ``contact_manifold.h``. Meshes of triangles have none, nor has anything without a C compiler.
     """
 
     def __init__(self, margins: Floats, usual: float, angle: float = 0.02, apart: float = 0.1) -> None:
@@ -109,8 +105,11 @@ class CollisionLibrary(SourceLibrary):
     """Compiled broad and narrow phase, once it is built; shared by all scenes of the process."""
 
     def __init__(self) -> None:
-        text = SWEEP + SUPPORT + SIMPLEX + PENETRATION + NARROW + SEARCH + MANIFOLD + ADVANCE
-        super().__init__(text, _declare_signatures)
+        constants = {name: getattr(broadphase, name) for name in _CONSTANTS}
+        memory_bits = broadphase.MEMORY_SLOTS.bit_length() - 1
+        super().__init__(
+            "geometry.c", _declare_signatures, **constants, ACCURACY=ACCURACY, MEMORY_BITS=memory_bits
+        )
 
     def place(self, table: ObjectTable, fresh: Floats) -> int:
         """Place objects as :func:`.broadphase.place_objects` does; ``fresh`` is contiguous."""

@@ -1,7 +1,7 @@
 """Support functions, separating directions and distances (GJK) of convex solids, in Python.
 
 The gap of two convex solids along any direction is a lower bound of their distance, and the largest gap is
-the distance, see :mod:`.narrowphase`. GJK is the iteration of :mod:`.narrowphase_c`, a thousand times slower,
+the distance, see :mod:`.narrowphase`. GJK is the iteration of ``gjk.h``, a thousand times slower,
 with the same two bounds: it returns a distance only once they meet.
 """
 

@@ -104,7 +104,7 @@ class Hull(Struct, frozen=True, eq=False):
 
 
 class Core(Struct, frozen=True, eq=False):
-    """Description of a convex solid by its support function, see :mod:`.support_c`.
+    """Description of a convex solid by its support function, see ``support_functions.h``.
 
     A core is the hull of corners; or the Minkowski sum of a box, an ellipsoid and a ball about the origin; or
     a cone.

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import ctypes
-from functools import lru_cache
-from importlib import resources
 from typing import Any
 
 import numpy as np
 
 from kineverse.compilation.c_library import SourceLibrary, struct_fields
-from kineverse.compilation.interruption import WATCH, raise_signal
-from kineverse.compilation.toolchain import NO_UNDEFINED_FLAGS, no_compiler
-from kineverse.compilation.vector_program import vector_header
+from kineverse.compilation.interruption import raise_signal
+from kineverse.compilation.toolchain import no_compiler
 from kineverse.control.contact_constraints import row_library
 from kineverse.errors import CompileError
 from kineverse.geometry.bindings import collision_library
-
-SOURCES = ("collision.c", "edges.c", "rrt_connect.c", "manifold.c", "roadmap.c")
 
 
 def _integers(names: str) -> list[tuple[str, type[np.int32]]]:
@@ -31,7 +26,7 @@ LINK = np.dtype([*_BOUNDS, *_integers("pose first coarse first_shape shapes exac
 SHAPE = np.dtype([("pose", np.float64, 12), ("object", np.int64)])
 COARSE = np.dtype([("sphere", np.float32, 4), *_integers("first count")])
 
-MOST_COORDINATES = 64  # largest number of coordinates, as in edges.c
+MOST_COORDINATES = 64  # largest number of coordinates
 BOX, CYLINDER, CAPSULE, SPHERE, HULL = range(5)  # kinds of obstacles
 FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY, TOO_LONG = range(5)  # outcomes of a search
 
@@ -80,37 +75,20 @@ class RoadmapStruct(ctypes.Structure):
     )
 
 
-class PlanningLibrary(SourceLibrary):
-    """Compiled planner, shared by all planners of the process."""
-
-    def __init__(self) -> None:
-        folder = resources.files("kineverse.planning") / "c_source"
-        files = ((folder / name).read_text(encoding="utf-8") for name in SOURCES)
-        source = "\n".join([vector_header("float"), WATCH, *files])
-        flags = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", *NO_UNDEFINED_FLAGS)
-        super().__init__(source, _declare_signatures, flags)
-
-
-@lru_cache(maxsize=1)
-def _library() -> PlanningLibrary:
-    return PlanningLibrary()
-
-
 def request_planner() -> None:
     """Request the planner in the background, after queries and contact rows, which are needed sooner."""
-    for library in (collision_library, row_library, _library()):
+    for library in (collision_library, row_library, _library):
         library.prepare()
 
 
 def planning_functions() -> Any:
     """Return the compiled functions of the planner, built first if necessary."""
-    library = _library()
-    if not library.prepare(wait=True):
+    if not _library.prepare(wait=True):
         raise CompileError(
-            f"Planning needs compiled C, and {library.error or no_compiler()}. Inverse kinematics "
+            f"Planning needs compiled C, and {_library.error or no_compiler()}. Inverse kinematics "
             "('kineverse reach') and controllers work without it."
         )
-    return library.code
+    return _library.code
 
 
 def _declare_signatures(code: Any) -> None:
@@ -146,3 +124,11 @@ def _ensure_whole(result: int, function: Any, arguments: tuple[Any, ...]) -> int
     """Raise the exception that ended a function of C early, if there is one."""
     raise_signal()
     return result
+
+
+_library = SourceLibrary(
+    "planning.c",
+    _declare_signatures,
+    ("-O3", "-ffp-contract=fast", "-fno-rounding-math"),
+    MOST_COORDINATES=MOST_COORDINATES,
+)

@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kineverse.compilation.c_library import SourceLibrary
-from kineverse.compilation.toolchain import NO_UNDEFINED_FLAGS
 from kineverse.errors import ShapeError
-from kineverse.estimation.c_source.identification_stages import IDENTIFICATION_SOURCE
 from kineverse.lie import Array, transform
 
 from .motion_model import LinearisedPoses
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
     from .families import GroupMotion, JointFamily
 
 # No other path has to agree with these numbers to the last bit, so contraction is allowed.
-_FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm", *NO_UNDEFINED_FLAGS)
+_FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm")
 _FAMILY = ("rows", "joints", "lefts", "rights", "pitches", "pitched", "reach", "slides")
 _SCALES = (
     "reach_scale", "pitch_scale", "close", "little", "narrowest", "settled", "better", "slid", "weight"
@@ -85,7 +83,7 @@ def _declare(code: Any) -> None:
         function.restype = None
 
 
-library = SourceLibrary(IDENTIFICATION_SOURCE, _declare, _FLAGS)
+library = SourceLibrary("identification.c", _declare, _FLAGS, MOST=_PARAMETERS, UNKNOWNS=_UNKNOWNS)
 """Compiled functions, shared by the whole process."""
 
 

@@ -20,9 +20,6 @@ import numpy.typing as npt
 
 from kineverse.compilation import CompiledFunction
 from kineverse.compilation.c_library import SourceLibrary
-from kineverse.compilation.toolchain import NO_UNDEFINED_FLAGS
-from kineverse.estimation.c_source.tracking_primitives import PROCESS_MODEL, QUADRATIC_PROGRAM, RESIDUAL
-from kineverse.estimation.c_source.tracking_update import MAP_UPDATE
 from kineverse.estimation.noise import Outliers
 from kineverse.lie import Array
 
@@ -62,7 +59,7 @@ def _declare(code: Any) -> None:
 
 # With -O3 the compiler takes three times as long, for the same speed.
 native_library = SourceLibrary(
-    QUADRATIC_PROGRAM + PROCESS_MODEL + RESIDUAL + MAP_UPDATE, _declare, ("-O2", *NO_UNDEFINED_FLAGS)
+    "tracking.c", _declare, ("-O2",), MOST=_MAX_UNKNOWNS, WIDE=_MAX_MEASUREMENT_SIZE
 )
 """Compiled update, shared by all trackers of the process."""
 

@@ -1,0 +1,159 @@
+/* Process model: prediction of means and covariances. */
+#pragma once
+#include "quadratic_program.h"
+
+/* An observation has WIDE numbers at most. */
+typedef struct {
+  Function compute;
+  int64_t observations, groups, coordinates, directions, known;
+  /* Of each observation: whether it is a pose, its size, and where its numbers are. */
+  const int64_t *is_pose, *size, *value, *slope, *seen, *white;
+  /* The directions of group g are place[first[g]] to place[first[g + 1]], of the whole tangent, and own says
+     which of its coordinates is one of them, or -1; likewise its coordinates, and what is seen of it. */
+  const int64_t *first, *place, *own, *first_x, *place_x, *first_watch, *watch;
+  /* Rates and steps of the groups that are moved by others' speeds, and which rates change on the way. */
+  const Function *rates, *step;
+  const int64_t *first_bend;
+  const double *bend;
+  const double *period, *lower, *upper;
+  double *input, *output, *work, *squares;
+} Problem;
+
+#define LONGEST 0.1 /* of a step of Runge and Kutta */
+#define MOST_STEPS 100000
+
+static int call(Function compute, const double *input, double *one, double *two, double *three) {
+  const double *arguments[1] = {input};
+  double *results[3] = {one, two, three};
+  return compute(arguments, results, NULL, NULL, 0);
+}
+
+/* The inverse of any matrix, which is lost; 0 if there is none. */
+static int invert_any(double *a, double *inverse, int n) {
+  for (int i = 0; i < n * n; i++) inverse[i] = i % (n + 1) == 0;
+  for (int c = 0; c < n; c++) {
+    int best = c;
+    for (int r = c + 1; r < n; r++)
+      if (fabs(a[r * n + c]) > fabs(a[best * n + c])) best = r;
+    if (!(fabs(a[best * n + c]) > 0.0)) return 0;
+    for (int k = 0; k < n; k++) {
+      const double u = a[c * n + k], v = inverse[c * n + k];
+      a[c * n + k] = a[best * n + k], a[best * n + k] = u;
+      inverse[c * n + k] = inverse[best * n + k], inverse[best * n + k] = v;
+    }
+    const double pivot = a[c * n + c];
+    for (int k = 0; k < n; k++) a[c * n + k] /= pivot, inverse[c * n + k] /= pivot;
+    for (int r = 0; r < n; r++) {
+      const double much = a[r * n + c];
+      if (r == c || much == 0.0) continue;
+      for (int k = 0; k < n; k++) {
+        a[r * n + k] -= much * a[c * n + k];
+        inverse[r * n + k] -= much * inverse[c * n + k];
+      }
+    }
+  }
+  return 1;
+}
+
+/* What leads back from how the tangent turns on the way: x becomes where a step along the rates ends, back is
+   the inverse of R(x)⁺ ∂x/∂step; 0 if it cannot be followed. */
+static int follow(const Problem *p, int64_t g, double *x, const double *step, double *back) {
+  const int n = (int)(p->first[g + 1] - p->first[g]), m = (int)(p->first_x[g + 1] - p->first_x[g]);
+  const double *known = p->input + p->coordinates, *bend = p->bend + p->first_bend[g];
+  double input[2 * MOST + p->known], rates[MOST * MOST], slope[MOST * MOST], gain[MOST * MOST];
+  double by_step[MOST * MOST], further[MOST], after[MOST], squares[MOST * MOST], turn[MOST * MOST];
+  memcpy(input, x, m * sizeof(double));
+  memcpy(input + m, known, p->known * sizeof(double));
+  if (call(p->rates[g], input, rates, NULL, NULL)) return 0;
+  double longest = 0.0;
+  for (int r = 0; r < m; r++)
+    for (int c = 0; c < n; c++) longest += bend[r * n + c] * fabs(rates[r * n + c] * step[c]);
+  if (!(longest <= MOST_STEPS * LONGEST)) return 0;
+  const int count = longest > LONGEST ? (int)ceil(longest / LONGEST) : 1;
+  memset(by_step, 0, m * n * sizeof(double));
+  for (int c = 0; c < n; c++) input[m + c] = step[c] / count;
+  memcpy(input + m + n, known, p->known * sizeof(double));
+  for (int k = 0; k < count; k++) {
+    if (call(p->step[g], input, after, slope, gain)) return 0;
+    memcpy(input, after, m * sizeof(double));
+    for (int c = 0; c < n; c++) {
+      for (int r = 0; r < m; r++) {
+        further[r] = gain[r * n + c] / count;
+        for (int i = 0; i < m; i++) further[r] += slope[r * m + i] * by_step[i * n + c];
+      }
+      for (int r = 0; r < m; r++) by_step[r * n + c] = further[r];
+    }
+  }
+  memcpy(x, input, m * sizeof(double));
+  memcpy(input + m, known, p->known * sizeof(double));
+  if (call(p->rates[g], input, rates, NULL, NULL)) return 0;
+  /* R⁺ = (RᵀR)⁻¹Rᵀ, as no direction is lost. */
+  for (int r = 0; r < n; r++)
+    for (int c = 0; c < n; c++) {
+      double sum = 0.0;
+      for (int i = 0; i < m; i++) sum += rates[i * n + r] * rates[i * n + c];
+      squares[r * n + c] = sum;
+    }
+  if (!factor(squares, n)) return 0;
+  for (int c = 0; c < n; c++) {
+    for (int r = 0; r < n; r++) {
+      further[r] = 0.0;
+      for (int i = 0; i < m; i++) further[r] += rates[i * n + r] * by_step[i * n + c];
+    }
+    solve(squares, further, n);
+    for (int r = 0; r < n; r++) turn[r * n + c] = further[r];
+  }
+  return invert_any(turn, back, n);
+}
+
+/* Move x by a step, and into the bounds; returns 2 if the tangent turns, 1 if not, 0 if it cannot be done. */
+static int move(const Problem *p, int64_t g, double *x, const double *step, double *back) {
+  const int n = (int)(p->first[g + 1] - p->first[g]);
+  const int64_t *own = p->own + p->first[g], *place = p->place_x + p->first_x[g];
+  const int turns = p->rates[g] != NULL;
+  if (turns && !follow(p, g, x, step, back)) return 0;
+  for (int i = 0; i < n; i++) {
+    if (own[i] < 0) continue;
+    const double to = turns ? x[own[i]] : x[own[i]] + step[i];
+    const double lower = p->lower[place[own[i]]], upper = p->upper[place[own[i]]];
+    x[own[i]] = to < lower ? lower : to > upper ? upper : to;
+  }
+  return turns ? 2 : 1;
+}
+
+/* What a step may be at most. */
+static void bounds(const Problem *p, int64_t g, const double *x, double *low, double *high) {
+  const int n = (int)(p->first[g + 1] - p->first[g]);
+  const int64_t *own = p->own + p->first[g], *place = p->place_x + p->first_x[g];
+  for (int i = 0; i < n; i++) {
+    low[i] = own[i] < 0 ? -INFINITY : p->lower[place[own[i]]] - x[own[i]];
+    high[i] = own[i] < 0 ? INFINITY : p->upper[place[own[i]]] - x[own[i]];
+  }
+}
+
+/* The quadratic ½ξᵀmξ - vᵀξ at the end of a step, in the tangent there if back is not NULL. */
+static void carry(double *m, double *v, const double *step, const double *back, int n) {
+  double turned[MOST * MOST], moved[MOST];
+  for (int r = 0; r < n; r++) {
+    moved[r] = v[r];
+    for (int c = 0; c < n; c++) moved[r] -= m[r * n + c] * step[c];
+  }
+  memcpy(v, moved, n * sizeof(double));
+  if (!back) return;
+  for (int r = 0; r < n; r++) {
+    v[r] = 0.0;
+    for (int i = 0; i < n; i++) v[r] += back[i * n + r] * moved[i];
+    for (int c = 0; c < n; c++) {
+      double sum = 0.0;
+      for (int i = 0; i < n; i++) sum += m[r * n + i] * back[i * n + c];
+      turned[r * n + c] = sum;
+    }
+  }
+  for (int r = 0; r < n; r++)
+    for (int c = 0; c <= r; c++) {
+      double one = 0.0, other = 0.0;
+      for (int i = 0; i < n; i++)
+        one += back[i * n + r] * turned[i * n + c], other += back[i * n + c] * turned[i * n + r];
+      m[r * n + c] = m[c * n + r] = (one + other) / 2;
+    }
+}

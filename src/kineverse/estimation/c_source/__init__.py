@@ -1,1 +1,0 @@
-"""C source of the compiled kernels of estimation."""
