@@ -122,11 +122,6 @@ class ObjectTable:
         if there.any():
             self.axis = int(np.argmax(self.position[there].std(axis=0)))
 
-    def record_distance(self, i: int, j: int, distance: float) -> None:
-        """Record a measured distance of two objects, i < j."""
-        if self.bounds is not None:
-            self.bounds[i, j] = distance + self.travel[i] + self.travel[j]
-
     def lower_bounds(self, ones: Indices, others: Indices) -> Floats:
         """Return lower bounds of the distances of pairs (K,), (K,), with ones < others, [m]."""
         between = self.position[others] - self.position[ones]

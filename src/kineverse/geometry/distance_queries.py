@@ -29,9 +29,7 @@ from .sampled_motion import SampledMotion
 
 def find_distance(world: CollisionWorld, a: str, b: str) -> DistanceResult:
     """Return the distance of two bodies, regardless of the rules."""
-    one, other = world.body_index(a), world.body_index(b)
-    if one == other:
-        raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
+    one, other = _two_bodies(world, a, b)
     members, others = world.members[one], world.members[other]
     world.prepare((*members, *others))
     pairs = _pair_product(members, others)
@@ -62,8 +60,7 @@ def find_pairs_within(
     """
     check_radius(radius)
     world.prepare(None if selection is None else ())
-    table = world.table
-    reach = radius + ACCURACY
+    table, reach = world.table, radius + ACCURACY
     measured, nearest = collision_library.search(table, reach, radius, selection, per_shape, facing)
     if measured is None:
         assert nearest is not None
@@ -72,9 +69,9 @@ def find_pairs_within(
     world.measure_remaining(pairs, lows, radius, distances, witnesses, per_shape)
     order = collision_library.rank(table, pairs, distances, radius, per_shape)
     ranked = collision_library.gather(table, pairs, distances, witnesses, order)
-    return DistanceResults(
-        world, *(ranked if facing is None else collision_library.extend(table, ranked, facing))
-    )
+    if facing is not None:
+        ranked = collision_library.extend(table, ranked, facing)
+    return DistanceResults(world, *ranked)
 
 
 def find_first_contact(world: CollisionWorld, margin: float) -> DistanceResult | None:
@@ -89,9 +86,9 @@ def find_first_contact(world: CollisionWorld, margin: float) -> DistanceResult |
         if math.isnan(distances[k]):
             world.measure_remaining(pairs[only], np.zeros(1), margin, distances[only], witnesses[only])
         if distances[k] <= margin:
-            return _make_results(
-                world, pairs[only], distances[only], witnesses[only], np.zeros(1, dtype=np.int64)
-            )[0]
+            order = np.array([k])
+            found = collision_library.gather(world.table, pairs, distances, witnesses, order)
+            return DistanceResults(world, *found)[0]
     return None
 
 
@@ -118,19 +115,14 @@ def _nearest_pairs(world: CollisionWorld, pairs: Indices, lows: Floats, radius: 
     """Measure pairs of objects, and return the nearest of each pair of bodies within a radius [m]."""
     distances, witnesses = world.measure(pairs, lows, radius)
     order = collision_library.rank(world.table, pairs, distances, radius)
-    return _make_results(world, pairs, distances, witnesses, order)
-
-
-def _make_results(
-    world: CollisionWorld, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
-) -> DistanceResults:
     return DistanceResults(world, *collision_library.gather(world.table, pairs, distances, witnesses, order))
 
 
-def check_radius(radius: float) -> None:
-    """Raise InvalidValueError for a radius that is negative or NaN."""
+def check_radius(radius: float) -> float:
+    """Return a radius; raise InvalidValueError if it is negative or NaN."""
     if not radius >= 0.0:
         raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
+    return radius
 
 
 PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags  # flags (B, B) of pairs of bodies, symmetric
@@ -155,9 +147,8 @@ class PreparedQuery:
     def __init__(
         self, world: CollisionWorld, choose: Callable[[], PairFlags], radius: float, per_shape: bool = False
     ) -> None:
-        check_radius(radius)
         self._world, self._choose, self._lock = world, choose, world.lock
-        self.radius, self.per_shape = float(radius), per_shape
+        self.radius, self.per_shape = float(check_radius(radius)), per_shape
         self._version: int | None = None
         self._flags: Flags = np.zeros((0, 0), dtype=np.uint8)
         self._selection: PairSelection | None = None
@@ -189,8 +180,7 @@ class PreparedQuery:
         UnknownNameError, ShapeError, InvalidValueError
             As :meth:`.Scene.update`.
         """
-        within = self.radius if radius is None else radius
-        check_radius(within)
+        within = check_radius(self.radius if radius is None else radius)
         with self._lock:
             result = self._world.search_at(values, within, self._select(), self.per_shape, facing)
             if result is not None:
@@ -225,8 +215,7 @@ class PreparedQuery:
         InvalidValueError
             If the radius is negative or NaN, or a pose is not finite.
         """
-        within = self.radius if radius is None else radius
-        check_radius(within)
+        within = check_radius(self.radius if radius is None else radius)
         for k in self._move(coordinates).find_rows(_as_rows(Q, len(coordinates)), within, first=True):
             if len(self(within)):
                 return k
@@ -240,8 +229,7 @@ class PreparedQuery:
 
         Parameters and errors are those of :meth:`first_within`. The scene stays where it is.
         """
-        within = self.radius if radius is None else radius
-        check_radius(within)
+        within = check_radius(self.radius if radius is None else radius)
         motion = self._move(coordinates)
         result = motion.struct
         for _ in motion.find_rows(_as_rows(Q, len(coordinates)), within, first=False):
@@ -310,12 +298,17 @@ def _as_rows(Q: npt.ArrayLike, columns: int) -> Floats:
 
 def flag_pair(world: CollisionWorld, a: str, b: str) -> Flags:
     """Return (B, B) flags of one pair of bodies."""
-    one, other = world.body_index(a), world.body_index(b)
-    if one == other:
-        raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
+    one, other = _two_bodies(world, a, b)
     flags = np.zeros_like(world.table.allowed)
     flags[one, other] = flags[other, one] = 1
     return flags
+
+
+def _two_bodies(world: CollisionWorld, a: str, b: str) -> tuple[int, int]:
+    one, other = world.body_index(a), world.body_index(b)
+    if one == other:
+        raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
+    return one, other
 
 
 def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:
@@ -342,10 +335,8 @@ def flag_subtree(model: ModelView, bodies: Sequence[str], frame: str) -> npt.NDA
     frames = model.frames
     if frame != WORLD and frame not in frames:
         raise UnknownNameError(f"There is no frame '{frame}'. {suggest(frame, frames, 'frame')}")
-    lookup = frames.__getitem__
-    return np.array(
-        [frame in (WORLD, body) or frame in ancestors(body, lookup) for body in bodies], dtype=bool
-    )
+    lookup, always = frames.__getitem__, frame == WORLD
+    return np.array([always or frame == b or frame in ancestors(b, lookup) for b in bodies], dtype=bool)
 
 
 def flag_relatively_moving(

@@ -28,8 +28,8 @@ def directional_gaps(a: PlacedSolid, b: PlacedSolid, directions: Floats) -> Floa
     (solid_a, rotation_a, position_a), (solid_b, rotation_b, position_b) = a, b
     apart: Floats = (
         directions @ (position_b - position_a)
-        - _support_values(solid_a, directions @ rotation_a)
-        - _support_values(solid_b, -directions @ rotation_b)
+        - support_values(solid_a, directions @ rotation_a)
+        - support_values(solid_b, -directions @ rotation_b)
     )
     return apart
 
@@ -57,9 +57,9 @@ def smoothed_support(placed: PlacedSolid, direction: Floats) -> Floats:
     step = 1e-6
     # The gradient of the support function is the support point; at an edge or a face, a mean of several.
     ends = direction + step * np.concatenate([np.eye(3), -np.eye(3)])
-    values = _support_values(solid, ends @ rotation)
+    values = support_values(solid, ends @ rotation)
     point = (values[:3] - values[3:]) / (2 * step)
-    missing = float(_support_values(solid, (direction @ rotation)[None])[0] - direction @ point)
+    missing = float(support_values(solid, (direction @ rotation)[None])[0] - direction @ point)
     return np.asarray(position + point + missing * direction)
 
 
@@ -95,7 +95,7 @@ def _ascend(a: PlacedSolid, b: PlacedSolid, direction: Floats, gap: float) -> tu
     return gap, direction
 
 
-def _support_values(solid: Solid, directions: Floats) -> Floats:
+def support_values(solid: Solid, directions: Floats) -> Floats:
     """Return the support function of a solid, max ``direction @ x``, for (n, 3) directions in its frame."""
     core = solid.core
     assert core is not None

@@ -97,13 +97,11 @@ def _read_file(file: MeshFile) -> Faces:
         raise
     except Exception as error:  # Parsers of trimesh raise all kinds of exceptions.
         raise FormatError(f"{file.path} cannot be read as a mesh: {summarize_error(error)}") from error
-    sizes = np.cumsum([0, *(len(part.vertices) for part in result[:-1])])
-    vertices = np.concatenate([np.asarray(part.vertices, dtype=float) for part in result]) * unit_length(
-        file.path
-    )
-    faces = np.concatenate(
-        [np.asarray(part.faces, dtype=np.int64) + n for part, n in zip(result, sizes, strict=True)]
-    )
+    firsts = np.cumsum([0, *(len(part.vertices) for part in result[:-1])]).tolist()
+    numbered = [np.asarray(part.faces, dtype=np.int64) + k for part, k in zip(result, firsts, strict=True)]
+    faces = np.concatenate(numbered)
+    vertices = np.concatenate([np.asarray(part.vertices, dtype=float) for part in result])
+    vertices *= unit_length(file.path)
     if not np.isfinite(vertices).all():
         raise FormatError(f"{file.path} has vertices that are not finite.")
     if faces.min() < 0 or faces.max() >= len(vertices):

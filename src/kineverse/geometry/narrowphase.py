@@ -107,11 +107,8 @@ class Narrowphase:
         if not (a.is_convex and b.is_convex):
             return self._measure_touching_triangles(i, j, functor)
         for request in (*self._coarser, None):
-            if (
-                -1e300 < distance < -_TOUCH
-                and self._is_unit_normal()
-                and self._normal_confirms(i, j, distance)
-            ):
+            is_deep = -1e300 < distance < -_TOUCH and self._is_unit_normal()
+            if is_deep and self._normal_confirms(i, j, distance):
                 return distance
             if request is None or abs(distance) <= _TOUCH:
                 break
@@ -149,11 +146,8 @@ class Narrowphase:
         factor = _enlargement(a, b)
         if factor > 1.0:
             poses = np.tile(np.eye(4)[:3], (2, 1, 1))
-            self._enlarged[i, j] = (
-                factor,
-                poses,
-                Narrowphase([scale_solid(a, factor), scale_solid(b, factor)], poses),
-            )
+            solids = [scale_solid(a, factor), scale_solid(b, factor)]
+            self._enlarged[i, j] = factor, poses, Narrowphase(solids, poses)
         return functor
 
     def _measure_enlarged(self, i: int, j: int) -> float:
@@ -243,7 +237,10 @@ class Narrowphase:
         """
         pose_a, result = self._transforms[i], self._result
         rotation, position = self._pose_views[j]
-        for shift in self._shifts(i, j):
+        far = min(_SHIFT, _SHIFT_OF_RADIUS * min(solid.radius for solid in self._pair(i, j)))
+        start, end = self._centres(i, j)
+        # A translation along the line between two inner points separates touching convex solids.
+        for shift in (far * _unit(end - start), *(far * np.eye(3))):
             shifted = self._coal.Transform3s(rotation, position + shift)
             for request in (self._request, *self._coarser):
                 result.clear()
@@ -274,12 +271,6 @@ class Narrowphase:
     def _placed_solids(self, i: int, j: int) -> tuple[PlacedSolid, PlacedSolid]:
         a, b = self._pair(i, j)
         return (a, *self._pose_views[i]), (b, *self._pose_views[j])
-
-    def _shifts(self, i: int, j: int) -> list[Floats]:
-        far = min(_SHIFT, _SHIFT_OF_RADIUS * min(solid.radius for solid in self._pair(i, j)))
-        start, end = self._centres(i, j)
-        # A translation along the line between two inner points separates touching convex solids.
-        return [far * _unit(end - start), *(far * np.eye(3))]
 
     def _centres(self, i: int, j: int) -> tuple[Floats, Floats]:
         a, b = self._pair(i, j)

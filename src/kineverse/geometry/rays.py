@@ -94,11 +94,9 @@ def _ball_interval(origin: Floats, direction: Floats, radius: float) -> tuple[fl
 
 
 def _intersect_capsule(shape: Capsule, origin: Floats, direction: Floats) -> RayEntry | None:
-    half = np.array([0.0, 0.0, shape.length / 2])
+    half, radii = np.array([0.0, 0.0, shape.length / 2]), np.full(3, shape.radius)
     result = [_intersect_cylinder_or_cone(Cylinder(shape.radius, shape.length), origin, direction)]
-    result += [
-        _intersect_ellipsoid(np.full(3, shape.radius), origin + end, direction) for end in (half, -half)
-    ]
+    result += [_intersect_ellipsoid(radii, origin + end, direction) for end in (half, -half)]
     hits = [hit for hit in result if hit is not None]
     # A ray that starts inside of any of the three starts inside of the capsule.
     return min(hits, key=lambda hit: hit[0]) if hits else None

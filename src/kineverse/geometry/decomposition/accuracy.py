@@ -193,11 +193,8 @@ def nearest_surface_points(engine: Any, points: Floats) -> tuple[Floats, Floats]
     import coal
 
     point_ball, origin, shifted = coal.Sphere(1e-9), coal.Transform3s(), coal.Transform3s()
-    functor, request, result = (
-        coal.ComputeDistance(engine, point_ball),
-        coal.DistanceRequest(),
-        coal.DistanceResult(),
-    )
+    functor = coal.ComputeDistance(engine, point_ball)
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
     distances, nearest = np.empty(len(points)), np.empty((len(points), 3))
     for k, point in enumerate(points):
         shifted.setTranslation(point)

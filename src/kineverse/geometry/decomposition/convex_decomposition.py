@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -31,8 +32,11 @@ def clean_hulls(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
     """
     result = []
     for points in hulls:
+        points = points.copy()
+        beyond = whole.face_distances(points) > 0.0
+        points[beyond] = nearest_surface_points(whole.engine, points[beyond])[1]
         try:
-            result.append(Polytope.from_points(_project_inside(points, whole)))
+            result.append(Polytope.from_points(points))
         except InvalidValueError:  # A degenerate part: a cut has met a corner or an edge.
             continue
     result.sort(key=lambda polytope: -polytope.volume)
@@ -44,22 +48,11 @@ def clean_hulls(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
     return kept
 
 
-def _project_inside(points: Floats, whole: Polytope) -> Floats:
-    points = points.copy()
-    beyond = whole.face_distances(points) > 0.0
-    points[beyond] = nearest_surface_points(whole.engine, points[beyond])[1]
-    return points
-
-
 def reduce_hulls(hulls: list[Polytope], count: int) -> list[Polytope]:
     """Join hulls until ``count`` are left, each time the pair whose common hull adds least volume."""
-    hulls = list(hulls)
-    joined = (
-        {(i, j): _join_hulls(hulls[i], hulls[j]) for j in range(len(hulls)) for i in range(j)}
-        if len(hulls) > count
-        else {}
-    )
     alive = dict(enumerate(hulls))
+    pairs = combinations(alive, 2) if len(alive) > count else ()
+    joined = {(i, j): _join_hulls(alive[i], alive[j]) for i, j in pairs}
     while len(alive) > count:
         (i, j), (_, one) = min(joined.items(), key=lambda item: (item[1][0], item[0]))
         new = max(alive) + 1
@@ -215,8 +208,5 @@ def _decompose_surface(
     corners = [np.ascontiguousarray(polytope.points) for polytope in hulls]
     for array in corners:
         array.flags.writeable = False
-    seconds = time.perf_counter() - start
-    now = time.time()
-    return Decomposition(
-        tuple(corners), surface.name, error, settings.max_hulls, accuracy, seconds, now, surface.remarks
-    )
+    facts = surface.name, error, settings.max_hulls, accuracy, time.perf_counter() - start, time.time()
+    return Decomposition(tuple(corners), *facts, surface.remarks)

@@ -7,7 +7,7 @@ import io
 import json
 import logging
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -93,19 +93,12 @@ class Decomposition:
     accuracy: Accuracy
     seconds: float
     made: float
-    remarks: tuple[str, ...] = field(default=())
+    remarks: tuple[str, ...] = ()
 
     def to_bytes(self) -> bytes:
         """Serialise the decomposition exactly; :meth:`from_bytes` reads it back."""
-        facts = {
-            "name": self.name,
-            "error": self.error,
-            "max_hulls": self.max_hulls,
-            "accuracy": asdict(self.accuracy),
-            "seconds": self.seconds,
-            "made": self.made,
-            "remarks": self.remarks,
-        }
+        facts = asdict(replace(self, hulls=()))
+        del facts["hulls"]
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
