@@ -121,7 +121,7 @@ class Path:
         """
         return join_sections(self._parameterize(deviation, ramp, velocity, acceleration))
 
-    @property
+    @cached_property
     def times(self) -> Array:
         """Times (N,) at which :meth:`trajectory` passes the points, or is nearest to them [s].
 
@@ -130,10 +130,6 @@ class Path:
         InvalidValueError
             As :meth:`trajectory`.
         """
-        return self._times
-
-    @cached_property
-    def _times(self) -> Array:
         result = section_times(self.points, self._parameterize(DEVIATION, RAMP, None, None))
         result.flags.writeable = False
         return result
@@ -149,17 +145,15 @@ class Path:
             raise InvalidValueError(f"There is no path to move along. {self.why}")
         checks = self._own_checks()
         checks.ensure_current()
-        stated = motion_limits(checks.model, self.symbols, ramp=ramp, state=self.state)
-        chosen = {"velocity=": velocity, "acceleration=": acceleration}
-        limits = MotionLimits(
-            *(
-                limit if other is None else _combine_limits(limit, _as_numbers(name, other))
-                for limit, (name, other) in zip(stated, chosen.items(), strict=True)
-            )
-        )
+        limits = list(motion_limits(checks.model, self.symbols, ramp=ramp, state=self.state))
+        for k, (name, other) in enumerate((("velocity=", velocity), ("acceleration=", acceleration))):
+            if other is not None:
+                # An array replaces the limits of the model (n,), and a number bounds them.
+                chosen = _as_numbers(name, other)
+                limits[k] = chosen if chosen.ndim or not chosen > 0 else np.minimum(limits[k], chosen)
         deviation = _as_numbers("deviation=", deviation)
         sections = self.sections or (PathSection(0, len(self.points) - 1, checks),)
-        return parameterize_sections(self.points, self.symbols, limits, deviation, sections)
+        return parameterize_sections(self.points, self.symbols, MotionLimits(*limits), deviation, sections)
 
     def _own_checks(self) -> PathChecks:
         if self.checks is None:
@@ -170,7 +164,7 @@ class Path:
         return self.checks
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the checks, which belong to one process."""
+        # Checks belong to one process.
         return {**self.__dict__, "checks": None, "sections": ()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -209,11 +203,6 @@ class Path:
         if self.found:
             return f"<Path: {len(self.points)} points, length {self.length:.3g}, {1e3 * self.seconds:.3g} ms>"
         return f"<Path: not found. {self.why}>"
-
-
-def _combine_limits(own: Array, given: Array) -> Array:
-    """Combine the limits of the model (n,) with an array that replaces them, or a number that bounds them."""
-    return given if given.ndim or not given > 0 else np.minimum(own, given)
 
 
 def _as_numbers(name: str, value: Any) -> Array:

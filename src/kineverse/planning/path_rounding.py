@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
@@ -59,9 +58,8 @@ def parameterize_sections(
     for section in sections:
         part = slice(section.first, section.last + 1)
         allowed = deviations if deviations.ndim == 0 else deviations[part]
-        result.append(
-            TimedSection(section, *parameterize_path(points[part], symbols, limits, allowed, section.checks))
-        )
+        motion = parameterize_path(points[part], symbols, limits, allowed, section.checks)
+        result.append(TimedSection(section, *motion))
     return result
 
 
@@ -158,7 +156,10 @@ def _round_free(path: BlendedPath, checks: PathChecks) -> BlendedPath:
     allowed = _deviations(path)
     unchecked = np.flatnonzero(allowed).tolist()
     for attempt in range(_ROUNDS):
-        unchecked = [k for k in unchecked if checks.find_collision(_chords(path, k - 1)) is not None]
+        # Chords so short that they are near to the blend.
+        counts = 3 + np.ceil(np.sqrt(2 * path.deviation / _SAGITTA)).astype(int)
+        blends = {k: path.blend(k - 1, int(counts[k - 1])) for k in unchecked}
+        unchecked = [k for k, chords in blends.items() if checks.find_collision(chords) is not None]
         if not unchecked:
             break
         allowed[unchecked] = allowed[unchecked] / 3 if attempt < _ROUNDS - 1 else 0.0
@@ -198,11 +199,6 @@ def _deviations(path: BlendedPath) -> Array:
     result: Array = np.zeros(len(path.points))
     result[1:-1] = path.deviation
     return result
-
-
-def _chords(path: BlendedPath, corner: int) -> Array:
-    """Sample the blend of an inner corner so densely that its chords are near to it."""
-    return path.blend(corner, 3 + math.ceil(math.sqrt(2 * path.deviation[corner] / _SAGITTA)))
 
 
 def _lengths(points: Array) -> Array:

@@ -74,11 +74,11 @@ class SceneJudge:
                 raise LateCheckError
         return None
 
-    def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
-        """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
+    def clearance(self, points: Array, step: float) -> float:
+        """Return the least distance of a pair at samples of a polyline [m]; infinite beyond .5 m."""
         samples = densify(points, step)
         self._update(samples[0])
-        return self._query.least_distance(self._coordinates, samples, radius)
+        return self._query.least_distance(self._coordinates, samples, 0.5)
 
 
 class PathChecks:
@@ -144,15 +144,14 @@ class PathChecks:
         return None if result is None else result[0]
 
 
-def describe_contacts(contacts: Sequence[DistanceResult], limit: int = 3) -> str:
+def describe_contacts(contacts: Sequence[DistanceResult]) -> str:
     """Name touching pairs of bodies, with the depth of their penetration."""
-    pairs = [f"'{c.a}' and '{c.b}' ({_describe_depth(-c.distance)})" for c in contacts[:limit]]
-    more = f" and {len(contacts) - limit} more pairs" if len(contacts) > limit else ""
+    depths = [
+        f"{-1e3 * c.distance:.1f} mm deep" if -c.distance >= _TOUCHING else "touching" for c in contacts
+    ]
+    pairs = [f"'{c.a}' and '{c.b}' ({depth})" for c, depth in zip(contacts, depths[:3], strict=False)]
+    more = f" and {len(contacts) - 3} more pairs" if len(contacts) > 3 else ""
     return ", ".join(pairs) + more
-
-
-def _describe_depth(depth: float) -> str:
-    return f"{1e3 * depth:.1f} mm deep" if depth >= _TOUCHING else "touching"
 
 
 def densify(points: Array, step: float) -> Array:

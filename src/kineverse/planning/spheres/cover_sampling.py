@@ -71,9 +71,7 @@ class CoverMesh:
         part = before / np.maximum(before + after, 1e-30)
         on_edges = self.points[a] + part[:, None] * (self.points[b] - self.points[a])
         labels = owners[self._triangles]
-        mixed = (
-            (labels[:, 0] != labels[:, 1]) & (labels[:, 1] != labels[:, 2]) & (labels[:, 2] != labels[:, 0])
-        )
+        mixed = (labels != np.roll(labels, 1, axis=1)).all(axis=1)
         corners, labels = self._triangles[mixed], labels[mixed]
         u, v = (powers[corners, labels[:, :1]] - powers[corners, labels[:, k : k + 1]] for k in (1, 2))
         weights = np.cross(u, v)
@@ -145,13 +143,8 @@ class CoverStarts:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         deepest = max(float(region.depths(region.middles).max()), protrusion)
         levels = protrusion * np.geomspace(0.7, max(1.2 * deepest / protrusion, 1.5), 5)
-        candidates = np.concatenate(
-            [
-                region.middles,
-                *(origins + size * surface for size in (0.3, 0.6, 0.8, 0.9)),
-                *(middles - t * normals for t in levels),
-            ]
-        )
+        inner = [origins + size * surface for size in (0.3, 0.6, 0.8, 0.9)]
+        candidates = np.concatenate([region.middles, *inner, *(middles - t * normals for t in levels)])
         candidates = candidates[region.depths(candidates) > 0.0]
         self._candidates = candidates[:: len(candidates) // _CANDIDATES + 1]
         self._depths = region.depths(self._candidates)
@@ -207,9 +200,8 @@ def _box_centres(corners: Floats, protrusion: float, most: int) -> Floats:
     axes = _principal_axes(corners)
     low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
     numbers = range(1, most + 1)
-    counts = np.array(
-        [(i, j, k) for i in numbers for j in numbers[: most // i] for k in numbers[: most // (i * j)]]
-    )
+    pairs = ((i, j) for i in numbers for j in numbers[: most // i])
+    counts = np.array([(i, j, k) for i, j in pairs for k in numbers[: most // (i * j)]])
     half = (high - low) / 2 / counts
     protrusions = np.linalg.norm(half, axis=1) - half.min(axis=1)
     totals = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)

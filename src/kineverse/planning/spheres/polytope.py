@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -83,21 +83,11 @@ class CoverPolytope:
         """Return the solid at a pose (4, 4), everything scaled by a factor."""
         rotation, place = pose[:3, :3], pose[:3, 3]
         normals, side = self.normals @ rotation.T, self.side
-        moved = replace(
-            side,
-            origin=factor * (rotation @ side.origin + place),
-            axis=rotation @ side.axis,
-            reach=factor * side.reach,
-            offset=factor * side.offset,
-        )
-        return replace(
-            self,
-            corners=factor * (self.corners @ rotation.T + place),
-            normals=normals,
-            offsets=factor * (self.offsets + normals @ place),
-            volume=factor**3 * self.volume,
-            side=moved,
-        )
+        origin, axis = factor * (rotation @ side.origin + place), rotation @ side.axis
+        moved = RoundSide(origin, axis, factor * side.reach, factor * side.offset, side.slope, side.width)
+        corners = factor * (self.corners @ rotation.T + place)
+        offsets, volume = factor * (self.offsets + normals @ place), factor**3 * self.volume
+        return CoverPolytope(corners, self.faces, normals, offsets, volume, moved, self.is_hull)
 
 
 class CoverRegion:
@@ -131,12 +121,8 @@ class CoverRegion:
 
     def part_depths(self, points: Floats) -> Floats:
         """Return the depths (n, P) of points (n, 3) in each solid [m]; negative outside."""
-        shape = len(points), *self._offsets.shape
-        flat = (
-            (self._offsets.reshape(-1) - scalar_products(points, self._normals.reshape(-1, 3)))
-            .reshape(shape)
-            .min(axis=2)
-        )
+        products = scalar_products(points, self._normals.reshape(-1, 3))
+        flat = (self._offsets - products.reshape(len(points), *self._offsets.shape)).min(axis=2)
         round_ = self._round_depths(points[:, None], np.arange(len(self.parts)))[0]
         return np.asarray(np.minimum(flat, round_))
 
@@ -153,10 +139,8 @@ class CoverRegion:
         count, rows = min(count, flat.shape[1]), np.arange(len(points))[:, None]
         near = np.argpartition(flat, count - 1, axis=1)[:, :count]
         depths, away = self._round_depths(points, owners)
-        return (
-            np.concatenate([flat[rows, near], depths[:, None]], axis=1),
-            np.concatenate([self._normals[owners[:, None], near], away[:, None]], axis=1),
-        )
+        normals = np.concatenate([self._normals[owners[:, None], near], away[:, None]], axis=1)
+        return np.concatenate([flat[rows, near], depths[:, None]], axis=1), normals
 
     def measure_volume(self) -> float:
         """Return the volume of the union, to about a percent where solids overlap [m³]."""

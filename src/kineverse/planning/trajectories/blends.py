@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -138,14 +138,14 @@ def round_corners(
     kept = polyline[keep]
     directions, lengths = _segments(kept)
     if len(kept) == 1:
-        return _frozen(kept, directions, lengths, np.zeros(0))
+        return BlendedPath(*map(_read_only, (kept, directions, lengths, np.zeros(0))))
     turn = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     turns = _find_turns(kept, directions, lengths)
     room = lengths / 2
     room[[0, -1]] = lengths[[0, -1]]  # no blend takes the other half
     reach = np.minimum(room[:-1], room[1:])
     reach = np.where(turns, np.minimum(reach, 4 * allowed[1:-1] / np.where(turns, turn, 1.0)), 0.0)
-    path = _frozen(kept, directions, lengths, reach)
+    path = BlendedPath(*map(_read_only, (kept, directions, lengths, reach)))
     return path if valid is None else _shrink(path, valid, resolution)
 
 
@@ -221,9 +221,9 @@ def _shrink(path: BlendedPath, valid: Validity, resolution: float) -> BlendedPat
             )
         open_corners = open_corners[~flags.reshape(samples.shape[:2]).all(axis=1)]
         reach[open_corners] /= 2
-        path = _frozen(path.points, path.directions, path.lengths, reach.copy())
+        path = replace(path, reach=_read_only(reach.copy()))
     reach[open_corners] = 0.0
-    return _frozen(path.points, path.directions, path.lengths, reach)
+    return replace(path, reach=_read_only(reach))
 
 
 def _blend_points(path: BlendedPath, corners: npt.NDArray[np.intp], count: int) -> Array:
@@ -234,7 +234,6 @@ def _blend_points(path: BlendedPath, corners: npt.NDArray[np.intp], count: int) 
     return np.asarray(moved)
 
 
-def _frozen(points: Array, directions: Array, lengths: Array, reach: Array) -> BlendedPath:
-    for part in (points, directions, lengths, reach):
-        part.flags.writeable = False
-    return BlendedPath(points, directions, lengths, reach)
+def _read_only(array: Array) -> Array:
+    array.flags.writeable = False
+    return array

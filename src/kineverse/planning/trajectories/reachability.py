@@ -42,14 +42,8 @@ def divide_path(path: BlendedPath, cells: int) -> PathGrid:
     configurations = corner + distance * (u**2 * after - (1 - u) ** 2 * before)
     curvature = np.repeat(path.curvature[blended], cells, axis=0)
     n = path.points.shape[1]
-    order = np.argsort(
-        np.concatenate(
-            [
-                np.arange(segments) * (cells + 1),
-                (blended[:, None] * (cells + 1) + 1 + np.arange(cells)).ravel(),
-            ]
-        )
-    )
+    places = blended[:, None] * (cells + 1) + 1 + np.arange(cells)
+    order = np.argsort(np.concatenate([np.arange(segments) * (cells + 1), places.ravel()]))
     lengths = np.concatenate([straight, np.repeat(2 * path.reach[blended] / cells, cells)])[order]
     first = np.concatenate([path.directions, tangents[:, :-1].reshape(-1, n)])[order]
     last = np.concatenate([path.directions, tangents[:, 1:].reshape(-1, n)])[order]
@@ -174,9 +168,8 @@ class CellPrograms:
             up, e, between = _extreme(self._x0, meet, np.argmin)
             result = up >= (a + slope * meet) * (1 - _ROUNDING)
             ahead = rising & (result | (between > 0))
-            left, a, slope = (
-                np.where(ahead, new, old) for new, old in ((meet, left), (e, a), (between, slope))
-            )
+            left, a = np.where(ahead, meet, left), np.where(ahead, e, a)
+            slope = np.where(ahead, between, slope)
             rising &= ~result
             if not rising.any():
                 break

@@ -85,9 +85,8 @@ def time_parameterize(
     speeds, accelerations = _limits(path, velocity_limits, acceleration_limits, symbols)
     blends = max(int(np.count_nonzero(path.reach)), 1)
     grid = divide_path(path, max(as_count("cells", cells, 0) // blends, _FEWEST))
-    times, positions, velocities = _motion(
-        grid, maximal_squared_speeds(grid, speeds, accelerations), speeds, accelerations
-    )
+    x = maximal_squared_speeds(grid, speeds, accelerations)
+    times, positions, velocities = _motion(grid, x, speeds, accelerations)
     positions[[0, -1]], velocities[-1] = path.points[[0, -1]], 0.0
     return Trajectory(tuple(symbols), times, positions, velocities)
 
@@ -184,13 +183,9 @@ def _motion(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> tu
     tangents = grid.first[cells] + grid.curvature[cells] * s
     positions = grid.start[cells] + (grid.first[cells] + tangents) / 2 * s
     velocities = tangents * phases.after[order, None] / slower
-    times = slower * np.cumsum(phases.durations[order])
+    times = np.append(0.0, slower * np.cumsum(phases.durations[order]))
     start = grid.start[:1]
-    return (
-        np.concatenate([[0.0], times]),
-        np.concatenate([start, positions]),
-        np.concatenate([0 * start, velocities]),
-    )
+    return times, np.concatenate([start, positions]), np.concatenate([0 * start, velocities])
 
 
 def _excess(grid: PathGrid, phases: _Phases, speeds: Array, accelerations: Array) -> float:

@@ -256,25 +256,21 @@ class Trajectory:
         return len(self.times)
 
     def __iter__(self) -> Iterator[State]:
-        """Yield the states at the knots, with their times as stamps."""
         for time, values in zip(self.times.tolist(), self.positions.tolist(), strict=True):
             yield State(dict(zip(self.symbols, values, strict=True)), stamp=time)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Trajectory):
             return NotImplemented
-        return self.symbols == other.symbols and all(
-            np.array_equal(a, b) for a, b in zip(self._arrays, other._arrays, strict=True)
-        )
+        return self.symbols == other.symbols and all(map(np.array_equal, self._arrays, other._arrays))
 
     def __hash__(self) -> int:
         return hash((self.symbols, *(values.tobytes() for values in self._arrays)))
 
     def __repr__(self) -> str:
         names = ", ".join(map(str, self.symbols[:4])) + (", ..." if len(self.symbols) > 4 else "")
-        return (
-            f"<Trajectory: {self.duration:g} s, {len(self)} knots, {len(self.symbols)} coordinates: {names}>"
-        )
+        size = f"{len(self)} knots, {len(self.symbols)} coordinates"
+        return f"<Trajectory: {self.duration:g} s, {size}: {names}>"
 
     @property
     def _arrays(self) -> tuple[Array, Array, Array]:
