@@ -171,8 +171,7 @@ def _check_covariances(each: Array, part: str) -> None:
     scale[scale == 0.0] = 1.0
     relative = each / (scale[:, :, None] * scale[:, None, :])
     symmetric = np.abs(relative - np.swapaxes(relative, 1, 2)).max(axis=(1, 2)) < 1e-8
-    smallest = np.linalg.eigvalsh(relative)[:, 0]
-    wrong = np.flatnonzero(~symmetric | (smallest < 1e-12))
+    wrong = np.flatnonzero(~symmetric | (np.linalg.eigvalsh(relative)[:, 0] < 1e-12))
     if len(wrong):
         k = int(wrong[0])
         how = "positive definite" if symmetric[k] else "symmetric"
@@ -253,9 +252,8 @@ def _track(name: str, observed: Any, noise: npt.ArrayLike | None, points: bool) 
     poses = _numbers(observed, f"The poses of '{name}'").copy()
     is_point = points and poses.ndim == 2 and poses.shape[1] == 3
     if is_point:
-        is_missing = np.isnan(poses).all(axis=1)
         poses = translation(poses)
-        poses[is_missing] = np.nan
+        poses[np.isnan(poses).all(axis=1)] = np.nan
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         also = ", or (N, 3) of a point" if points else ""
         raise ShapeError(f"The poses of '{name}' are an array of shape (N, 4, 4){also}, not {poses.shape}.")
