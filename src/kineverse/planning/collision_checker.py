@@ -95,8 +95,7 @@ class CollisionChecker:
         # Loops that do not close have no pose: the sum of all entries is NaN then, and so is no condition.
         if any(e.nodes for e in outputs):
             outputs.append(as_expression(sum((p.sum() for p in poses), as_expression(0.0)) * 0.0))
-        moving = {*self.coordinates}
-        result = {s for e in outputs for s in e.symbols} - moving
+        result = {s for e in outputs for s in e.symbols} - {*self.coordinates}
         self.parameters = tuple(sorted(result, key=lambda s: s.sort_key))
         self.conditions = len(outputs) - len(poses)
         return VectorProgram(outputs, self.coordinates, self.parameters, scalar="float")
@@ -112,8 +111,7 @@ class CollisionChecker:
         world = self.scene.collision_world
         static = [k for k, item in enumerate(world.objects) if not dependence.moves(item.body)]
         self._static = np.array(static, dtype=int)
-        owners = world.table.body[self._static]
-        used, numbers = np.unique(owners, return_inverse=True)
+        used, numbers = np.unique(world.table.body[self._static], return_inverse=True)
         self.standing = tuple(world.bodies[k] for k in used)
         moving = np.array([world.body_index(body) for body in self.moving], dtype=int)
         self._allowed = np.ascontiguousarray(world.table.allowed[np.ix_(moving, used)], dtype=np.uint8)

@@ -36,8 +36,7 @@ class LinkTable:
         self.spheres: list[Array] = []
         count = 0
         self.shapes = np.zeros(sum(map(len, members)), dtype=SHAPE)
-        placed = [T[:3] for items in members for _, _, T in items]
-        self.shapes["pose"] = np.reshape(placed, (-1, 12))
+        self.shapes["pose"] = np.reshape([T[:3] for items in members for _, _, T in items], (-1, 12))
         shapes = 0
         for k, (items, pose) in enumerate(zip(members, poses, strict=True)):
             link = self.links[k]
@@ -158,8 +157,7 @@ class ObstacleSet:
         round_ = (slack <= _ALIGNED) & np.isin(items["kind"], (CYLINDER, CAPSULE))
         items["aligned"] = boxes | round_
         items["rotation"], items["translation"] = rotation.reshape(-1, 9), translation
-        grown = self._sizes[moved] + (slack * round_)[:, None]
-        items["size"] = np.where(boxes[:, None], extent, grown)
+        items["size"] = np.where(boxes[:, None], extent, self._sizes[moved] + (slack * round_)[:, None])
         self._items[moved] = items
         # The largest rounding of float at these places.
         extent += 1e-6 * (1.0 + np.abs(centre) + extent)

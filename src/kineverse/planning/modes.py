@@ -53,9 +53,8 @@ class Mode:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise InvalidValueError(f"The name of a mode is a text, not {self.name!r:.80}.")
-        holds = as_entries("along=", self.along, Hold, "holds, one or several")
         moves = as_entries("moves=", self.moves, (str, Symbol), "coordinates, as symbols or names")
-        object.__setattr__(self, "along", holds)
+        object.__setattr__(self, "along", as_entries("along=", self.along, Hold, "holds, one or several"))
         object.__setattr__(self, "moves", moves)
 
 
@@ -227,8 +226,7 @@ class ModeSearch:
         still, mode = self._still[node.mode], self._modes[node.mode]
         touching = self._touching_around(node) | self._scene.touching_pairs(self._tasks)
         if self._ends is not None:
-            same = np.abs(self._ends - node.q)[:, still].max(axis=1, initial=0.0) < _SAME
-            ends = self._ends[same].copy()
+            ends = self._ends[np.abs(self._ends - node.q)[:, still].max(axis=1, initial=0.0) < _SAME].copy()
             ends[:, still] = node.q[still]
         elif self._concerns_still(node):
             return None
@@ -241,8 +239,7 @@ class ModeSearch:
         """Return True if a task is about objects that do not move in the mode, and is not met."""
         moving = set(itertools.compress(self._scene.space.symbols, ~self._still[node.mode]))
         for task in self._tasks:
-            resolved = self._scene.model.rates.resolve(task.expression)
-            if moving.isdisjoint(resolved.symbols):
+            if moving.isdisjoint(self._scene.model.rates.resolve(task.expression).symbols):
                 manifold = self._scene.manifold([task])
                 if manifold is not None and float(manifold.residuals(node.q[None])[0]) > _SAME:
                     return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .path_rounding import PathSection, TimedSection, join_sections, parameterize_sections, section_times
-from .state_validity import PathChecks
+from .path_rounding import PathSection, TimedSection, parameterize_sections, section_times
+from .state_validity import PathChecks, lengths_along
 from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.kinematic_limits import RAMP
 
@@ -83,10 +83,6 @@ class Path:
         InvalidValueError
             If the model has been edited since the path was planned, or the path was pickled.
         """
-        return self._clearance
-
-    @cached_property
-    def _clearance(self) -> float:
         return self._own_checks().clearance(self.points)
 
     def trajectory(
@@ -119,7 +115,8 @@ class Path:
         InvalidValueError
             If the path was not found, or the model has been edited since; as :func:`.time_parameterize`.
         """
-        return join_sections(self._parameterize(deviation, ramp, velocity, acceleration))
+        parts = self._parameterize(deviation, ramp, velocity, acceleration)
+        return reduce(Trajectory.then, [trajectory for _, _, trajectory in parts])
 
     @cached_property
     def times(self) -> Array:
@@ -179,7 +176,7 @@ class Path:
 
     def at(self, fraction: float) -> State:
         """Return the state at a fraction of the length, from 0 at the start to 1 at the end."""
-        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))])
+        lengths = lengths_along(self.points)
         share = finite_number(fraction)
         if share is None:
             raise InvalidValueError(f"A fraction of a path is a number from 0 to 1, not {fraction!r}.")

@@ -225,8 +225,7 @@ class PlanningScene:
                 try:
                     best = search(left if k == len(ways) - 1 else left / 2, seed)
                 except LateCheckError:
-                    why = _TOO_FAR.format(straight)
-                    return self.no_path(q, why, begin, perf_counter() - begin)
+                    return self.no_path(q, _TOO_FAR.format(straight), begin, perf_counter() - begin)
                 if best.found:
                     break
             while optimize and best.found and best.length > straight + _SAME:

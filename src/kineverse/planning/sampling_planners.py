@@ -77,8 +77,7 @@ class RrtConnect:
             ctypes.addressof(s), work.ctypes.data, len(points), room, patience, LEAST_INFLATION
         )
         result = work[:count]
-        apart = np.abs(np.diff(result, axis=0)).max(axis=1, initial=0.0) > 1e-6
-        keep = np.concatenate([[True], apart])
+        keep = np.concatenate([[True], np.abs(np.diff(result, axis=0)).max(axis=1, initial=0.0) > 1e-6])
         keep[-1] = True  # the ends stay exact
         return np.ascontiguousarray(result[keep])
 

@@ -38,8 +38,7 @@ class CoverMesh:
         step = len(inner) // (_INNER_TRIANGLES * len(region.parts)) + 1
         inner, of_inner = inner[::step], of_inner[::step]
         middles = region.middles[of_inner][:, None]
-        layers = [middles + size * (inner - middles) for size in _LAYERS]
-        triangles = np.concatenate([surface, *layers])
+        triangles = np.concatenate([surface, *[middles + size * (inner - middles) for size in _LAYERS]])
         owners = np.concatenate([of_surface, *(of_inner for _ in _LAYERS)])
         triangles = triangles[~is_deep_in_others(region, triangles, owners, spacing)].reshape(-1, 3)
         # Corners are merged, so that each counts once.
@@ -67,8 +66,7 @@ class CoverMesh:
         cut = owners[a] != owners[b]
         a, b = a[cut], b[cut]
         before = powers[a, owners[b]] - powers[a, owners[a]]
-        after = powers[b, owners[a]] - powers[b, owners[b]]
-        part = before / np.maximum(before + after, 1e-30)
+        part = before / np.maximum(before + (powers[b, owners[a]] - powers[b, owners[b]]), 1e-30)
         on_edges = self.points[a] + part[:, None] * (self.points[b] - self.points[a])
         labels = owners[self._triangles]
         mixed = (labels != np.roll(labels, 1, axis=1)).all(axis=1)
@@ -80,8 +78,7 @@ class CoverMesh:
         inside = np.einsum("nk,nkj->nj", weights, self.points[corners])
         points = np.concatenate([self.points, on_edges, inside])
         # Points between two triangles may belong to yet another sphere.
-        added = points[len(self.points) :]
-        others = squares - scalar_products(added.astype(np.float32), twice)
+        others = squares - scalar_products(points[len(self.points) :].astype(np.float32), twice)
         return points, np.concatenate([owners, others.argmin(axis=1)])
 
 

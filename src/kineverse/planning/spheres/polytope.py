@@ -199,8 +199,7 @@ def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
     places = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     chosen = corners[np.minimum(np.searchsorted(shares / shares[-1], places), len(corners) - 1)]
     # Weights of the corners of each tetrahedron, from a sequence that fills the cube.
-    u = np.sort(np.arange(_SAMPLES)[:, None] * _SEQUENCE % 1.0, axis=1)
-    weights = np.diff(u, axis=1, prepend=0.0)
+    weights = np.diff(np.sort(np.arange(_SAMPLES)[:, None] * _SEQUENCE % 1.0, axis=1), axis=1, prepend=0.0)
     return np.asarray(middle + np.einsum("nk,nkj->nj", weights, chosen))
 
 

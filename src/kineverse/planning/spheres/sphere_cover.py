@@ -89,8 +89,7 @@ def cover_solids(
     spheres = [(pose, solid.surface) for solid, pose in solids if isinstance(solid.surface, Sphere)]
     if len(spheres) == len(solids) <= most:
         places = np.array([pose[:3, 3] for pose, _ in spheres])
-        sizes = np.array([sphere.radius for _, sphere in spheres], dtype=float)
-        return _make_cover(places, sizes, 0.0)
+        return _make_cover(places, np.array([sphere.radius for _, sphere in spheres], dtype=float), 0.0)
     if protrusion is None:
         protrusion = default_protrusion(solids)
     # Solids may be longer than any sensible protrusion, and one ball is then enough.

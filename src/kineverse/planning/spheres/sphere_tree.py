@@ -111,8 +111,7 @@ def _cluster(centres: Floats, radii: Floats, count: int) -> Integers:
     means = centres[seeds]
     clusters = np.zeros(len(centres), dtype=np.int64)
     for _ in range(_LLOYD_ROUNDS):
-        reach = np.linalg.norm(centres[:, None] - means, axis=2) + radii[:, None]
-        clusters = reach.argmin(axis=1)
+        clusters = (np.linalg.norm(centres[:, None] - means, axis=2) + radii[:, None]).argmin(axis=1)
         used = np.unique(clusters)
         before, means = means, np.array([centres[clusters == k].mean(axis=0) for k in used.tolist()])
         if means.shape == before.shape and np.allclose(means, before):
