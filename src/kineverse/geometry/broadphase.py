@@ -249,8 +249,7 @@ def rank_pairs(
     if per_shape:
         return np.asarray(order)
     bodies = low[order].astype(np.int64) * len(table.allowed) + high[order]
-    leading = np.unique(bodies, return_index=True)[1]
-    return np.asarray(order[np.sort(leading)])
+    return np.asarray(order[np.sort(np.unique(bodies, return_index=True)[1])])
 
 
 def gather_pairs(

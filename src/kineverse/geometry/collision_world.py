@@ -215,8 +215,7 @@ class CollisionWorld:
 
     def compute_poses(self, values: Floats) -> Floats:
         """Return the poses of the moving objects, (K, 3, 4), at values of :attr:`inputs`."""
-        poses: Floats = self._function(values)
-        return poses
+        return np.asarray(self._function(values))
 
     def _select_inputs(self, state: StateLike) -> StateLike:
         """Select the values that poses depend on, after a check of all other names."""
@@ -376,8 +375,7 @@ def _compile_poses(moving: list[CollisionObject]) -> CompiledFunction[Floats]:
     poses = []
     for _, group in groupby(moving, lambda item: item.body):
         items = [*group]
-        origins = np.hstack([item.shape.origin.matrix for item in items])
-        rows = items[0].body_pose[:3] @ origins
+        rows = items[0].body_pose[:3] @ np.hstack([item.shape.origin.matrix for item in items])
         poses.append(rows.reshape(3, len(items), 4).transpose(1, 0, 2))
     return compile_expressions(np.concatenate(poses))
 

@@ -212,8 +212,7 @@ class Narrowphase:
 
     def _remeasure(self, i: int, j: int, functor: Any) -> float:
         self._result.clear()
-        distance: float = functor(self._transforms[i], self._transforms[j], self._coarsest, self._result)
-        return distance
+        return float(functor(self._transforms[i], self._transforms[j], self._coarsest, self._result))
 
     def _solve_triangles(self, i: int, j: int) -> float | None:
         """Measure a convex solid and triangles by GJK, without coal; None if they touch."""
@@ -307,9 +306,8 @@ class Narrowphase:
 
 def distance_to_point(solid: Solid, pose: Floats, point: Floats) -> tuple[float, Floats, Floats]:
     """Return signed distance of a point from a placed solid [m], its nearest point, and the normal there."""
-    ball = solid_from_geometry(Sphere(_POINT_RADIUS))
     # The radius of the solid bounds the translations of _measure_shifted, not that of the ball.
-    point_ball = replace(ball, radius=solid.radius)
+    point_ball = replace(solid_from_geometry(Sphere(_POINT_RADIUS)), radius=solid.radius)
     narrow = Narrowphase([solid, point_ball], np.stack([pose, np.column_stack([np.eye(3), point])]))
     distance = narrow.distance(0, 1) + _POINT_RADIUS
     nearest, _, normal = narrow.witness()

@@ -221,8 +221,7 @@ def find_nearest_point(world: CollisionWorld, point: npt.ArrayLike, radius: floa
     table = world.table
     to_point = location - table.position
     lows = np.linalg.norm(to_point, axis=1) - table.radius
-    inside = np.einsum("kji,kj->ki", table.poses[:, :, :3], to_point)
-    outside = np.maximum(np.abs(inside) - table.half, 0.0)
+    outside = np.maximum(np.abs(np.einsum("kji,kj->ki", table.poses[:, :, :3], to_point)) - table.half, 0.0)
     lows = np.maximum(lows, np.where(outside.any(axis=1), np.linalg.norm(outside, axis=1), -math.inf))
     best: NearestPoint | None = None
     for k in np.argsort(lows, kind="stable").tolist():

@@ -386,8 +386,7 @@ class Scene:
         moving = _as_list(symbols)
 
         def choose() -> PairFlags:
-            relative = flag_relatively_moving(self.model, self.bodies, moving)
-            return self._world.table.allowed * relative
+            return self._world.table.allowed * flag_relatively_moving(self.model, self.bodies, moving)
 
         return self._query_pairs(("moved by", *moving), choose)(radius)
 

@@ -280,8 +280,7 @@ def _drop_degenerate(vertices: Floats, faces: Integers) -> Integers:
     has_area = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14 * longest
     if not has_area.any():
         raise InvalidValueError("all its triangles are lines or points, so that there is nothing to touch.")
-    kept: Integers = faces[has_area]
-    return kept
+    return np.asarray(faces[has_area])
 
 
 def _solid_around(

@@ -125,8 +125,7 @@ def _sample_surface(vertices: Floats, faces: Integers, count: int, random: np.ra
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     chosen = random.choice(len(areas), count, p=areas / areas.sum())
-    weights = random.dirichlet(np.ones(3), count)
-    return np.asarray(np.einsum("nk,nkd->nd", weights, vertices[faces[chosen]]))
+    return np.asarray(np.einsum("nk,nkd->nd", random.dirichlet(np.ones(3), count), vertices[faces[chosen]]))
 
 
 def _uncovered(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) -> float:

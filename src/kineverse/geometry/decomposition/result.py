@@ -122,10 +122,9 @@ class Decomposition:
                 facts = json.loads(arrays["facts"].tobytes())
                 points, sizes = arrays["points"], arrays["sizes"]
             points.flags.writeable = False
-            hulls = tuple(np.split(points, np.cumsum(sizes)[:-1]))
             facts["accuracy"] = Accuracy(**facts["accuracy"])
             facts["remarks"] = tuple(facts["remarks"])
-            return Decomposition(hulls, **facts)
+            return Decomposition(tuple(np.split(points, np.cumsum(sizes)[:-1])), **facts)
         except Exception as error:  # zip, numpy and json raise all kinds of errors for a damaged archive.
             raise FormatError("This is not a decomposition.") from error
 
