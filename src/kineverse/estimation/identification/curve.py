@@ -445,7 +445,8 @@ def _length_along_path(points: Array) -> Array:
     costs = np.maximum(distances[some] - 1.0, 1e-3) ** 2
     for k in range(len(some)):
         np.minimum(costs, costs[:, k, None] + costs[None, k], out=costs)
-    reached = np.argsort(costs[int(np.argmax(costs[int(np.argmax(costs[0]))]))], kind="stable")
+    first = int(np.argmax(costs[int(np.argmax(costs[0]))]))
+    reached = np.argsort(costs[first], kind="stable")
     along = np.empty(len(some))
     along[reached] = np.arange(len(some))
     result = np.asarray(along[np.argsort(distances, axis=1)[:, :2]].mean(axis=1))

@@ -90,7 +90,8 @@ def _width(values: Array, variances: Array, weight: float) -> tuple[float, float
     """Return the best s, and the log of the mean likelihood over all s relative to the best."""
     total = variances + GRID[:, None, None] ** 2
     weights = 1.0 / total
-    squares = (values - ((weights * values).sum(axis=1) / weights.sum(axis=1))[:, None, :]) ** 2 * weights
+    mean = (weights * values).sum(axis=1) / weights.sum(axis=1)
+    squares = (values - mean[:, None, :]) ** 2 * weights
     # The mean is integrated out. Else the width of a few values would be biased towards zero.
     logs = -0.5 * weight * (np.log(total) + squares).sum(axis=(1, 2))
     logs -= 0.5 * np.log(weights.sum(axis=1)).sum(axis=1)

@@ -252,8 +252,9 @@ def _track(name: str, observed: Any, noise: npt.ArrayLike | None, points: bool) 
     poses = _numbers(observed, f"The poses of '{name}'").copy()
     is_point = points and poses.ndim == 2 and poses.shape[1] == 3
     if is_point:
+        is_missing = np.isnan(poses).all(axis=1)
         poses = translation(poses)
-        poses[np.isnan(poses).all(axis=1)] = np.nan
+        poses[is_missing] = np.nan
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         also = ", or (N, 3) of a point" if points else ""
         raise ShapeError(f"The poses of '{name}' are an array of shape (N, 4, 4){also}, not {poses.shape}.")

@@ -191,11 +191,12 @@ class ProcessModel:
                 continue
             covariance = inverse_spd(belief.information[group.block])
             after, slope, gain = self.transition(number, belief.x[group.x], displacement, inputs)
+            mean = slope @ (covariance @ belief.vector[group.t])
             covariance = slope @ covariance @ slope.T + (gain * added_variance) @ gain.T
             information = inverse_spd(covariance)
             belief.x[group.x] = after
             belief.information[group.block] = information
-            belief.vector[group.t] = information @ (slope @ (covariance @ belief.vector[group.t]))
+            belief.vector[group.t] = information @ mean
 
     def transition(
         self, number: int, x: Array, displacement: Array, inputs: Array

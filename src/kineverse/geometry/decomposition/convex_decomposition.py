@@ -24,11 +24,11 @@ from kineverse._extras import install_command
 from kineverse.compilation.cache import UNFINISHED
 from kineverse.errors import FormatError, InvalidValueError, KineverseError, MissingDependencyError
 from kineverse.geometry.mesh_files import Faces, Floats, Integers, find_mesh_file, read_faces
-from kineverse.geometry.shapes import check_extent
+from kineverse.geometry.shapes import check_extent, enclosed_volume
 from kineverse.model.body import Mesh
 
 from . import result
-from .accuracy import Polytope, enclosed_volume, is_closed, measure_accuracy, nearest_surface_points
+from .accuracy import Polytope, is_closed, measure_accuracy, nearest_surface_points
 from .result import DECOMPOSITIONS, Decomposition, DecompositionSettings
 
 MOST_FACES = 300_000  # largest number of triangles that is decomposed; more take CoACD hours and all memory

@@ -17,7 +17,14 @@ import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
-from kineverse.geometry.shapes import Hull, Solid, solid_from_points, solid_surface
+from kineverse.geometry.shapes import (
+    Hull,
+    Solid,
+    enclosed_volume,
+    sample_inside,
+    solid_from_points,
+    solid_surface,
+)
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 _ROUNDNESS = 0.03  # gap between a round solid and its polytope, as a fraction of the protrusion of a cover
@@ -30,7 +37,6 @@ _MANY_CORNERS, _DIRECTIONS = 200, 400
 
 _BLOCK = 80_000
 _SAMPLES = 1000
-_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)  # steps of the sequence R3 (Roberts 2018)
 _FAR = 1e9  # offset of a plane that bounds nothing
 
 
@@ -149,7 +155,8 @@ class CoverRegion:
         volume = 0.0
         for k, part in enumerate(self.parts):
             # Each point counts as often as one solid contains it.
-            shared = (self.part_depths(_sample_inside(part, self.middles[k])) >= 0.0).sum(axis=1)
+            inside = sample_inside(part.corners, part.faces, self.middles[k], _SAMPLES)
+            shared = (self.part_depths(inside) >= 0.0).sum(axis=1)
             volume += part.volume * float((1.0 / np.maximum(shared, 1)).mean())
         return volume
 
@@ -190,17 +197,6 @@ def scalar_products(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> npt.N
     for k in range(0, len(points), rows):
         np.matmul(points[k : k + rows], others.T, out=result[k : k + rows])
     return result
-
-
-def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
-    """Return evenly spread points (n, 3) of an outer polytope around a point of it."""
-    corners = part.corners[part.faces] - middle
-    shares = np.cumsum(np.abs(np.linalg.det(corners)))
-    places = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    chosen = corners[np.minimum(np.searchsorted(shares / shares[-1], places), len(corners) - 1)]
-    # Weights of the corners of each tetrahedron, from a sequence that fills the cube.
-    weights = np.diff(np.sort(np.arange(_SAMPLES)[:, None] * _SEQUENCE % 1.0, axis=1), axis=1, prepend=0.0)
-    return np.asarray(middle + np.einsum("nk,nkj->nj", weights, chosen))
 
 
 def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
@@ -262,8 +258,7 @@ def _bound_hull(solid: Solid) -> CoverPolytope:
     mesh, surface = solid_surface(solid), solid.surface
     assert isinstance(mesh, Faces)
     assert isinstance(surface, Hull)
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
-    volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+    volume = enclosed_volume(mesh.vertices, mesh.faces)
     # Triangles of one flat face share a plane.
     planes = np.column_stack([surface.normals, surface.offsets / solid.radius])
     kept = np.unique(np.round(planes, 9), axis=0, return_index=True)[1]
