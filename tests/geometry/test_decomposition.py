@@ -17,7 +17,6 @@ from kineverse.geometry.decomposition import (
     DecompositionSettings,
     ResourceLimits,
     clear,
-    coacd_process,
     convex_decomposition,
     decompose,
     decompose_all,
@@ -26,8 +25,7 @@ from kineverse.geometry.decomposition import (
     result,
 )
 from kineverse.geometry.decomposition.accuracy import Polytope, is_closed, measure_accuracy
-from kineverse.geometry.decomposition.convex_decomposition import clean_hulls, reduce_hulls
-from kineverse.geometry.decomposition.mesh_cleanup import clean_mesh
+from kineverse.geometry.decomposition.convex_decomposition import clean_hulls, clean_mesh, reduce_hulls
 from kineverse.geometry.decomposition.result import Decomposition
 from kineverse.geometry.mesh_files import Faces
 from kineverse.model.body import Mesh
@@ -362,7 +360,7 @@ def test_coacd_process_does_not_outlive_its_parent(tmp_path, monkeypatch):
     command = [
         sys.executable,
         "-P",
-        str(coacd_process.PROGRAM),
+        str(convex_decomposition.PROGRAM),
         str(tmp_path / "in.npz"),
         "out.npz",
         "1",
@@ -422,7 +420,7 @@ def test_decompose_refuses_an_invalid_scale(file, scale):
 
 
 def test_decompose_refuses_too_many_triangles(file, monkeypatch):
-    monkeypatch.setattr("kineverse.geometry.decomposition.mesh_cleanup.MOST_FACES", 10)
+    monkeypatch.setattr("kineverse.geometry.decomposition.convex_decomposition.MOST_FACES", 10)
     with pytest.raises(InvalidValueError, match="12 triangles"):
         decompose(file(cube()))
 

@@ -113,7 +113,7 @@ def test_a_node_that_draws_itself_is_refused(tmp_path: Path) -> None:
 
 
 def test_long_files_that_draw_nothing_twice_are_not_refused(tmp_path: Path) -> None:
-    from kineverse.geometry.mesh_expansion import expanded_size
+    from kineverse.geometry.mesh_files import expanded_size
 
     nodes = "".join(f'<node id="m{k}"><instance_geometry url="#g"/></node>' for k in range(1000))
     write(tmp_path, "a.dae", collada(0).replace('<node><instance_node url="#n0"/></node>', nodes))

@@ -18,7 +18,7 @@ from kineverse.expressions.printing import format_number
 from kineverse.formats import read_srdf
 from kineverse.geometry import Rule
 from kineverse.planning import Planner
-from kineverse.planning.trajectories.trajectory_file import check_trajectory_name
+from kineverse.planning.trajectories.trajectory import check_trajectory_name
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
 from .output import format_table, name_options, show_activity

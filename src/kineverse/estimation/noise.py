@@ -124,8 +124,7 @@ class Outliers:
             The cost is the negative log density less ``log_scale``; without outliers it is ½ ``square``.
         """
         inlier = math.log(1 - self.fraction) - square / 2
-        outlier = log_density + log_scale
-        total = float(np.logaddexp(inlier, outlier))
+        total = float(np.logaddexp(inlier, log_density + log_scale))
         return math.exp(inlier - total), -total
 
 

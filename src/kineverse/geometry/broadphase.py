@@ -122,11 +122,6 @@ class ObjectTable:
         if there.any():
             self.axis = int(np.argmax(self.position[there].std(axis=0)))
 
-    def record_distance(self, i: int, j: int, distance: float) -> None:
-        """Record a measured distance of two objects, i < j."""
-        if self.bounds is not None:
-            self.bounds[i, j] = distance + self.travel[i] + self.travel[j]
-
     def lower_bounds(self, ones: Indices, others: Indices) -> Floats:
         """Return lower bounds of the distances of pairs (K,), (K,), with ones < others, [m]."""
         between = self.position[others] - self.position[ones]
@@ -254,8 +249,7 @@ def rank_pairs(
     if per_shape:
         return np.asarray(order)
     bodies = low[order].astype(np.int64) * len(table.allowed) + high[order]
-    leading = np.unique(bodies, return_index=True)[1]
-    return np.asarray(order[np.sort(leading)])
+    return np.asarray(order[np.sort(np.unique(bodies, return_index=True)[1])])
 
 
 def gather_pairs(

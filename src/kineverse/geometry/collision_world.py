@@ -8,7 +8,6 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse._checks import as_entries
 from kineverse._runtime import CallLock
@@ -70,17 +69,9 @@ class CollisionWorld:
         self._version: int | None = None
         self._placed_at: tuple[tuple[Symbol, ...], Floats] = (), np.zeros(0)  # symbols and values
         self._missing_state = ""
-        self._function: Any = None
-        self._evaluator: Any = None
-        self.inputs: tuple[Symbol, ...] = ()
         self.objects: list[CollisionObject] = []
-        self.bodies: tuple[str, ...] = ()
-        self._body_numbers: dict[str, int] = {}
         self._origins: dict[int, Floats] = {}
-        self.members: list[list[int]] = []
-        self.shape_numbers: Indices = np.zeros(0, dtype=np.int32)
         self._solids: list[Solid | None] = []
-        self._all_loaded = False
         self.table = ObjectTable(0, np.zeros(0, dtype=np.int32), np.zeros((0, 0), dtype=np.uint8))
         collision_library.prepare()
         self.synchronize()
@@ -98,7 +89,7 @@ class CollisionWorld:
             return
         version = self.model.version
         rules = self.rules
-        if self._source.synchronize(self.model):
+        if self._source.synchronize(self.model) or self._version is None:
             try:
                 self._rebuild(rules)
             except BaseException:
@@ -115,14 +106,14 @@ class CollisionWorld:
         old_solids = self._solids
         everything = [item for items in by_body.values() for item in items]
         moving = [item for item in everything if item.moves]
-        same = moving == self.objects[: old.moving]
+        is_same = self._version is not None and moving == self.objects[: old.moving]
         self.objects = [*moving, *(item for item in everything if not item.moves)]
         self.bodies = tuple(by_body)
         self._body_numbers = number = {name: k for k, name in enumerate(self.bodies)}
         self._origins.clear()
         body = np.array([number[item.body] for item in self.objects], dtype=np.int32)
-        self.members = [[] for _ in self.bodies]
-        self.shape_numbers = np.array([item.number for item in self.objects], dtype=np.int32)
+        self.members: list[list[int]] = [[] for _ in self.bodies]
+        self.shape_numbers: Indices = np.array([item.number for item in self.objects], dtype=np.int32)
         for k, owner in enumerate(body.tolist()):
             self.members[owner].append(k)
         self.table = table = ObjectTable(len(moving), body, allowed_pairs(self.model, self.bodies, rules))
@@ -142,7 +133,7 @@ class CollisionWorld:
         self._travel = table.travel.data
         self._bounds: Any = None if table.bounds is None else table.bounds.data
         self._measurements: dict[tuple[int, int], tuple[float, float, float, Floats]] = {}
-        if not same:
+        if not is_same:
             self._compile(moving)
         self._restore_poses()
 
@@ -154,11 +145,11 @@ class CollisionWorld:
             places = ((item.body, item.shape.origin, id(item.body_pose)) for item in moving)
             key = "poses of objects", tuple(places)
             _, function = cached_for_version(self.model, key, lambda: (poses, _compile_poses(moving)))
-        self._function = function
-        self.inputs = function.inputs if function else ()
-        self._evaluator = evaluator = function.bind() if function else None
-        self._addresses = (0, 0)
-        if evaluator is not None:
+        self._function: Any = function
+        self.inputs: tuple[Symbol, ...] = function.inputs if function else ()
+        self._evaluator: Any = None
+        if function:
+            self._evaluator = evaluator = function.bind()
             self._addresses = evaluator.input.ctypes.data, evaluator.outputs[0].ctypes.data
 
     def add_rules(self, rules: Iterable[Rule]) -> None:
@@ -224,8 +215,7 @@ class CollisionWorld:
 
     def compute_poses(self, values: Floats) -> Floats:
         """Return the poses of the moving objects, (K, 3, 4), at values of :attr:`inputs`."""
-        poses: Floats = self._function(values)
-        return poses
+        return np.asarray(self._function(values))
 
     def _select_inputs(self, state: StateLike) -> StateLike:
         """Select the values that poses depend on, after a check of all other names."""
@@ -317,22 +307,22 @@ class CollisionWorld:
 
         If ``per_shape``, all of them are measured, even if a nearer pair of the same bodies is known.
         """
-        owners = self.table.body[pairs]
-        keys = owners.min(axis=1).astype(np.int64) * len(self.bodies) + owners.max(axis=1)
+        keys = [frozenset(owners) for owners in self.table.body[pairs].tolist()]
         unsolved = np.flatnonzero(np.isnan(distances))
+        nearest = dict.fromkeys(keys, math.inf)
         # Most bodies have one object; then no other pair of the same bodies can be nearer.
-        several = not per_shape and len(np.unique(keys)) < len(keys)
-        nearest = _NearestByBodies(keys, distances) if several else None
+        several = not per_shape and len(nearest) < len(keys)
+        for k in np.flatnonzero(~np.isnan(distances)).tolist() if several else ():
+            nearest[keys[k]] = min(nearest[keys[k]], distances[k])
         for k in unsolved[np.argsort(lows[unsolved], kind="stable")].tolist():
-            if nearest is not None and nearest.has_nearer(k, lows[k]):
+            if several and lows[k] > nearest[keys[k]] + ACCURACY:
                 distances[k] = math.inf
                 continue
             i, j = pairs[k].tolist()
             distances[k], witness = self._measure_by_coal(i, j, limit)
             if witness is not None:
                 witnesses[k] = witness
-            if nearest is not None:
-                nearest.update(k, distances[k])
+            nearest[keys[k]] = min(nearest[keys[k]], distances[k])
 
     def _measure_by_coal(self, i: int, j: int, limit: float) -> tuple[float, Floats | None]:
         """Return distance and witness of two objects, i < j, from memory if neither has moved since.
@@ -345,7 +335,7 @@ class CollisionWorld:
             return (known[2], known[3]) if known[2] <= limit else (math.inf, None)
         distance = self.narrowphase.distance(i, j)
         if self._bounds is not None:
-            self._bounds[i, j] = distance + one + other  # ObjectTable.record_distance, faster
+            self._bounds[i, j] = distance + one + other
         if distance > limit:
             return math.inf, None
         witness = np.concatenate(self.narrowphase.witness())
@@ -380,31 +370,12 @@ class CollisionWorld:
         return solid
 
 
-class _NearestByBodies:
-    """Smallest known distance of each pair of bodies, by the key of the pair."""
-
-    def __init__(self, keys: npt.NDArray[np.int64], distances: Floats) -> None:
-        self._keys = keys.tolist()
-        self._least: dict[int, float] = {}
-        for k in np.flatnonzero(~np.isnan(distances)).tolist():
-            self.update(k, distances[k])
-
-    def update(self, k: int, distance: float) -> None:
-        key = self._keys[k]
-        self._least[key] = min(self._least.get(key, math.inf), distance)
-
-    def has_nearer(self, k: int, low: float) -> bool:
-        """Return True if another pair of the same bodies is nearer than a lower bound, by the accuracy."""
-        return low > self._least.get(self._keys[k], math.inf) + ACCURACY
-
-
 def _compile_poses(moving: list[CollisionObject]) -> CompiledFunction[Floats]:
     """Compile the poses (M, 3, 4) of moving objects, those of a body together."""
     poses = []
     for _, group in groupby(moving, lambda item: item.body):
         items = [*group]
-        origins = np.hstack([item.shape.origin.matrix for item in items])
-        rows = items[0].body_pose[:3] @ origins
+        rows = items[0].body_pose[:3] @ np.hstack([item.shape.origin.matrix for item in items])
         poses.append(rows.reshape(3, len(items), 4).transpose(1, 0, 2))
     return compile_expressions(np.concatenate(poses))
 

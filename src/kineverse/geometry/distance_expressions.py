@@ -81,26 +81,20 @@ def distance_parameters(
     Symbols that the model already contains are reused; new ones have the present values as defaults.
     """
     known = {symbol.path: symbol for symbol in model.symbols}
-
-    def symbol_at(path: str, value: float) -> Symbol:
-        return known[path] if path in known else parameter(path, value)
-
     path = f"distance/{_escape_to(closest.a)}/to/{_escape_to(closest.b)}"
-    return tuple(
-        tuple(
-            symbol_at(f"{path}/{name}/{axis}", float(value)) for axis, value in zip("xyz", row, strict=True)
-        )
-        for name, row in zip(_ROWS, _parameter_rows(closest, world_T_a, world_T_b), strict=True)
-    )
+    result = []
+    for name, row in zip(_ROWS, _parameter_rows(closest, world_T_a, world_T_b), strict=True):
+        values = {f"{path}/{name}/{axis}": value for axis, value in zip("xyz", row.tolist(), strict=True)}
+        result.append(tuple(known[p] if p in known else parameter(p, v) for p, v in values.items()))
+    return tuple(result)
 
 
 def distance_expression(model: ModelView, a: str, b: str, parameters: DistanceParameters) -> PairDistance:
     """Return the distance of two bodies as an expression of a model's coordinates."""
     a_p, b_p, normal = (array(list(row)) for row in parameters)
-    point_a, point_b = (
-        world_T_body[:3, :3] @ body_p + world_T_body[:3, 3]
-        for world_T_body, body_p in ((model.fk(a), a_p), (model.fk(b), b_p))
-    )
+    world_T_a, world_T_b = model.fk(a), model.fk(b)
+    point_a = world_T_a[:3, :3] @ a_p + world_T_a[:3, 3]
+    point_b = world_T_b[:3, :3] @ b_p + world_T_b[:3, 3]
     return PairDistance(a, b, normal @ (point_b - point_a), point_a, point_b, normal, parameters)
 
 

@@ -2,36 +2,34 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse._runtime import one_at_a_time
-from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.model.frame import WORLD
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
-from .bindings import FacingPoints, collision_library
+from .bindings import FacingPoints, MotionStruct, collision_library
 from .broadphase import Flags, Indices, PairSelection
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
 from .narrowphase import ACCURACY
 from .objects import matches_pattern
 from .results import DistanceResult, DistanceResults
-from .sampled_motion import SampledMotion
 
 
 def find_distance(world: CollisionWorld, a: str, b: str) -> DistanceResult:
     """Return the distance of two bodies, regardless of the rules."""
-    one, other = world.body_index(a), world.body_index(b)
-    if one == other:
-        raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
+    one, other = _two_bodies(world, a, b)
     members, others = world.members[one], world.members[other]
     world.prepare((*members, *others))
     pairs = _pair_product(members, others)
@@ -62,8 +60,7 @@ def find_pairs_within(
     """
     check_radius(radius)
     world.prepare(None if selection is None else ())
-    table = world.table
-    reach = radius + ACCURACY
+    table, reach = world.table, radius + ACCURACY
     measured, nearest = collision_library.search(table, reach, radius, selection, per_shape, facing)
     if measured is None:
         assert nearest is not None
@@ -72,9 +69,9 @@ def find_pairs_within(
     world.measure_remaining(pairs, lows, radius, distances, witnesses, per_shape)
     order = collision_library.rank(table, pairs, distances, radius, per_shape)
     ranked = collision_library.gather(table, pairs, distances, witnesses, order)
-    return DistanceResults(
-        world, *(ranked if facing is None else collision_library.extend(table, ranked, facing))
-    )
+    if facing is not None:
+        ranked = collision_library.extend(table, ranked, facing)
+    return DistanceResults(world, *ranked)
 
 
 def find_first_contact(world: CollisionWorld, margin: float) -> DistanceResult | None:
@@ -89,9 +86,8 @@ def find_first_contact(world: CollisionWorld, margin: float) -> DistanceResult |
         if math.isnan(distances[k]):
             world.measure_remaining(pairs[only], np.zeros(1), margin, distances[only], witnesses[only])
         if distances[k] <= margin:
-            return _make_results(
-                world, pairs[only], distances[only], witnesses[only], np.zeros(1, dtype=np.int64)
-            )[0]
+            found = collision_library.gather(world.table, pairs, distances, witnesses, np.array([k]))
+            return DistanceResults(world, *found)[0]
     return None
 
 
@@ -118,19 +114,107 @@ def _nearest_pairs(world: CollisionWorld, pairs: Indices, lows: Floats, radius: 
     """Measure pairs of objects, and return the nearest of each pair of bodies within a radius [m]."""
     distances, witnesses = world.measure(pairs, lows, radius)
     order = collision_library.rank(world.table, pairs, distances, radius)
-    return _make_results(world, pairs, distances, witnesses, order)
-
-
-def _make_results(
-    world: CollisionWorld, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
-) -> DistanceResults:
     return DistanceResults(world, *collision_library.gather(world.table, pairs, distances, witnesses, order))
 
 
-def check_radius(radius: float) -> None:
-    """Raise InvalidValueError for a radius that is negative or NaN."""
+def check_radius(radius: float) -> float:
+    """Return a radius; raise InvalidValueError if it is negative or NaN."""
     if not radius >= 0.0:
         raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
+    return radius
+
+
+_ROOM = 64  # number of samples whose poses are kept at a time
+
+
+class SampledMotion:
+    """Motion of the objects that some coordinates move, at the present version of a model."""
+
+    def __init__(self, world: CollisionWorld, selected: Flags, coordinates: Sequence[Symbol]) -> None:
+        self._world, self.coordinates, self.version = world, tuple(coordinates), world.model.version
+        self._selected = np.ascontiguousarray(selected, dtype=np.uint8)
+        wanted, moves = {*coordinates}, np.zeros(world.table.count, dtype=bool)
+        for k, item in enumerate(world.objects[: world.table.moving]):
+            moves[k] = not wanted.isdisjoint(item.body_pose.symbols)
+        involved = np.asarray(self._selected.any(axis=1))[world.table.body]
+        self._moving, self._standing = (
+            np.flatnonzero(flags & involved).astype(np.int32) for flags in (moves, ~moves)
+        )
+        moved_bodies = np.zeros(len(self._selected), dtype=bool)
+        moved_bodies[world.table.body[self._moving]] = True
+        self._has_still_pairs = bool(self._selected[np.ix_(~moved_bodies, ~moved_bodies)].any())
+        place = {s: k for k, s in enumerate(world.inputs)}
+        self._columns = np.array([place.get(s, -1) for s in coordinates], dtype=np.int64)
+        self._moved = self._columns >= 0
+        moved, still = len(self._moving), len(self._standing)
+        self._placed, self._boxes = np.empty((moved, _ROOM, 22)), np.empty((7, still))
+        self._inputs, self._outputs = np.zeros(len(world.inputs)), np.empty((world.table.moving, 12))
+        arrays = self._moving, self._standing, self._selected, self._placed, self._boxes
+        more = self._inputs, self._outputs, self._columns
+        self.struct = MotionStruct(
+            moved, still, _ROOM, *(a.ctypes.data for a in arrays), None, *(a.ctypes.data for a in more)
+        )
+        self.struct.coordinates = len(self._columns)
+
+    def find_rows(self, Q: Floats, limit: float, first: bool) -> Iterator[int]:
+        """Place the world at configurations (N, n) one after the other, and yield their indices.
+
+        Those configurations are passed over at which C finds no pair within the limit [m]. If not ``first``,
+        it passes over configurations with near pairs as well, and shrinks ``limit`` and ``least``. The world
+        is placed where it was before when all configurations are done.
+        """
+        world, s = self._world, self.struct
+        s.limit, s.least, s.first = limit, np.inf, first
+        before = world.values
+        values, away = before.copy(), False
+        for k in self._pass_over(Q, before):
+            values[self._columns[self._moved]] = Q[k, self._moved]
+            world.update(values)
+            away = True
+            yield k
+        if away:
+            world.update(before)
+
+    def _pass_over(self, Q: Floats, before: Floats) -> Iterator[int]:
+        """Yield the indices of the configurations that C does not pass over."""
+        code, table = collision_library.code, self._world.table
+        if code is None:
+            yield from range(len(Q))
+            return
+        address, motion = collision_library.bind(table), ctypes.addressof(self.struct)
+        # Pairs that stand still are as near as at the first one everywhere.
+        begin = 0
+        if self._has_still_pairs and len(Q):
+            yield 0
+            begin = 1
+        while begin < len(Q) and self.struct.moved:
+            rows = np.ascontiguousarray(Q[begin : begin + _ROOM])
+            count = code.settle(address, motion, self._trace(rows, before))
+            if not count:
+                yield begin  # the poses are not finite, and an update says so
+                count = 1
+            k = -1
+            while (k := code.advance(address, motion, k + 1, count)) >= 0:
+                yield begin + k
+            begin += count
+
+    def _trace(self, rows: Floats, before: Floats) -> int:
+        """Compute the poses at some configurations, and return the number of those that have any."""
+        self._inputs[:] = before
+        address = self._world.kinematics_address
+        if address is not None:
+            self.struct.compute = address
+            return int(
+                collision_library.code.trace(ctypes.addressof(self.struct), rows.ctypes.data, len(rows))
+            )
+        for k, row in enumerate(rows):
+            self._inputs[self._columns[self._moved]] = row[self._moved]
+            try:
+                poses = self._world.compute_poses(self._inputs)
+            except KineverseError:
+                return k
+            self._placed[:, k, :12] = poses[self._moving].reshape(-1, 12)
+        return len(rows)
 
 
 PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags  # flags (B, B) of pairs of bodies, symmetric
@@ -155,9 +239,8 @@ class PreparedQuery:
     def __init__(
         self, world: CollisionWorld, choose: Callable[[], PairFlags], radius: float, per_shape: bool = False
     ) -> None:
-        check_radius(radius)
         self._world, self._choose, self._lock = world, choose, world.lock
-        self.radius, self.per_shape = float(radius), per_shape
+        self.radius, self.per_shape = float(check_radius(radius)), per_shape
         self._version: int | None = None
         self._flags: Flags = np.zeros((0, 0), dtype=np.uint8)
         self._selection: PairSelection | None = None
@@ -189,8 +272,7 @@ class PreparedQuery:
         UnknownNameError, ShapeError, InvalidValueError
             As :meth:`.Scene.update`.
         """
-        within = self.radius if radius is None else radius
-        check_radius(within)
+        within = check_radius(self.radius if radius is None else radius)
         with self._lock:
             result = self._world.search_at(values, within, self._select(), self.per_shape, facing)
             if result is not None:
@@ -225,8 +307,7 @@ class PreparedQuery:
         InvalidValueError
             If the radius is negative or NaN, or a pose is not finite.
         """
-        within = self.radius if radius is None else radius
-        check_radius(within)
+        within = check_radius(self.radius if radius is None else radius)
         for k in self._move(coordinates).find_rows(_as_rows(Q, len(coordinates)), within, first=True):
             if len(self(within)):
                 return k
@@ -240,8 +321,7 @@ class PreparedQuery:
 
         Parameters and errors are those of :meth:`first_within`. The scene stays where it is.
         """
-        within = self.radius if radius is None else radius
-        check_radius(within)
+        within = check_radius(self.radius if radius is None else radius)
         motion = self._move(coordinates)
         result = motion.struct
         for _ in motion.find_rows(_as_rows(Q, len(coordinates)), within, first=False):
@@ -268,8 +348,7 @@ class PreparedQuery:
         world = self._world
         if self._selection is None or self._version != world.model.version:
             flags = self._selected()
-            involved = np.asarray(flags.any(axis=1))
-            world.load(np.flatnonzero(involved[world.table.body]).tolist())
+            world.load(np.flatnonzero(np.asarray(flags.any(axis=1))[world.table.body]).tolist())
             world.table.choose_axis()
             self._selection = PairSelection(world.table, flags)
         return self._selection
@@ -310,12 +389,17 @@ def _as_rows(Q: npt.ArrayLike, columns: int) -> Floats:
 
 def flag_pair(world: CollisionWorld, a: str, b: str) -> Flags:
     """Return (B, B) flags of one pair of bodies."""
-    one, other = world.body_index(a), world.body_index(b)
-    if one == other:
-        raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
+    one, other = _two_bodies(world, a, b)
     flags = np.zeros_like(world.table.allowed)
     flags[one, other] = flags[other, one] = 1
     return flags
+
+
+def _two_bodies(world: CollisionWorld, a: str, b: str) -> tuple[int, int]:
+    one, other = world.body_index(a), world.body_index(b)
+    if one == other:
+        raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
+    return one, other
 
 
 def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:
@@ -342,10 +426,8 @@ def flag_subtree(model: ModelView, bodies: Sequence[str], frame: str) -> npt.NDA
     frames = model.frames
     if frame != WORLD and frame not in frames:
         raise UnknownNameError(f"There is no frame '{frame}'. {suggest(frame, frames, 'frame')}")
-    lookup = frames.__getitem__
-    return np.array(
-        [frame in (WORLD, body) or frame in ancestors(body, lookup) for body in bodies], dtype=bool
-    )
+    lookup, always = frames.__getitem__, frame == WORLD
+    return np.array([always or frame == b or frame in ancestors(b, lookup) for b in bodies], dtype=bool)
 
 
 def flag_relatively_moving(

@@ -26,12 +26,11 @@ def directional_gaps(a: PlacedSolid, b: PlacedSolid, directions: Floats) -> Floa
     If a gap is negative, a translation of the second solid by that length along the direction separates them.
     """
     (solid_a, rotation_a, position_a), (solid_b, rotation_b, position_b) = a, b
-    apart: Floats = (
+    return np.asarray(
         directions @ (position_b - position_a)
-        - _support_values(solid_a, directions @ rotation_a)
-        - _support_values(solid_b, -directions @ rotation_b)
+        - support_values(solid_a, directions @ rotation_a)
+        - support_values(solid_b, -directions @ rotation_b)
     )
-    return apart
 
 
 def find_widest_gap(a: PlacedSolid, b: PlacedSolid, directions: Floats) -> tuple[float, Floats]:
@@ -56,10 +55,9 @@ def smoothed_support(placed: PlacedSolid, direction: Floats) -> Floats:
     solid, rotation, position = placed
     step = 1e-6
     # The gradient of the support function is the support point; at an edge or a face, a mean of several.
-    ends = direction + step * np.concatenate([np.eye(3), -np.eye(3)])
-    values = _support_values(solid, ends @ rotation)
+    values = support_values(solid, (direction + step * np.concatenate([np.eye(3), -np.eye(3)])) @ rotation)
     point = (values[:3] - values[3:]) / (2 * step)
-    missing = float(_support_values(solid, (direction @ rotation)[None])[0] - direction @ point)
+    missing = float(support_values(solid, (direction @ rotation)[None])[0] - direction @ point)
     return np.asarray(position + point + missing * direction)
 
 
@@ -95,7 +93,7 @@ def _ascend(a: PlacedSolid, b: PlacedSolid, direction: Floats, gap: float) -> tu
     return gap, direction
 
 
-def _support_values(solid: Solid, directions: Floats) -> Floats:
+def support_values(solid: Solid, directions: Floats) -> Floats:
     """Return the support function of a solid, max ``direction @ x``, for (n, 3) directions in its frame."""
     core = solid.core
     assert core is not None

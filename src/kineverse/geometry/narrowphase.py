@@ -107,11 +107,8 @@ class Narrowphase:
         if not (a.is_convex and b.is_convex):
             return self._measure_touching_triangles(i, j, functor)
         for request in (*self._coarser, None):
-            if (
-                -1e300 < distance < -_TOUCH
-                and self._is_unit_normal()
-                and self._normal_confirms(i, j, distance)
-            ):
+            is_deep = -1e300 < distance < -_TOUCH and self._is_unit_normal()
+            if is_deep and self._normal_confirms(i, j, distance):
                 return distance
             if request is None or abs(distance) <= _TOUCH:
                 break
@@ -149,11 +146,8 @@ class Narrowphase:
         factor = _enlargement(a, b)
         if factor > 1.0:
             poses = np.tile(np.eye(4)[:3], (2, 1, 1))
-            self._enlarged[i, j] = (
-                factor,
-                poses,
-                Narrowphase([scale_solid(a, factor), scale_solid(b, factor)], poses),
-            )
+            solids = [scale_solid(a, factor), scale_solid(b, factor)]
+            self._enlarged[i, j] = factor, poses, Narrowphase(solids, poses)
         return functor
 
     def _measure_enlarged(self, i: int, j: int) -> float:
@@ -218,8 +212,7 @@ class Narrowphase:
 
     def _remeasure(self, i: int, j: int, functor: Any) -> float:
         self._result.clear()
-        distance: float = functor(self._transforms[i], self._transforms[j], self._coarsest, self._result)
-        return distance
+        return float(functor(self._transforms[i], self._transforms[j], self._coarsest, self._result))
 
     def _solve_triangles(self, i: int, j: int) -> float | None:
         """Measure a convex solid and triangles by GJK, without coal; None if they touch."""
@@ -243,7 +236,10 @@ class Narrowphase:
         """
         pose_a, result = self._transforms[i], self._result
         rotation, position = self._pose_views[j]
-        for shift in self._shifts(i, j):
+        far = min(_SHIFT, _SHIFT_OF_RADIUS * min(solid.radius for solid in self._pair(i, j)))
+        start, end = self._centres(i, j)
+        # A translation along the line between two inner points separates touching convex solids.
+        for shift in (far * _unit(end - start), *(far * np.eye(3))):
             shifted = self._coal.Transform3s(rotation, position + shift)
             for request in (self._request, *self._coarser):
                 result.clear()
@@ -274,12 +270,6 @@ class Narrowphase:
     def _placed_solids(self, i: int, j: int) -> tuple[PlacedSolid, PlacedSolid]:
         a, b = self._pair(i, j)
         return (a, *self._pose_views[i]), (b, *self._pose_views[j])
-
-    def _shifts(self, i: int, j: int) -> list[Floats]:
-        far = min(_SHIFT, _SHIFT_OF_RADIUS * min(solid.radius for solid in self._pair(i, j)))
-        start, end = self._centres(i, j)
-        # A translation along the line between two inner points separates touching convex solids.
-        return [far * _unit(end - start), *(far * np.eye(3))]
 
     def _centres(self, i: int, j: int) -> tuple[Floats, Floats]:
         a, b = self._pair(i, j)
@@ -316,9 +306,8 @@ class Narrowphase:
 
 def distance_to_point(solid: Solid, pose: Floats, point: Floats) -> tuple[float, Floats, Floats]:
     """Return signed distance of a point from a placed solid [m], its nearest point, and the normal there."""
-    ball = solid_from_geometry(Sphere(_POINT_RADIUS))
     # The radius of the solid bounds the translations of _measure_shifted, not that of the ball.
-    point_ball = replace(ball, radius=solid.radius)
+    point_ball = replace(solid_from_geometry(Sphere(_POINT_RADIUS)), radius=solid.radius)
     narrow = Narrowphase([solid, point_ball], np.stack([pose, np.column_stack([np.eye(3), point])]))
     distance = narrow.distance(0, 1) + _POINT_RADIUS
     nearest, _, normal = narrow.witness()

@@ -94,11 +94,9 @@ def _ball_interval(origin: Floats, direction: Floats, radius: float) -> tuple[fl
 
 
 def _intersect_capsule(shape: Capsule, origin: Floats, direction: Floats) -> RayEntry | None:
-    half = np.array([0.0, 0.0, shape.length / 2])
+    half, radii = np.array([0.0, 0.0, shape.length / 2]), np.full(3, shape.radius)
     result = [_intersect_cylinder_or_cone(Cylinder(shape.radius, shape.length), origin, direction)]
-    result += [
-        _intersect_ellipsoid(np.full(3, shape.radius), origin + end, direction) for end in (half, -half)
-    ]
+    result += [_intersect_ellipsoid(radii, origin + end, direction) for end in (half, -half)]
     hits = [hit for hit in result if hit is not None]
     # A ray that starts inside of any of the three starts inside of the capsule.
     return min(hits, key=lambda hit: hit[0]) if hits else None
@@ -223,8 +221,7 @@ def find_nearest_point(world: CollisionWorld, point: npt.ArrayLike, radius: floa
     table = world.table
     to_point = location - table.position
     lows = np.linalg.norm(to_point, axis=1) - table.radius
-    inside = np.einsum("kji,kj->ki", table.poses[:, :, :3], to_point)
-    outside = np.maximum(np.abs(inside) - table.half, 0.0)
+    outside = np.maximum(np.abs(np.einsum("kji,kj->ki", table.poses[:, :, :3], to_point)) - table.half, 0.0)
     lows = np.maximum(lows, np.where(outside.any(axis=1), np.linalg.norm(outside, axis=1), -math.inf))
     best: NearestPoint | None = None
     for k in np.argsort(lows, kind="stable").tolist():

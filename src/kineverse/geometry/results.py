@@ -119,13 +119,15 @@ class DistanceResults(Sequence[DistanceResult]):
         (K, 9) points of both bodies and normals side by side.
     body_indices
         (K, 2) indices of both bodies in the scene's ``bodies`` at the time of the query.
+    object_indices
+        (K, 2) indices of both collision objects in the scene: shapes, or hulls of decomposed meshes.
     """
 
     def __init__(
         self, world: CollisionWorld, objects: Indices, bodies: Indices, distances: Floats, witnesses: Floats
     ) -> None:
         self._bodies, self._shape_numbers = world.bodies, world.shape_numbers
-        self._object_indices, self.body_indices = objects, bodies
+        self.object_indices, self.body_indices = objects, bodies
         self.distances, self.witnesses = distances, witnesses
 
     @property
@@ -142,11 +144,6 @@ class DistanceResults(Sequence[DistanceResult]):
     def normals(self) -> Floats:
         """Unit vectors (K, 3) from the first bodies to the second ones."""
         return self.witnesses[:, 6:]
-
-    @property
-    def object_indices(self) -> Indices:
-        """Indices (K, 2) of both collision objects in the scene: shapes, or hulls of decomposed meshes."""
-        return self._object_indices
 
     @property
     def shape_indices(self) -> Indices:

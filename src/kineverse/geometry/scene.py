@@ -34,7 +34,7 @@ from .mesh_files import Floats
 from .objects import Exclusion
 from .results import DistanceResult, DistanceResults, NearestPoint, RayHit
 
-_MAX_QUERIES, _MAX_PAIR_QUERIES, _SAMPLES = 32, 256, 200
+_MAX_QUERIES, _SAMPLES = 256, 200
 
 
 class Scene:
@@ -82,7 +82,6 @@ class Scene:
         self._world = CollisionWorld(model, rules, triangles, decomposed, leave_out)
         self._lock = self._world.lock
         self._parameters: dict[tuple[str, str], DistanceParameters] = {}
-        self._pair_queries: dict[tuple[str, str], PreparedQuery] = {}
         self._queries: dict[tuple[Any, ...], PreparedQuery] = {}
 
     @property
@@ -164,7 +163,8 @@ class Scene:
         """Return the pairs within a radius [m] between the subtrees of two frames, nearest first."""
 
         def choose() -> PairFlags:
-            return flag_between(*(flag_subtree(self.model, self.bodies, frame) for frame in (one, other)))
+            subtrees = (flag_subtree(self.model, self.bodies, frame) for frame in (one, other))
+            return self._world.table.allowed * flag_between(*subtrees)
 
         return self._query_pairs(("between", one, other), choose)(radius)
 
@@ -242,13 +242,7 @@ class Scene:
 
     @one_at_a_time
     def _with_poses(self, a: str, b: str) -> tuple[DistanceResult, Floats, Floats]:
-        if (a, b) not in self._pair_queries:
-            if len(self._pair_queries) >= _MAX_PAIR_QUERIES:
-                self._pair_queries.clear()
-            self._pair_queries[a, b] = PreparedQuery(
-                self._world, lambda: flag_pair(self._world, a, b), math.inf
-            )
-        (closest,) = self._pair_queries[a, b]()
+        (closest,) = self._query_pairs(("pair", a, b), lambda: flag_pair(self._world, a, b))()
         return closest if closest.a == a else closest.swap(), self.pose(a), self.pose(b)
 
     @one_at_a_time
@@ -392,18 +386,16 @@ class Scene:
         moving = _as_list(symbols)
 
         def choose() -> PairFlags:
-            return flag_relatively_moving(self.model, self.bodies, moving)
+            return self._world.table.allowed * flag_relatively_moving(self.model, self.bodies, moving)
 
         return self._query_pairs(("moved by", *moving), choose)(radius)
 
     def _query_pairs(self, key: tuple[Any, ...], choose: Callable[[], PairFlags]) -> PreparedQuery:
-        """Return the query about the checked pairs that are chosen, made once for a key."""
+        """Return the query about the pairs that are chosen, made once for a key."""
         if key not in self._queries:
             if len(self._queries) >= _MAX_QUERIES:
                 self._queries.clear()
-            self._queries[key] = PreparedQuery(
-                self._world, lambda: self._world.table.allowed * choose(), math.inf
-            )
+            self._queries[key] = PreparedQuery(self._world, choose, math.inf)
         return self._queries[key]
 
     def __repr__(self) -> str:

@@ -36,6 +36,7 @@ _MESH_HULLS = ContentCache(
 )
 _WHOLE_FILES = (".stl", ".obj", ".dae", ".ply", ".off")  # suffixes of files without further files
 _HULL_VERSION = 1  # raise the number when the hulls of equal meshes change
+_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)  # steps of the sequence R3 (Roberts 2018)
 
 
 def convex_hull(points: Floats) -> Any:
@@ -280,8 +281,7 @@ def _drop_degenerate(vertices: Floats, faces: Integers) -> Integers:
     has_area = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14 * longest
     if not has_area.any():
         raise InvalidValueError("all its triangles are lines or points, so that there is nothing to touch.")
-    kept: Integers = faces[has_area]
-    return kept
+    return np.asarray(faces[has_area])
 
 
 def _solid_around(
@@ -373,3 +373,20 @@ def hull_faces(convex: Any) -> Faces:
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), np.array(convex.normals())) < 0.0
     faces[inward] = faces[inward][:, ::-1]
     return Faces(vertices, faces)
+
+
+def enclosed_volume(vertices: Floats, faces: Integers) -> float:
+    """Return the volume that triangles enclose, positive if they are counter-clockwise from outside [m³]."""
+    a, b, c = (vertices[faces[:, k]] - vertices[faces[0, 0]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def sample_inside(corners: Floats, faces: Integers, middle: Floats, count: int) -> Floats:
+    """Return evenly spread points (n, 3) of the tetrahedra between triangles (F, 3) and a point [m]."""
+    edges = corners[faces] - middle
+    shares = np.cumsum(np.abs(np.linalg.det(edges)))
+    places = (np.arange(count) + 0.5) / count
+    chosen = edges[np.minimum(np.searchsorted(shares / shares[-1], places), len(edges) - 1)]
+    # Weights of the corners of each tetrahedron, from a sequence that fills the cube.
+    weights = np.diff(np.sort(np.arange(count)[:, None] * _SEQUENCE % 1.0, axis=1), axis=1, prepend=0.0)
+    return np.asarray(middle + np.einsum("nk,nkj->nj", weights, chosen))

@@ -95,8 +95,7 @@ class CollisionChecker:
         # Loops that do not close have no pose: the sum of all entries is NaN then, and so is no condition.
         if any(e.nodes for e in outputs):
             outputs.append(as_expression(sum((p.sum() for p in poses), as_expression(0.0)) * 0.0))
-        moving = {*self.coordinates}
-        result = {s for e in outputs for s in e.symbols} - moving
+        result = {s for e in outputs for s in e.symbols} - {*self.coordinates}
         self.parameters = tuple(sorted(result, key=lambda s: s.sort_key))
         self.conditions = len(outputs) - len(poses)
         return VectorProgram(outputs, self.coordinates, self.parameters, scalar="float")
@@ -110,11 +109,9 @@ class CollisionChecker:
 
     def _place_static(self, dependence: FrameDependence) -> None:
         world = self.scene.collision_world
-        self._static = np.array(
-            [k for k, o in enumerate(world.objects) if not dependence.moves(o.body)], dtype=int
-        )
-        owners = world.table.body[self._static]
-        used, numbers = np.unique(owners, return_inverse=True)
+        static = [k for k, item in enumerate(world.objects) if not dependence.moves(item.body)]
+        self._static = np.array(static, dtype=int)
+        used, numbers = np.unique(world.table.body[self._static], return_inverse=True)
         self.standing = tuple(world.bodies[k] for k in used)
         moving = np.array([world.body_index(body) for body in self.moving], dtype=int)
         self._allowed = np.ascontiguousarray(world.table.allowed[np.ix_(moving, used)], dtype=np.uint8)
@@ -129,16 +126,13 @@ class CollisionChecker:
     ) -> None:
         lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
-        self._costs = []
         table = self.scene.collision_world.table
         numbers = [self.scene.collision_world.body_index(body) for body in self.moving]
         self._carried = np.flatnonzero(np.isin(table.body, numbers))
         for k, items in enumerate(members):
             solids = [solid for _, solid, _ in items]
             bodies, places = np.zeros(len(solids), dtype=np.int32), np.array([T[:3] for _, _, T in items])
-            result = ObstacleSet(solids, bodies, places, self._planes, lanes, poses[k], k)
-            self._sets.append(result)
-            self._costs.append(result.cost)
+            self._sets.append(ObstacleSet(solids, bodies, places, self._planes, lanes, poses[k], k))
 
     def _choose_pairs(self, dependence: FrameDependence) -> None:
         """Choose for each pair of moving bodies whether shapes or spheres represent the second one.
@@ -147,19 +141,15 @@ class CollisionChecker:
         """
         world = self.scene.collision_world
         number = [world.body_index(body) for body in self.moving]
-        spheres = [len(s) for s in self.links.spheres]
+        spheres, shapes = [len(s) for s in self.links.spheres], [s.cost for s in self._sets]
         pairs: list[tuple[int, int]] = []
         moving_pairs: list[tuple[int, int]] = []
         for (i, a), (j, b) in combinations(enumerate(self.moving), 2):
             if not world.table.allowed[number[i], number[j]] or not dependence.moves_between(a, b):
                 continue
             # Shapes stick out less, but spheres have a hierarchy.
-            costs = {
-                0: spheres[i] * spheres[j] / 2,
-                1: spheres[i] * self._costs[j],
-                2: spheres[j] * self._costs[i],
-            }
-            choice = min(costs, key=lambda k: costs[k])
+            costs = spheres[i] * spheres[j] / 2, spheres[i] * shapes[j], spheres[j] * shapes[i]
+            choice = costs.index(min(costs))
             (moving_pairs if choice else pairs).append((j, i) if choice == 2 else (i, j))
         self.pairs = np.array(pairs, dtype=np.int32).reshape(-1, 2)
         self.moving_pairs = np.array(moving_pairs, dtype=np.int32).reshape(-1, 2)
@@ -273,14 +263,10 @@ class CollisionChecker:
         self._code.kineverse_valid(self.address, Q.ctypes.data, len(Q), result.ctypes.data)
         return result.astype(bool)
 
-    def edges(
-        self, A: Floats32, B: Floats32, resolution: float = RESOLUTION, least: float = 0.0
-    ) -> npt.NDArray[np.bool_]:
+    def edges(self, A: Floats32, B: Floats32, least: float = 0.0) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of the straight edges between configurations (N, n) that are free."""
-        result = np.zeros(len(A), dtype=np.uint8)
-        self._code.kineverse_edges(
-            self.address, A.ctypes.data, B.ctypes.data, len(A), resolution, least, result.ctypes.data
-        )
+        result, ends = np.zeros(len(A), dtype=np.uint8), (A.ctypes.data, B.ctypes.data, len(A))
+        self._code.kineverse_edges(self.address, *ends, RESOLUTION, least, result.ctypes.data)
         return result.astype(bool)
 
     def find_collision(self, points: Floats32, seconds: float = math.inf) -> tuple[int, float] | None:

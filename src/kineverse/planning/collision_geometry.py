@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation.batch import allocate_aligned
+from kineverse.geometry.gjk import support_values
 from kineverse.geometry.objects import CollisionObject
-from kineverse.geometry.shapes import Core, Hull, Solid
+from kineverse.geometry.shapes import Hull, Solid
 from kineverse.lie import Array
 from kineverse.model.body import Box, Capsule, Cylinder, Sphere
 
@@ -35,8 +36,7 @@ class LinkTable:
         self.spheres: list[Array] = []
         count = 0
         self.shapes = np.zeros(sum(map(len, members)), dtype=SHAPE)
-        placed = [T[:3] for items in members for _, _, T in items]
-        self.shapes["pose"] = np.reshape(placed, (-1, 12))
+        self.shapes["pose"] = np.reshape([T[:3] for items in members for _, _, T in items], (-1, 12))
         shapes = 0
         for k, (items, pose) in enumerate(zip(members, poses, strict=True)):
             link = self.links[k]
@@ -157,8 +157,7 @@ class ObstacleSet:
         round_ = (slack <= _ALIGNED) & np.isin(items["kind"], (CYLINDER, CAPSULE))
         items["aligned"] = boxes | round_
         items["rotation"], items["translation"] = rotation.reshape(-1, 9), translation
-        grown = self._sizes[moved] + (slack * round_)[:, None]
-        items["size"] = np.where(boxes[:, None], extent, grown)
+        items["size"] = np.where(boxes[:, None], extent, self._sizes[moved] + (slack * round_)[:, None])
         self._items[moved] = items
         # The largest rounding of float at these places.
         extent += 1e-6 * (1.0 + np.abs(centre) + extent)
@@ -183,29 +182,12 @@ def _hull_planes(solid: Solid) -> Array:
     if isinstance(surface, Hull):
         rows = np.column_stack([surface.normals, surface.offsets])
     else:
-        assert solid.core is not None
-        normals = _directions()
-        rows = np.column_stack([normals, _support(solid.core, normals)])
+        # Unit vectors towards the faces, edges and corners of a cube.
+        grid = np.array([v for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v)])
+        normals = grid / np.linalg.norm(grid, axis=1)[:, None]
+        rows = np.column_stack([normals, support_values(solid, normals)])
     _, first, count = np.unique(np.round(rows, _SAME_PLANE), axis=0, return_index=True, return_counts=True)
     return np.asarray(rows[first[np.argsort(-count, kind="stable")]])
-
-
-def _directions() -> Array:
-    """Return 26 unit vectors: towards the faces, edges and corners of a cube."""
-    grid = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z])
-    return np.asarray(grid / np.linalg.norm(grid, axis=1)[:, None])
-
-
-def _support(core: Core, normals: Array) -> Array:
-    """Return the largest n·x over a core, for each of (N, 3) normals."""
-    if core.corners.shape[1]:
-        return np.asarray((normals @ core.corners).max(axis=1))
-    if core.tip:
-        base = np.linalg.norm(normals[:, :2], axis=1) * core.radii[0] - normals[:, 2] * core.tip
-        return np.asarray(np.maximum(base, normals[:, 2] * core.tip))
-    return np.asarray(
-        np.abs(normals) @ core.half + np.linalg.norm(normals * core.radii, axis=1) + core.radius
-    )
 
 
 def _spatial_order(points: Array, size: int) -> npt.NDArray[np.intp]:

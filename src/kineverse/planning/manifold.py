@@ -64,8 +64,7 @@ def hold_frames(
     if len(turns) == 2:
         # The free axis of a points where that of b does: no singularity at half a turn about it.
         (axis,) = {0, 1, 2}.difference(turns)
-        direction = np.eye(3)[axis]
-        turn = look_at(np.eye(4), held_T_a[:3, axis], direction)
+        turn = look_at(np.eye(4), held_T_a[:3, axis], np.eye(3)[axis])
         parts += [turn[i] for i in turns]
     elif turns:
         vector = log_so3(held_T_a[:3, :3])

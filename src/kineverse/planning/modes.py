@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -52,9 +53,8 @@ class Mode:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise InvalidValueError(f"The name of a mode is a text, not {self.name!r:.80}.")
-        holds = as_entries("along=", self.along, Hold, "holds, one or several")
         moves = as_entries("moves=", self.moves, (str, Symbol), "coordinates, as symbols or names")
-        object.__setattr__(self, "along", holds)
+        object.__setattr__(self, "along", as_entries("along=", self.along, Hold, "holds, one or several"))
         object.__setattr__(self, "moves", moves)
 
 
@@ -123,9 +123,8 @@ class ModeSearch:
                 "to move=."
             )
         self._objects = np.array([s in objects for s in scene.space.symbols], dtype=bool)
-        self._still = [
-            np.array([s in objects - movable for s in scene.space.symbols], dtype=bool) for movable in moved
-        ]
+        still = [objects - movable for movable in moved]
+        self._still = [np.array([s in each for s in scene.space.symbols], dtype=bool) for each in still]
         self._touching = [scene.touching_pairs(mode.along) for mode in self._modes]
         self._searches = 0
         self._generator = np.random.default_rng(seed)
@@ -135,9 +134,8 @@ class ModeSearch:
         self._end = working_seconds() + self._seconds
         first = self._find_mode(q)
         if first is None:
-            return ModePath(
-                [], 0, f"The start is in none of the modes {', '.join(m.name for m in self._modes)}."
-            )
+            names = ", ".join(mode.name for mode in self._modes)
+            return ModePath([], 0, f"The start is in none of the modes {names}.")
         nodes = [_Node(first, q, None, q[None])]
         seen = {self._signature(nodes[0])}
         self._round, k, tried = 0, 0, 0
@@ -182,11 +180,9 @@ class ModeSearch:
         return self._end - working_seconds()
 
     def _find_mode(self, q: Array) -> int | None:
-        for k, mode in enumerate(self._modes):
-            manifold = self._scene.manifold(mode.along)
-            if manifold is None or float(manifold.residuals(q[None])[0]) < 1e-2:
-                return k
-        return None
+        manifolds = (self._scene.manifold(mode.along) for mode in self._modes)
+        met = (m is None or float(m.residuals(q[None])[0]) < 1e-2 for m in manifolds)
+        return next(itertools.compress(itertools.count(), met), None)
 
     def _signature(self, node: _Node) -> tuple[object, ...]:
         """Return the mode of a node and the rounded places of the objects, by which nodes are told apart."""
@@ -206,10 +202,8 @@ class ModeSearch:
         if not moving.any():
             return [node.q]
         lower, upper = self._scene.space.bounds(node.q, node.q[None])
-        if self._round:
-            shares = [self._generator.random(len(node.q))]
-        else:
-            shares = [np.ones(len(node.q)), np.zeros(len(node.q))]
+        count = len(node.q)
+        shares = [self._generator.random(count)] if self._round else [np.ones(count), np.zeros(count)]
         return [np.where(moving, lower + share * (upper - lower), node.q) for share in shares]
 
     def _change(self, node: _Node, other: int, values: Array) -> _Node | None:
@@ -219,11 +213,9 @@ class ModeSearch:
         touching = self._touching_around(node) | self._touching[other]
         ends = self._solve(holds, values, touching, self._objects) if holds else values[None]
         points = self._connect(node, ends, touching)
-        return (
-            None
-            if points is None
-            else _Node(other, np.asarray(points[-1]), node, points, touching, node.depth + 1)
-        )
+        if points is None:
+            return None
+        return _Node(other, np.asarray(points[-1]), node, points, touching, node.depth + 1)
 
     def _touching_around(self, node: _Node) -> BodyPairs:
         """Return the pairs that may touch in a node's mode, and where it was entered."""
@@ -234,8 +226,7 @@ class ModeSearch:
         still, mode = self._still[node.mode], self._modes[node.mode]
         touching = self._touching_around(node) | self._scene.touching_pairs(self._tasks)
         if self._ends is not None:
-            same = np.abs(self._ends - node.q)[:, still].max(axis=1, initial=0.0) < _SAME
-            ends = self._ends[same].copy()
+            ends = self._ends[np.abs(self._ends - node.q)[:, still].max(axis=1, initial=0.0) < _SAME].copy()
             ends[:, still] = node.q[still]
         elif self._concerns_still(node):
             return None
@@ -246,12 +237,9 @@ class ModeSearch:
 
     def _concerns_still(self, node: _Node) -> bool:
         """Return True if a task is about objects that do not move in the mode, and is not met."""
-        moving = {
-            s for s, still in zip(self._scene.space.symbols, self._still[node.mode], strict=True) if not still
-        }
+        moving = set(itertools.compress(self._scene.space.symbols, ~self._still[node.mode]))
         for task in self._tasks:
-            resolved = self._scene.model.rates.resolve(task.expression)
-            if moving.isdisjoint(resolved.symbols):
+            if moving.isdisjoint(self._scene.model.rates.resolve(task.expression).symbols):
                 manifold = self._scene.manifold([task])
                 if manifold is not None and float(manifold.residuals(node.q[None])[0]) > _SAME:
                     return True

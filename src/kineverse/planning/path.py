@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .path_rounding import PathSection, TimedSection, join_sections, parameterize_sections, section_times
-from .state_validity import PathChecks
+from .path_rounding import PathSection, TimedSection, parameterize_sections, section_times
+from .state_validity import PathChecks, lengths_along
 from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.kinematic_limits import RAMP
 
@@ -83,10 +83,6 @@ class Path:
         InvalidValueError
             If the model has been edited since the path was planned, or the path was pickled.
         """
-        return self._clearance
-
-    @cached_property
-    def _clearance(self) -> float:
         return self._own_checks().clearance(self.points)
 
     def trajectory(
@@ -119,9 +115,10 @@ class Path:
         InvalidValueError
             If the path was not found, or the model has been edited since; as :func:`.time_parameterize`.
         """
-        return join_sections(self._parameterize(deviation, ramp, velocity, acceleration))
+        parts = self._parameterize(deviation, ramp, velocity, acceleration)
+        return reduce(Trajectory.then, [trajectory for _, _, trajectory in parts])
 
-    @property
+    @cached_property
     def times(self) -> Array:
         """Times (N,) at which :meth:`trajectory` passes the points, or is nearest to them [s].
 
@@ -130,10 +127,6 @@ class Path:
         InvalidValueError
             As :meth:`trajectory`.
         """
-        return self._times
-
-    @cached_property
-    def _times(self) -> Array:
         result = section_times(self.points, self._parameterize(DEVIATION, RAMP, None, None))
         result.flags.writeable = False
         return result
@@ -149,17 +142,15 @@ class Path:
             raise InvalidValueError(f"There is no path to move along. {self.why}")
         checks = self._own_checks()
         checks.ensure_current()
-        stated = motion_limits(checks.model, self.symbols, ramp=ramp, state=self.state)
-        chosen = {"velocity=": velocity, "acceleration=": acceleration}
-        limits = MotionLimits(
-            *(
-                limit if other is None else _combine_limits(limit, _as_numbers(name, other))
-                for limit, (name, other) in zip(stated, chosen.items(), strict=True)
-            )
-        )
+        limits = list(motion_limits(checks.model, self.symbols, ramp=ramp, state=self.state))
+        for k, (name, other) in enumerate((("velocity=", velocity), ("acceleration=", acceleration))):
+            if other is not None:
+                # An array replaces the limits of the model (n,), and a number bounds them.
+                chosen = _as_numbers(name, other)
+                limits[k] = chosen if chosen.ndim or not chosen > 0 else np.minimum(limits[k], chosen)
         deviation = _as_numbers("deviation=", deviation)
         sections = self.sections or (PathSection(0, len(self.points) - 1, checks),)
-        return parameterize_sections(self.points, self.symbols, limits, deviation, sections)
+        return parameterize_sections(self.points, self.symbols, MotionLimits(*limits), deviation, sections)
 
     def _own_checks(self) -> PathChecks:
         if self.checks is None:
@@ -170,7 +161,7 @@ class Path:
         return self.checks
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the checks, which belong to one process."""
+        # Checks belong to one process.
         return {**self.__dict__, "checks": None, "sections": ()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -185,7 +176,7 @@ class Path:
 
     def at(self, fraction: float) -> State:
         """Return the state at a fraction of the length, from 0 at the start to 1 at the end."""
-        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))])
+        lengths = lengths_along(self.points)
         share = finite_number(fraction)
         if share is None:
             raise InvalidValueError(f"A fraction of a path is a number from 0 to 1, not {fraction!r}.")
@@ -209,11 +200,6 @@ class Path:
         if self.found:
             return f"<Path: {len(self.points)} points, length {self.length:.3g}, {1e3 * self.seconds:.3g} ms>"
         return f"<Path: not found. {self.why}>"
-
-
-def _combine_limits(own: Array, given: Array) -> Array:
-    """Combine the limits of the model (n,) with an array that replaces them, or a number that bounds them."""
-    return given if given.ndim or not given > 0 else np.minimum(own, given)
 
 
 def _as_numbers(name: str, value: Any) -> Array:

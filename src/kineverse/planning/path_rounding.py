@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from functools import reduce
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ShapeError
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .state_validity import PathChecks
+from .state_validity import PathChecks, dense_places, lengths_along
 from .trajectories import BlendedPath, Trajectory, round_corners, time_parameterize
+from .trajectories.blends import each_deviation
 from .trajectories.kinematic_limits import MotionLimits
 
 RESIDUAL = 1e-5  # largest residual of holds on rounded corners [m], [rad]
@@ -33,12 +31,7 @@ class PathSection(NamedTuple):
     checks: PathChecks
 
 
-class TimedSection(NamedTuple):
-    """Section of a path with its rounded polyline and the motion along it."""
-
-    section: PathSection
-    path: BlendedPath
-    trajectory: Trajectory
+TimedSection: TypeAlias = tuple[PathSection, BlendedPath, Trajectory]  # with the motion along it
 
 
 def parameterize_sections(
@@ -49,25 +42,12 @@ def parameterize_sections(
     sections: Sequence[PathSection],
 ) -> list[TimedSection]:
     """Compute the motions along the sections of a path (N, n), see :func:`parameterize_path`."""
-    deviations = np.asarray(deviation, dtype=float)
-    if deviations.shape not in ((), (len(points),)):
-        raise ShapeError(
-            f"deviation= is a number or an array of one for each of the {len(points)} points, not of shape "
-            f"{deviations.shape}."
-        )
-    result = []
+    deviations, result = each_deviation(deviation, len(points)), []
     for section in sections:
         part = slice(section.first, section.last + 1)
-        allowed = deviations if deviations.ndim == 0 else deviations[part]
-        result.append(
-            TimedSection(section, *parameterize_path(points[part], symbols, limits, allowed, section.checks))
-        )
+        motion = parameterize_path(points[part], symbols, limits, deviations[part], section.checks)
+        result.append((section, *motion))
     return result
-
-
-def join_sections(sections: Sequence[TimedSection]) -> Trajectory:
-    """Join the motions along sections."""
-    return reduce(Trajectory.then, [timed.trajectory for timed in sections])
 
 
 def section_times(points: Array, sections: Sequence[TimedSection]) -> Array:
@@ -83,7 +63,7 @@ def parameterize_path(
     points: Array,
     symbols: Sequence[Symbol],
     limits: MotionLimits,
-    deviation: npt.ArrayLike,
+    deviations: Array,
     checks: PathChecks,
 ) -> tuple[BlendedPath, Trajectory]:
     """Round a path and find its fastest motion, which is certainly free wherever the path is.
@@ -91,7 +71,7 @@ def parameterize_path(
     The motion is checked, and corners are rounded less where it collides, down to a stop.
     """
     with checks.placed(points):
-        path = _round_valid(*_drop_near(points, deviation), checks)
+        path = _round_valid(*_drop_near(points, deviations), checks)
         for attempt in range(_LAST_ROUNDS):
             trajectory = time_parameterize(path, *limits, symbols)
             corner = _find_collision(path, trajectory, checks)
@@ -111,19 +91,19 @@ def parameterize_path(
 def passing_times(points: Array, path: BlendedPath, trajectory: Trajectory) -> Array:
     """Compute the times (N,) at which a motion along a rounded path is nearest to its points (N, n)."""
     times = _fine_times(trajectory)
-    travelled = _lengths(trajectory.positions_at(times))
+    travelled = lengths_along(trajectory.positions_at(times))
     # The way along the rounded path to the middle of each blend, and along the polyline to its corner.
-    halves = np.array([_lengths(path.blend(k, 65))[32] for k in range(len(path.reach))])
+    halves = np.array([lengths_along(path.blend(k, 65))[32] for k in range(len(path.reach))])
     cut = np.concatenate([[0.0], path.reach - halves, [0.0]])
     way = np.concatenate([[0.0], np.cumsum(path.lengths - cut[:-1] - cut[1:])])
     at_corners = np.interp(way * (travelled[-1] / max(way[-1], 1e-300)), travelled, times)
     corners = np.concatenate([[0.0], np.cumsum(path.lengths)])
-    result: Array = np.interp(_lengths(points), corners, at_corners)
+    result: Array = np.interp(lengths_along(points), corners, at_corners)
     result[-1] = trajectory.duration
     return result
 
 
-def _drop_near(points: Array, deviation: npt.ArrayLike) -> tuple[Array, npt.ArrayLike]:
+def _drop_near(points: Array, deviations: Array) -> tuple[Array, Array]:
     """Drop inner points (N, n), and their deviations, that practically equal the one before.
 
     Such a short edge has a direction of its own, for which the motion would slow down.
@@ -133,13 +113,12 @@ def _drop_near(points: Array, deviation: npt.ArrayLike) -> tuple[Array, npt.Arra
     if len(points) > 2 and not keep[-1]:
         keep[[-2, -1]] = False, True
     keep[0] = True
-    deviations = np.asarray(deviation)
-    return points[keep], deviations[keep] if deviations.shape == keep.shape else deviation
+    return points[keep], deviations[keep]
 
 
-def _round_valid(points: Array, deviation: npt.ArrayLike, checks: PathChecks) -> BlendedPath:
+def _round_valid(points: Array, deviations: Array, checks: PathChecks) -> BlendedPath:
     """Round corners as far as samples of the blends are valid."""
-    path = round_corners(points, deviation, lambda Q: checks.valid(Q, RESIDUAL))
+    path = round_corners(points, deviations, lambda Q: checks.valid(Q, RESIDUAL))
     if len(path.points) < 3:
         return path
     allowed = _deviations(path)
@@ -158,7 +137,10 @@ def _round_free(path: BlendedPath, checks: PathChecks) -> BlendedPath:
     allowed = _deviations(path)
     unchecked = np.flatnonzero(allowed).tolist()
     for attempt in range(_ROUNDS):
-        unchecked = [k for k in unchecked if checks.find_collision(_chords(path, k - 1)) is not None]
+        # Chords so short that they are near to the blend.
+        counts = 3 + np.ceil(np.sqrt(2 * path.deviation / _SAGITTA)).astype(int)
+        blends = {k: path.blend(k - 1, int(counts[k - 1])) for k in unchecked}
+        unchecked = [k for k, chords in blends.items() if checks.find_collision(chords) is not None]
         if not unchecked:
             break
         allowed[unchecked] = allowed[unchecked] / 3 if attempt < _ROUNDS - 1 else 0.0
@@ -186,26 +168,9 @@ def _find_collision(path: BlendedPath, trajectory: Trajectory, checks: PathCheck
 
 def _fine_times(trajectory: Trajectory) -> Array:
     """Return the times of the knots, and others between distant ones."""
-    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-    counts = np.maximum(np.ceil(steps / _STEP), 1).astype(int)
-    parts = [k + np.arange(count) / count for k, count in enumerate(counts.tolist())]
-    at = np.concatenate([*parts, [float(len(counts))]])
-    result: Array = np.interp(at, np.arange(len(trajectory)), trajectory.times)
-    return result
+    places = dense_places(trajectory.positions, _STEP)
+    return np.asarray(np.interp(places, np.arange(len(trajectory)), trajectory.times))
 
 
 def _deviations(path: BlendedPath) -> Array:
-    result: Array = np.zeros(len(path.points))
-    result[1:-1] = path.deviation
-    return result
-
-
-def _chords(path: BlendedPath, corner: int) -> Array:
-    """Sample the blend of an inner corner so densely that its chords are near to it."""
-    return path.blend(corner, 3 + math.ceil(math.sqrt(2 * path.deviation[corner] / _SAGITTA)))
-
-
-def _lengths(points: Array) -> Array:
-    """Return the lengths (N,) of a polyline from its first point to each."""
-    result: Array = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    return result
+    return np.pad(path.deviation, 1)

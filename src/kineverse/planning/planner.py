@@ -328,7 +328,8 @@ class Planner:
         holds = as_holds("along=", along)
         roadmap = self._choose_roadmap(method, holds)
         q = self.planning_scene.here if start is None else self._start(start)
-        tasks = () if not _are_tasks(goals) else as_holds("goals", goals)
+        first = goals[0] if isinstance(goals, list | tuple) and goals else goals
+        tasks = as_holds("goals", goals) if isinstance(first, Hold | Goal) else ()
         ends = q[None] if tasks else self._configurations(goals, "goals")
         scene = self._check_separate_pairs(np.vstack([q, ends]))
         touching = scene.touching_pairs([*holds, *tasks])
@@ -433,9 +434,3 @@ def as_holds(argument: str, tasks: Any) -> tuple[Hold, ...]:
     """Turn holds and goals, one or several, into holds."""
     entries = as_entries(argument, tasks, (Hold, Goal), "kv.control.Hold or Goal, or planner.hold(a, b)")
     return tuple(t if isinstance(t, Hold) else Hold(t.expression, t.target, name=t.name) for t in entries)
-
-
-def _are_tasks(goals: Any) -> bool:
-    if isinstance(goals, Hold | Goal):
-        return True
-    return isinstance(goals, list | tuple) and len(goals) > 0 and isinstance(goals[0], Hold | Goal)

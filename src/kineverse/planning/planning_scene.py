@@ -30,7 +30,7 @@ from .collision_checker import BodyPairs, CollisionChecker, LateCheckError
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
 from .path import Path
 from .planning_space import BEYOND, FULL_TURN, HALF_TURN, PlanningSpace
-from .query import MORE_PATIENCE, PATIENCE, checked_by, connect, connect_on_manifold
+from .query import MORE_PATIENCE, PATIENCE, checked_by, connect
 from .sampling_planners import MOST_EDGES, Roadmap
 from .start_goal import MOST_BATCHES, Endpoints, find_solutions
 from .state_validity import PathChecks, SceneJudge, describe_contacts
@@ -68,11 +68,8 @@ class PlanningScene:
             raise InvalidValueError(
                 "No body of the model has a shape, so nothing can collide: add collision or visual shapes."
             )
-        self.excluded = tuple(
-            rule
-            for rule in find_overlapping_pairs(scene, space)
-            if frozenset((rule.a, rule.b)) not in separate
-        )
+        overlapping = find_overlapping_pairs(scene, space)
+        self.excluded = tuple(rule for rule in overlapping if frozenset((rule.a, rule.b)) not in separate)
         scene.collision_world.add_rules(self.excluded)
         self.checker = CollisionChecker(scene, space.symbols, space.conditions, margin, protrusion)
         space.turning &= self.checker.find_periodic(space.turning)
@@ -95,9 +92,18 @@ class PlanningScene:
         return self.state.vector(self.space.symbols)
 
     def find_separate_pairs(self, Q: Array) -> BodyPairs:
-        """Return the unchecked pairs that are apart at one of the configurations (N, n)."""
-        margin = self.checker.struct.margin
-        return find_separate_pairs(self.scene, self.space, self.excluded, self.state, Q, margin)
+        """Return the unchecked pairs that are apart at one of the configurations (N, n).
+
+        Samples miss a small gap, in which a start may be.
+        """
+        apart, pairs = self.checker.struct.margin + _APART, [(rule.a, rule.b) for rule in self.excluded]
+        result = set()
+        for q in Q if pairs else ():
+            state = self.state.updated(dict(zip(self.space.symbols, q.tolist(), strict=True)))
+            if _has_poses(self.scene, state):
+                distances = self.scene.distances(pairs)
+                result |= {frozenset((r.a, r.b)) for r in distances if r.distance > apart}
+        return frozenset(result)
 
     def set_bounds(
         self,
@@ -157,10 +163,13 @@ class PlanningScene:
         """Return the pairs of bodies that may touch while holds last."""
         frames = frozenset(hold.frames for hold in holds if isinstance(hold, FrameHold))
         if frames not in self._touching:
+            lookup = self.model.frames.__getitem__
+            above = {f: {f, *ancestors(f, lookup)} for ends in frames for f in ends if f != WORLD}
             self._touching[frames] = frozenset(
                 frozenset((a, b))
                 for one, other in frames
-                if _are_apart(self.model, one, other)
+                # One does not carry the other.
+                if WORLD not in (one, other) and one not in above[other] and other not in above[one]
                 for a in self._carried(one)
                 for b in self._carried(other)
                 if a != b
@@ -216,8 +225,7 @@ class PlanningScene:
                 try:
                     best = search(left if k == len(ways) - 1 else left / 2, seed)
                 except LateCheckError:
-                    why = _TOO_FAR.format(straight)
-                    return self.no_path(q, why, begin, perf_counter() - begin)
+                    return self.no_path(q, _TOO_FAR.format(straight), begin, perf_counter() - begin)
                 if best.found:
                     break
             while optimize and best.found and best.length > straight + _SAME:
@@ -269,11 +277,8 @@ class PlanningScene:
         targets = np.ascontiguousarray(variants, dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched, until = perf_counter(), checked_by(working_seconds(), seconds)
-        if manifold is None:
-            patience = MORE_PATIENCE if optimize else PATIENCE
-            result = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience, asked)
-        else:
-            result = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges, asked)
+        patience, checker = MORE_PATIENCE if optimize else PATIENCE, self.checker
+        result = connect(checker, manifold, starts, targets, seconds, seed, edges, roadmap, patience, asked)
         spent = perf_counter() - searched
         if result.problem:
             return self.no_path(result.points, result.problem, begin, spent, result.iterations)
@@ -341,12 +346,6 @@ def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> 
     return ()
 
 
-def _are_apart(model: ModelView, a: str, b: str) -> bool:
-    """Return True if neither of two frames carries the other."""
-    lookup = model.frames.__getitem__
-    return WORLD not in (a, b) and a != b and a not in ancestors(b, lookup) and b not in ancestors(a, lookup)
-
-
 _SAMPLES = 64
 _APART = 1e-4  # distance beyond the margin at which bodies do not just rest on each other [m]
 
@@ -363,21 +362,6 @@ def find_overlapping_pairs(scene: Scene, space: PlanningSpace) -> tuple[Rule, ..
     pairs = {frozenset(pair) for pair in scene.pairs_affected_by(space.symbols)}
     result = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
     return tuple(rule for rule in result if frozenset((rule.a, rule.b)) in pairs)
-
-
-def find_separate_pairs(
-    scene: Scene, space: PlanningSpace, rules: tuple[Rule, ...], state: State, Q: Array, margin: float
-) -> frozenset[frozenset[str]]:
-    """Return the pairs of some rules that are apart at one of the configurations (N, n).
-
-    Samples miss a small gap, in which a start may be.
-    """
-    result = set()
-    for q in Q if rules else ():
-        if _has_poses(scene, state.updated(dict(zip(space.symbols, q.tolist(), strict=True)))):
-            results = scene.distances((rule.a, rule.b) for rule in rules)
-            result |= {frozenset((r.a, r.b)) for r in results if r.distance > margin + _APART}
-    return frozenset(result)
 
 
 def _has_poses(scene: Scene, state: State) -> bool:

@@ -63,8 +63,7 @@ class PlanningSpace:
             if any(s.order for s in c.symbols):
                 continue
             low, middle, high = (rates.resolve(e) for e in (c.lower, c.expression, c.upper))
-            symbols = {s for e in (low, middle, high) for s in e.symbols}
-            if moved.isdisjoint(symbols):
+            if moved.isdisjoint({s for e in (low, middle, high) for s in e.symbols}):
                 continue
             whole = Constraint(low, middle, high)
             ranges[name] = whole
@@ -219,10 +218,9 @@ def read_state(model: ModelView, state: Any) -> State:
 
 
 def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) -> tuple[Symbol, ...]:
-    entries = (move,) if isinstance(move, Symbol | str) else tuple(move)
     names = {str(s): s for s in model.degrees_of_freedom}
     result: dict[Symbol, None] = {}
-    for item in entries:
+    for item in (move,) if isinstance(move, Symbol | str) else tuple(move):
         if isinstance(item, str) and any(sign in item for sign in _WILDCARDS):
             matching = [s for name, s in names.items() if fnmatchcase(name, item)]
             if not matching:

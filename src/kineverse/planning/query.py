@@ -15,7 +15,7 @@ from .bindings import TIME_IS_UP, TOO_LONG
 from .collision_checker import RESOLUTION, CollisionChecker
 from .collision_geometry import Floats32
 from .manifold import Manifold
-from .sampling_planners import MOST_EDGES, PATH_ROOM, Roadmap, RrtConnect, SearchResult
+from .sampling_planners import PATH_ROOM, Roadmap, RrtConnect, SearchResult
 
 PATIENCE, MORE_PATIENCE = 40, 160
 """Numbers of shortcuts in a row that may bring nothing: for the first path, and where paths are optimized."""
@@ -39,53 +39,69 @@ class Connected:
     iterations: int  # number of samples
 
 
+_THIN = "A path was found whose samples are free, but something thin lies between two of them"
+
+
 def connect(
     checker: CollisionChecker,
+    manifold: Manifold | None,
     starts: Floats32,
     goals: Floats32,
     seconds: float,
     seed: int,
-    edges: int = MOST_EDGES,
-    roadmap: Roadmap | None = None,
-    patience: int = PATIENCE,
-    asked: float | None = None,
+    edges: int,
+    roadmap: Roadmap | None,
+    patience: int,
+    asked: float,
 ) -> Connected:
     """Find a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
 
-    Edges that collide between samples are planned again, with more samples.
+    In the whole space, edges that collide between samples are planned again, with more samples. The points of
+    a path on a manifold are on it in double precision, and lines between them keep to it, see
+    :meth:`.Manifold.refine`. If it collides between samples, another seed and more samples are tried.
     """
     begin = working_seconds()
-    search = RrtConnect(checker)
-    iterations, points = 0, starts
+    search, ends = RrtConnect(checker, manifold), np.vstack([starts, goals])
+    iterations, resolution, problem, points = 0, RESOLUTION, "", starts
     for attempt in range(_ATTEMPTS):
-        left = seconds - (working_seconds() - begin)
-        if attempt and left <= 0.0:
+        if attempt and working_seconds() - begin >= seconds:
             break
         for by in (_WIDER, 0.0):
             left = seconds - (working_seconds() - begin)
-            with checker.widened(by, np.vstack([starts, goals])) as wider:
+            with checker.widened(by, ends) as wider:
                 share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
                 if roadmap is None:
-                    result = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, edges=most)
+                    result = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)
                 else:
                     result = roadmap.solve(checker, starts, goals, share, seed + _NEXT_SEED * attempt)
+                points = result.points
+                if manifold is not None and result.found:
+                    points = search.contract(points, left)
             iterations += result.iterations
             if result.found or not wider:
                 break
         if not result.found:
-            problem = explain_failure(result, seconds if asked is None else asked)
-            return Connected(result.points.astype(float), problem, iterations)
-        # Parts of a shortcut that just passes would not be certain by themselves.
-        with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
-            points = search.shorten(result.points, seconds - (working_seconds() - begin), seed, patience)
-        certain = _repair(search, checker, points, begin + seconds, checked_by(begin, seconds), seed, edges)
-        if certain is not None:
-            return Connected(certain.astype(float), "", iterations)
-    problem = (
-        "A path was found whose samples are free, but something thin lies between two of them, and no "
-        "detour was found in time. More seconds=, or another seed=, may find one."
-    )
-    return Connected(points.astype(float), problem, iterations)
+            return Connected(points.astype(float), problem or explain_failure(result, asked), iterations)
+        checked = checked_by(begin, seconds)
+        if manifold is None:
+            # Parts of a shortcut that just passes would not be certain by themselves.
+            with checker.widened(_WIDER / 2, ends):
+                points = search.shorten(points, seconds - (working_seconds() - begin), seed, patience)
+            certain = _repair(search, checker, points, begin + seconds, checked, seed, edges)
+            if certain is not None:
+                return Connected(certain.astype(float), "", iterations)
+            continue
+        exact = manifold.refine(points)
+        if exact is None:
+            problem = "A path was found, but within limits its holds cannot be met exactly all along it."
+            continue
+        narrow = np.ascontiguousarray(exact, dtype=np.float32)
+        if checker.find_collision(narrow, checked - working_seconds()) is None:
+            return Connected(exact, "", iterations)
+        problem = f"{_THIN}."
+        resolution *= 2.0
+    hint = ", and no detour was found in time. More seconds=, or another seed=, may find one."
+    return Connected(points.astype(float), problem or _THIN + hint, iterations)
 
 
 def _repair(
@@ -111,53 +127,6 @@ def _repair(
             return None
         points = np.ascontiguousarray(np.vstack([points[:k], detour.points, points[k + 2 :]]))
     return None
-
-
-def connect_on_manifold(
-    checker: CollisionChecker,
-    manifold: Manifold,
-    starts: Floats32,
-    goals: Floats32,
-    seconds: float,
-    seed: int,
-    edges: int = MOST_EDGES,
-    asked: float | None = None,
-) -> Connected:
-    """Find a path on a manifold from one of (S, n) starts to one of (G, n) goals.
-
-    Its points are on the manifold in double precision, and lines between them keep to it, see
-    :meth:`.Manifold.refine`. If it collides between samples, another seed and more samples are tried.
-    """
-    begin = working_seconds()
-    search = RrtConnect(checker, manifold)
-    iterations, resolution, problem = 0, RESOLUTION, ""
-    points = starts
-    for attempt in range(_ATTEMPTS):
-        left = seconds - (working_seconds() - begin)
-        if attempt and left <= 0.0:
-            break
-        for by in (_WIDER, 0.0):
-            left = seconds - (working_seconds() - begin)
-            with checker.widened(by, np.vstack([starts, goals])) as wider:
-                share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
-                result = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)
-                iterations += result.iterations
-                points = search.contract(result.points, left) if result.found else result.points
-            if result.found or not wider:
-                break
-        if not result.found:
-            problem = problem or explain_failure(result, seconds if asked is None else asked)
-            return Connected(points.astype(float), problem, iterations)
-        exact = manifold.refine(points)
-        if exact is None:
-            problem = "A path was found, but within limits its holds cannot be met exactly all along it."
-            continue
-        left = checked_by(begin, seconds) - working_seconds()
-        if checker.find_collision(np.ascontiguousarray(exact, dtype=np.float32), left) is None:
-            return Connected(exact, "", iterations)
-        problem = "A path was found whose samples are free, but something thin lies between two of them."
-        resolution *= 2.0
-    return Connected(points.astype(float), problem, iterations)
 
 
 def checked_by(begin: float, seconds: float) -> float:

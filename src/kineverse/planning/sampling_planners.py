@@ -77,8 +77,7 @@ class RrtConnect:
             ctypes.addressof(s), work.ctypes.data, len(points), room, patience, LEAST_INFLATION
         )
         result = work[:count]
-        apart = np.abs(np.diff(result, axis=0)).max(axis=1, initial=0.0) > 1e-6
-        keep = np.concatenate([[True], apart])
+        keep = np.concatenate([[True], np.abs(np.diff(result, axis=0)).max(axis=1, initial=0.0) > 1e-6])
         keep[-1] = True  # the ends stay exact
         return np.ascontiguousarray(result[keep])
 
@@ -87,9 +86,8 @@ class RrtConnect:
         s = self._setup(seconds, 0, RESOLUTION)
         work = np.zeros((3 * len(points) + 64, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points
-        return work[
-            : self._code.kineverse_relax(ctypes.addressof(s), work.ctypes.data, len(points), len(work))
-        ]
+        count = self._code.kineverse_relax(ctypes.addressof(s), work.ctypes.data, len(points), len(work))
+        return work[:count]
 
     def _setup(self, seconds: float, seed: int, resolution: float) -> SearchStruct:
         s = self._struct
@@ -165,7 +163,6 @@ class Roadmap:
         self.nodes_checked = self.edges_checked = 0
 
     def __len__(self) -> int:
-        """Return the number of nodes."""
         return int(self._struct.count)
 
     def suits(self, symbols: Sequence[Symbol], turning: npt.NDArray[np.bool_]) -> bool:

@@ -146,12 +146,9 @@ def find_solutions(
     begin = working_seconds()
     lower, upper = checker.lower.astype(float), checker.upper.astype(float)
     result, idle = np.zeros((0, len(near))), 0
-    for k in range(batches):
-        if k == 0:
-            tries = near + generator.standard_normal((_BATCH, len(near))) * (upper - lower) / 8
-            tries[0] = near
-        else:
-            tries = generator.uniform(lower, upper, (_BATCH, len(near)))
+    tries = near + generator.standard_normal((_BATCH, len(near))) * (upper - lower) / 8
+    tries[0] = near
+    for _ in range(batches):
         rows = np.ascontiguousarray(np.clip(tries, lower, upper), dtype=np.float32)
         rows = np.ascontiguousarray(rows[manifold.project(rows)])
         rows, before = rows[checker.valid(rows)], len(result)
@@ -166,4 +163,5 @@ def find_solutions(
         idle = 0 if len(result) > before else idle + 1
         if len(result) >= count or (len(result) and idle >= _IDLE) or working_seconds() - begin > seconds:
             break
+        tries = generator.uniform(lower, upper, (_BATCH, len(near)))
     return result[np.argsort(np.linalg.norm(result - near, axis=1), kind="stable")][:count]

@@ -74,11 +74,11 @@ class SceneJudge:
                 raise LateCheckError
         return None
 
-    def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
-        """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
+    def clearance(self, points: Array, step: float) -> float:
+        """Return the least distance of a pair at samples of a polyline [m]; infinite beyond .5 m."""
         samples = densify(points, step)
         self._update(samples[0])
-        return self._query.least_distance(self._coordinates, samples, radius)
+        return self._query.least_distance(self._coordinates, samples, 0.5)
 
 
 class PathChecks:
@@ -144,40 +144,43 @@ class PathChecks:
         return None if result is None else result[0]
 
 
-def describe_contacts(contacts: Sequence[DistanceResult], limit: int = 3) -> str:
+def describe_contacts(contacts: Sequence[DistanceResult]) -> str:
     """Name touching pairs of bodies, with the depth of their penetration."""
-    pairs = [f"'{c.a}' and '{c.b}' ({_describe_depth(-c.distance)})" for c in contacts[:limit]]
-    more = f" and {len(contacts) - limit} more pairs" if len(contacts) > limit else ""
+    depths = [
+        f"{-1e3 * c.distance:.1f} mm deep" if -c.distance >= _TOUCHING else "touching" for c in contacts
+    ]
+    pairs = [f"'{c.a}' and '{c.b}' ({depth})" for c, depth in zip(contacts, depths[:3], strict=False)]
+    more = f" and {len(contacts) - 3} more pairs" if len(contacts) > 3 else ""
     return ", ".join(pairs) + more
-
-
-def _describe_depth(depth: float) -> str:
-    return f"{1e3 * depth:.1f} mm deep" if depth >= _TOUCHING else "touching"
 
 
 def densify(points: Array, step: float) -> Array:
     """Return the points of a polyline (N, n) with others between them, at most a step apart."""
+    return _interpolate(points, np.arange(float(len(points))), dense_places(points, step))
+
+
+def dense_places(points: Array, step: float) -> Array:
+    """Return the places of these on the polyline: indices of its points, and fractions between them."""
     if len(points) < 2:
-        return points
-    counts = np.maximum(np.ceil(_segment_lengths(points) / step), 1).astype(int)
+        return np.zeros(len(points))
+    counts = np.maximum(np.ceil(np.diff(lengths_along(points)) / step), 1).astype(int)
     ends = np.cumsum(counts)
     shares = (np.arange(ends[-1]) - np.repeat(ends - counts, counts)) / np.repeat(counts, counts)
-    at = np.append(np.repeat(np.arange(len(counts)), counts) + shares, len(counts))
-    return _interpolate(points, np.arange(float(len(points))), at)
+    return np.append(np.repeat(np.arange(len(counts)), counts) + shares, len(counts))
 
 
 def sample_path(points: Array, step: float) -> Array:
     """Return samples of a polyline (N, n), at most a step apart: its points and others, or some of many."""
-    lengths = _segment_lengths(points)
-    count = int(np.ceil(lengths.sum() / step)) + 1
+    along = lengths_along(points)
+    count = int(np.ceil(along[-1] / step)) + 1
     if len(points) <= 4 * count:
         return densify(points, step)
-    along = np.concatenate([[0.0], np.cumsum(lengths)])
     return _interpolate(points, along, np.linspace(0.0, along[-1], count))
 
 
-def _segment_lengths(points: Array) -> Array:
-    return np.asarray(np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)))
+def lengths_along(points: Array) -> Array:
+    """Return the lengths (N,) of a polyline from its first point to each."""
+    return np.append(0.0, np.cumsum(np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1))))
 
 
 def _interpolate(points: Array, along: Array, at: Array) -> Array:

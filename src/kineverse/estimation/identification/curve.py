@@ -232,8 +232,7 @@ class CurveMotion:
         if self.rows == 3:
             return replace(self, positions=positions)
         half = np.concatenate([0.5 * moved[:, 3:], np.ones((len(moved), 1))], axis=1)
-        quaternions = unit_vector(_product(half, self.quaternions))
-        return replace(self, positions=positions, quaternions=quaternions)
+        return replace(self, positions=positions, quaternions=unit_vector(_product(half, self.quaternions)))
 
     def retract_joints(self, values: Array, step: Array) -> Array:
         """Return joint values after a step of at most a distance of two knots, not far beyond the ends."""
@@ -291,25 +290,16 @@ class CurveMotion:
 
     def scaled(self, unit: float) -> Self:
         """Return the curve with lengths in another unit, which is smaller by a factor."""
-        knots = replace(self.spline, first=unit * self.spline.first, step=unit * self.spline.step)
-        across = self.across.copy()
+        spline = replace(self.spline, first=unit * self.spline.first, step=unit * self.spline.step)
+        across, widths = self.across.copy(), self.widths.scaled(unit)
         across[:, 3:] /= unit
-        return replace(
-            self,
-            spline=knots,
-            positions=unit * self.positions,
-            across=across,
-            widths=self.widths.scaled(unit),
-            lever=unit * self.lever,
-        )
+        moved = replace(self, spline=spline, across=across, widths=widths, lever=unit * self.lever)
+        return replace(moved, positions=unit * self.positions)
 
     def _splines(self, joint: Expression, values: Array) -> Sequence[Expression]:
-        slopes = self.spline.knot_slopes @ values
-        knots = self.spline.knots.tolist()
-        return [
-            spline(joint, knots, v.tolist(), slopes=(float(s[0]), float(s[-1])))
-            for v, s in zip(values.T, slopes.T, strict=True)
-        ]
+        ends, knots = (self.spline.knot_slopes @ values)[[0, -1]], self.spline.knots.tolist()
+        columns = zip(values.T.tolist(), ends.T.tolist(), strict=True)
+        return [spline(joint, knots, column, slopes=(first, last)) for column, (first, last) in columns]
 
     @cached_property
     def _differences(self) -> Array:
@@ -319,14 +309,6 @@ class CurveMotion:
             return moved
         turns = quaternion(self.quaternions)
         return np.concatenate([moved, log_so3(turns[1:] @ np.swapaxes(turns[:-1], 1, 2))], axis=1)
-
-
-def aligned_quaternions(rotations: Array) -> Array:
-    """Return unit quaternions of rotations (N, 3, 3), each on the half of the sphere of the one before."""
-    result = to_quaternion(rotations)
-    signs = np.where(np.sum(result[1:] * result[:-1], axis=1) < 0.0, -1.0, 1.0)
-    result[1:] *= np.cumprod(signs)[:, None]
-    return result
 
 
 def _in_rows(by_knots: Array) -> Array:
@@ -381,13 +363,11 @@ def fit_curve(
         thinned = observations.select(some), covariance[some], [order[some] for order in orders]
         known = fit_curve(*thinned, log_evidence)
         assert known is not None  # there are enough observations
-        motion, covariance = _as_curve(known.solution), known.solution.covariance
-        deviations = np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0))
-        values = _nearest(observations, deviations, motion)
+        motion = _as_curve(known.solution)
+        values = _nearest(observations, _mean_deviations(known.solution.covariance), motion)
         solution = levenberg_marquardt(observations, motion, values, steps=_STEPS)
         return Scored(solution, stated_log_evidence(solution))
-    score = log_evidence or stated_log_evidence
-    deviations = np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0))
+    score, deviations = log_evidence or stated_log_evidence, _mean_deviations(covariance)
     possible = [count for count in KNOTS if count <= _DENSEST * len(observations)]
     middle = max(k for k, count in enumerate(possible) if count <= _COARSE)
     points = _whitened(observations.relative, observations.relative, deviations)
@@ -400,15 +380,15 @@ def fit_curve(
     begun = [(_refine(observations, deviations, motion, 1, even), even) for motion, even in starts]
     start, even = min(begun, key=lambda pair: pair[0].cost)
 
-    def fit(motion: CurveMotion, count: int) -> _FittedCurve:
+    def fit(motion: CurveMotion, count: int) -> Scored:
         solution = _refine(observations, deviations, _with_knots(motion, count, even), _ROUNDS, even)
-        return _FittedCurve(solution, score(solution))
+        return Scored(solution, score(solution))
 
     best = latest = fit(start.motion, possible[middle])
     worse = 0
     for count in possible[middle + 1 :]:
         missing = competitor - latest.log_evidence
-        latest = fit(latest.solution.motion, count)
+        latest = fit(_as_curve(latest.solution), count)
         worse = 0 if latest.log_evidence > best.log_evidence else worse + 1
         best = max(best, latest, key=lambda fitted: fitted.log_evidence)
         if worse == 2 or competitor - latest.log_evidence > max(_HOPELESS, _LEFT * missing):
@@ -422,22 +402,18 @@ def fit_curve(
     return continue_curve(observations, best.solution)
 
 
-class _FittedCurve(NamedTuple):
-    """Solution of a curve with some number of knots, and its log evidence."""
-
-    solution: Solution[CurveMotion]
-    log_evidence: float
-
-
 def continue_curve(observations: Observations, before: Solution[FamilyMember]) -> Scored:
     """Return the curve with the knots of an earlier one, for the same observations or more."""
     motion, known, values = _as_curve(before), len(before.values), before.values
     if known < len(observations):
         new = observations.select(slice(known, None))
-        deviations = np.sqrt(np.einsum("nii->ni", before.covariance).mean(axis=0))
-        values = np.concatenate([values, _nearest(new, deviations, motion)])
+        values = np.concatenate([values, _nearest(new, _mean_deviations(before.covariance), motion)])
     solution = levenberg_marquardt(observations, motion, values, steps=2 * _STEPS)
     return Scored(solution, stated_log_evidence(solution))
+
+
+def _mean_deviations(covariance: Array) -> Array:
+    return np.asarray(np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0)))
 
 
 def _as_curve(solution: Solution[FamilyMember]) -> CurveMotion:
@@ -465,33 +441,29 @@ def _length_along_path(points: Array) -> Array:
     count = len(points)
     some = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
     distances = np.linalg.norm(points[:, None] - points[None, some], axis=2)
-    among = distances[some]
     # Long steps cost more, so the path passes through near neighbours. Steps within the noise are free.
-    costs = np.maximum(among - 1.0, 1e-3) ** 2
+    costs = np.maximum(distances[some] - 1.0, 1e-3) ** 2
     for k in range(len(some)):
         np.minimum(costs, costs[:, k, None] + costs[None, k], out=costs)
     first = int(np.argmax(costs[int(np.argmax(costs[0]))]))
     reached = np.argsort(costs[first], kind="stable")
     along = np.empty(len(some))
     along[reached] = np.arange(len(some))
-    nearest = np.argsort(distances, axis=1)[:, :2]
-    result = np.asarray(along[nearest].mean(axis=1))
+    result = np.asarray(along[np.argsort(distances, axis=1)[:, :2]].mean(axis=1))
     result[some] = along
     return result
 
 
 def _regressed(observations: Observations, along: Array, count: int, even: bool = True) -> CurveMotion:
-    along = np.argsort(np.argsort(along, kind="stable"), kind="stable").astype(np.float64)
-    order = np.argsort(along, kind="stable")
     spline = NaturalSpline(0.0, (len(along) - 1) / (count - 1), count)
-    weights = spline.weights(along[order]).values
-    relative = observations.relative[order]
-    places = relative[:, :3, 3]
-    turns = aligned_quaternions(relative[:, :3, :3])
+    weights = spline.weights(np.arange(len(along), dtype=np.float64)).values
+    relative = observations.relative[np.argsort(along, kind="stable")]
+    # Each quaternion is on the half of the sphere of the one before.
+    turns = to_quaternion(relative[:, :3, :3])
+    turns[1:] *= np.cumprod(np.where(np.sum(turns[1:] * turns[:-1], axis=1) < 0.0, -1.0, 1.0))[:, None]
     # The ridge keeps knots finite that no observation determines.
-    ridge = 1e-3 * np.diff(np.eye(count), n=2, axis=0)
-    system = np.concatenate([weights, ridge])
-    right = np.concatenate([np.concatenate([places, turns], axis=1), np.zeros((count - 2, 7))])
+    system = np.concatenate([weights, 1e-3 * np.diff(np.eye(count), n=2, axis=0)])
+    right = np.vstack([np.hstack([relative[:, :3, 3], turns]), np.zeros((count - 2, 7))])
     values = np.linalg.lstsq(system, right, rcond=None)[0]
     widths = PathWidths.of_poses(relative, observations.rows)
     return _resampled(observations.rows, spline, values[:, :3], values[:, 3:], count, even, widths)
@@ -537,17 +509,14 @@ def _refine(
     observations: Observations, deviations: Array, motion: CurveMotion, rounds: int, even: bool = True
 ) -> Solution[CurveMotion]:
     """Return the solution after rounds of projection onto the curve, steps of the solver and even knots."""
-    for k in range(rounds):
+    while True:
         values = _nearest(observations, deviations, motion)
         solution = levenberg_marquardt(observations, motion, values, steps=_STEPS)
-        if k == rounds - 1:
-            break
-        used = solution.values[:, 0]
+        rounds, used = rounds - 1, solution.values[:, 0]
         ends = float(used.min()), float(used.max())
-        if ends[1] - ends[0] < 1e-3 * motion.length:
-            break
+        if not rounds or ends[1] - ends[0] < 1e-3 * motion.length:
+            return solution
         motion = _with_knots(solution.motion, motion.spline.count, even, ends)
-    return solution
 
 
 def _nearest(observations: Observations, deviations: Array, motion: CurveMotion) -> Array:

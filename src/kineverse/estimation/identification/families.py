@@ -129,12 +129,10 @@ class GroupMotion:
         arm = slide @ l_R.T + lever
         parent_T_child = transform(parent_R_joint @ self.right[:3, :3], self.left[:3, 3] + arm)
         moved = _columns(parent_R_joint, lever)
-        blocks = [_columns(np.broadcast_to(l_R, turn.shape), arm)[:, :, freedom.left]]
-        blocks.append(moved[:, :, freedom.right])
-        if self.group.pitch:
-            along = np.zeros((len(values), 6, 1))
-            along[:, :3, 0] = l_R[:, 2] * twist[:, WZ, None]
-            blocks.append(along)
+        by_left = _columns(np.broadcast_to(l_R, turn.shape), arm)[:, :, freedom.left]
+        by_pitch = np.zeros((len(values), 6, int(self.group.pitch)))
+        by_pitch[:, :3] = (l_R[:, 2] * twist[:, WZ, None])[:, :, None]
+        by_parameters = np.concatenate([by_left, moved[:, :, freedom.right], by_pitch], axis=2)
         by_joints = moved.copy()
         # Translations come before the rotation, so they are along the axes of L.
         by_joints[:, :3, :3], by_joints[:, 3:, :3] = l_R, 0.0
@@ -142,8 +140,8 @@ class GroupMotion:
             by_joints[:, :, 3:] = moved[:, :, 3:] @ right_jacobian(twist[:, 3:])
         if self.group.pitch:
             by_joints[:, :3, WZ] += self.pitch * l_R[:, 2]
-        by_joints, rows = by_joints[:, :, freedom.joints], self.rows
-        return LinearisedPoses(parent_T_child, np.concatenate(blocks, axis=2)[:, :rows], by_joints[:, :rows])
+        rows = self.rows
+        return LinearisedPoses(parent_T_child, by_parameters[:, :rows], by_joints[:, :rows, freedom.joints])
 
     def retract(self, step: Array) -> Self:
         """Return the motion after a step in the parameters."""
@@ -186,12 +184,10 @@ class GroupMotion:
         log = 0.0
         if WX in freedom.left:
             log -= math.log(math.tau)
-        if VX in freedom.left and VY in freedom.left and reach:
-            lever = self.right[:reach, 3] / REACH
-            log -= 0.5 * float(lever @ lever) + 0.5 * reach * math.log(math.tau * REACH**2)
-        if self.slides:
-            place = self.right[: self.slides, 3] / REACH
-            log -= 0.5 * float(place @ place) + 0.5 * self.slides * math.log(math.tau * REACH**2)
+        # The lever, and the sliding point.
+        for count in (reach if {VX, VY} <= {*freedom.left} else 0, self.slides):
+            place = self.right[:count, 3] / REACH
+            log -= 0.5 * float(place @ place) + 0.5 * count * math.log(math.tau * REACH**2)
         if self.group.pitch:
             log -= 0.5 * (self.pitch / PITCHES) ** 2 + 0.5 * math.log(math.tau * PITCHES**2)
         # Volume of mean poses per unit of the parameters and joint values that move them.
@@ -210,21 +206,16 @@ class GroupMotion:
 
     def named_parameters(self) -> dict[str, Array | float]:
         """Return the parameters by name."""
-        name = self.name
-        result: dict[str, Array | float] = {}
         axis, point = self.left[:3, 2].copy(), self.left[:3, 3].copy()
-        if name == "planar":
-            result["normal"] = axis
-        elif name == "spherical":
-            result["centre"] = point
-        elif name not in ("rigid", "free"):
-            result["axis"] = axis
-            if name != "prismatic":
-                result["point"] = point
-        if self.group.pitch:
-            result["pitch"] = math.tau * self.pitch
-        result["reference"] = self.left @ self.right
-        return result
+        special: dict[str, dict[str, Array | float]] = {
+            "rigid": {},
+            "prismatic": {"axis": axis},
+            "screw": {"axis": axis, "point": point, "pitch": math.tau * self.pitch},
+            "spherical": {"centre": point},
+            "planar": {"normal": axis},
+            "free": {},
+        }
+        return special.get(self.name, {"axis": axis, "point": point}) | {"reference": self.left @ self.right}
 
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of the parameters, in their order."""
@@ -237,17 +228,15 @@ class GroupMotion:
     def prior(self) -> ParameterPrior:
         """Return the Gaussian prior of levers and pitch."""
         reach, freedom = self.group.reach, self.parametrisation
-        r_p = self.right[:3, 3]
+        r_p, start = self.right[:3, 3], len(freedom.left)
         moves = np.concatenate([np.eye(3), -skew(r_p)], axis=1)[:reach, freedom.right]
-        derivatives = np.zeros((reach, self.size))
-        start = len(freedom.left)
-        derivatives[:, start : start + len(freedom.right)] = moves
-        if not self.group.pitch:
-            return ParameterPrior(r_p[:reach] / REACH, derivatives / REACH)
-        steep = np.zeros((1, self.size))
-        steep[0, -1] = 1.0 / PITCHES
-        residuals = np.append(r_p[:reach] / REACH, self.pitch / PITCHES)
-        return ParameterPrior(residuals, np.concatenate([derivatives / REACH, steep]))
+        derivatives = np.zeros((reach + self.group.pitch, self.size))
+        derivatives[:reach, start : start + len(freedom.right)] = moves / REACH
+        residuals = r_p[:reach] / REACH
+        if self.group.pitch:
+            derivatives[-1, -1] = 1.0 / PITCHES
+            residuals = np.append(residuals, self.pitch / PITCHES)
+        return ParameterPrior(residuals, derivatives)
 
 
 def _columns(parent_R_frame: Array, lever: Array) -> Array:
@@ -456,9 +445,9 @@ def _nearest(motion: FamilyMotion, observations: Observations) -> Array:
     distances = np.sum((observations.relative[:, None, :3, 3] - poses[None, :, :3, 3]) ** 2, axis=-1)
     if observations.rows == 6:
         turns = np.swapaxes(observations.relative[:, None, :3, :3], -1, -2) @ poses[None, :, :3, :3]
-        lever = float(np.mean(np.einsum("nii->ni", observations.child_covariance)[:, :3]))
-        angle = float(np.mean(np.einsum("nii->ni", observations.child_covariance)[:, 3:]))
-        distances = distances + lever / angle * np.sum(log_so3(turns) ** 2, axis=-1)
+        variances = np.einsum("nii->ni", observations.child_covariance)
+        ratio = float(np.mean(variances[:, :3])) / float(np.mean(variances[:, 3:]))
+        distances = distances + ratio * np.sum(log_so3(turns) ** 2, axis=-1)
     return np.asarray(candidates.reshape(-1, motion.joints)[np.argmin(distances, axis=1)])
 
 

@@ -44,12 +44,6 @@ class MotionStatistics:
         return log_so3(self.poses[:, :3, :3] @ self.mean[:3, :3].T)
 
     @cached_property
-    def axes(self) -> list[Array]:
-        """Candidate directions of the rotation axis."""
-        normal = self.spread[2]
-        return [_principal_directions(self.turns)[0], normal] if self.rows == 6 else [normal]
-
-    @cached_property
     def axis_rotations(self) -> list[_AxisRotation]:
         """Rotations about the candidate axes, the starts of revolute, screw and cylindrical joints."""
         return [rotation for plane in self.planes for rotation in _find_rotations(self, *plane)]
@@ -57,7 +51,8 @@ class MotionStatistics:
     @cached_property
     def planes(self) -> list[tuple[Array, Array]]:
         """Frames with a candidate axis as z axis, and positions relative to the mean in each."""
-        frames = [rotation_along_z(axis) for axis in self.axes]
+        axes = [_principal_directions(self.turns)[0]] if self.rows == 6 else []
+        frames = [rotation_along_z(axis) for axis in (*axes, self.spread[2])]
         return [(frame, (self.positions - self.mean[:3, 3]) @ frame) for frame in frames]
 
 
@@ -74,8 +69,7 @@ def initial_guesses(name: str, statistics: MotionStatistics) -> Iterator[Initial
     if name == "rigid":
         yield start(np.eye(3), np.zeros(3), np.zeros((count, 0)))
     elif name == "free":
-        moved = mean[:3, :3].T @ (statistics.positions - mean[:3, 3])[:, :, None]
-        parts = [moved[:, :, 0]]
+        parts = [(mean[:3, :3].T @ (statistics.positions - mean[:3, 3])[:, :, None])[:, :, 0]]
         if rows == 6:
             parts.append(log_so3(mean[:3, :3].T @ statistics.poses[:, :3, :3]))
         yield start(mean[:3, :3], mean[:3, 3], np.concatenate(parts, axis=1))

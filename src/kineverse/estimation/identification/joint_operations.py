@@ -93,7 +93,7 @@ class SlidingPoint(Joint, document_kind="SlidingPoint"):
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the coordinates and their limits."""
-        names = [f"{self.name}/{axis}" for axis, _ in zip("xyz", self.ranges, strict=False)]
+        names = [f"{self.name}/{axis}" for axis in "xyz"[: len(self.ranges)]]
         return _writes(self, model, names, lambda q: translation(*q, *([0.0] * (3 - len(q)))))
 
 

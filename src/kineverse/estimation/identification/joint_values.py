@@ -181,8 +181,7 @@ def slide_child_origin(
     for row, component in enumerate(freedom.right):
         for column, other in enumerate((*freedom.left, *freedom.right)):
             if component < WX <= other:
-                lever = middle if column < ends else place
-                moved[ends + row, column] = -skew(lever)[component, other - WX]
+                moved[ends + row, column] = -skew(middle if column < ends else place)[component, other - WX]
     motion = replace(motion, left=left, right=right)
     covariances = by @ covariances @ np.swapaxes(by, 1, 2)
     return ChildOriginMotion(motion, moved @ covariance @ moved.T, values, covariances)
@@ -363,8 +362,7 @@ def unwrap_screw(observations: Observations, solution: Solution[FamilyMember]) -
     angles = np.unwrap(solution.values[:, 0])
     if np.array_equal(angles, solution.values[:, 0]):
         return None
-    along = (inverse(motion.left) @ observations.relative)[:, 2, 3]
-    pitch, offset = np.polyfit(angles, along, 1)
+    pitch, offset = np.polyfit(angles, (inverse(motion.left) @ observations.relative)[:, 2, 3], 1)
     right = motion.right.copy()
     right[2, 3] = offset
     return InitialGuess(replace(motion, right=right, pitch=float(pitch)), angles[:, None])
@@ -381,9 +379,8 @@ def log_unwrapping_gain(solution: Solution[FamilyMember]) -> float:
     known = solve_per_observation(solution)
     values = known.values
     middle = math.atan2(float(np.sin(values).mean()), float(np.cos(values).mean()))
-    within = values - math.tau * np.round((values - middle) / math.tau)
     logs = []
-    for each in (known, replace(known, values=within)):
+    for each in (known, replace(known, values=values - math.tau * np.round((values - middle) / math.tau))):
         ranges = fit_joint_ranges(solution.motion, each)
         precision = float(np.sum(1.0 / (ranges.deviations[0] ** 2 + known.covariances[:, 0, 0])))
         # The evidence integrates over the mean, which is less certain with more revolutions.

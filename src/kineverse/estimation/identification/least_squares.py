@@ -119,15 +119,10 @@ def levenberg_marquardt(
         if trial.cost <= point.cost + 1e-12 * abs(point.cost):
             converged = gain < CLOSE or gain * gain < CLOSE * before
             point, damping, before = trial, 0.1 * damping if damping > 1e-6 else 0.0, gain
-            if converged:
-                break
         else:
-            if gain < CLOSE:
-                converged = True
-                break
-            damping = max(10.0 * damping, 1e-4)
-            if damping > 1e8:
-                break
+            converged, damping = gain < CLOSE, max(10.0 * damping, 1e-4)
+        if converged or damping > 1e8:
+            break
     at_end = point.residuals, point.covariance, point.linear, point.parent
     return Solution(point.motion, point.values, point.cost, *at_end, joint_prior, converged)
 

@@ -148,11 +148,10 @@ def continue_from(
 ) -> Scored:
     """Return the solution of more observations than ``known``, continued from an earlier one."""
     motion, values, parent = start.motion, start.values.copy(), parent.copy()
-    new = slice(known, len(observations))
     if known < len(observations):
-        projected = levenberg_marquardt(
-            observations.select(new), FixedMotion(motion), values[new], parent[new], joint_prior
-        )
+        new, fixed = slice(known, None), FixedMotion(motion)
+        some = observations.select(new)
+        projected = levenberg_marquardt(some, fixed, values[new], parent[new], joint_prior)
         values[new], parent[new] = projected.values, projected.parent
     solution = levenberg_marquardt(observations, motion, values, parent, joint_prior)
     if joint_prior.marginal:
@@ -173,9 +172,8 @@ def _iterate_ranges(observations: Observations, solution: Solution[FamilyMember]
         before = widths
         start = solution.motion, solution.values, solution.parent
         joint_prior = JointValuePrior(ranges.mean, widths**-2.0, marginal=True)
-        solution = choose_mirrored_values(
-            observations, levenberg_marquardt(observations, *start, joint_prior)
-        )
+        solution = levenberg_marquardt(observations, *start, joint_prior)
+        solution = choose_mirrored_values(observations, solution)
     return solution
 
 

@@ -15,10 +15,9 @@ the noise is stated too small. So families are also compared for a noise of up t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,12 +25,15 @@ from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
 from .curve import CURVE, FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
-from .families import Family, FamilyMotion
+from .families import FamilyMotion
 from .least_squares import Solution
 from .marginal_likelihood import Scored
 from .model_selection import (
     SAME_RATIO,
+    FamilyName,
     FamilySolution,
+    FamilySolutions,
+    FamilyWeights,
     IdentificationData,
     measure_fit,
     solve_families,
@@ -78,23 +80,14 @@ _FEW, _SMOOTH = 20, math.cos(math.radians(45.0))
 _SYSTEMATIC, _SYSTEMATIC_SHARE = 1e-3, 0.7
 _ROUNDS = 3  # largest number of classifications of outliers
 
-Solutions = Mapping["str | Family", FamilySolution]
-
-
-class CheckedComparison(NamedTuple):
-    """Result of a comparison that is checked, and the solution of the curve if one was fitted."""
-
-    result: IdentificationResult
-    curve: FamilySolution | None
-
 
 def weigh_and_check(
     data: IdentificationData,
-    solutions: Solutions,
-    weights: Mapping[str | Family, float],
+    solutions: FamilySolutions,
+    weights: FamilyWeights,
     before: FamilySolution | None = None,
-) -> CheckedComparison:
-    """Return the fits of all families with their probabilities, and the reason if the best is not sure."""
+) -> tuple[IdentificationResult, FamilySolution | None]:
+    """Return the fits of all families, with the reason if the best is not sure, and the curve if any."""
     result = weigh_families(data, solutions, weights) if solutions else None
     curve, is_online = None, before is not None
     is_sure = result is not None and not is_doubtful(data, result, solutions)
@@ -116,36 +109,34 @@ def weigh_and_check(
         compare = partial(_compare_refuted, data, solutions, weights, is_online)
         if fit.p_value < REFUTED and fit.factor > CALIBRATED:
             factor = _best_scale(data, solutions, weights, _REFUTED_SCALES)[1]
-            return CheckedComparison(compare(factor, "none of these joints"), curve)
+            return compare(factor, "none of these joints"), curve
         if solution.motion.joints > 1 or name == CURVE:
             other, factor, logs = _best_scale(data, solutions, weights, _DOUBTED_SCALES)
             if other != name and factor > CALIBRATED:
                 if logs[other] - logs[name] > math.log(SURE / (1.0 - SURE)):
-                    return CheckedComparison(compare(factor, solution.motion.name), curve)
+                    return compare(factor, solution.motion.name), curve
                 family = solutions[other].scored.solution.motion.name
                 reason = f"with {factor:.1f} times the stated noise it would be {family}"
     result = replace(result, reason=reason or next(_reasons(data, result, solutions), ""))
     if CURVE not in result.probabilities and CURVE in weights and may_be_curve(data.observations):
         later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
         result = replace(result, lazy_fits=(*result.lazy_fits, later))
-    return CheckedComparison(result, curve)
+    return result, curve
 
 
-def without_curve(weights: Mapping[str | Family, float]) -> dict[str | Family, float]:
+def without_curve(weights: FamilyWeights) -> dict[FamilyName, float]:
     """Return the families that are solved in any case."""
     return {name: weight for name, weight in weights.items() if name != CURVE}
 
 
-def solve_joints(
-    data: IdentificationData, weights: Mapping[str | Family, float]
-) -> dict[str | Family, FamilySolution]:
+def solve_joints(data: IdentificationData, weights: FamilyWeights) -> FamilySolutions:
     """Return the solutions of all families but the curve."""
     joints = without_curve(weights)
     return solve_with_inliers(data, joints) if joints else {}
 
 
 def solve_curve(
-    data: IdentificationData, solutions: Solutions, before: FamilySolution | None = None
+    data: IdentificationData, solutions: FamilySolutions, before: FamilySolution | None = None
 ) -> FamilySolution | None:
     """Return the most probable curve by its inliers; None if there are too few for one, or equal."""
     observations, count = data.observations, len(data.observations)
@@ -223,7 +214,7 @@ def _fit_to_noise(
     return adapt_noise(observations, near, continue_curve)
 
 
-def is_doubtful(data: IdentificationData, result: IdentificationResult, solutions: Solutions) -> bool:
+def is_doubtful(data: IdentificationData, result: IdentificationResult, solutions: FamilySolutions) -> bool:
     """Return True if a curve or a larger noise may explain the observations better than the best family."""
     solution = solutions[_best_name(result, solutions)].scored.solution
     if solution.motion.joints > 1:
@@ -234,8 +225,8 @@ def is_doubtful(data: IdentificationData, result: IdentificationResult, solution
 
 def _compare_refuted(
     data: IdentificationData,
-    solutions: Solutions,
-    weights: Mapping[str | Family, float],
+    solutions: FamilySolutions,
+    weights: FamilyWeights,
     is_online: bool,
     factor: float,
     otherwise: str,
@@ -257,7 +248,9 @@ def _compare_refuted(
     return replace(result, reason=reason)
 
 
-def _reasons(data: IdentificationData, result: IdentificationResult, solutions: Solutions) -> Iterator[str]:
+def _reasons(
+    data: IdentificationData, result: IdentificationResult, solutions: FamilySolutions
+) -> Iterator[str]:
     name = _best_name(result, solutions)
     if result.lazy_fits[0].probability < SURE:
         return
@@ -289,7 +282,7 @@ def _reasons(data: IdentificationData, result: IdentificationResult, solutions: 
             yield "its residuals depend on the joint value, so this may be none of these joints"
 
 
-def _is_explained(curve: FamilySolution, solutions: Solutions) -> bool:
+def _is_explained(curve: FamilySolution, solutions: FamilySolutions) -> bool:
     """Return True if a joint with one joint value leaves no more than the noise of a curve.
 
     Then the curve is that joint, and its evidence is no argument: its smoothness is estimated, so it pays
@@ -312,8 +305,8 @@ def _is_smooth(values: Array) -> bool:
 
 
 def _best_scale(
-    data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float], scales: Array
-) -> tuple[str | Family, float, dict[str | Family, float]]:
+    data: IdentificationData, solutions: FamilySolutions, weights: FamilyWeights, scales: Array
+) -> tuple[FamilyName, float, dict[FamilyName, float]]:
     """Return the best family for a noise of unknown size, its size, and the log evidences with priors."""
     prior, factors = -0.5 * (np.log(scales) / _SCALE_SPREAD) ** 2, np.column_stack([scales, scales])
     weight, at_scales = data.observation_weight, {}
@@ -327,7 +320,7 @@ def _best_scale(
     return best, float(scales[int(np.argmax(at_scales[best]))]), logs
 
 
-def _best_name(result: IdentificationResult, solutions: Solutions) -> str | Family:
+def _best_name(result: IdentificationResult, solutions: FamilySolutions) -> FamilyName:
     family = result.lazy_fits[0].family
     return next(name for name, one in solutions.items() if one.scored.solution.motion.name == family)
 
@@ -348,8 +341,8 @@ def _classify(data: IdentificationData, one: NoiseSolution) -> RowIndices:
 
 def fit_of_curve(
     data: IdentificationData,
-    solutions: Solutions,
-    weights: Mapping[str | Family, float],
+    solutions: FamilySolutions,
+    weights: FamilyWeights,
     before: FamilySolution | None = None,
     probability: float = 0.0,
 ) -> Fit:

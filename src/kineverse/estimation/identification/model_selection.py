@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
@@ -45,6 +45,9 @@ from .observations import Observations
 from .outlier_rejection import RowIndices, find_inliers, log_inlier_prior
 from .result import Fit, IdentificationResult, LazyFit, build_fit, complete_fit
 from .solver import solver
+
+FamilyName: TypeAlias = "str | Family"
+FamilyWeights: TypeAlias = Mapping[FamilyName, float]  # prior weights
 
 # Number of slow cosines along a joint value: at most, and relative to the number of observations.
 _COSINES, _DENSITY = 6, 0.25
@@ -127,9 +130,8 @@ def bound_log_evidences(
     result = dict(logs)
     grouped = {name: one for name, one in solutions.items() if isinstance(one.motion, GroupMotion)}
     names = {one.motion.name: name for name, one in grouped.items()}
-    for family in ("prismatic", "revolute"):
-        if "rigid" in names and family in names:
-            name = names[family]
+    for name in (names[family] for family in ("prismatic", "revolute") if family in names):
+        if "rigid" in names:
             result[name] = max(result[name], logs[names["rigid"]] + math.log(UNSEEN))
     if "prismatic" in names and "revolute" in names:
         line, name = grouped[names["prismatic"]], names["revolute"]
@@ -150,8 +152,7 @@ def log_probability_straight(line: Solution[FamilyMember]) -> float:
     if len(along) < 3:
         return -0.5  # any arc goes through two points
     terms = np.column_stack([np.ones_like(along), along, along**2])
-    triangle: Array = np.linalg.qr(terms)[1]  # the residual of x² after regression on 1 and x
-    bend = abs(float(triangle[2, 2]))
+    bend = abs(float(np.linalg.qr(terms)[1][2, 2]))
     axis = line.motion.left[:3, 2]
     across = np.trace(line.covariance, axis1=1, axis2=2) - axis @ line.covariance @ axis
     curvature = 2.0 * math.sqrt(0.5 * float(across.mean())) / max(bend, 1e-12)
@@ -194,6 +195,10 @@ class FamilySolution:
         return self.scored.log_evidence + self.noise.log_weight
 
 
+FamilySolutions: TypeAlias = dict[FamilyName, FamilySolution]
+FamilyInliers: TypeAlias = Mapping[FamilyName, RowIndices]
+
+
 def prepare_data(
     observations: Observations,
     stated: bool,
@@ -212,12 +217,9 @@ def prepare_data(
     return IdentificationData(scaled, unit, stated, outliers, sequential, 1.0, observation_weight)
 
 
-def solve_with_inliers(
-    data: IdentificationData, weights: Mapping[str | Family, float]
-) -> dict[str | Family, FamilySolution]:
+def solve_with_inliers(data: IdentificationData, weights: FamilyWeights) -> FamilySolutions:
     """Return the solution of each family by its inliers."""
-    everything = np.arange(len(data.observations))
-    inliers: Mapping[str | Family, RowIndices] = dict.fromkeys(weights, everything)
+    inliers = dict.fromkeys(weights, np.arange(len(data.observations)))
     if data.outliers is not None:
         inliers = _classify(data, weights, data.observations)
     solutions = _solve_inliers(data, inliers)
@@ -232,29 +234,26 @@ def solve_with_inliers(
 
 
 def _classify(
-    data: IdentificationData, families: Iterable[str | Family], observations: Observations
-) -> dict[str | Family, RowIndices]:
+    data: IdentificationData, families: Iterable[FamilyName], observations: Observations
+) -> dict[FamilyName, RowIndices]:
     assert data.outliers is not None  # else there is nothing to classify
 
-    def solve(some: Observations, name: str | Family) -> Scored:
+    def solve(some: Observations, name: FamilyName) -> Scored:
         return solve_families(some, [name], data.unit)[name]
 
     solutions = solve_families(observations, families, data.unit)
     return find_inliers(observations, solutions, data.outliers, data.stated, solve)
 
 
-def _solve_inliers(
-    data: IdentificationData, inliers: Mapping[str | Family, RowIndices]
-) -> dict[str | Family, NoiseSolution]:
-
-    def solve(name: str | Family, statistics: MotionStatistics, some: Observations) -> Scored:
+def _solve_inliers(data: IdentificationData, inliers: FamilyInliers) -> dict[FamilyName, NoiseSolution]:
+    def solve(name: FamilyName, statistics: MotionStatistics, some: Observations) -> Scored:
         scored = solver.maximum_likelihood(some, _starts(some, name, statistics, data.unit))
         # A screw is solved again with the revolutions of the observations.
         start = unwrap_screw(some, scored.solution) if data.sequential else None
         return scored if start is None else solver.maximum_likelihood(some, [start])
 
     solver.prepare()
-    solutions: dict[str | Family, NoiseSolution] = {}
+    solutions: dict[FamilyName, NoiseSolution] = {}
     for rows in {rows.tobytes(): rows for rows in inliers.values()}.values():
         observations = data.observations.select(rows)
         statistics = MotionStatistics(observations)
@@ -268,11 +267,11 @@ def _solve_inliers(
 
 def score_solutions(
     data: IdentificationData,
-    solutions: Mapping[str | Family, NoiseSolution],
-    inliers: Mapping[str | Family, RowIndices],
-    weights: Mapping[str | Family, float],
+    solutions: Mapping[FamilyName, NoiseSolution],
+    inliers: FamilyInliers,
+    weights: FamilyWeights,
     renew: bool = True,
-) -> dict[str | Family, FamilySolution]:
+) -> FamilySolutions:
     """Score solutions of families against each other; an unknown noise is estimated again if ``renew``."""
     count = len(data.observations)
     log_priors = dict.fromkeys(solutions, 0.0)
@@ -283,11 +282,9 @@ def score_solutions(
         if data.sequential:
             log_priors[name] += log_unwrapping_gain(one.scored.solution)
     # The threshold is on evidence in which each observation has its weight.
-    weight, result = data.observation_weight, {}
-    logs = {
-        name: one.log_evidence + math.log(weights[name]) / weight + log_priors[name]
-        for name, one in solutions.items()
-    }
+    weight, logs, result = data.observation_weight, {}, {}
+    for name, one in solutions.items():
+        logs[name] = one.log_evidence + math.log(weights[name]) / weight + log_priors[name]
     threshold = max(logs.values()) - _NEGLIGIBLE / weight
     threshold -= _NEGLIGIBLE_EACH * max(map(len, inliers.values()))
     refine = adapt_noise if renew and not data.stated else _integrate_joint_values
@@ -300,8 +297,8 @@ def score_solutions(
 
 
 def solve_families(
-    observations: Observations, families: Iterable[str | Family], unit: float = 1.0
-) -> dict[str | Family, Scored]:
+    observations: Observations, families: Iterable[FamilyName], unit: float = 1.0
+) -> dict[FamilyName, Scored]:
     """Return the most likely member of each family, for observations in a unit of length [m]."""
     solver.prepare()
     statistics = MotionStatistics(observations)
@@ -310,7 +307,7 @@ def solve_families(
 
 
 def _starts(
-    observations: Observations, family: str | Family, statistics: MotionStatistics, unit: float
+    observations: Observations, family: FamilyName, statistics: MotionStatistics, unit: float
 ) -> list[InitialGuess]:
     if isinstance(family, Family):
         return [InitialGuess(motion, values) for motion, values in family_starts(family, observations, unit)]
@@ -327,9 +324,7 @@ def _integrate_joint_values(observations: Observations, one: NoiseSolution) -> N
 
 
 def weigh_families(
-    data: IdentificationData,
-    solutions: Mapping[str | Family, FamilySolution],
-    weights: Mapping[str | Family, float],
+    data: IdentificationData, solutions: FamilySolutions, weights: FamilyWeights
 ) -> IdentificationResult:
     """Return the fits of all families with their posterior probabilities."""
     solutions = {name: _weigh_observations(data, one) for name, one in solutions.items()}
@@ -337,10 +332,10 @@ def weigh_families(
     logs = bound_log_evidences(evidences, {name: one.scored.solution for name, one in solutions.items()})
     total: Array = np.array([logs[name] + math.log(weights[name]) for name in solutions])
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
-    lazy_fits = [
-        LazyFit(one.scored.solution.motion.name, p, partial(_fit, data, one, logs[name], p))
-        for (name, one), p in zip(solutions.items(), probabilities, strict=True)
-    ]
+    lazy_fits = []
+    for (name, one), p in zip(solutions.items(), probabilities, strict=True):
+        compute = partial(_fit, data, one, logs[name], p)
+        lazy_fits.append(LazyFit(one.scored.solution.motion.name, p, compute))
     lazy_fits.sort(key=lambda lazy_fit: -lazy_fit.probability)
     best = list(solutions.values())[int(np.argmax(total))]
     return IdentificationResult(tuple(lazy_fits), best.noise.deviations(data.unit))

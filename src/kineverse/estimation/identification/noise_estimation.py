@@ -36,8 +36,8 @@ more: of cranes, and in millimetres.
 _SHARE = 1e-3
 _SPREAD = math.log(5.0)  # standard deviation of their logarithms: a factor of 5
 
-# Factors on the medians for first solutions: ratios of position to orientation noise of 1, 16 and 1/16.
-_STARTS = ((1.0, 1.0), (4.0, 0.25), (0.25, 4.0))
+# Factors on the medians for further first solutions: ratios of position to orientation noise of 16 and 1/16.
+_STARTS = ((4.0, 0.25), (0.25, 4.0))
 # Least factor, 5 µm and 0.001°. Without it the likelihood of identical poses has no maximum.
 _ROUNDING = 1e-3
 _COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])  # logarithms of the factors of the first search
@@ -189,18 +189,13 @@ def estimate_noise(
 
 def solve_unknown_noise(observations: Observations, solve: Callable[[Observations], Scored]) -> NoiseSolution:
     """Return the most likely member of a family, at the noise that suits it best."""
-    search, mode = None, None
-    for factors in _STARTS:
+    search = _NoiseSearch(observations, solve(observations).solution)
+    mode = search.maximise_anywhere()
+    for factors in _STARTS if search.dimensions > 1 else ():
         solution = solve(scale_noise(observations, np.array(factors))).solution
         other = _NoiseSearch(observations, solution)
-        if search is None or mode is None:
-            search, mode = other, other.maximise_anywhere()
-        elif other.log_density(mode.logs[None])[0] > mode.log_density + _BETTER:
+        if other.log_density(mode.logs[None])[0] > mode.log_density + _BETTER:
             search, mode = other, other.maximise(mode.logs, mode.root)
-        if other.dimensions == 1:
-            break
-    assert search is not None
-    assert mode is not None  # there is a start
     return _at_mode(search, mode)
 
 
@@ -251,10 +246,9 @@ def weigh_observations(observations: Observations, one: NoiseSolution, weight: f
     # Steps that did not converge reach less than the quadratic approximation predicts.
     missing = reached - float(_NoiseSearch(observations, solution).log_evidences(noise.logs[None])[0])
     mode = search.maximise(noise.logs, noise.root / math.sqrt(weight))
-    predicted = float(search.log_evidences(mode.logs[None])[0])
-    covariance = np.tensordot(_factors(mode.logs[None])[0] ** 2, search.parts, axes=1)
-    scored = Scored(replace(solution, covariance=covariance), predicted + weight * missing)
-    return NoiseSolution(scored, NoisePosterior(mode.logs, mode.root, search.integrate(mode) - predicted))
+    (solution, predicted), noise = _at_mode(search, mode)
+    scored = Scored(solution, predicted + weight * missing)
+    return NoiseSolution(scored, noise._replace(log_weight=search.integrate(mode) - predicted))
 
 
 def _factors(logs: Array) -> Array:

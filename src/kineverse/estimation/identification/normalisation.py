@@ -69,10 +69,8 @@ def convert_to_metres(fit: Fit, unit: float) -> Fit:
         motion = motion.scaled(unit)
         scale, slides = np.full(len(fit.covariance), unit), np.array([unit])
     elif isinstance(motion, GroupMotion):
-        is_length = [
-            name == "pitch" or name.startswith("point.") or name in _PLACES for name in fit.coordinates
-        ]
-        scale = np.where(is_length, unit, 1.0)
+        lengths = ("pitch", "point.x", "point.y", "point.z", "child.x", "child.y", "child.z")
+        scale = np.where([name in lengths for name in fit.coordinates], unit, 1.0)
         slides = np.array([unit if j < WX else 1.0 for j in motion.parametrisation.joints])
         frame, right = _scale_positions(motion.left, unit), _scale_positions(motion.right, unit)
         motion = replace(motion, left=frame, right=right, pitch=unit * motion.pitch)
@@ -94,9 +92,6 @@ def _scale_positions(poses: Array, factor: float) -> Array:
     result = poses.copy()
     result[..., :3, 3] *= factor
     return result
-
-
-_PLACES = ("child.x", "child.y", "child.z")
 
 
 def fix_gauge(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:

@@ -171,8 +171,7 @@ def _check_covariances(each: Array, part: str) -> None:
     scale[scale == 0.0] = 1.0
     relative = each / (scale[:, :, None] * scale[:, None, :])
     symmetric = np.abs(relative - np.swapaxes(relative, 1, 2)).max(axis=(1, 2)) < 1e-8
-    smallest = np.linalg.eigvalsh(relative)[:, 0]
-    wrong = np.flatnonzero(~symmetric | (smallest < 1e-12))
+    wrong = np.flatnonzero(~symmetric | (np.linalg.eigvalsh(relative)[:, 0] < 1e-12))
     if len(wrong):
         k = int(wrong[0])
         how = "positive definite" if symmetric[k] else "symmetric"

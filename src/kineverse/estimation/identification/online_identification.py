@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +17,21 @@ from kineverse.estimation.noise import Outliers, as_outliers
 from kineverse.lie import Array
 
 from .curve import CURVE
-from .families import Family
 from .joint_identification import Families, family_weights, resolve_noise
 from .joint_values import is_screw
 from .kinematic_graph.pairwise import SURPRISE_DEVIATIONS
 from .least_squares import InitialGuess
 from .model_check import fit_of_curve, is_doubtful, solve_joints, weigh_and_check, without_curve
-from .model_selection import FamilySolution, IdentificationData, prepare_data, score_solutions, weigh_families
+from .model_selection import (
+    FamilyName,
+    FamilySolution,
+    FamilySolutions,
+    FamilyWeights,
+    IdentificationData,
+    prepare_data,
+    score_solutions,
+    weigh_families,
+)
 from .noise_estimation import NoiseSolution, scale_noise
 from .observations import Observations, check_observations
 from .outlier_rejection import RowIndices
@@ -69,14 +76,11 @@ _FIELDS = tuple(field.name for field in fields(Observations))
 
 
 def warm_start(
-    data: IdentificationData,
-    known: Mapping[str | Family, FamilySolution],
-    weights: Mapping[str | Family, float],
-    renew: bool = False,
-) -> dict[str | Family, FamilySolution]:
+    data: IdentificationData, known: FamilySolutions, weights: FamilyWeights, renew: bool = False
+) -> FamilySolutions:
     """Return the solutions of families for all observations, starting from earlier solutions."""
     inliers = {name: _predict_inliers(data, one) for name, one in known.items()}
-    nearest_of = functools.cache(_nearest_observations)  # most families have the same inliers
+    nearest_of = cache(_nearest_observations)  # most families have the same inliers
     solutions = {}
     for name, one in known.items():
         observations, rows, before = data.observations, inliers[name], one.scored.solution
@@ -165,13 +169,12 @@ class Identifier:
         self._sequential = sequential
         self._outliers = as_outliers(outliers)
         self._weights = family_weights(families)
-        self._joint_weights = without_curve(self._weights)
         self._noise = parent_covariance, child_covariance, noise
         self._stated = True
         self._buffer = ObservationBuffer()
-        self._solutions: dict[str | Family, FamilySolution] = {}
+        self._solutions: FamilySolutions = {}
         # Log odds of each family against the best one at its last update.
-        self._odds: dict[str | Family, float] = {}
+        self._odds: dict[FamilyName, float] = {}
         self._result: IdentificationResult | None = None
         self._full_count, self._noise_count, self._count, self._unit = 0, 0, 0, 1.0
         # Last check of the most probable family, and the solution of the curve at that time.
@@ -233,10 +236,10 @@ class Identifier:
     @singularity_named()
     def _identify(self) -> IdentificationResult:
         observations = self._buffer.all
-        if not self._joint_weights:
+        if not without_curve(self._weights):
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
-            return weigh_and_check(data, {}, self._weights).result
-        deferred: dict[str | Family, FamilySolution] = {}
+            return weigh_and_check(data, {}, self._weights)[0]
+        deferred: FamilySolutions = {}
         # A few observations do not determine which of them are outliers.
         growth = 2.0 if self._outliers is None else 1.0 + _MORE
         if len(observations) >= growth * self._full_count:
@@ -259,8 +262,8 @@ class Identifier:
         lazy_fits = {fit.family: fit for fit in result.lazy_fits}
         for name, one in deferred.items():
             fit = lazy_fits[one.scored.solution.motion.name]
-            compute = partial(_deferred_fit, data, name, one, self._weights, fit.probability)
-            lazy_fits[fit.family] = fit._replace(compute=compute)
+            compute = partial(_deferred_fit, data, name, one, self._weights)
+            lazy_fits[fit.family] = fit._replace(compute=partial(_with_probability, compute, fit.probability))
         result = replace(result, lazy_fits=tuple(lazy_fits.values()))
         check, best_family = self._check, result.lazy_fits[0].family
         is_recent = check is not None and len(observations) < (1.0 + _MORE) * check.count
@@ -272,17 +275,14 @@ class Identifier:
         if check is not None:
             # The families below one in a million may be those that a larger noise makes probable.
             known = solve_joints(data, self._weights)
-        before = None if check is None else check.curve
-        result, curve = weigh_and_check(data, known, self._weights, before)
+        result, curve = weigh_and_check(data, known, self._weights, None if check is None else check.curve)
         probabilities = result.probabilities
         best_family = next((fit.family for fit in result.lazy_fits if fit.family != CURVE), "")
         odds = probabilities.get(CURVE, 0.0) / max(probabilities.get(best_family, 0.0), 1e-300)
         self._check = _Check(best_family, len(observations), bool(result.reason), curve, odds)
         return result
 
-    def _update_families(
-        self, data: IdentificationData
-    ) -> tuple[dict[str | Family, FamilySolution], dict[str | Family, FamilySolution]]:
+    def _update_families(self, data: IdentificationData) -> tuple[FamilySolutions, FamilySolutions]:
         best = max(self._odds, key=self._odds.__getitem__)
         count = len(self._buffer)
         renew = not data.stated and count >= (1.0 + _MORE) * self._noise_count
@@ -309,7 +309,7 @@ class Identifier:
             deferred[name] = replace(one, scored=scored)
         return known, deferred
 
-    def _log_posterior(self, name: str | Family, one: FamilySolution) -> float:
+    def _log_posterior(self, name: FamilyName, one: FamilySolution) -> float:
         return one.log_evidence + one.log_prior + math.log(self._weights[name])
 
 
@@ -325,10 +325,7 @@ class _Check:
 
 
 def _with_curve(
-    data: IdentificationData,
-    result: IdentificationResult,
-    check: _Check,
-    weights: Mapping[str | Family, float],
+    data: IdentificationData, result: IdentificationResult, check: _Check, weights: FamilyWeights
 ) -> IdentificationResult:
     """Return a result with a curve at the odds of its last check. Its fit uses all observations."""
     share = check.odds * result.lazy_fits[0].probability
@@ -345,11 +342,6 @@ def _with_probability(compute: Callable[[], Fit], probability: float) -> Fit:
 
 
 def _deferred_fit(
-    data: IdentificationData,
-    name: str | Family,
-    one: FamilySolution,
-    weights: Mapping[str | Family, float],
-    probability: float,
+    data: IdentificationData, name: FamilyName, one: FamilySolution, weights: FamilyWeights
 ) -> Fit:
-    fit = weigh_families(data, warm_start(data, {name: one}, weights), weights).best
-    return replace(fit, probability=probability)
+    return weigh_families(data, warm_start(data, {name: one}, weights), weights).best

@@ -155,18 +155,17 @@ class _InlierSearch:
 
     def anneal(self, hypothesis: _InlierHypothesis) -> _InlierHypothesis:
         """Return the hypothesis that graduated non-convexity reaches from a first one."""
-        solution, weights, quantile = hypothesis.solution, None, _CHI_SQUARED[self.observations.rows]
-        squares, _ = self._whitened_errors(solution, weights)
+        solution, quantile = hypothesis.solution, _CHI_SQUARED[self.observations.rows]
+        squares, _ = self._whitened_errors(solution, None)
         tolerance = max(1.0, 2.0 * float(squares.max()) / quantile)
         while True:
             tolerated = tolerance * quantile
             weights = np.maximum((tolerated / (squares + tolerated)) ** 2, _LEAST_WEIGHT)
             solution = self._solve(solution.motion, solution.values, solution.parent, weights, _FEW_STEPS)
-            squares, _ = self._whitened_errors(solution, weights)
             if tolerance == 1.0:
-                break
+                return self._iterate(self.hypothesis(solution, weights))
+            squares, _ = self._whitened_errors(solution, weights)
             tolerance = max(1.0, tolerance / _ANNEALING)
-        return self._iterate(self.hypothesis(solution, weights))
 
     def grow(self, subset: Solution[FamilyMember], rows: RowIndices) -> _InlierHypothesis:
         """Return the hypothesis that the solution of some of the observations leads to."""

@@ -5,8 +5,10 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .check import check_plausibility as check_plausibility
-    from .monitor import PlausibilityMonitor as PlausibilityMonitor
+    from .check import (
+        PlausibilityMonitor as PlausibilityMonitor,
+        check_plausibility as check_plausibility,
+    )
     from .report import (
         ImplausibleError as ImplausibleError,
         JointVerdict as JointVerdict,

@@ -69,8 +69,7 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
     log = -float(np.sum(0.5 * np.sum(residuals.orthogonal**2, axis=1) + residuals.log_scale))
     log -= 0.5 * float(np.nansum(np.maximum(residuals.limit_excess, 0.0) ** 2))
     # The expected squared disagreement under a correct model is 1.
-    known = np.isfinite(residuals.disagreement)
-    excess = np.nansum(residuals.disagreement**2, axis=0) - known.sum(axis=0)
+    excess = np.nansum(residuals.disagreement**2, axis=0) - np.isfinite(residuals.disagreement).sum(axis=0)
     log -= 0.5 * float(np.maximum(excess, 0.0).sum())
     widths = _STATIC_WIDTH if is_static else _WIDTHS
     if served.joints == 1:
@@ -176,9 +175,8 @@ class JointObservations:
     def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the observations."""
         poses, residuals = self.observations.select(rows), self.residuals.select(rows)
-        return JointObservations(
-            self.joint, self.served, poses, residuals, self.times[rows], self.stamps[rows]
-        )
+        times, stamps = self.times[rows], self.stamps[rows]
+        return JointObservations(self.joint, self.served, poses, residuals, times, stamps)
 
     def decorrelate(self, looks: float) -> JointObservations:
         """Return evenly spaced observations with larger covariances, as independent ones."""
@@ -325,5 +323,4 @@ def _explains_alone(model: Model, data: JointObservations, alternative: Identifi
         return False
     served = KnownJoint(model, data.joint.child, data.joint.parent, open_loops=True)
     residuals = compute_residuals(served, data.observations)
-    alone = _probabilities(replace(data, served=served, residuals=residuals), alternative)
-    return alone["served"] >= SURE
+    return _probabilities(replace(data, served=served, residuals=residuals), alternative)["served"] >= SURE

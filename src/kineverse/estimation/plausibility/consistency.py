@@ -169,8 +169,7 @@ class _Limits:
         z = _deviations(slack, spread, others, bool(shared[:m].any()))
         # First-order propagation is valid only where the limit is nearly linear within the uncertainty.
         of_joint = np.einsum("nii->ni", residuals.covariances) if served.is_plain else np.zeros((count, n))
-        of_others = np.einsum("nii->ni", covariances[:, :m, :m])
-        within = np.sqrt(np.concatenate([of_joint, of_others], axis=1))
+        within = np.sqrt(np.concatenate([of_joint, np.einsum("nii->ni", covariances[:, :m, :m])], axis=1))
         total = np.sqrt(spread + others)
         for k in range(points.shape[1]):
             for step in (-_RANGE, _RANGE):

@@ -83,9 +83,8 @@ class SequentialTest:
         parts: list[tuple[float, float, int]] = []
         if len(orthogonal):
             squares = float(orthogonal @ orthogonal)
-            displaced = self._displacement.add(
-                weight, self.count - 1, orthogonal, squares, displacement_jacobian, looks
-            )
+            index = self.count - 1
+            displaced = self._displacement.add(weight, index, orthogonal, displacement_jacobian, looks)
             log = _HALF_SHRUNK * squares - len(orthogonal) * _LOG_GROWN
             unconstrained = self._unconstrained.add(weight, self.count - 1, log / looks)
             parts += [(0.5, *displaced), (0.3, *unconstrained)]
@@ -192,13 +191,7 @@ class _DisplacementTest:
         self._covariances = np.tile(self._prior, (_CHANGE_POINTS, 1, 1, 1))
 
     def add(
-        self,
-        weight: float,
-        index: int,
-        orthogonal: Array,
-        squares: float,
-        displacement_jacobian: Array,
-        looks: float,
+        self, weight: float, index: int, orthogonal: Array, displacement_jacobian: Array, looks: float
     ) -> tuple[float, int]:
         """Return the log of the mixture over sizes and change points, and the most likely change point."""
         self._begin(weight, index)
@@ -208,9 +201,9 @@ class _DisplacementTest:
         spread = displacement_jacobian @ cross_covariance
         spread += looks * np.eye(len(orthogonal))
         information = np.linalg.inv(spread)
-        solved = (information @ error[..., None])[..., 0]
-        displaced = np.sum(error * solved, axis=2)
+        displaced = np.sum(error * (information @ error[..., None])[..., 0], axis=2)
         log_volume = np.linalg.slogdet(spread)[1] - len(orthogonal) * math.log(looks)
+        squares = float(orthogonal @ orthogonal)
         self._logs += self._bet.gains(0.5 * (squares / looks - displaced - log_volume))
         if self._bet.robust:
             information *= (displaced <= CHI_SQUARED_6)[..., None, None]

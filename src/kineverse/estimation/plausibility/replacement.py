@@ -51,12 +51,6 @@ class JointValue:
     lower: float  # limits of the value
     upper: float
 
-    def evaluate(self, coordinates: Array) -> Array:
-        """Return the joint values at values of the coordinate, (N,)."""
-        if not self.is_derived:
-            return coordinates
-        return np.asarray(compile(self.value, [self.coordinate]).batch(coordinates[:, None]))
-
 
 def find_joint_value(
     model: Model, joint: TestableJoint, served: KnownJoint, records: Mapping[str, Articulation]
@@ -68,14 +62,13 @@ def find_joint_value(
     position = next((record.position for record in records.values()), None)
     if position is None or position == coordinate:
         return JointValue(coordinate, coordinate, None, False, float(served.lower[0]), float(served.upper[0]))
-    value = model.rates.resolve(to_plain(position))
     lower, upper = -math.inf, math.inf
     for (kind, _), limit in model.history.entry(joint.tag).writes.items():
         if kind == CONSTRAINTS and limit.expression == position:
             if not (limit.lower.symbols or limit.upper.symbols):
                 lower, upper = max(lower, float(limit.lower)), min(upper, float(limit.upper))
     follows = None if isinstance(position, Symbol) else position
-    return JointValue(coordinate, value, follows, True, lower, upper)
+    return JointValue(coordinate, model.rates.resolve(to_plain(position)), follows, True, lower, upper)
 
 
 def follows_another(model: Model, joint: TestableJoint) -> bool:
@@ -117,8 +110,7 @@ class ReplacedJoint(Operation, document_kind="Relearned"):
         writes = self.joint.apply(model).writes()
         if (FRAMES, self.frame) in writes:
             placed = writes[FRAMES, self.frame]
-            factors = (self.before, *placed.factors, self.after)
-            writes[FRAMES, self.frame] = Frame(placed.parent, factors)
+            writes[FRAMES, self.frame] = Frame(placed.parent, (self.before, *placed.factors, self.after))
         if self.record is not None:
             cells = writes.items()
             writes = {(k, self.record if k == ARTICULATIONS else name): value for (k, name), value in cells}
@@ -153,7 +145,9 @@ def build_replacement(
         if same_kind and turns and not before.is_derived:
             coordinates = coordinates + _turn_about_axis(served, coordinates, motion, values)
         known = others[:, 0] if others.shape[1] else coordinates[:, 0]
-        old = before.evaluate(np.where(np.isfinite(known), known, coordinates[:, 0]))
+        old = np.where(np.isfinite(known), known, coordinates[:, 0])
+        if before.is_derived:
+            old = np.asarray(compile(before.value, [before.coordinate]).batch(old[:, None]))
         geared = before.is_derived and bool(others.shape[1])
         motion, values, slope = _align_values(motion, values, old, same_kind, geared)
         same_kind = same_kind and slope == 1.0

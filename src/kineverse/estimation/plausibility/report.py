@@ -49,13 +49,12 @@ class _Finder:
     """Search for testable pairs of observed frames."""
 
     def __init__(self, model: Model, frames: list[str], exact: str | None) -> None:
-        self.model = model
-        self.exact = exact
-        self.chains = {f: self._chain(f) for f in (*frames, *([] if exact is None else [exact]))}
+        self.model, self.exact, last = model, exact, [] if exact is None else [exact]
+        self.chains = {f: self._chain(f) for f in (*frames, *last)}
         self.frames = sorted(frames, key=lambda f: len(self.chains[f]))
         # Observed frames of each part. The observer's frame comes last, because others are preferred.
         self.parts: dict[str, list[str]] = {}
-        for name in (*self.frames, *([] if exact is None else [exact])):
+        for name in (*self.frames, *last):
             self.parts.setdefault(self._root(name), []).append(name)
 
     def find(self) -> TestableJoints:
@@ -75,7 +74,7 @@ class _Finder:
         first = self.exact if self.exact in part else part[0]
         if first is None or first == name or name == WORLD:
             return None
-        nearest = self._nearest(self.chains[name][1:], part, first)
+        nearest = next((f for f in self.chains[name][1:] if f in part), first)
         return TestableJoint(self._writer(name), nearest, name, self.model.frames[name].parent, name, False)
 
     def _find_moving_pair(self, name: str) -> TestableJoint | str:
@@ -91,14 +90,11 @@ class _Finder:
         else:
             return "no frame with which it could be compared is observed"
         part = self.parts[top]
-        parent = self._nearest(self._chain(base), part, part[0])
+        parent = next((f for f in self._chain(base) if f in part), part[0])
         if len(tags) > 1:
             between = ", ".join(f"'{tag}'" for tag in tags)
             return f"several operations are between it and '{parent}': {between}; observe a frame in between"
         return TestableJoint(tags[0], parent, name, base, frame, True)
-
-    def _nearest(self, chain: list[str], part: list[str], otherwise: str) -> str:
-        return next((f for f in chain if f in part), otherwise)
 
     def _writer(self, frame: str) -> str:
         return self.model.history.writers(f"frames/{frame}")[-1]
@@ -257,13 +253,11 @@ class Plausibility:
             lines.append(f"\n  '{verdict.tag}' {verdict.verdict}: {alternative}")
         proposed = "Replace these operations by their proposals"
         advice = proposed if self.replacements else "Observe more of the motion"
-        raise ImplausibleError(
-            f"The model does not explain the observations. {advice}, or check the stated noise:"
-            + "".join(lines)
-        )
+        summary = f"The model does not explain the observations. {advice}, or check the stated noise:"
+        raise ImplausibleError(summary + "".join(lines))
 
     def __getitem__(self, tag: str) -> JointVerdict:
-        """Return the verdict on an operation; of several, the worst one."""
+        # Of several verdicts on an operation, the worst one.
         result = [r for r in self.verdicts if r.tag == tag]
         if not result:
             tags = [r.tag for r in self.verdicts]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ from kineverse.estimation.identification.motion_model import LinearisedPoses, Pa
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.linear_algebra import invert_matrices, log_determinants
 from kineverse.expressions.expression import array, as_expression
-from kineverse.lie import Array, log_so3, pose_difference, skew
+from kineverse.lie import Array, exp_so3, log_so3, pose_difference, skew, transform
 from kineverse.model.constraint import Constraint
 from kineverse.model.model import Model
 from kineverse.model.rates import to_plain
@@ -87,14 +88,7 @@ class KnownJoint:
         if not len(coordinates):
             return self._constant
         pose, *slopes = self._linear(np.concatenate([coordinates, self._others]))
-        twists = np.empty((6, len(slopes)))
-        for j, slope in enumerate(slopes):
-            turned = (slope[:3, :3] @ pose[:3, :3].T).tolist()
-            twists[:3, j] = slope[:3, 3]
-            twists[3, j] = 0.5 * (turned[2][1] - turned[1][2])
-            twists[4, j] = 0.5 * (turned[0][2] - turned[2][0])
-            twists[5, j] = 0.5 * (turned[1][0] - turned[0][1])
-        return pose, twists
+        return pose, _twists(pose, slopes)
 
     @cached_property
     def _constant(self) -> tuple[Array, Array]:
@@ -104,8 +98,7 @@ class KnownJoint:
     def retract(self, coordinates: Array, change: Array) -> Array:
         """Return coordinates (N, n) after changes of the joint values (N, k), without limits."""
         if self._rates is not None:
-            rates = self._rates.batch(self._points(coordinates))
-            change = (rates @ change[:, :, None])[:, :, 0]
+            change = (self._rates.batch(self._points(coordinates)) @ change[:, :, None])[:, :, 0]
         return np.asarray(coordinates + change)
 
     def per_joint(self, coordinates: Array, slopes: Array) -> Array:
@@ -118,13 +111,7 @@ class KnownJoint:
 
     def _twists(self, coordinates: Array) -> tuple[Array, Array]:
         poses, *slopes = self._linear.batch(self._points(coordinates))
-        twists = np.zeros((len(poses), 6, len(slopes)))
-        for j, slope in enumerate(slopes):
-            turned = slope[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2)
-            twists[:, :3, j] = slope[:, :3, 3]
-            for row, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
-                twists[:, 3 + row, j] = 0.5 * (turned[:, a, b] - turned[:, b, a])
-        return poses, twists
+        return poses, _twists(poses, slopes)
 
     def solve(self, observations: Observations) -> tuple[Array, Solution[KnownMotion]]:
         """Find the most likely coordinates (N, n) inside the limits, and the solution around them."""
@@ -183,8 +170,7 @@ class KnownJoint:
         if self.joints == 1:
             values = np.linspace(low, high, _GRID_SIZE)
         else:
-            random = np.random.default_rng(0)
-            values = random.uniform(low, high, (_SAMPLE_SIZE, self.joints))
+            values = np.random.default_rng(0).uniform(low, high, (_SAMPLE_SIZE, self.joints))
         start = np.zeros_like(self.home) if self.is_plain else self.home
         return self.retract(np.tile(start, (len(values), 1)), values)
 
@@ -194,6 +180,17 @@ class KnownJoint:
         width = self.upper - self.lower
         margin = np.where(np.isfinite(width), _MARGIN * width, 0.0)
         return self.lower + margin, self.upper - margin
+
+
+def _twists(poses: Array, slopes: Sequence[Array]) -> Array:
+    """Return twists (..., 6, n) per unit of each coordinate, from slopes of poses (..., 4, 4)."""
+    twists = np.empty((*poses.shape[:-2], 6, len(slopes)))
+    rows, columns = (2, 0, 1), (1, 2, 0)
+    for j, slope in enumerate(slopes):
+        turned = slope[..., :3, :3] @ np.swapaxes(poses[..., :3, :3], -1, -2)
+        twists[..., :3, j] = slope[..., :3, 3]
+        twists[..., 3:, j] = 0.5 * (turned[..., rows, columns] - turned[..., columns, rows])
+    return twists
 
 
 UNBOUNDED = (-math.inf, math.inf)
@@ -252,7 +249,7 @@ _STEPS, _STEP = 12, 0.5  # largest number of steps, and largest step of an angle
 # Squared residual beyond which the true pose of the parent stays at the observed one. The pose that explains
 # a gross error best is many steps away, and of no use.
 _GROSS = 1e3
-_EYE_3, _EYE_6 = np.eye(3), np.eye(6)
+_EYE_6 = np.eye(6)
 
 
 class PoseSolution(NamedTuple):
@@ -274,7 +271,7 @@ def solve_observation(
     of_child = observations.child_covariance[0]
     low, high = served.inner_limits
     values, true = np.clip(start, low, high), parent
-    turned, error, parent_error = np.zeros((6, 6)), np.empty(6), np.empty(6)
+    turned, lever, error, parent_error = np.zeros((6, 6)), np.eye(6), np.empty(6), np.empty(6)
     covariance = weights = _EYE_6
     curbed = bool(np.any(served.is_angle))
     for count in range(_STEPS):
@@ -288,7 +285,7 @@ def solve_observation(
             if of_parent is not None:
                 parent_error[:3] = rotation @ (parent[:3, 3] - true[:3, 3])
                 parent_error[3:] = _rotation_vector(rotation @ parent[:3, :3])
-                lever = _lever(pose)
+                lever[:3, 3:] = -skew(pose[:3, 3])
                 lifted = turned @ of_parent @ turned.T @ lever.T
                 covariance += lever @ lifted
                 error -= lever @ parent_error
@@ -310,9 +307,7 @@ def solve_observation(
             blame = parent_error + lifted @ (weights @ left)
             gain += float(np.sum(blame**2 / np.diagonal(of_parent)))
             if gain >= CLOSE:
-                step = np.eye(4)
-                step[:3, :3], step[:3, 3] = _rotation(blame[3:]), blame[:3]
-                true = true @ step
+                true = true @ transform(exp_so3(blame[3:]), blame[:3])
         if gain < CLOSE:
             return PoseSolution(values, pose, by_joints, error, covariance)
         values = there
@@ -335,15 +330,15 @@ def complete_basis(directions: Array) -> Array:
     return _EYE_6[:, 1:] - np.outer(v, (2.0 / square) * v[1:]) if square else _EYE_6[:, 1:]
 
 
-def displacement_jacobian(pose: Array, middle: Array) -> Array:
-    """Return the child's twist per unit twist of the joint in the parent, and of the child on it, (6, 12)."""
-    x, y, z = (pose[:3, 3] - middle).tolist()
-    result = np.zeros((6, 12))
-    result[:3, :3] = result[3:, 3:6] = _EYE_3
-    result[0, 4], result[0, 5] = z, -y
-    result[1, 3], result[1, 5] = -z, x
-    result[2, 3], result[2, 4] = y, -x
-    result[:3, 6:9] = result[3:, 9:] = pose[:3, :3]
+def displacement_jacobian(poses: Array, middle: Array) -> Array:
+    """Return the twists of the child at poses (..., 4, 4) by two unit twists, (..., 6, 12).
+
+    The first is that of the joint in the parent, and the second that of the child on the joint.
+    """
+    result = np.zeros((*poses.shape[:-2], 6, 12))
+    result[..., :3, :3] = result[..., 3:, 3:6] = np.eye(3)
+    result[..., :3, 3:6] = -skew(poses[..., :3, 3] - middle)
+    result[..., :3, 6:9] = result[..., 3:, 9:] = poses[..., :3, :3]
     return result
 
 
@@ -359,33 +354,6 @@ def _rotation_vector(rotation: Array) -> Array:
     return np.array([factor * x, factor * y, factor * z])
 
 
-def _rotation(v: Array) -> Array:
-    """Return the rotation of one rotation vector, as :func:`kineverse.lie.exp_so3`."""
-    x, y, z = v.tolist()
-    square = x * x + y * y + z * z
-    angle = math.sqrt(square)
-    a, b = 1.0, 0.5
-    if angle > 1e-5:
-        a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
-    return np.array(
-        [
-            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
-            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
-        ]
-    )
-
-
-def _lever(pose: Array) -> Array:
-    """Return the displacement of the child by an error of the parent, (6, 6)."""
-    x, y, z = pose[:3, 3].tolist()
-    result = np.eye(6)
-    result[0, 4], result[0, 5] = z, -y
-    result[1, 3], result[1, 5] = -z, x
-    result[2, 3], result[2, 4] = y, -x
-    return result
-
-
 SIZES = (0.01, 0.05, 0.3)  # standard deviations of a displacement, for each component of a twist [m], [rad]
 _PRECISION = 1e-4  # prior information of joint values: a deviation of 100 [m] or [rad]
 
@@ -399,9 +367,7 @@ class KnownResiduals:
     covariances: Array  # of the values, (N, k, k)
     orthogonal: Array  # ρ, the whitened residual orthogonal to the joint directions, (N, 6 - k)
     whitened: Array  # the same residual in the axes of the whitened pose, (N, 6)
-    displacement_jacobian: (
-        Array  # G, of ρ by a displacement of the joint and of the child on it, (N, 6 - k, 12)
-    )
+    displacement_jacobian: Array  # G, of ρ by displacements of the joint, the child on it, (N, 6 - k, 12)
     bound_excess: Array  # values beyond their lower and upper limits, in standard deviations, (N, 2 k)
     pose_residuals: Array  # in the parent's axes, (N, 6)
     log_scale: Array  # log of the volume of the noise across the joint directions, (N,)
@@ -448,8 +414,7 @@ def compute_residuals(served: KnownJoint, observations: Observations) -> KnownRe
     joints = served.joints
     covariances = invert_matrices(transposed @ directions + _PRECISION * np.eye(joints))
     # At a limit, one Gauss-Newton step leads to the optimum without limits.
-    step = (covariances @ transposed @ error[:, :, None])[:, :, 0]
-    values = solution.values + step
+    values = solution.values + (covariances @ transposed @ error[:, :, None])[:, :, 0]
     if not served.is_plain:
         # From the first pose to each, to first order.
         linear = solution.linear
@@ -466,7 +431,7 @@ def compute_residuals(served: KnownJoint, observations: Observations) -> KnownRe
         covariances,
         orthogonal,
         (basis[:, :, joints:] @ orthogonal[:, :, None])[:, :, 0],
-        across @ whitening @ _displacement_jacobian(pose, served.middle),
+        across @ whitening @ displacement_jacobian(pose, served.middle),
         excess / np.tile(deviations, (1, 2)),
         solution.residuals,
         0.5 * (log_determinants(math.tau * solution.covariance) - log_determinants(math.tau * covariances)),
@@ -505,8 +470,7 @@ def orthogonal_residuals(solution: Solution[Any]) -> Array:
     """Return the whitened residuals without their components along the joint directions, (N, 6)."""
     _, error, directions = _whiten(solution)
     basis = np.linalg.qr(directions)[0]
-    along: Array = basis @ (np.swapaxes(basis, 1, 2) @ error[:, :, None])
-    return error - along[:, :, 0]
+    return error - (basis @ (np.swapaxes(basis, 1, 2) @ error[:, :, None]))[:, :, 0]
 
 
 def _whiten(solution: Solution[Any]) -> tuple[Array, Array, Array]:
@@ -514,12 +478,3 @@ def _whiten(solution: Solution[Any]) -> tuple[Array, Array, Array]:
     whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
     error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
     return whitening, error, whitening @ solution.linear.by_joints
-
-
-def _displacement_jacobian(pose: Array, middle: Array) -> Array:
-    """Return the child's twist per unit twist of the joint in the parent, and of the child on the joint."""
-    result = np.zeros((len(pose), 6, 12))
-    result[:, :3, :3] = result[:, 3:, 3:6] = np.eye(3)
-    result[:, :3, 3:6] = -skew(pose[:, :3, 3] - middle)
-    result[:, :3, 6:9] = result[:, 3:, 9:] = pose[:, :3, :3]
-    return result

@@ -19,7 +19,7 @@ from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 from kineverse.spatial import translation
 
-from .recording import RecordedPair
+from .recording import RecordedPair, spaced_indices
 
 _ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
 
@@ -67,8 +67,8 @@ def _make_operation(fit: Fit, parent: str, child: str) -> Operation:
 
 def _parent_shapes(fit: Fit, positions: Array, size: float) -> tuple[Shape, ...]:
     """Return the axis, and dots at observed positions, in the parent's frame."""
-    indices = np.unique(np.linspace(0, len(positions) - 1, _DOTS).round().astype(int))
-    parts = [Shape(Sphere(0.008 * size), shift(*map(float, positions[i])), color=_ORANGE) for i in indices]
+    dots = positions[spaced_indices(len(positions), _DOTS)]
+    parts = [Shape(Sphere(0.008 * size), shift(*map(float, dot)), color=_ORANGE) for dot in dots]
     if "axis" in fit.parameters:
         half = 0.5 * size * np.asarray(fit.parameters["axis"])
         middle = _closest_point_on_axis(fit, positions.mean(axis=0))
@@ -99,5 +99,4 @@ def _closest_point_on_axis(fit: Fit, position: Array) -> Array:
     if "point" not in fit.parameters:
         return position
     axis, point = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
-    foot: Array = point + (axis @ (position - point)) * axis
-    return foot
+    return np.asarray(point + (axis @ (position - point)) * axis)

@@ -6,7 +6,7 @@ import csv
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -127,37 +127,24 @@ def _parse_column(name: str, where: str) -> tuple[str, str, float]:
 
 
 def _parse_part(
-    part: str, places: Mapping[tuple[str, str], int], where: str, ignored: Iterable[str]
+    part: str, places: Mapping[tuple[str, str], int], where: str, ignored: Sequence[str]
 ) -> PartColumns:
-    position = _find_columns(part, POSITION, places, where, ignored)
-    if not position:
-        raise FormatError(f"{where}: {_describe_owner(part)} an orientation, but no position x, y, z.")
-    columns = {form: _find_columns(part, q, places, where, ignored) for form, q in ORIENTATIONS.items()}
-    forms = [form for form, those in columns.items() if those]
-    if len(forms) > 1:
-        both = " and ".join(forms)
-        raise FormatError(f"{where}: {_describe_owner(part)} its orientation twice, as {both}.")
-    return PartColumns(position, columns[forms[0]], forms[0]) if forms else PartColumns(position)
-
-
-def _find_columns(
-    part: str,
-    quantities: tuple[str, ...],
-    places: Mapping[tuple[str, str], int],
-    where: str,
-    ignored: Iterable[str],
-) -> tuple[int, ...]:
-    """Return the columns of quantities that belong together; none if all are missing."""
-    missing = [quantity for quantity in quantities if (part, quantity) not in places]
-    if missing and len(missing) < len(quantities):
-        others, absent = list(ignored), ", ".join(missing)
-        hint = f" Not understood: {_format_list(others)}." if others else ""
-        raise FormatError(f"{where}: {_describe_owner(part)} no column {absent}.{hint} {COLUMN_HELP}")
-    return () if missing else tuple(places[part, quantity] for quantity in quantities)
-
-
-def _describe_owner(part: str) -> str:
-    return f"the part '{part}' has" if part else "the table has"
+    owner = f"{where}: the part '{part}' has" if part else f"{where}: the table has"
+    columns: dict[str, tuple[int, ...]] = {}
+    for form, quantities in {"position": POSITION, **ORIENTATIONS}.items():
+        missing = [quantity for quantity in quantities if (part, quantity) not in places]
+        if not missing:
+            columns[form] = tuple(places[part, quantity] for quantity in quantities)
+        elif len(missing) < len(quantities):
+            hint = f" Not understood: {_format_list(ignored)}." if ignored else ""
+            raise FormatError(f"{owner} no column {', '.join(missing)}.{hint} {COLUMN_HELP}")
+    position = columns.pop("position", None)
+    if position is None:
+        raise FormatError(f"{owner} an orientation, but no position x, y, z.")
+    if len(columns) > 1:
+        raise FormatError(f"{owner} its orientation twice, as {' and '.join(columns)}.")
+    form, orientation = next(iter(columns.items()), ("", ()))
+    return PartColumns(position, orientation, form)
 
 
 def _format_list(names: Sequence[str]) -> str:
@@ -185,8 +172,15 @@ def read_table(path: Path) -> TextTable:
     cells is not a number. It also determines the separator: a semicolon if it has one, else a comma, else a
     tab in a head, else spaces.
     """
-    source = str(path)
-    lines = enumerate(_read_text(path, source).splitlines(), start=1)
+    source, data = str(path), read_file(path)
+    wanted = "poses are read from a table in text"
+    if b"\0" in data:
+        raise FormatError(f"{source}: this is no text, or not in UTF-8; {wanted}.")
+    try:
+        lines = enumerate(data.decode("utf-8-sig").splitlines(), start=1)
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise FormatError(f"{source}, line {line}: this is no text in UTF-8; {wanted}.") from None
     texts = {line: text for line, text in lines if text.strip() and not text.lstrip().startswith(COMMENT)}
     if not texts:
         raise FormatError(f"{source}: the file is empty; a row for each pose is expected.")
@@ -212,26 +206,11 @@ def read_table(path: Path) -> TextTable:
 
 def is_number(text: str) -> bool:
     """Return True if a text is a number, including NaN and infinities."""
-    # Python also reads digits grouped by underscores.
-    if "_" in text:
-        return False
     try:
         float(text)
     except ValueError:
         return False
-    return True
-
-
-def _read_text(path: Path, source: str) -> str:
-    data = read_file(path)
-    wanted = "poses are read from a table in text"
-    if b"\0" in data:
-        raise FormatError(f"{source}: this is no text, or not in UTF-8; {wanted}.")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise FormatError(f"{source}, line {line}: this is no text in UTF-8; {wanted}.") from None
+    return "_" not in text  # Python also reads digits grouped by underscores
 
 
 def _split_cells(text: str, separator: str | None) -> list[str]:
@@ -306,14 +285,12 @@ def _rows_by_part(table: TextTable, columns: Columns, where: PartColumns) -> dic
         name, place = "" if columns.part is None else cells[columns.part], f"line {table.lines[row]}"
         if columns.part is not None and not name:
             raise FormatError(f"{table.source}, {place}: the name of the part is missing.")
-        rows, lacking = observed.setdefault(name, []), [k for k in needed if not cells[k]]
+        rows, lacking = observed.setdefault(name, []), [columns.names[k] for k in needed if not cells[k]]
         if not lacking:
             rows.append(row)
         elif len(lacking) < len(needed):
-            raise FormatError(
-                f"{table.source}, {place}: {columns.names[lacking[0]]} is missing; all cells of a part that "
-                "was not observed are empty."
-            )
+            rule = "all cells of a part that was not observed are empty"
+            raise FormatError(f"{table.source}, {place}: {lacking[0]} is missing; {rule}.")
     return {name: np.array(rows, dtype=np.intp) for name, rows in observed.items()}
 
 
@@ -331,12 +308,10 @@ def _build_track(table: TextTable, columns: Columns, where: PartColumns, rows: I
 
 def _parse_numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: Indices) -> Array:
     texts = [[table.cells[row][k] for k in places] for row in rows]
-    try:
+    good = np.array([[is_number(text) for text in row] for row in texts], dtype=bool)
+    if good.all():
         numbers = np.array(texts, dtype=np.float64).reshape(len(rows), len(places))
         good = np.abs(numbers) <= LARGEST  # NaN is not
-        good &= np.array(["_" not in text for row in texts for text in row], dtype=bool).reshape(good.shape)
-    except ValueError:
-        good = np.array([[is_number(text) for text in row] for row in texts])
     if not good.all():
         row, k = np.argwhere(~good)[0]
         text, name = texts[row][k], columns.names[places[k]]

@@ -164,7 +164,11 @@ def identify_recorded_joint(
     """
     comparison = _Comparison(pair, families, independent)
     first = comparison.assume(noise, 1.0, comparison.distinct)
-    fits = {} if independent else comparison.fits_of_estimated_noise(noise, first)
+    fits = {}
+    if not independent:
+        # If the stated noise is too small, most observations are outliers.
+        estimated = first if noise is None else comparison.assume(None, 1.0, comparison.distinct)
+        fits = {fit.family: fit for fit in estimated.found if fit.family not in ("free", CURVE)}
     times = {name: comparison.correlation_time(fit) for name, fit in fits.items()}
     best, rows = first, comparison.distinct
     for _ in times:
@@ -173,7 +177,8 @@ def identify_recorded_joint(
             break
         rows = comparison.sufficient_rows(times[name], first.found[name])
         best = comparison.assume(noise, times[name], rows)
-    best = comparison.with_curve(noise, best, rows)
+    if comparison.joints != comparison.families:
+        best = comparison.assume(noise, best.correlation_time, rows, comparison.families)
     others = comparison.alternatives(noise, best, fits, times, rows)
     count = len(comparison.distinct)
     return RecordedJoint(
@@ -212,12 +217,6 @@ class _Comparison:
         if independent:
             self.distinct = np.arange(len(repeats))
 
-    def with_curve(self, noise: ObservationNoise | None, best: Assumption, rows: Indices) -> Assumption:
-        """Return an assumption with the curve among the families, if it is asked for."""
-        if self.joints == self.families:
-            return best
-        return self.assume(noise, best.correlation_time, rows, self.families)
-
     def assume(
         self, noise: ObservationNoise | None, time: float, rows: Indices, families: list[str] | None = None
     ) -> Assumption:
@@ -232,12 +231,11 @@ class _Comparison:
             sequential=self.pair.is_timed,
             correlation_time=max(1.0, time * len(rows) / len(self.distinct)),
         )
-        return Assumption(noise or estimated_noise(result, self.pair), time, result)
-
-    def fits_of_estimated_noise(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, Fit]:
-        # If the stated noise is too small, most observations are outliers.
-        result = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
-        return {fit.family: fit for fit in result if fit.family not in ("free", CURVE)}
+        if result.noise is not None:  # it is not stated
+            position, orientation = result.noise
+            noise = ObservationNoise(position, orientation if self.pair.has_orientation else None, False)
+        assert noise is not None
+        return Assumption(noise, time, result)
 
     def correlation_time(self, fit: Fit) -> float:
         largest = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
@@ -297,10 +295,9 @@ class _Comparison:
 
 def _residuals_across_motion(fit: Fit) -> Array:
     """Return the residuals of inliers without the part along the motion, which joint values follow slowly."""
-    residuals = fit.residuals[fit.inliers]
     by_joints = fit.motion.linearise(fit.joint_values[fit.inliers]).by_joints[:, : fit.rows]
     sizes = np.repeat(fit.rms, 3)[: fit.rows] + _TINY
-    across, along = residuals / sizes, np.linalg.qr(by_joints / sizes[:, None])[0]
+    across, along = fit.residuals[fit.inliers] / sizes, np.linalg.qr(by_joints / sizes[:, None])[0]
     return np.asarray(across - np.einsum("nik,njk,nj->ni", along, along, across)) * sizes
 
 
@@ -328,13 +325,6 @@ def residual_noise(fit: Fit) -> ObservationNoise:
         return ObservationNoise(position / math.sqrt(max(1.0, 3.0 - joints)), None, True)
     root = math.sqrt(max(0.5, 3.0 - 0.5 * joints))
     return ObservationNoise(position / root, orientation / root, True)
-
-
-def estimated_noise(result: IdentificationResult, pair: RecordedPair) -> ObservationNoise:
-    """Return the noise that an identification without stated noise estimated."""
-    assert result.noise is not None  # it is estimated if it is not stated
-    position, orientation = result.noise
-    return ObservationNoise(position, orientation if pair.has_orientation else None, False)
 
 
 def log_probability(result: IdentificationResult) -> float:

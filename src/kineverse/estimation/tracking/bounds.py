@@ -36,24 +36,18 @@ class StateBounds:
 
 def collect_bounds(model: ModelView, tangent_space: TangentSpace, inputs: frozenset[Symbol]) -> StateBounds:
     """Collect the position limits: constraints without speeds on estimated coordinates and inputs alone."""
-    index = {x: i for i, x in enumerate(tangent_space.coordinates)}
+    index, by_speeds = {x: i for i, x in enumerate(tangent_space.coordinates)}, tangent_space.by_speeds
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
     names, curved = [], []
     for name, carried in model.constraints_for(tangent_space.coordinates).items():
-        constraint = Constraint(
-            *(tangent_space.resolve(e) for e in (carried.lower, carried.expression, carried.upper))
-        )
+        below, middle, above = map(tangent_space.resolve, (carried.lower, carried.expression, carried.upper))
+        constraint = Constraint(below, middle, above)
         moving = [s for s in constraint.symbols if s.has_derivative and s not in inputs]
         if any(s not in index for s in moving) or not any(s in index for s in constraint.expression.symbols):
             continue
         names.append(name)
-        below, middle, above = constraint.lower, constraint.expression, constraint.upper
-        bound_symbols = (*below.symbols, *above.symbols)
-        if (
-            constraint.line is not None
-            and not bound_symbols
-            and middle.symbols[0] not in tangent_space.by_speeds
-        ):
+        bound_symbols, is_free = (*below.symbols, *above.symbols), middle.symbols[0] not in by_speeds
+        if constraint.line is not None and not bound_symbols and is_free:
             slope, offset = constraint.line
             low, high = sorted((float(b) - offset) / slope for b in (below, above))
             i = index[middle.symbols[0]]
@@ -198,8 +192,7 @@ class SpeedLocks:
         """Return the speeds that no lock holds at the estimate."""
         if self._bounds is None:
             return self._all
-        bounds = self._bounds(np.concatenate([belief.x, inputs])).reshape(-1, 2)
-        still = np.abs(bounds).max(axis=1) < _STILL
+        still = np.abs(self._bounds(np.concatenate([belief.x, inputs])).reshape(-1, 2)).max(axis=1) < _STILL
         return self._all - {v for v, is_locked in zip(self._speeds, still.tolist(), strict=True) if is_locked}
 
 
@@ -231,16 +224,13 @@ def solve_bounded_qp(
         while True:
             held = normals[active]
             direction = inverse @ normal
+            relation = np.empty(0)
             if active:
                 relation = np.linalg.lstsq(held @ inverse @ held.T, held @ direction, rcond=None)[0]
                 direction = direction - inverse @ held.T @ relation
-            else:
-                relation = np.empty(0)
             along = float(direction @ normal)
-            blocking = [
-                (m / r, k) for k, (m, r) in enumerate(zip(multipliers, relation, strict=True)) if r > _LEAST
-            ]
-            partial, leaving = min(blocking, default=(np.inf, -1))
+            pairs = enumerate(zip(multipliers, relation, strict=True))
+            partial, leaving = min([(m / r, k) for k, (m, r) in pairs if r > _LEAST], default=(np.inf, -1))
             is_free = along > _LEAST * float(normal @ inverse @ normal)
             full = -(float(normal @ x) - bounds[worst]) / along if is_free else np.inf
             step = min(partial, full)

@@ -90,10 +90,8 @@ class RidgeCovariance(_CovarianceComputation):
                 total += density
                 result += density * (posterior.spread(point) - posterior.spread(top))
                 along, *deviation = point.step @ inverse
-                log = math.log(density) + along**2 / 2
-                is_straight &= (
-                    float(np.linalg.norm(deviation)) < _RIDGE_CURVATURE and abs(log) < _RIDGE_CURVATURE
-                )
+                off = abs(math.log(density) + along**2 / 2), float(np.linalg.norm(deviation))
+                is_straight &= max(off) < _RIDGE_CURVATURE
         result /= total
         return result - np.outer(direction, direction), is_straight
 
@@ -156,18 +154,16 @@ class RidgeCovariance(_CovarianceComputation):
         prior = posterior.record.prior
         cost = float(step @ prior.matrix @ step) / 2 - float(prior.vector @ step)
         gradient, information = prior.matrix @ step - prior.vector, prior.matrix.copy()
-        for error, slope in self._residuals.errors(
-            predicted, posterior.reading, group.observation_indices
-        ).values():
+        errors = self._residuals.errors(predicted, posterior.reading, group.observation_indices)
+        for error, slope in errors.values():
             along = slope if transport is None else slope @ transport
             cost += float(error @ error) / 2
             gradient -= along.T @ error
             information += along.T @ along
         if not (math.isfinite(cost) and np.isfinite(information).all()):
             return None
-        return _ManifoldPoint(
-            step, cost, posterior.across @ gradient, posterior.across @ information @ posterior.across.T
-        )
+        across = posterior.across
+        return _ManifoldPoint(step, cost, across @ gradient, across @ information @ across.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -212,8 +212,7 @@ class Estimate:
         result: dict[Symbol | str, float] = {}
         for number, group in enumerate(self._layout.groups):
             basis = self._update_step.process_model.basis(number, self._belief.x[group.x], self._inputs)
-            block = self.covariance[group.block]
-            variances = np.einsum("ij,jk,ik->i", basis, block, basis)
+            variances = np.einsum("ij,jk,ik->i", basis, self.covariance[group.block], basis)
             for x, variance in zip(group.coordinates, variances.tolist(), strict=True):
                 result[x] = result[str(x)] = float(np.sqrt(variance))
         for v, variance in zip(self.speeds, np.diag(self.speed_covariance).tolist(), strict=True):
@@ -258,11 +257,9 @@ def collect_recent_poses(
     poses = {i: one for i, one in enumerate(layout.observations) if one.is_pose}
     observer = next((one.relative_to for one in poses.values()), "")
     has_times = all(stamp is not None for stamp, _, _ in readings)
-    stamps: Array = np.array(
-        [stamp if has_times else k for k, (stamp, _, _) in enumerate(readings)], dtype=float
-    )
+    stamps = [stamp if has_times else k for k, (stamp, _, _) in enumerate(readings)]
     # Readings of one time are one row.
-    times, rows = np.unique(stamps, return_inverse=True)
+    times, rows = np.unique(np.array(stamps, dtype=float), return_inverse=True)
     measured, covariances = {}, {}
     inputs = np.zeros((len(times), len(layout.inputs)))
     for row, (_, _, values) in zip(rows.tolist(), readings, strict=True):
@@ -273,8 +270,7 @@ def collect_recent_poses(
             weights = []
             for row, (_, reading, _) in zip(rows.tolist(), readings, strict=True):
                 if reading.mask[i]:
-                    pose = reading.values[layout.measurement_slices[i]].reshape(4, 4)
-                    measured[one.frame][row] = pose
+                    measured[one.frame][row] = reading.values[layout.measurement_slices[i]].reshape(4, 4)
                     weights.append(reading.whitening[layout.whitening_slices[i]].reshape(6, 6))
             white: Array = np.array(weights).reshape(-1, 6, 6)
             each = np.linalg.inv(white.transpose(0, 2, 1) @ white)

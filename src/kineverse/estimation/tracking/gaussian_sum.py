@@ -58,11 +58,6 @@ class GaussianSum:
         """Best component of every group."""
         return self.beliefs[0]
 
-    @property
-    def is_single(self) -> bool:
-        """True if there is one component only."""
-        return len(self.beliefs) == 1
-
     def groups(self, component: int, among: Iterable[int]) -> list[int]:
         """Return those of some groups that have a component."""
         return [number for number in among if self.alive[component, number]]
@@ -150,9 +145,8 @@ class MergeCriterion:
         other: Candidate,
     ) -> bool:
         """Return True if two candidates predict the same measurements of a group from nearby states."""
-        values = self._reader.as_values(other.predicted)
         empty = self._reader.empty()
-        predicted = empty._replace(values=values, mask=~empty.mask)
+        predicted = empty._replace(values=self._reader.as_values(other.predicted), mask=~empty.mask)
         errors = self._residuals.errors(one.predicted, predicted, group.observation_indices)
         if any(float(e @ e) >= _SAME_PREDICTION**2 for e, _ in errors.values()):
             return False

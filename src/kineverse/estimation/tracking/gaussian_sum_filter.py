@@ -100,7 +100,7 @@ class UpdateStep:
 
     def _update(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
         mixture = self._forget_other_inputs(mixture, inputs)
-        if not mixture.is_single or self.outliers is not None:
+        if len(mixture.beliefs) > 1 or self.outliers is not None:
             return self._update_mixture(mixture, reading, inputs)
         before = mixture.best
         result = self._map_update(before, reading, inputs)
@@ -115,9 +115,8 @@ class UpdateStep:
         if not candidates:
             return StepResult(after, result.nis, result.dof, (), result.rounds)
         first = self._candidate(result, unexplained, inputs)
-        after, best = after.select(
-            [first, *candidates], partial(self.merge_criterion.should_merge, inputs, self.periods)
-        )
+        should_merge = partial(self.merge_criterion.should_merge, inputs, self.periods)
+        after, best = after.select([first, *candidates], should_merge)
         for number, candidate in enumerate(best):
             if candidate:
                 result.nis[number] = candidate.nis[number]
@@ -126,13 +125,11 @@ class UpdateStep:
     def _map_update(
         self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int] | None = None
     ) -> MapResult:
-        result = None
         if self.native is not None and self.native.is_ready:
-            result = self.native.update(belief, reading, inputs)
-        if result is None:
-            groups = self._measured_groups(reading) if groups is None else groups
-            result = self.solver.update(belief, reading, inputs, groups)
-        return result
+            if (result := self.native.update(belief, reading, inputs)) is not None:
+                return result
+        groups = self._measured_groups(reading) if groups is None else groups
+        return self.solver.update(belief, reading, inputs, groups)
 
     def _restart(
         self,
@@ -210,10 +207,8 @@ class UpdateStep:
 
     def _forget_other_inputs(self, mixture: GaussianSum, inputs: Array) -> GaussianSum:
         def changed(belief: InformationState) -> InformationState:
-            records = enumerate(belief.records)
-            return self._inflated(
-                belief, [n for n, r in records if r and not np.array_equal(r.inputs, inputs)]
-            )
+            records = [(n, record) for n, record in enumerate(belief.records) if record]
+            return self._inflated(belief, [n for n, r in records if not np.array_equal(r.inputs, inputs)])
 
         return mixture.map(changed) if len(inputs) else mixture
 
@@ -239,32 +234,28 @@ class UpdateStep:
             _require_finite(result.numbers)
             return result
         moving = self.process_model.find_moving_groups(speeds, noise)
-        noise_only = [
-            n for n in moving if belief.records[n] is not None and self.process_model.is_noise_only(n, speeds)
-        ]
+        recorded = [n for n in moving if belief.records[n] is not None]
+        noise_only = [n for n in recorded if self.process_model.is_noise_only(n, speeds)]
         belief = self._inflated(belief, set(moving).difference(noise_only))
         moved = None
         if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
             tangent = self.layout.tangent_space.tangent
-            displacement, added_variance = (
-                np.array([by.get(v, 0.0) for v in tangent]) * dt for by in (speeds, noise)
-            )
-            moved = self.native.predict(belief, displacement, added_variance)
+            motion = (np.array([by.get(v, 0.0) for v in tangent]) * dt for by in (speeds, noise))
+            moved = self.native.predict(belief, *motion)
         if moved is None:
             moved = belief.copy()
             self.process_model.predict(moved, inputs, dt, speeds, noise)
             moved = self._constrained(moved, inputs)
-        result = moved
         for number in noise_only:
             # A straight posterior is Gaussian; its prediction is exact.
             if self.inflation.is_straight(number, belief):
-                result.records[number] = None
+                moved.records[number] = None
                 continue
             group = self.layout.groups[number]
             added_variance = np.array([noise.get(v, 0.0) for v in group.tangent]) * dt
-            self.static_batch.add_noise(number, belief, result, added_variance)
-        _require_finite(result.numbers)
-        return result
+            self.static_batch.add_noise(number, belief, moved, added_variance)
+        _require_finite(moved.numbers)
+        return moved
 
     def _constrained(self, belief: InformationState, inputs: Array) -> InformationState:
         is_inside = (belief.x >= self.limits.lower).all() and (belief.x <= self.limits.upper).all()
@@ -285,10 +276,8 @@ class UpdateStep:
         except KineverseError:
             return False
         group = self.layout.groups[number]
-        for i in group.observation_indices:
-            for where in (self.layout.value_slices[i], self.layout.jacobian_slices[i]):
-                if not np.isfinite(out[where]).all():
-                    return False
+        if not self.residuals.is_finite(out, group.observation_indices):
+            return False
         return self.solver.group_bounds[number].rows(belief.x[group.x], out).violation < _OUTSIDE
 
     def _measured_groups(self, reading: Measurements) -> list[int]:
@@ -320,9 +309,8 @@ class UpdateStep:
                 continue
             candidates += new
             rounds = max(rounds, count)
-        after, best = mixture.select(
-            candidates, partial(self.merge_criterion.should_merge, inputs, self.periods)
-        )
+        should_merge = partial(self.merge_criterion.should_merge, inputs, self.periods)
+        after, best = mixture.select(candidates, should_merge)
         nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
         dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
         weights = [None if c is None else c.weights for c in best]
@@ -386,18 +374,13 @@ class UpdateStep:
         self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int], is_best: bool
     ) -> tuple[list[Candidate], int]:
         """Return candidates for one component: without outliers, with outliers, and all outliers."""
-        candidates, rounds = [], 0
         if self.outliers is None:
-            starts = [belief]
+            results = [(belief, self._map_update(belief, reading, inputs, groups))]
         else:
-            starts = [belief, self.solver.find_robust_start(belief, reading, inputs, groups)]
-        for start in starts:
-            if self.outliers is None:
-                result = self._map_update(start, reading, inputs, groups)
-            else:
-                result = self.solver.update(start, reading, inputs, groups, self.outliers)
-            candidates.append(self._relinearised(start, result, reading, inputs, groups))
-            rounds = max(rounds, result.rounds)
+            starts = belief, self.solver.find_robust_start(belief, reading, inputs, groups)
+            results = [(s, self.solver.update(s, reading, inputs, groups, self.outliers)) for s in starts]
+        candidates = [self._relinearised(s, result, reading, inputs, groups) for s, result in results]
+        rounds, result = max(result.rounds for _, result in results), results[-1][1]
         if is_best:
             rejected = self._with_rejected(result, reading, groups)
             unexplained = {*self.stationary_points.unexplained(belief, result), *rejected}

@@ -77,8 +77,7 @@ class HypothesisBank:
     def probabilities(self) -> dict[str, float]:
         """Probability of each tracker, by name."""
         logs = np.array(list(self._logs.values()))
-        weights = np.exp(logs - np.logaddexp.reduce(logs))
-        return dict(zip(self._logs, weights.tolist(), strict=True))
+        return dict(zip(self._logs, np.exp(logs - np.logaddexp.reduce(logs)).tolist(), strict=True))
 
     @property
     def best(self) -> str:

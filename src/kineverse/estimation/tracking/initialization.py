@@ -83,13 +83,12 @@ def _difference(layout: Layout, before: Array, after: Array) -> Array:
 
 def _turns_some(layout: Layout, i: int, predicted: Array, is_same: npt.NDArray[np.bool_]) -> bool:
     """Return True if an observation that moves with a coordinate is the same after a full turn."""
-    number, group = next((n, g) for n, g in enumerate(layout.groups) if i in g.x)
+    group = next(group for group in layout.groups if i in group.x)
     column = group.tangent_index(group.x.tolist().index(i))
-    for k, (one, value, jacobian) in enumerate(
-        zip(layout.observations, layout.value_slices, layout.jacobian_slices, strict=True)
-    ):
-        if layout.group_of[k] == number and is_same[value].all() and is_same[jacobian].all():
-            if predicted[jacobian].reshape(one.size, -1)[:, column].any():
+    for k in group.observation_indices:
+        value, jacobian = layout.value_slices[k], layout.jacobian_slices[k]
+        if is_same[value].all() and is_same[jacobian].all():
+            if predicted[jacobian].reshape(layout.observations[k].size, -1)[:, column].any():
                 return True
     return False
 
@@ -103,7 +102,13 @@ def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Arra
         steps = [_offsets(update_step, first, i, i in ambiguous) for i in group.x]
         changes = list(itertools.islice(itertools.product(*steps), 4096))
         changes = changes[:: math.ceil(len(changes) / _MOST_STARTS)]
-        offsets = [_to_tangent(layout, number, change) for change in changes[1:]]
+        offsets = []
+        for change in changes[1:]:
+            step = np.zeros(len(group.tangent))
+            for symbol, by in zip(group.coordinates, change, strict=True):
+                if symbol not in layout.tangent_space.by_speeds:
+                    step[group.tangent.index(symbol.derivative())] = by
+            offsets.append(step)
         # Half turns about rate directions, such as those of quaternions.
         offsets += [math.pi * np.eye(len(group.tangent))[k] for k in group.rate_directions]
         component = 0
@@ -121,9 +126,8 @@ def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Arra
                 alive.append(np.zeros(len(layout.groups), dtype=bool))
             alive[component][number] = True
             beliefs[component].x[group.x] = x
-            beliefs[component].set_group_cost(
-                group.t, first.group_cost(group.t).transported(offset, transport)
-            )
+            cost = first.group_cost(group.t).transported(offset, transport)
+            beliefs[component].set_group_cost(group.t, cost)
     return GaussianSum(layout, beliefs, np.array(alive))
 
 
@@ -182,17 +186,7 @@ def _offsets(update_step: UpdateStep, first: InformationState, i: int, is_ambigu
     if high - low <= 2 * _SPACING + _SAME:
         return [0.0, *(low + share * (high - low) - first.x[i] for share in _SAMPLES if is_ambiguous)]
     count = min(math.ceil((high - low) / _SPACING), _MOST_STARTS - 1)
-    middles = low + (np.arange(count) + 0.5) * (high - low) / count - first.x[i]
-    return [0.0, *middles.tolist()]
-
-
-def _to_tangent(layout: Layout, number: int, change: Iterable[float]) -> Array:
-    group = layout.groups[number]
-    step = np.zeros(len(group.tangent))
-    for x, by in zip(group.coordinates, change, strict=True):
-        if x not in layout.tangent_space.by_speeds:
-            step[group.tangent.index(x.derivative())] = by
-    return step
+    return [0.0, *(low + (np.arange(count) + 0.5) * (high - low) / count - first.x[i]).tolist()]
 
 
 _BEYOND = 1e-3  # distance beyond limits that may be rounding
@@ -209,8 +203,7 @@ class InitialBelief:
 
     def spread(self, update_step: UpdateStep, inputs: Array) -> GaussianSum:
         """Return the belief about several initial points."""
-        groups = len(update_step.layout.groups)
-        belief = InformationState((len(self.x), len(self.deviations), groups))
+        belief = InformationState((len(self.x), len(self.deviations), len(update_step.layout.groups)))
         belief.x[:] = self.x
         with np.errstate(over="ignore"):
             variances = np.array([*self.deviations**2, *self.deviations**-2.0])

@@ -216,6 +216,13 @@ def require_mapping(values: Any, label: str) -> Mapping[Any, Any]:
     return values
 
 
+def require_time(at: object) -> float:
+    """Check the time of an observation [s]."""
+    if (time := finite_number(at)) is None:
+        raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
+    return time
+
+
 def require_positive(key: object, value: Any) -> float:
     """Check the standard deviation or variance of ``key``."""
     number = finite_number(value)

@@ -122,9 +122,8 @@ class StationaryPoints:
             for direction in (*directions, *-directions):
                 try:
                     there, _ = self._process_model.retract(number, x, direction, inputs)
-                    step = self._group_bounds[number].remaining(
-                        x, self._group_bounds[number].clip(there), direction
-                    )
+                    bounds = self._group_bounds[number]
+                    step = bounds.remaining(x, bounds.clip(there), direction)
                     there, transport = self._process_model.retract(number, x, step, inputs)
                 except KineverseError:  # infeasible
                     continue
@@ -276,10 +275,9 @@ class StaticBatch:
         first = before.copy()
         first.set_group_cost(group.t, record.prior)
         first.evidence[number] = record.evidence
-        reading = record.as_measurements(self._layout, self._reader)
         # The C code does not return the transport of the tangent space.
         update = self._solver.update if group.by_speeds else self._update
-        return update(first, reading, record.inputs, [number])
+        return update(first, record.as_measurements(self._layout, self._reader), record.inputs, [number])
 
     def _transport_prior(
         self, number: int, before: InformationState, prior: QuadraticCost, result: MapResult
@@ -287,5 +285,4 @@ class StaticBatch:
         if result.priors is not None:
             return result.priors[number]
         group = self._layout.groups[number]
-        step = result.belief.x[group.x] - before.x[group.x]
-        return prior.transported(step, None)
+        return prior.transported(result.belief.x[group.x] - before.x[group.x], None)

@@ -67,8 +67,7 @@ class RateFlow:
         k1 = matrix @ u
         k2 = rate(q + k1 / 2)
         k3 = rate(q + k2 / 2)
-        k4 = rate(q + k3)
-        after = q + (k1 + 2 * k2 + 2 * k3 + k4) / 6
+        after = q + (k1 + 2 * k2 + 2 * k3 + rate(q + k3)) / 6
         arguments = (*self.coordinates, *self.speeds, *inputs)
         # Constant rates are integrated exactly by one step of any length.
         self.is_varying = np.array([[v in row and bool(row[v].symbols) for v in speeds] for row in rows])
@@ -296,8 +295,7 @@ class ConstantVelocity:
         self.periods: Mapping[Symbol, float] = {}
         by_size: dict[tuple[int, int], list[int]] = {}
         for number, group in enumerate(layout.groups):
-            size = len(group.t), len(process_model.speeds_of(number))
-            by_size.setdefault(size, []).append(number)
+            by_size.setdefault((len(group.t), len(process_model.speeds_of(number))), []).append(number)
         self._batches = list(by_size.values())
 
     def initialise(self, belief: InformationState, means: Speeds, variances: Speeds) -> None:

@@ -61,8 +61,7 @@ class FixedLag:
             )
         predict, state = later[0].predict, later[0].before
         steps = [one for one in self.steps if one.stamp <= stamp]
-        late = Step(stamp, state, partial(_apply_late, predict, stamp, apply), predict)
-        for one in (late, *later):
+        for one in (Step(stamp, state, partial(_apply_late, predict, stamp, apply), predict), *later):
             steps.append(replace(one, before=state))
             state = one.apply(state)
         self.steps = tuple(steps)
@@ -164,10 +163,8 @@ class Recursion:
             loss = loss.after(find_measured(step.layout, reading), refuted, self.lost_after)
             due = loss.is_lost & (loss.refuted % self.lost_after == 0) & refuted
             if self.restarts and due.any():
-                groups = np.flatnonzero(due).tolist()
-                restarted = step.restart(
-                    state.mixture, self.first.spread(step, values), groups, reading, values
-                )
+                groups, initial = np.flatnonzero(due).tolist(), self.first.spread(step, values)
+                restarted = step.restart(state.mixture, initial, groups, reading, values)
                 if has_outliers:
                     explained = due & step.find_accepted(restarted.mixture, reading, values)
                 else:

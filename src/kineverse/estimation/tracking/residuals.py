@@ -98,9 +98,8 @@ class MeasurementReader:
         return Measurements(values, observed, *self._whiten_all(covariances, observed))
 
     def _whiten_all(self, covariances: npt.ArrayLike, observed: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
-        checked = _numbers(covariances, "The covariances")
-        if checked.shape != (len(observed), 6, 6):
-            shape = (len(observed), 6, 6)
+        checked, shape = _numbers(covariances, "The covariances"), (len(observed), 6, 6)
+        if checked.shape != shape:
             raise ShapeError(f"The covariances are an array of shape {shape}, not {checked.shape}.")
         R = np.where(observed[:, None, None], checked, np.eye(6))
         try:
@@ -236,9 +235,8 @@ class Residuals:
             observed = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
             transforms = transform(predicted[:, :9].reshape(-1, 3, 3), predicted[:, 9:])
             differences = pose_difference(observed, transforms)
-            back = inverse_right_jacobian(differences[:, 3:])
             errors.update(zip(poses, differences, strict=True))
-            for i, turn in zip(poses, back, strict=True):
+            for i, turn in zip(poses, inverse_right_jacobian(differences[:, 3:]), strict=True):
                 slopes[i] = np.concatenate([slopes[i][:3], turn @ slopes[i][3:]])
         pairs = {}
         for i in measured:
@@ -249,13 +247,16 @@ class Residuals:
             pairs[i] = white @ errors[i], white @ slopes[i]
         return pairs
 
+    def is_finite(self, out: Array, indices: Sequence[int]) -> bool:
+        """Return True if values and Jacobians of observations are finite."""
+        slices = self._layout.value_slices, self._layout.jacobian_slices
+        return all(np.isfinite(out[where[i]]).all() for i in indices for where in slices)
+
     def check(self, out: Array, indices: Sequence[int]) -> None:
         """Check that values and Jacobians of observations are finite."""
         for i in indices:
-            one = self._layout.observations[i]
-            for where in (self._layout.value_slices[i], self._layout.jacobian_slices[i]):
-                if not np.isfinite(out[where]).all():
-                    raise InvalidValueError(
-                        f"'{one.label}' or its derivative is not finite at the present estimate. Give start= "
-                        "a state where it is, or the model limits."
-                    )
+            if not self.is_finite(out, (i,)):
+                raise InvalidValueError(
+                    f"'{self._layout.observations[i].label}' or its derivative is not finite at the present "
+                    "estimate. Give start= a state where it is, or the model limits."
+                )

@@ -54,8 +54,7 @@ class TangentSpace:
         result: dict[Symbol, Expression] = {}
         for key, entry in expression.gradient(heuristic=False).items():
             coordinate = key.position
-            row = self.rate_row(coordinate) if coordinate in self.coordinates else {}
-            for speed, rate in row.items():
+            for speed, rate in (self.rate_row(coordinate) if coordinate in self.coordinates else {}).items():
                 term = entry * rate if coordinate in self.by_speeds else entry
                 result[speed] = result[speed] + term if speed in result else term
         return result
@@ -96,10 +95,9 @@ def connected_components(items: Sequence[frozenset[Symbol]]) -> list[set[Symbol]
     unions: list[set[Symbol]] = []
     for item in items:
         touching = [u for u in unions if u & item]
-        merged = set(item).union(*touching)
         first = unions.index(touching[0]) if touching else len(unions)
         unions = [u for u in unions if not any(u is t for t in touching)]
-        unions.insert(first, merged)
+        unions.insert(first, set(item).union(*touching))
     return unions
 
 
@@ -114,8 +112,7 @@ def _are_redundant(
     random = np.random.default_rng(0)
     for _ in range(_SAMPLES):
         point = {x: default.get(x, 0.0) + random.uniform(-0.3, 0.3) for x in block}
-        rate_matrix = _evaluate_at(matrix, point, default)
-        left, singular, _ = np.linalg.svd(rate_matrix)
+        left, singular, _ = np.linalg.svd(_evaluate_at(matrix, point, default))
         rank = int((singular > 1e-9).sum())
         if rank < len(speeds) or rank == len(block):
             return False

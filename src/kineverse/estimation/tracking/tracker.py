@@ -25,7 +25,7 @@ from .estimate import Estimate, RecentPoses, TrackerState, TrackLoss, collect_re
 from .gaussian_sum_filter import UpdateStep
 from .information_state import InformationState
 from .initialization import InitialValues, make_initial_belief
-from .measurements import ObservedLike, build_measurement_models, list_observed, require_mapping
+from .measurements import ObservedLike, build_measurement_models, list_observed, require_mapping, require_time
 from .native import native_library
 from .process_model import INITIAL_SPEED_TIME, Process, check_process, default_process_noise
 from .recursion import FixedLag, Recursion, Step
@@ -121,9 +121,8 @@ class Tracker:
         symbols = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in keys)
         layout, limits = arrange_state(model, build_measurement_models(model, self._observed), symbols)
         self.model, self._layout = model, layout
-        self._update_step = UpdateStep(
-            layout, limits, as_outliers(outliers, has_gate=True), process == "velocity"
-        )
+        outliers = as_outliers(outliers, has_gate=True)
+        self._update_step = UpdateStep(layout, limits, outliers, process == "velocity")
         noise = self._read_noise(process_noise)
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
@@ -152,10 +151,8 @@ class Tracker:
     @property
     def limits(self) -> dict[Symbol, tuple[float, float]]:
         """Bounds of single coordinates; ±inf without constant bounds."""
-        limits = self._update_step.limits
-        return dict(
-            zip(self.symbols, zip(limits.lower.tolist(), limits.upper.tolist(), strict=True), strict=True)
-        )
+        lower, upper = self._update_step.limits.lower.tolist(), self._update_step.limits.upper.tolist()
+        return {s: (low, high) for s, low, high in zip(self.symbols, lower, upper, strict=True)}
 
     @property
     def periodic(self) -> frozenset[Symbol]:
@@ -270,7 +267,7 @@ class Tracker:
             For names that are not estimated, and numbers that are not finite.
         """
         tangent_space, now = self._layout.tangent_space, self._now
-        stamp = now.stamp if at is None else _require_time(at)
+        stamp = now.stamp if at is None else require_time(at)
         values = InitialValues.read(self._update_step, start, uncertainty)
         first, groups = self._recursion.first, list(range(len(self._layout.groups)))
         if (start is not None and len(start)) or (uncertainty is not None and len(uncertainty)):
@@ -294,9 +291,8 @@ class Tracker:
             speeds_of = self._update_step.process_model.speeds_of
             moving = [{*g.coordinates, *g.tangent, *speeds_of(n)} for n, g in enumerate(self._layout.groups)]
             groups = [n for n, symbols in enumerate(moving) if changed & symbols]
-        mixture = now.mixture.replace_groups(
-            first.spread(self._update_step, np.nan_to_num(now.inputs)), groups
-        )
+        initial = first.spread(self._update_step, np.nan_to_num(now.inputs))
+        mixture = now.mixture.replace_groups(initial, groups)
         chosen = np.isin(np.arange(len(self._layout.groups)), groups)
         loss = TrackLoss(np.where(chosen, 0, now.loss.refuted), now.loss.is_lost & ~chosen)
         self._now = replace(now, mixture=mixture, loss=loss, stamp=stamp, reading=None)
@@ -454,16 +450,10 @@ class Tracker:
             subject = "Commands" if commands else "process_noise="
             raise InvalidValueError(f"{subject} need the time they lasted: give at=, or call predict.")
         noise = self._read_noise(process_noise)
-        stamp = None if at is None else _require_time(at)
+        stamp = None if at is None else require_time(at)
         speeds, before = self._read_commands(commands), self._now
-        apply = partial(
-            self._recursion.update,
-            reading=reading,
-            stamp=stamp,
-            speeds=speeds,
-            inputs=copy.copy(inputs),
-            noise_now=noise,
-        )
+        update, fixed = partial(self._recursion.update, reading=reading, stamp=stamp), copy.copy(inputs)
+        apply = partial(update, speeds=speeds, inputs=fixed, noise_now=noise)
         if stamp is not None and before.stamp is not None and stamp < before.stamp:
             if not self._buffer.lag:
                 raise InvalidValueError(
@@ -492,9 +482,3 @@ class Tracker:
     def __repr__(self) -> str:
         sizes = f"{len(self.symbols)} coordinates in {len(self.groups)} groups"
         return f"<Tracker: {sizes}, {len(self.observed)} observed>"
-
-
-def _require_time(at: Any) -> float:
-    if (time := finite_number(at)) is None:
-        raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
-    return time

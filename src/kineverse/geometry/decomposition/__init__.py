@@ -11,9 +11,10 @@ from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
     from .accuracy import Accuracy as Accuracy
-    from .coacd_process import DecompositionError as DecompositionError, ResourceLimits as ResourceLimits
     from .convex_decomposition import (
+        DecompositionError as DecompositionError,
         DecompositionOutcome as DecompositionOutcome,
+        ResourceLimits as ResourceLimits,
         decompose as decompose,
         decompose_all as decompose_all,
         find_hulls as find_hulls,

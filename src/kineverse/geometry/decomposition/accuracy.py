@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
-from kineverse.geometry.shapes import build_bvh, convex_hull, hull_faces
+from kineverse.geometry.shapes import build_bvh, convex_hull, enclosed_volume, hull_faces, sample_inside
 
 SAMPLES = 4000  # number of sample points on each surface and in each hull, in addition to all corners
 _MOST_CORNERS = 20_000  # largest number of corners of the mesh that are sampled
@@ -79,17 +79,11 @@ def measure_accuracy(mesh: Faces, hulls: list[Polytope]) -> Accuracy:
     random = np.random.default_rng(0)
     return Accuracy(
         mesh_volume=abs(enclosed_volume(mesh.vertices, mesh.faces)) if is_closed(mesh.faces) else None,
-        volume=_union_volume(hulls, random),
+        volume=_union_volume(hulls),
         hull_volume=Polytope.from_points(mesh.vertices).volume,
         excess=_excess(mesh, hulls, random),
         uncovered=_uncovered(mesh, hulls, random),
     )
-
-
-def enclosed_volume(vertices: Floats, faces: Integers) -> float:
-    """Return the volume that triangles enclose, positive if they are counter-clockwise from outside [m³]."""
-    a, b, c = (vertices[faces[:, k]] - vertices[faces[0, 0]] for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
 def is_closed(faces: Integers) -> bool:
@@ -99,11 +93,11 @@ def is_closed(faces: Integers) -> bool:
     return bool((counts == 1).all()) and np.array_equal(unique, np.unique(edges[:, ::-1], axis=0))
 
 
-def _union_volume(hulls: list[Polytope], random: np.random.Generator) -> float:
+def _union_volume(hulls: list[Polytope]) -> float:
     """Return ``Σ V_i · mean of 1/m(x) over x in hull i``, where m(x) hulls contain x."""
     total = 0.0
     for k, polytope in enumerate(hulls):
-        inside = _sample_volume(polytope, random)
+        inside = sample_inside(polytope.points, polytope.triangles, polytope.points.mean(axis=0), SAMPLES)
         count = np.ones(len(inside))
         for other in (*hulls[:k], *hulls[k + 1 :]):
             count += other.face_distances(inside) < 0.0
@@ -111,22 +105,11 @@ def _union_volume(hulls: list[Polytope], random: np.random.Generator) -> float:
     return total
 
 
-def _sample_volume(polytope: Polytope, random: np.random.Generator) -> Floats:
-    """Return points distributed uniformly in a hull, by tetrahedra over its triangles."""
-    centre = polytope.points.mean(axis=0)
-    corners = polytope.points[polytope.triangles] - centre
-    volumes = np.abs(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
-    chosen = random.choice(len(volumes), SAMPLES, p=volumes / volumes.sum())
-    weights = random.dirichlet(np.ones(4), SAMPLES)[:, :3]
-    return np.asarray(centre + np.einsum("nk,nkd->nd", weights, corners[chosen]))
-
-
 def _sample_surface(vertices: Floats, faces: Integers, count: int, random: np.random.Generator) -> Floats:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     chosen = random.choice(len(areas), count, p=areas / areas.sum())
-    weights = random.dirichlet(np.ones(3), count)
-    return np.asarray(np.einsum("nk,nkd->nd", weights, vertices[faces[chosen]]))
+    return np.asarray(np.einsum("nk,nkd->nd", random.dirichlet(np.ones(3), count), vertices[faces[chosen]]))
 
 
 def _uncovered(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) -> float:
@@ -193,11 +176,8 @@ def nearest_surface_points(engine: Any, points: Floats) -> tuple[Floats, Floats]
     import coal
 
     point_ball, origin, shifted = coal.Sphere(1e-9), coal.Transform3s(), coal.Transform3s()
-    functor, request, result = (
-        coal.ComputeDistance(engine, point_ball),
-        coal.DistanceRequest(),
-        coal.DistanceResult(),
-    )
+    functor = coal.ComputeDistance(engine, point_ball)
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
     distances, nearest = np.empty(len(points)), np.empty((len(points), 3))
     for k, point in enumerate(points):
         shifted.setTranslation(point)

@@ -7,7 +7,7 @@ import io
 import json
 import logging
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -93,19 +93,12 @@ class Decomposition:
     accuracy: Accuracy
     seconds: float
     made: float
-    remarks: tuple[str, ...] = field(default=())
+    remarks: tuple[str, ...] = ()
 
     def to_bytes(self) -> bytes:
         """Serialise the decomposition exactly; :meth:`from_bytes` reads it back."""
-        facts = {
-            "name": self.name,
-            "error": self.error,
-            "max_hulls": self.max_hulls,
-            "accuracy": asdict(self.accuracy),
-            "seconds": self.seconds,
-            "made": self.made,
-            "remarks": self.remarks,
-        }
+        facts = asdict(replace(self, hulls=()))
+        del facts["hulls"]
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
@@ -129,10 +122,9 @@ class Decomposition:
                 facts = json.loads(arrays["facts"].tobytes())
                 points, sizes = arrays["points"], arrays["sizes"]
             points.flags.writeable = False
-            hulls = tuple(np.split(points, np.cumsum(sizes)[:-1]))
             facts["accuracy"] = Accuracy(**facts["accuracy"])
             facts["remarks"] = tuple(facts["remarks"])
-            return Decomposition(hulls, **facts)
+            return Decomposition(tuple(np.split(points, np.cumsum(sizes)[:-1])), **facts)
         except Exception as error:  # zip, numpy and json raise all kinds of errors for a damaged archive.
             raise FormatError("This is not a decomposition.") from error
 

@@ -70,8 +70,7 @@ def _nearest_spheres(cells: Floats, centres: Floats, radii: Floats) -> Integers:
     count = len(radii)
     if count <= _NEAR:
         return np.broadcast_to(np.arange(count), (len(cells), count)).copy()
-    depths = distances(cells.mean(axis=1), centres) - radii
-    return np.argpartition(depths, _NEAR, axis=1)[:, :_NEAR]
+    return np.argpartition(distances(cells.mean(axis=1), centres) - radii, _NEAR, axis=1)[:, :_NEAR]
 
 
 def _measure_gaps(

@@ -110,8 +110,7 @@ def _least_protrusion(region: CoverRegion, most: int) -> float:
 
 def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
     corners = problem.region.corners
-    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    best = descend(problem, middle[None], aim, _FEW_ROUNDS)
+    best = descend(problem, ((corners.min(axis=0) + corners.max(axis=0)) / 2)[None], aim, _FEW_ROUNDS)
     if best.protrusion <= aim or most == 1:
         return best
     starts = CoverStarts(problem.region, aim)
@@ -165,8 +164,7 @@ def _split_worst(problem: _Problem, cover: FittedSpheres, most: int) -> Floats:
     needs = np.linalg.norm(points - cover.centres[owners], axis=1) - depths[owners]
     order = np.argsort(-needs, kind="stable")
     first = order[np.sort(np.unique(owners[order], return_index=True)[1])][: most - len(cover.radii)]
-    added = 0.4 * cover.centres[owners[first]] + 0.6 * points[first]
-    return np.concatenate([cover.centres, added])
+    return np.concatenate([cover.centres, 0.4 * cover.centres[owners[first]] + 0.6 * points[first]])
 
 
 def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUNDS) -> FittedSpheres:
@@ -206,8 +204,7 @@ def _pull_inside(region: CoverRegion, centres: Floats) -> tuple[Floats, Integers
     outside = np.flatnonzero(depths[np.arange(len(centres)), solids] < 0.0)
     if len(outside):
         goals, least = region.middles[solids[outside]], depths[outside, solids[outside]]
-        deepest = region.depths(goals)
-        part = np.minimum(-1.0001 * least / np.maximum(deepest - least, 1e-300), 1.0)[:, None]
+        part = np.minimum(-1.0001 * least / np.maximum(region.depths(goals) - least, 1e-300), 1.0)[:, None]
         centres = centres.copy()
         centres[outside] += part * (goals - centres[outside])
         depths = region.part_depths(centres)

@@ -38,8 +38,7 @@ class CoverMesh:
         step = len(inner) // (_INNER_TRIANGLES * len(region.parts)) + 1
         inner, of_inner = inner[::step], of_inner[::step]
         middles = region.middles[of_inner][:, None]
-        layers = [middles + size * (inner - middles) for size in _LAYERS]
-        triangles = np.concatenate([surface, *layers])
+        triangles = np.concatenate([surface, *[middles + size * (inner - middles) for size in _LAYERS]])
         owners = np.concatenate([of_surface, *(of_inner for _ in _LAYERS)])
         triangles = triangles[~is_deep_in_others(region, triangles, owners, spacing)].reshape(-1, 3)
         # Corners are merged, so that each counts once.
@@ -67,13 +66,10 @@ class CoverMesh:
         cut = owners[a] != owners[b]
         a, b = a[cut], b[cut]
         before = powers[a, owners[b]] - powers[a, owners[a]]
-        after = powers[b, owners[a]] - powers[b, owners[b]]
-        part = before / np.maximum(before + after, 1e-30)
+        part = before / np.maximum(before + (powers[b, owners[a]] - powers[b, owners[b]]), 1e-30)
         on_edges = self.points[a] + part[:, None] * (self.points[b] - self.points[a])
         labels = owners[self._triangles]
-        mixed = (
-            (labels[:, 0] != labels[:, 1]) & (labels[:, 1] != labels[:, 2]) & (labels[:, 2] != labels[:, 0])
-        )
+        mixed = (labels != np.roll(labels, 1, axis=1)).all(axis=1)
         corners, labels = self._triangles[mixed], labels[mixed]
         u, v = (powers[corners, labels[:, :1]] - powers[corners, labels[:, k : k + 1]] for k in (1, 2))
         weights = np.cross(u, v)
@@ -82,8 +78,7 @@ class CoverMesh:
         inside = np.einsum("nk,nkj->nj", weights, self.points[corners])
         points = np.concatenate([self.points, on_edges, inside])
         # Points between two triangles may belong to yet another sphere.
-        added = points[len(self.points) :]
-        others = squares - scalar_products(added.astype(np.float32), twice)
+        others = squares - scalar_products(points[len(self.points) :].astype(np.float32), twice)
         return points, np.concatenate([owners, others.argmin(axis=1)])
 
 
@@ -145,13 +140,8 @@ class CoverStarts:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         deepest = max(float(region.depths(region.middles).max()), protrusion)
         levels = protrusion * np.geomspace(0.7, max(1.2 * deepest / protrusion, 1.5), 5)
-        candidates = np.concatenate(
-            [
-                region.middles,
-                *(origins + size * surface for size in (0.3, 0.6, 0.8, 0.9)),
-                *(middles - t * normals for t in levels),
-            ]
-        )
+        inner = [origins + size * surface for size in (0.3, 0.6, 0.8, 0.9)]
+        candidates = np.concatenate([region.middles, *inner, *(middles - t * normals for t in levels)])
         candidates = candidates[region.depths(candidates) > 0.0]
         self._candidates = candidates[:: len(candidates) // _CANDIDATES + 1]
         self._depths = region.depths(self._candidates)
@@ -207,9 +197,8 @@ def _box_centres(corners: Floats, protrusion: float, most: int) -> Floats:
     axes = _principal_axes(corners)
     low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
     numbers = range(1, most + 1)
-    counts = np.array(
-        [(i, j, k) for i in numbers for j in numbers[: most // i] for k in numbers[: most // (i * j)]]
-    )
+    pairs = ((i, j) for i in numbers for j in numbers[: most // i])
+    counts = np.array([(i, j, k) for i, j in pairs for k in numbers[: most // (i * j)]])
     half = (high - low) / 2 / counts
     protrusions = np.linalg.norm(half, axis=1) - half.min(axis=1)
     totals = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)

@@ -55,7 +55,9 @@ def cover_objects(
                 f"No spheres cover the shapes of body '{items[0].body}' ({_name(items)}): {error} Make them "
                 "thicker, or leave the body out: Planner(model, leave_out=[...])."
             ) from None
-        keep_cover(key, _name(items), result)
+        _remember(key, result)
+        head = {"name": _name(items), "protrusion": result.protrusion, "sizes": [len(result)]}
+        COVERS.write(key, _pack(head, result.centres, result.radii))
     return result
 
 
@@ -137,13 +139,6 @@ def cover_key(
 def find_cover(key: str) -> SphereCover | None:
     """Return the cover of a key, see :func:`cover_key`, from memory or the disk; None if there is none."""
     return _find(COVERS, key, lambda content: _parse_cover(content)[1])
-
-
-def keep_cover(key: str, name: str, cover: SphereCover) -> None:
-    """Keep a cover in memory, and atomically on the disk, with the name of what it covers."""
-    _remember(key, cover)
-    head = {"name": name, "protrusion": cover.protrusion, "sizes": [len(cover)]}
-    COVERS.write(key, _pack(head, cover.centres, cover.radii))
 
 
 def find_or_make_tree(key: str, make: Callable[[], SphereTree]) -> SphereTree:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -17,7 +17,14 @@ import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
-from kineverse.geometry.shapes import Hull, Solid, solid_from_points, solid_surface
+from kineverse.geometry.shapes import (
+    Hull,
+    Solid,
+    enclosed_volume,
+    sample_inside,
+    solid_from_points,
+    solid_surface,
+)
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 _ROUNDNESS = 0.03  # gap between a round solid and its polytope, as a fraction of the protrusion of a cover
@@ -30,7 +37,6 @@ _MANY_CORNERS, _DIRECTIONS = 200, 400
 
 _BLOCK = 80_000
 _SAMPLES = 1000
-_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)  # steps of the sequence R3 (Roberts 2018)
 _FAR = 1e9  # offset of a plane that bounds nothing
 
 
@@ -83,21 +89,11 @@ class CoverPolytope:
         """Return the solid at a pose (4, 4), everything scaled by a factor."""
         rotation, place = pose[:3, :3], pose[:3, 3]
         normals, side = self.normals @ rotation.T, self.side
-        moved = replace(
-            side,
-            origin=factor * (rotation @ side.origin + place),
-            axis=rotation @ side.axis,
-            reach=factor * side.reach,
-            offset=factor * side.offset,
-        )
-        return replace(
-            self,
-            corners=factor * (self.corners @ rotation.T + place),
-            normals=normals,
-            offsets=factor * (self.offsets + normals @ place),
-            volume=factor**3 * self.volume,
-            side=moved,
-        )
+        origin, axis = factor * (rotation @ side.origin + place), rotation @ side.axis
+        moved = RoundSide(origin, axis, factor * side.reach, factor * side.offset, side.slope, side.width)
+        corners = factor * (self.corners @ rotation.T + place)
+        offsets, volume = factor * (self.offsets + normals @ place), factor**3 * self.volume
+        return CoverPolytope(corners, self.faces, normals, offsets, volume, moved, self.is_hull)
 
 
 class CoverRegion:
@@ -131,12 +127,8 @@ class CoverRegion:
 
     def part_depths(self, points: Floats) -> Floats:
         """Return the depths (n, P) of points (n, 3) in each solid [m]; negative outside."""
-        shape = len(points), *self._offsets.shape
-        flat = (
-            (self._offsets.reshape(-1) - scalar_products(points, self._normals.reshape(-1, 3)))
-            .reshape(shape)
-            .min(axis=2)
-        )
+        products = scalar_products(points, self._normals.reshape(-1, 3))
+        flat = (self._offsets - products.reshape(len(points), *self._offsets.shape)).min(axis=2)
         round_ = self._round_depths(points[:, None], np.arange(len(self.parts)))[0]
         return np.asarray(np.minimum(flat, round_))
 
@@ -153,10 +145,8 @@ class CoverRegion:
         count, rows = min(count, flat.shape[1]), np.arange(len(points))[:, None]
         near = np.argpartition(flat, count - 1, axis=1)[:, :count]
         depths, away = self._round_depths(points, owners)
-        return (
-            np.concatenate([flat[rows, near], depths[:, None]], axis=1),
-            np.concatenate([self._normals[owners[:, None], near], away[:, None]], axis=1),
-        )
+        normals = np.concatenate([self._normals[owners[:, None], near], away[:, None]], axis=1)
+        return np.concatenate([flat[rows, near], depths[:, None]], axis=1), normals
 
     def measure_volume(self) -> float:
         """Return the volume of the union, to about a percent where solids overlap [m³]."""
@@ -165,7 +155,8 @@ class CoverRegion:
         volume = 0.0
         for k, part in enumerate(self.parts):
             # Each point counts as often as one solid contains it.
-            shared = (self.part_depths(_sample_inside(part, self.middles[k])) >= 0.0).sum(axis=1)
+            inside = sample_inside(part.corners, part.faces, self.middles[k], _SAMPLES)
+            shared = (self.part_depths(inside) >= 0.0).sum(axis=1)
             volume += part.volume * float((1.0 / np.maximum(shared, 1)).mean())
         return volume
 
@@ -206,18 +197,6 @@ def scalar_products(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> npt.N
     for k in range(0, len(points), rows):
         np.matmul(points[k : k + rows], others.T, out=result[k : k + rows])
     return result
-
-
-def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
-    """Return evenly spread points (n, 3) of an outer polytope around a point of it."""
-    corners = part.corners[part.faces] - middle
-    shares = np.cumsum(np.abs(np.linalg.det(corners)))
-    places = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    chosen = corners[np.minimum(np.searchsorted(shares / shares[-1], places), len(corners) - 1)]
-    # Weights of the corners of each tetrahedron, from a sequence that fills the cube.
-    u = np.sort(np.arange(_SAMPLES)[:, None] * _SEQUENCE % 1.0, axis=1)
-    weights = np.diff(u, axis=1, prepend=0.0)
-    return np.asarray(middle + np.einsum("nk,nkj->nj", weights, chosen))
 
 
 def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
@@ -279,8 +258,7 @@ def _bound_hull(solid: Solid) -> CoverPolytope:
     mesh, surface = solid_surface(solid), solid.surface
     assert isinstance(mesh, Faces)
     assert isinstance(surface, Hull)
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
-    volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+    volume = enclosed_volume(mesh.vertices, mesh.faces)
     # Triangles of one flat face share a plane.
     planes = np.column_stack([surface.normals, surface.offsets / solid.radius])
     kept = np.unique(np.round(planes, 9), axis=0, return_index=True)[1]

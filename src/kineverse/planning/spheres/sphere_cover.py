@@ -13,7 +13,7 @@ from kineverse.geometry.mesh_files import Faces, Floats
 from kineverse.geometry.shapes import Hull, Solid, scale_solid, thicken_primitive
 from kineverse.model.body import Capsule, Sphere
 
-from .cover_fit import FittedSpheres, fit_spheres
+from .cover_fit import fit_spheres
 from .polytope import CoverPolytope, CoverRegion, bound_solid, solid_volume
 
 MOST = 48  # default largest number of spheres of a cover
@@ -89,8 +89,7 @@ def cover_solids(
     spheres = [(pose, solid.surface) for solid, pose in solids if isinstance(solid.surface, Sphere)]
     if len(spheres) == len(solids) <= most:
         places = np.array([pose[:3, 3] for pose, _ in spheres])
-        sizes = np.array([sphere.radius for _, sphere in spheres], dtype=float)
-        return _make_cover(places, sizes, 0.0)
+        return _make_cover(places, np.array([sphere.radius for _, sphere in spheres], dtype=float), 0.0)
     if protrusion is None:
         protrusion = default_protrusion(solids)
     # Solids may be longer than any sensible protrusion, and one ball is then enough.
@@ -99,7 +98,9 @@ def cover_solids(
     if isinstance(first.surface, Capsule) and not others:
         centres, radii, reached = _capsule_chain(first.surface, protrusion, most)
         return _make_cover(centres, radii, reached).move(pose)
-    if _is_needle(first) and not others:
+    _, width, length = np.sort(first.half).tolist()
+    is_primitive = not isinstance(first.surface, Hull | Faces)
+    if is_primitive and width <= _NEEDLE * length and not others:
         centres, reached = _needle_chain(first, protrusion, most)
         return _make_cover(centres, np.full(len(centres), reached), reached).move(pose)
     parts, growth = _bound_solids(solids, protrusion)
@@ -109,7 +110,7 @@ def cover_solids(
     shift = np.eye(4)
     shift[:3, 3] = -origin
     region = CoverRegion([part.move(shift, 1.0 / unit) for part in parts])
-    fitted: FittedSpheres = fit_spheres(region, protrusion / unit, most)
+    fitted = fit_spheres(region, protrusion / unit, most)
     reached = fitted.protrusion * unit + growth
     return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, reached)
 
@@ -119,8 +120,12 @@ def default_protrusion(solids: Sequence[tuple[Solid, Floats]]) -> float:
 
     The size is the edge of a cube with the volume of the union.
     """
-    size = math.cbrt(_volume(solids))
-    return min(max(PROTRUSION_OF_SIZE * size, LEAST_PROTRUSION), LARGEST_PROTRUSION)
+    if len(solids) == 1:
+        volume = solid_volume(solids[0][0])
+    else:
+        parts, _ = _bound_solids(solids, 0.1 * min(solid.radius for solid, _ in solids))
+        volume = CoverRegion(parts).measure_volume()
+    return min(max(PROTRUSION_OF_SIZE * math.cbrt(volume), LEAST_PROTRUSION), LARGEST_PROTRUSION)
 
 
 def check_cover_settings(protrusion: float | None, most: int) -> None:
@@ -129,13 +134,6 @@ def check_cover_settings(protrusion: float | None, most: int) -> None:
         raise InvalidValueError(f"A protrusion of {protrusion:g} m: spheres stick out by a positive length.")
     if not 1 <= most <= _MOST_OF_ALL:
         raise InvalidValueError(f"most={most}: a cover has 1 to {_MOST_OF_ALL} spheres.")
-
-
-def _volume(solids: Sequence[tuple[Solid, Floats]]) -> float:
-    if len(solids) == 1:
-        return solid_volume(solids[0][0])
-    parts, _ = _bound_solids(solids, 0.1 * min(solid.radius for solid, _ in solids))
-    return CoverRegion(parts).measure_volume()
 
 
 def _bound_solids(
@@ -157,11 +155,6 @@ def _bound_solids(
         part = bound_solid(solid if size == 1.0 else scale_solid(solid, 1.0 / size), protrusion / size)
         parts.append(part.move(np.eye(4), size).move(pose))
     return parts, most
-
-
-def _is_needle(solid: Solid) -> bool:
-    _, width, length = np.sort(solid.half).tolist()
-    return not isinstance(solid.surface, Hull | Faces) and width <= _NEEDLE * length
 
 
 def _needle_chain(solid: Solid, protrusion: float, most: int) -> tuple[Floats, float]:
@@ -191,8 +184,7 @@ def _capsule_chain(capsule: Capsule, protrusion: float, most: int) -> tuple[Floa
     With radius r + e they reach beyond both ends by e if the outermost are e inside of the ends of the axis,
     and cover the side as long as neighbours are no further than 2 √((r + e)² - r²) apart.
     """
-    radius = float(capsule.radius)
-    length = float(capsule.length)
+    radius, length = float(capsule.radius), float(capsule.length)
 
     def count_spheres(e: float) -> int:
         span = max(length - 2 * e, 0.0)

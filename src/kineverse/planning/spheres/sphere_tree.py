@@ -66,10 +66,8 @@ def make_sphere_tree(centres: npt.ArrayLike, radii: npt.ArrayLike) -> SphereTree
         raise InvalidValueError("Spheres have finite centres and positive radii.")
     ball_centre, ball_radius = enclosing_ball(where, sizes)
     if len(sizes) <= _ALWAYS_FLAT:
-        order = np.arange(len(sizes))
-        return SphereTree(
-            where, sizes, order, where, sizes, np.arange(len(sizes) + 1), ball_centre, ball_radius
-        )
+        first = np.arange(len(sizes) + 1)
+        return SphereTree(where, sizes, first[:-1], where, sizes, first, ball_centre, ball_radius)
     clusters = _cluster(where, sizes, round(math.sqrt(len(sizes))))
     order = np.argsort(clusters, kind="stable")
     where, sizes, clusters = where[order], sizes[order], clusters[order]
@@ -80,7 +78,7 @@ def make_sphere_tree(centres: npt.ArrayLike, radii: npt.ArrayLike) -> SphereTree
     return SphereTree(where, sizes, order, coarse_centres, coarse_radii, first, ball_centre, ball_radius)
 
 
-def enclosing_ball(centres: Floats, radii: Floats, steps: int = _BALL_STEPS) -> tuple[Floats, float]:
+def enclosing_ball(centres: Floats, radii: Floats) -> tuple[Floats, float]:
     """Return centre (3,) and radius [m] of a ball around spheres, close to the smallest one.
 
     The centre approaches the sphere that reaches furthest by ever smaller steps (Bădoiu and Clarkson, Smaller
@@ -90,7 +88,7 @@ def enclosing_ball(centres: Floats, radii: Floats, steps: int = _BALL_STEPS) -> 
         return centres[0].copy(), float(radii[0])
     centre = centres.mean(axis=0)
     best, least = centre, math.inf
-    for k in range(1, steps + 1):
+    for k in range(1, _BALL_STEPS + 1):
         reach = np.linalg.norm(centres - centre, axis=1) + radii
         furthest = int(reach.argmax())
         if reach[furthest] < least:
@@ -113,8 +111,7 @@ def _cluster(centres: Floats, radii: Floats, count: int) -> Integers:
     means = centres[seeds]
     clusters = np.zeros(len(centres), dtype=np.int64)
     for _ in range(_LLOYD_ROUNDS):
-        reach = np.linalg.norm(centres[:, None] - means, axis=2) + radii[:, None]
-        clusters = reach.argmin(axis=1)
+        clusters = (np.linalg.norm(centres[:, None] - means, axis=2) + radii[:, None]).argmin(axis=1)
         used = np.unique(clusters)
         before, means = means, np.array([centres[clusters == k].mean(axis=0) for k in used.tolist()])
         if means.shape == before.shape and np.allclose(means, before):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -65,21 +65,18 @@ class BlendedPath:
     @property
     def deviation(self) -> Array:
         """Distances between the inner corners and their blends (N-2,)."""
-        result: Array = self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4
-        return result
+        return np.asarray(self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4)
 
     @property
     def curvature(self) -> Array:
         """Second derivatives q'' of the blends (N-2, n); 0 where there is none."""
         change: Array = np.diff(self.directions, axis=0)
         reach = self.reach[:, None]
-        result: Array = np.where(reach > 0, change / np.where(reach > 0, 2 * reach, 1.0), 0.0)
-        return result
+        return np.where(reach > 0, change / np.where(reach > 0, 2 * reach, 1.0), 0.0)
 
     def blend(self, corner: int, count: int) -> Array:
         """Return ``count`` configurations on the blend of an inner corner, both ends included."""
-        points: Array = _blend_points(self, np.array([corner]), count)[0]
-        return points
+        return np.asarray(_blend_points(self, np.array([corner]), count)[0])
 
 
 def round_corners(
@@ -119,17 +116,9 @@ def round_corners(
         raise ShapeError(f"A path is an array (N, n) of N >= 1 points, not of shape {polyline.shape}.")
     if not np.isfinite(polyline).all():
         raise InvalidValueError("The points of a path are finite; there is a NaN or an infinity among them.")
-    allowed = np.asarray(deviation, dtype=float)
-    if allowed.shape not in ((), polyline.shape[:1]):
-        raise ShapeError(
-            f"deviation= is a number or an array of one for each of the {len(polyline)} points, not of shape "
-            f"{allowed.shape}."
-        )
-    if not (allowed >= 0).all():
-        raise InvalidValueError(f"deviation= is a distance from 0, not {allowed}.")
     keep = _find_distinct(polyline)
     # Of points that count once, the strictest deviation counts; and the path ends at the last one.
-    allowed = np.minimum.reduceat(np.broadcast_to(allowed, polyline.shape[:1]), keep)
+    allowed = np.minimum.reduceat(each_deviation(deviation, len(polyline)), keep)
     allowed[[0, -1]] = 0.0
     keep[1:][-1:] = len(polyline) - 1
     if len(keep) > 2 and allowed.any():
@@ -138,15 +127,28 @@ def round_corners(
     kept = polyline[keep]
     directions, lengths = _segments(kept)
     if len(kept) == 1:
-        return _frozen(kept, directions, lengths, np.zeros(0))
+        return BlendedPath(*map(_read_only, (kept, directions, lengths, np.zeros(0))))
     turn = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     turns = _find_turns(kept, directions, lengths)
     room = lengths / 2
     room[[0, -1]] = lengths[[0, -1]]  # no blend takes the other half
     reach = np.minimum(room[:-1], room[1:])
     reach = np.where(turns, np.minimum(reach, 4 * allowed[1:-1] / np.where(turns, turn, 1.0)), 0.0)
-    path = _frozen(kept, directions, lengths, reach)
+    path = BlendedPath(*map(_read_only, (kept, directions, lengths, reach)))
     return path if valid is None else _shrink(path, valid, resolution)
+
+
+def each_deviation(deviation: npt.ArrayLike, count: int) -> Array:
+    """Return the largest distances (N,) from the points of a polyline."""
+    allowed = np.asarray(deviation, dtype=float)
+    if allowed.shape not in ((), (count,)):
+        raise ShapeError(
+            f"deviation= is a number or an array of one for each of the {count} points, not of shape "
+            f"{allowed.shape}."
+        )
+    if not (allowed >= 0).all():
+        raise InvalidValueError(f"deviation= is a distance from 0, not {allowed}.")
+    return np.broadcast_to(allowed, count)
 
 
 def _segments(points: Array) -> tuple[Array, Array]:
@@ -164,8 +166,7 @@ def _find_turns(points: Array, directions: Array, lengths: Array) -> npt.NDArray
     """Return flags of the inner corners (N-2,) where the direction changes by more than rounding."""
     turn = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     shorter = np.minimum(lengths[:-1], lengths[1:])
-    turns: npt.NDArray[np.bool_] = turn > _STRAIGHT + _rounding(points) / shorter
-    return turns
+    return np.asarray(turn > _STRAIGHT + _rounding(points) / shorter)
 
 
 def _find_distinct(points: Array) -> npt.NDArray[np.intp]:
@@ -221,20 +222,18 @@ def _shrink(path: BlendedPath, valid: Validity, resolution: float) -> BlendedPat
             )
         open_corners = open_corners[~flags.reshape(samples.shape[:2]).all(axis=1)]
         reach[open_corners] /= 2
-        path = _frozen(path.points, path.directions, path.lengths, reach.copy())
+        path = replace(path, reach=_read_only(reach.copy()))
     reach[open_corners] = 0.0
-    return _frozen(path.points, path.directions, path.lengths, reach)
+    return replace(path, reach=_read_only(reach))
 
 
 def _blend_points(path: BlendedPath, corners: npt.NDArray[np.intp], count: int) -> Array:
     u = np.linspace(0.0, 1.0, count)[:, None]
     reach = path.reach[corners, None, None]
     before, after = path.directions[corners, None], path.directions[corners + 1, None]
-    moved = path.points[corners + 1, None] + reach * (u**2 * after - (1 - u) ** 2 * before)
-    return np.asarray(moved)
+    return np.asarray(path.points[corners + 1, None] + reach * (u**2 * after - (1 - u) ** 2 * before))
 
 
-def _frozen(points: Array, directions: Array, lengths: Array, reach: Array) -> BlendedPath:
-    for part in (points, directions, lengths, reach):
-        part.flags.writeable = False
-    return BlendedPath(points, directions, lengths, reach)
+def _read_only(array: Array) -> Array:
+    array.flags.writeable = False
+    return array

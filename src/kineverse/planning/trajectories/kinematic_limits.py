@@ -88,10 +88,9 @@ def _speed_bounds(model: ModelView, speeds: Sequence[Symbol], values: State) -> 
     for name, constraint in model.constraints_for(moving).items():
         if max((s.order for s in constraint.expression.symbols), default=0) == 1:
             limits.add(name, constraint)
-    admissible = limits.admissible_speeds(moving)
-    bounds = {
-        s: min(-_evaluate(low, values), _evaluate(high, values)) for s, (low, high) in admissible.box.items()
-    }
+    admissible, bounds = limits.admissible_speeds(moving), {}
+    for symbol, (low, high) in admissible.box.items():
+        bounds[symbol] = min(-_evaluate(low, values), _evaluate(high, values))
 
     def tighten(weights: Mapping[Symbol, Expression], bound: float) -> None:
         for symbol, weight in weights.items():

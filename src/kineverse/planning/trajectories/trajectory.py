@@ -1,27 +1,35 @@
-"""Trajectories: timed motions of coordinates as values, and goals that let a controller follow them."""
+"""Trajectories: timed motions of coordinates as values, and goals that let a controller follow them.
+
+Files of trajectories are JSON, plain data with names, exact to the last bit::
+
+    {"format": "kineverse trajectory", "version": 1, "coordinates": ["kitchen/fridge_door", ...],
+     "times": [0.0, ...], "positions": [[0.0, ...], ...], "velocities": [[0.0, ...], ...]}
+
+Times are in [s], positions and velocities in [rad], [m] and per second, one row for each time.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import finite_number
-from kineverse.errors import FormatError, InvalidValueError, ShapeError
+from kineverse.errors import ExpressionError, FormatError, InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
+from kineverse.formats.files import read_file, replace_file
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
-from kineverse.symbols import Symbol
-
-from .trajectory_file import TrajectoryData, parse_coordinates, read_trajectory_file, write_trajectory_file
+from kineverse.symbols import Symbol, parse_symbol_name
 
 if TYPE_CHECKING:
     from kineverse.control import Controller
@@ -106,22 +114,21 @@ class Trajectory:
         """
         if isinstance(times, float) and math.isfinite(times):
             return self._position_at(times)
-        k, u, dt = self._locate(times)
-        p, q = self.positions[k], self.positions[k + 1 - self._single]
-        v, w = self.velocities[k] * dt, self.velocities[k + 1 - self._single] * dt
-        # Cubic Hermite polynomial, about the nearer end so that knots are met exactly.
-        change = q - p
-        near = p + u * (v + u * ((3 * change - 2 * v - w) + u * (v + w - 2 * change)))
-        r = u - 1
-        far = q + r * (w + r * ((2 * w + v - 3 * change) + r * (v + w - 2 * change)))
-        return np.asarray(np.where(u < 0.5, near, far))
+        k, u, _ = self._locate(times)
+        about_end = u >= 0.5
+        polynomials = self._polynomials[about_end[..., 0].astype(int), k]
+        return np.asarray(np.einsum("...i,...in->...n", (u - about_end) ** np.arange(4), polynomials))
 
     @cached_property
     def _polynomials(self) -> Array:
-        """Coefficients (2, T - 1, 4, n) of the cubics in the intervals, about their beginnings and ends."""
-        dt = np.diff(self.times)[:, None]
-        p, q = self.positions[:-1], self.positions[1:]
-        v, w = self.velocities[:-1] * dt, self.velocities[1:] * dt
+        """Coefficients (2, T - 1, 4, n) of the cubics in the intervals, about their beginnings and ends.
+
+        Hermite polynomials about the nearer end meet knots exactly. One knot is an interval without length.
+        """
+        count = max(len(self.times) - 1, 1)
+        dt = (self.times[-count:] - self.times[:count])[:, None]
+        p, q = self.positions[:count], self.positions[-count:]
+        v, w = self.velocities[:count] * dt, self.velocities[-count:] * dt
         change = q - p
         cubic = v + w - 2 * change
         begins = p, v, 3 * change - 2 * v - w, cubic
@@ -138,8 +145,7 @@ class Trajectory:
         u = (time - start) / (self.times.item(k + 1) - start)
         about_end = u >= 0.5
         u -= about_end
-        powers = np.array((1.0, u, u * u, u * u * u))
-        return np.asarray(powers @ self._polynomials[int(about_end), k])
+        return np.asarray(np.array((1.0, u, u * u, u * u * u)) @ self._polynomials[int(about_end), k])
 
     def velocities_at(self, times: npt.ArrayLike) -> Array:
         """Return the velocities at times of shape (...), with the shape (..., n) [rad/s], [m/s].
@@ -225,8 +231,11 @@ class Trajectory:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trajectory to a JSON file; all numbers are exact."""
+        check_trajectory_name(path)
         names = [str(symbol) for symbol in self.symbols]
-        write_trajectory_file(path, TrajectoryData(names, self.times, self.positions, self.velocities))
+        document = {"format": FORMAT, "version": VERSION, "coordinates": names}
+        document |= {key: getattr(self, key).tolist() for key in _ARRAYS}
+        replace_file(Path(path), json.dumps(document, allow_nan=False).encode())
 
     @staticmethod
     def load(path: str | os.PathLike[str], model: ModelView | None = None) -> Trajectory:
@@ -242,13 +251,13 @@ class Trajectory:
         FormatError
             If the file cannot be read or is no trajectory; the message says what is wrong.
         """
-        data, source = read_trajectory_file(path), Path(path).name
+        source, (names, *arrays) = Path(path).name, _read_file(Path(path))
         if model is None:
-            symbols = parse_coordinates(data.names, source)
+            symbols = tuple(_parse_coordinate(name, source) for name in names)
         else:
-            symbols = tuple(model.symbol(name) for name in data.names)
+            symbols = tuple(model.symbol(name) for name in names)
         try:
-            return Trajectory(symbols, *data[1:])
+            return Trajectory(symbols, *arrays)
         except (InvalidValueError, ShapeError) as error:
             raise FormatError(f"{source}: {error}") from None
 
@@ -256,25 +265,21 @@ class Trajectory:
         return len(self.times)
 
     def __iter__(self) -> Iterator[State]:
-        """Yield the states at the knots, with their times as stamps."""
         for time, values in zip(self.times.tolist(), self.positions.tolist(), strict=True):
             yield State(dict(zip(self.symbols, values, strict=True)), stamp=time)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Trajectory):
             return NotImplemented
-        return self.symbols == other.symbols and all(
-            np.array_equal(a, b) for a, b in zip(self._arrays, other._arrays, strict=True)
-        )
+        return self.symbols == other.symbols and all(map(np.array_equal, self._arrays, other._arrays))
 
     def __hash__(self) -> int:
         return hash((self.symbols, *(values.tobytes() for values in self._arrays)))
 
     def __repr__(self) -> str:
         names = ", ".join(map(str, self.symbols[:4])) + (", ..." if len(self.symbols) > 4 else "")
-        return (
-            f"<Trajectory: {self.duration:g} s, {len(self)} knots, {len(self.symbols)} coordinates: {names}>"
-        )
+        size = f"{len(self)} knots, {len(self.symbols)} coordinates"
+        return f"<Trajectory: {self.duration:g} s, {size}: {names}>"
 
     @property
     def _arrays(self) -> tuple[Array, Array, Array]:
@@ -378,3 +383,87 @@ def _time(value: float) -> float:
     if number is None:
         raise InvalidValueError(f"A time is a finite number of seconds, not {value!r}.")
     return number
+
+
+FORMAT = "kineverse trajectory"
+VERSION = 1
+_ARRAYS = "times", "positions", "velocities"
+
+
+def check_trajectory_name(path: str | os.PathLike[str]) -> None:
+    """Check that a file name ends in .json, or has no suffix."""
+    suffix = Path(path).suffix
+    if suffix.lower() not in ("", ".json"):
+        raise FormatError(
+            f"Trajectories are written as .json, not {suffix}: '{Path(path).with_suffix('.json')}'."
+        )
+
+
+def _read_file(path: Path) -> tuple[list[str], Array, Array, Array]:
+    """Read names (n,), times (T,), positions and velocities (T, n), and check their types and shapes."""
+    source = path.name
+
+    def refuse(text: str) -> NoReturn:
+        raise FormatError(f"{source}: {text} is not a number.")
+
+    try:
+        document = json.loads(read_file(path), parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"{source}: not JSON: {str(error)[:200]}.") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise FormatError(f'{source}: not a trajectory, which is an object with "format": "{FORMAT}".')
+    if document.get("version") != VERSION:
+        raise FormatError(
+            f"{source}: version {document.get('version')!r:.40} of the format; this version reads {VERSION}."
+        )
+    missing = [key for key in ("coordinates", *_ARRAYS) if key not in document]
+    if missing:
+        raise FormatError(f"{source}: there is no {missing[0]!r}.")
+    names = document["coordinates"]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise FormatError(f"{source}: 'coordinates' is a list of names.")
+    times = _numbers(document["times"], "times", source)
+    shape = (times.size, len(names))
+    positions, velocities = (_table(document[key], key, shape, source) for key in _ARRAYS[1:])
+    return names, times, positions, velocities
+
+
+def _parse_coordinate(name: str, source: str) -> Symbol:
+    try:
+        path, order = parse_symbol_name(name)
+        symbol = Symbol(path, order)
+    except ExpressionError as error:
+        raise FormatError(f"{source}: {name!r:.80} is not the name of a coordinate: {error}") from None
+    if order:
+        raise FormatError(f"{source}: {name!r:.80} is a derivative; the columns are positions.")
+    return symbol
+
+
+def _numbers(values: Any, key: str, source: str) -> Array:
+    """Read a list of numbers as an array; texts, truth values and nested lists are refused."""
+    if not isinstance(values, list):
+        raise FormatError(f"{source}: '{key}' is a list of numbers, not {values!r:.40}.")
+    for value in values:
+        if type(value) not in (int, float):
+            raise FormatError(f"{source}: {value!r:.40} in '{key}' is not a number.")
+    try:
+        return np.array(values, dtype=float)
+    except OverflowError:
+        raise FormatError(f"{source}: '{key}' has a number that is too large.") from None
+
+
+def _table(rows: Any, key: str, shape: tuple[int, int], source: str) -> Array:
+    if not isinstance(rows, list) or len(rows) != shape[0]:
+        raise FormatError(f"{source}: '{key}' is a list of {shape[0]} rows, one for each time.")
+    table = np.empty(shape)
+    for k, row in enumerate(rows):
+        numbers = _numbers(row, key, source)
+        if len(numbers) != shape[1]:
+            raise FormatError(
+                f"{source}: row {k} of '{key}' has {len(numbers)} numbers, and there are {shape[1]} "
+                "coordinates."
+            )
+        table[k] = numbers
+    return table

@@ -200,8 +200,7 @@ def find_rigid_bodies(
         if a == b or joined.log_odds_rigid <= 0.0:
             continue
         across = [pairs[frozenset((x, y))] for x in a for y in b if frozenset((x, y)) in pairs]
-        odds = sum(p.log_odds_rigid for p in across)
-        if odds <= 0.0:
+        if sum(p.log_odds_rigid for p in across) <= 0.0:
             continue
         least = min(joined.result["rigid"].probability, surest[a[0]], surest[b[0]])
         for name in (*a, *b):
@@ -221,8 +220,7 @@ def _poses_in_first(
 ) -> dict[str, Array]:
     """Return the poses of parts in the first, along the pairs with the largest odds of being rigid."""
     places = {parts[0]: np.eye(4)}
-    rigid = {c: p.log_odds_rigid for c, p in pairs.items() if c <= set(parts)}
-    tree = spanning_tree(parts, rigid, points)
+    tree = spanning_tree(parts, {c: p.log_odds_rigid for c, p in pairs.items() if c <= set(parts)}, points)
     for part in parts[1:]:
         place = np.eye(4)
         for a, b in pairwise(tree_path(tree, parts[0], part)):
@@ -329,8 +327,7 @@ class KinematicGraph:
             if root != WORLD:
                 yield Floating(name=name(root), parent=WORLD, child=name(root))
         placed = {edge.child: edge for edge in self.edges}
-        ordered = [*self.roots, *placed]
-        for first in ordered:
+        for first in [*self.roots, *placed]:
             if first in placed:
                 edge = placed[first]
                 yield edge.fit.operation(name(first), name(edge.parent), as_point=first in self.points)

@@ -131,9 +131,8 @@ def build_chain(joints: Sequence[PartPair], start: str, random: np.random.Genera
     for one in joints[1:]:
         times = np.intersect1d(times, one.times)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
-    twists: list[Array] = []  # twists about the origin of the first part, until all joints are passed
-    values: list[Array] = []
-    deviations: list[Array] = []
+    # Twists are about the origin of the first part, until all joints are passed.
+    parts: list[tuple[Array, Array, Array]] = []
     for one in joints:
         fit = one.result.best
         rows = np.searchsorted(one.times, times)
@@ -151,16 +150,13 @@ def build_chain(joints: Sequence[PartPair], start: str, random: np.random.Genera
         turned = parent[:, :3, :3]
         v, w = turned @ linear.by_joints[:, :3], turned @ linear.by_joints[:, 3:]
         place = (parent @ linear.pose)[:, :3, 3]
-        twists.append(np.concatenate([v + skew(place) @ w, w], axis=1))
-        values.append(q)
-        deviations.append(fit.deviations[rows])
+        parts.append((np.concatenate([v + skew(place) @ w, w], axis=1), q, fit.deviations[rows]))
         poses = poses @ step
         start = one.child if forward else one.parent
-    columns = np.concatenate(twists, axis=2)
-    columns[:, :3] -= skew(poses[:, :3, 3]) @ columns[:, 3:]
+    twists, values, deviations = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
+    twists[:, :3] -= skew(poses[:, :3, 3]) @ twists[:, 3:]
     angles = tuple(angle for one in joints for angle in find_angles(one.result.best))
-    joined, spread = np.concatenate(values, axis=1), np.concatenate(deviations, axis=1)
-    return Chain(poses, columns, joined, spread, angles, times)
+    return Chain(poses, twists, values, deviations, angles, times)
 
 
 def closes_loop(pair: PartPair, joints: Sequence[PartPair]) -> bool:
@@ -297,8 +293,7 @@ def close_loops(
 ) -> Iterator[tuple[ObservedLoop, LoopClosure | None]]:
     """Yield the loops that remove mobility, the shortest first, with their closures, or None."""
     # Loops are selected by strength and then closed by length.
-    selected = []
-    dependents = DependentCoordinates()
+    selected, dependents = [], DependentCoordinates()
     for loop in sorted(loops, key=lambda loop: -loop.strength):
         ends = _ends(loop)
         if ends is None:
@@ -423,8 +418,7 @@ def _lever(twists: Array) -> float:
 def _equations(twists: Array, seat_R_new: Array) -> Array:
     """Return twists in new axes, with translations divided by the lever, (N, 6, n)."""
     lever = _lever(twists)
-    parts = [seat_R_new.T @ twists[:, :3] / lever, seat_R_new.T @ twists[:, 3:]]
-    return np.concatenate(parts, axis=1)
+    return np.concatenate([seat_R_new.T @ twists[:, :3] / lever, seat_R_new.T @ twists[:, 3:]], axis=1)
 
 
 def _tolerance(loop: ObservedLoop) -> float:

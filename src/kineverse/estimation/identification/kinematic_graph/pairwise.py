@@ -54,9 +54,9 @@ class PartPair:
     @property
     def log_odds_rigid(self) -> float:
         """Log odds of one rigid body against the most probable other family."""
-        rigid = sum(fit.probability for fit in self.result if fit.family == "rigid")
-        other = max((fit.probability for fit in self.result if fit.family != "rigid"), default=0.0)
-        return math.log(max(rigid, _TINY)) - math.log(max(other, _TINY))
+        probabilities = self.result.probabilities
+        rigid = probabilities.pop("rigid", 0.0)
+        return math.log(max(rigid, _TINY)) - math.log(max(max(probabilities.values(), default=0.0), _TINY))
 
 
 def identify_pair(
@@ -148,13 +148,11 @@ def identify_pairs(
     tracks: Mapping[str, PoseTrack], families: FamilyChoice, progress: Callable[[int, int], object] | None
 ) -> dict[frozenset[str], PartPair]:
     """Identify the joints between all pairs of parts that were observed together."""
-    names = list(combinations(tracks, 2))
+    names, report = list(combinations(tracks, 2)), progress or (lambda done, count: None)
     result: dict[frozenset[str], PartPair] = {}
     for done, (a, b) in enumerate(names):
-        if progress is not None:
-            progress(done, len(names))
+        report(done, len(names))
         if (pair := identify_pair(tracks, a, b, families)) is not None:
             result[frozenset((a, b))] = pair
-    if progress is not None:
-        progress(len(names), len(names))
+    report(len(names), len(names))
     return result
