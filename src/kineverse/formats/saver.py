@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from kineverse._checks import real_number
+from kineverse._checks import finite_number
 from kineverse.errors import FormatError, InvalidValueError
 from kineverse.model import registry
 from kineverse.model.model_view import ModelView
@@ -92,11 +91,9 @@ def _check(target: Path) -> FileFormat:
 
 
 def _checked(tolerance: object) -> float | None:
-    try:
-        if tolerance is None or 0 < real_number(tolerance) < math.inf:
-            return None if tolerance is None else real_number(tolerance)
-    except (TypeError, ValueError, OverflowError):
-        pass
+    number = finite_number(tolerance)
+    if tolerance is None or (number is not None and number > 0):
+        return number
     raise InvalidValueError(f"A tolerance is a positive number [m] and [rad], or None, not {tolerance!r}.")
 
 

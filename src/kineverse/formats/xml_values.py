@@ -118,9 +118,8 @@ def read_attribute_vector(
     if text is None:
         return _require_default(element, key, default)
     try:
-        if turns:
-            return parse_directions(text, 3)  # type: ignore[return-value]  # as many as asked for
-        return parse_numbers(text, 3)  # type: ignore[return-value]  # as many as asked for
+        x, y, z = parse_directions(text, 3) if turns else parse_numbers(text, 3)
+        return x, y, z
     except ValueError as error:
         raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
 

@@ -149,7 +149,7 @@ class SaveResult(Struct, frozen=True):
 
 # -- entries -------------------------------------------------------------------------------------------------
 
-_COLLECTIONS: Mapping[str, ModelCollection] = {
+COLLECTIONS: Mapping[str, ModelCollection] = {
     "articulations": ModelCollection(
         "kineverse.gallery:names",
         summary="one for each articulation",
@@ -275,16 +275,6 @@ def find_format(name: str, content: bytes) -> FileFormat | None:
 def find_writer(name: str) -> FileFormat | None:
     """Return the format that writes files of this name; None if none does."""
     return next((one for one in list_formats() if name.endswith(one.written)), None)
-
-
-def find_collection(name: str) -> ModelCollection | None:
-    """Return the collection of models of this name; None if there is none."""
-    return _COLLECTIONS.get(name)
-
-
-def list_collections() -> tuple[str, ...]:
-    """Return the names of all collections of models."""
-    return tuple(_COLLECTIONS)
 
 
 def make_shorthand(name: str, /, **parameters: Any) -> Operation:

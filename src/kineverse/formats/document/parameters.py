@@ -94,7 +94,6 @@ def document_kind(kind: type) -> str:
 
 @cache
 def _fields(kind: Any) -> tuple[str, ...] | None:
-    """Return the names of the constructor arguments of a class; None for one without fields."""
     if issubclass(kind, msgspec.Struct):
         # The place of a mesh on this machine is no part of it.
         return kind.__struct_fields__[:2] if kind is Mesh else kind.__struct_fields__

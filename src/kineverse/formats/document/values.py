@@ -195,7 +195,6 @@ def _decode_articulation(
 
 
 def _has_numbers(constraint: Constraint) -> bool:
-    """Return whether the bounds are numbers, as most are."""
     return bool(constraint.lower.sx.is_constant() and constraint.upper.sx.is_constant())
 
 

@@ -69,7 +69,6 @@ class CurveApproximation:
         return replace(found, motions=tuple(motions))
 
     def _fit_motion(self, motion: JointMotion) -> tuple[JointMotion, float] | str:
-        """Return a polynomial motion and the bound of its error, or the reason why there is none."""
         symbols = find_term_symbols(motion.variable)
         if len(symbols) != 1:
             names = ", ".join(map(str, symbols))
@@ -315,7 +314,6 @@ def _size(a: RealInterval) -> float:
 
 
 def _remez(x: Matrix, y: Matrix, lower: float, upper: float, degree: int) -> Coefficients:
-    """Return the minimax polynomial on points by Remez' exchange of the reference points."""
     t = (2 * x - lower - upper) / (upper - lower)
     basis = np.polynomial.chebyshev.chebvander(t, degree)
     chosen = np.linspace(0, len(x) - 1, degree + 2).round().astype(int)

@@ -158,7 +158,6 @@ def _matrix_entries(
 def _substitute_polynomials(
     parts: Iterable[Matrix | AnyJointMotion], converter: TrigPolynomialConverter
 ) -> Iterator[Matrix | AnyJointMotion]:
-    """Yield the parts, with motions by variables that are polynomials replaced by polynomial motions."""
     for part in parts:
         sums = (
             _as_polynomials(converter.convert(part.variable), converter)
@@ -217,14 +216,12 @@ def _axis_motion(
 
 
 def _has_only_coordinates(amount: TrigPolynomial, converter: TrigPolynomialConverter) -> bool:
-    """Return True if all variables of an amount are coordinates, rather than curves over them."""
     return all(converter.variables[v].op == ca.OP_PARAMETER for v in amount.variables)
 
 
 def _as_polynomials(
     amount: TrigPolynomial, converter: TrigPolynomialConverter
 ) -> tuple[dict[int, Coefficients], float] | None:
-    """Return an amount as polynomials of single coordinates and a constant; None if it is no such sum."""
     return amount.polynomials if _has_only_coordinates(amount, converter) else None
 
 

@@ -148,7 +148,6 @@ def assign_limits(
 
 
 def _is_about_joint(joint: JointDescription, coordinate: Symbol, item: CoordinateLimit) -> bool:
-    """Return True if a limit is on exactly the joint's position, or on its speed."""
     if joint.symbol != coordinate or len(joint.coefficients) != 2:
         return False
     offset = 0.0 if item.symbol.order else joint.coefficients[0]

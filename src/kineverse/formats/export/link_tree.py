@@ -108,7 +108,6 @@ def find_loop_joints(model: ModelView) -> Iterator[LoopJoint]:
 
 
 def _loop_joint_kind(model: ModelView, loop: LoopRecord) -> Literal["connect", "weld"] | None:
-    """Return the kind of equality that is equivalent to a loop; None if there is none."""
     if set(loop.mask) == set(AXES):
         return "weld"
     if not set(loop.mask) <= set(AXES[:3]):
@@ -221,7 +220,6 @@ class LinkTreeBuilder:
                 yield item
 
     def _check_errors(self, errors: Mapping[str, FrameDeviation]) -> None:
-        """Refuse the frame with the largest pose error, if that exceeds the tolerance."""
         assert self._tolerance is not None
         worst = max(errors, key=lambda name: max(errors[name].position, errors[name].angle), default=None)
         if worst is None:
@@ -258,7 +256,6 @@ class LinkTreeBuilder:
         return apply_substitution(expression, known) if known else expression
 
     def _decompose_frame(self, name: str, approximation: CurveApproximation | None) -> MotionChain | None:
-        """Return the transform of a frame from its parent as a motion chain; None if it is refused."""
         factors = [self._factor(f) for f in self.model.frames[name].factors]
         record = self._articulation_of(name)
         follows = record is not None and record.follows is not None

@@ -75,7 +75,6 @@ class MjcfShapes:
         return Body(tuple(visuals), tuple(collisions), self._inertia(number))
 
     def _inertia(self, number: int) -> Inertia | None:
-        """Return the inertia of a body; None if it is unknown or zero."""
         m = self._model
         mass = float(m.body_mass[number])
         a, b, c = m.body_inertia[number].tolist()
@@ -84,7 +83,6 @@ class MjcfShapes:
         return Inertia(mass, (a, 0.0, 0.0, b, 0.0, c), mujoco_pose(m.body_ipos[number], m.body_iquat[number]))
 
     def _shape(self, geom: int, color: Rgba) -> Shape | None:
-        """Return the shape of a geom; None, with a remark, if it is left out."""
         m, kinds = self._model, mujoco().mjtGeom
         name, kind = m.geom(geom).name, m.geom_type[geom]
         pose = mujoco_pose(m.geom_pos[geom], m.geom_quat[geom])
@@ -128,7 +126,6 @@ class MjcfShapes:
 
 
 def _primitive(kind: int, size: list[float]) -> Geometry | None:
-    """Return the geometry of a primitive geom; None for other types."""
     kinds = mujoco().mjtGeom
     x, y, z = size
     if kind == kinds.mjGEOM_BOX:
@@ -290,7 +287,6 @@ class MjcfBodies:
         )
 
     def _mocap_joint(self, number: int) -> MjcfJoint:
-        """Return the free joint of a mocap body, whose pose programs set."""
         where = self._where(self._body_nodes[number])
         name = self._unique_joints.invent(f"{self.body_names[number]}/{FREE_JOINT}", where)
         return MjcfJoint(name, "free", self.body_names[number], home=(0.0,) * 6 + (1.0,), where=where)

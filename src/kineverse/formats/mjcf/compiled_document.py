@@ -84,7 +84,6 @@ def _try_compile(
     remark: ElementRemark,
     with_files: bool = True,
 ) -> CompiledMjcf:
-    """Compile a document with or without the mesh files that inertia and sizes depend on."""
     spec = mujoco_api.parse_spec(prepared, source)
     strength, home = joint_efforts(spec), _home(spec)
     if spec.actuators or spec.keys:
@@ -121,7 +120,6 @@ def _prepare_shapes(spec: Any) -> list[Any]:
 
 
 def _home(spec: Any) -> npt.NDArray[np.float64] | None:
-    """Return the joint positions of the key ``home``; None if there is none."""
     for key in spec.keys:
         if key.name == "home" and len(key.qpos):
             return np.array(key.qpos, dtype=float)
@@ -159,7 +157,6 @@ def _strength(actuator: Any) -> float:
 
 
 def _limited(flag: Any, limits: Any) -> bool:
-    """Return True if MuJoCo applies a range."""
     kinds = mujoco().mjtLimited
     return bool(flag == kinds.mjLIMITED_TRUE or (flag == kinds.mjLIMITED_AUTO and limits[0] < limits[1]))
 

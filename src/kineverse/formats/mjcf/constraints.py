@@ -95,7 +95,6 @@ class MjcfConstraints:
         return self._coupling(number, self._bodies.joint_names, m.qpos0[m.jnt_qposadr])
 
     def _tendon_coupling(self, number: int) -> Iterator[MjcfCoupling]:
-        """Yield a tendon equality, unless one of its tendons is left out."""
         coupling = self._coupling(number, self._tendon_names, self._model.tendon_length0)
         if coupling.follower in self._known and (coupling.leader is None or coupling.leader in self._known):
             yield coupling
@@ -103,7 +102,6 @@ class MjcfConstraints:
             self._remark(self._nodes.get(number), "is left out, as its tendon is.")
 
     def _coupling(self, number: int, names: Sequence[str], rest: npt.NDArray[np.float64]) -> MjcfCoupling:
-        """Return an equality between two joints or two tendons, with their names and rest values."""
         m = self._model
         follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
         return MjcfCoupling(
@@ -152,7 +150,6 @@ class MjcfConstraints:
         yield MjcfClosure(self._names[number], kind, names[0], names[1], inside[0], inside[1], where)
 
     def _tendon(self, number: int) -> MjcfTendon | None:
-        """Return a tendon; None, with a remark, if it wraps around a geom."""
         m, kinds = self._model, mujoco().mjtWrap
         node = self._tendon_nodes.get(number)
         first = int(m.tendon_adr[number])

@@ -133,7 +133,6 @@ def _swap_ends(closure: MjcfClosure) -> MjcfClosure:
 
 
 def _parse_range(text: str) -> tuple[float, float] | None:
-    """Return the two numbers of a range; None if the text is none."""
     try:
         lower, upper = map(float, text.split())
     except ValueError:
@@ -142,7 +141,6 @@ def _parse_range(text: str) -> tuple[float, float] | None:
 
 
 def _object_names(node: MjcfElement, kind: str, dependent: bool | None = None) -> Iterator[str]:
-    """Yield the names of one type of objects in a tuple; only dependent or independent ones on request."""
     for element in node.children:
         attributes = element.attributes
         is_dependent = attributes.get("prm", "0") not in ("0", "")

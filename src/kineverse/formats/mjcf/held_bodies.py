@@ -62,7 +62,6 @@ class _HeldBodies:
         return (frame, pose) if site is None else (site.parent, compose_poses(site.pose, pose))
 
     def _attach_to(self, closure: MjcfClosure, holder: tuple[str, Pose], held: tuple[str, Pose]) -> bool:
-        """Attach the free body at one end to the link at the other end; return False if it is not free."""
         name, end = held
         while not self.links[name].joints and name != WORLD:
             end, name = compose_poses(self.links[name].pose, end), self.links[name].parent
@@ -90,7 +89,6 @@ def _is_free(link: MjcfLink) -> bool:
 
 
 def _outwards(links: Iterable[MjcfLink]) -> tuple[MjcfLink, ...]:
-    """Return links from the world outwards, depth first."""
     below: dict[str, list[MjcfLink]] = {}
     world = []
     for link in links:

@@ -130,7 +130,6 @@ class MeshReplacement:
             joint.align = kinds.mjALIGNFREE_FALSE
 
     def _needs_file(self, geom: Any, body: Any) -> bool:
-        """Return True if the inertia of a body or the size of a geom depends on a mesh file."""
         if geom.meshname not in self._nodes:
             return False
         engine, compiler = mujoco(), self._spec.compiler

@@ -124,7 +124,6 @@ def _assets(root: Tag) -> list[Tag]:
 
 
 def _with_absolute_files(root: Tag, folder: Path, copies: Mapping[Path, Path]) -> Tag:
-    """Return a document with absolute paths of its assets; those of temporary copies where there are some."""
     inside = []
     for part in root.inside:
         if part.name == "asset":

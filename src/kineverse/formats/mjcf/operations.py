@@ -101,7 +101,6 @@ def _home_position(joint: MjcfJoint, model_name: NameMap) -> Iterator[tuple[str,
 
 
 def _nonzero_rest(joint: MjcfJoint, model_name: NameMap) -> Iterator[tuple[str, float]]:
-    """Yield the coordinates of a joint that are not zero in the reference configuration of its equalities."""
     if joint.kind in ("ball", "free"):
         yield symbol_name(f"{model_name(joint.name)}/qw", 0), 1.0
     elif joint.reference:

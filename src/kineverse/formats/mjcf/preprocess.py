@@ -114,7 +114,6 @@ def remove_unsupported(
 
 
 def _check_numbers(node: MjcfElement, key: str, value: str) -> None:
-    """Refuse an attribute with a NaN or with numbers that are too large."""
     if not _NOT_NUMBERS.isdisjoint(value.lower().split()):
         node.refuse(f"{key}={quote(value)} has a NaN, where a number is expected.")
     if key == "count" or not _LARGE.search(value):
@@ -130,7 +129,6 @@ def _check_numbers(node: MjcfElement, key: str, value: str) -> None:
 
 
 def _is_large(word: str) -> bool:
-    """Return True for an infinite number, or one beyond :data:`LARGEST`."""
     try:
         number = float.fromhex(word) if "x" in word.lower() else float(word)
     except OverflowError:
@@ -144,7 +142,6 @@ def _is_large(word: str) -> bool:
 def _is_removed(
     node: MjcfElement, unwanted: frozenset[str], remark: Callable[[MjcfElement, str], None]
 ) -> bool:
-    """Return True for an element to remove, with a remark where that changes the model."""
     if node.tag not in unwanted:
         return False
     if node.tag in _REMARKS:
@@ -153,7 +150,6 @@ def _is_removed(
 
 
 def _mesh_directory(root: MjcfElement) -> tuple[str, bool]:
-    """Return ``meshdir`` and ``strippath`` of the compiler settings."""
     meshdir, strip_paths = "", False
     for node in root.children:
         if node.tag == "compiler":
@@ -209,7 +205,6 @@ def _replace_mesh(
 
 
 def _is_small(params: str) -> bool:
-    """Return True if a mesh of these parameters has few enough triangles to be generated."""
     try:
         return all(float(word) <= _MAX_RESOLUTION for word in params.split())
     except ValueError:  # MuJoCo reports it

@@ -208,7 +208,6 @@ class MjcfWriter:
                     self._qpos.append(self._home_position(joint))
 
     def _freejoint_name(self, link: LinkDescription) -> str | None:
-        """Return the name of the free joint of a link; None if the link does not move freely in the world."""
         if link.parent != WORLD or len(link.joints) != 4:
             return None
         *slides, ball = link.joints
@@ -330,7 +329,6 @@ def _group_joints(
 
 
 def _unless_zero(point: Iterable[float]) -> Iterable[float] | None:
-    """Return a point, or None for the origin, which is the default."""
     return point if any(point) else None
 
 

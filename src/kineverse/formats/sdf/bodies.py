@@ -66,7 +66,6 @@ def read_sdf_body(link: PoseNode) -> Body:
 
 
 def _shape(element: Element, link: PoseNode) -> Shape | None:
-    """Return a visual or collision shape; None if it has no geometry."""
     geometry = find_child(element, "geometry")
     form = None if geometry is None else _geometry(geometry, element, link)
     if form is None:
@@ -83,7 +82,6 @@ def _shape(element: Element, link: PoseNode) -> Shape | None:
 
 
 def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | None:
-    """Return the geometry of a shape; None, with a remark, if it is empty or unknown."""
     form = geometry[2][0] if geometry[2] else None
     tag = "empty" if form is None else form[0]
     if form is None or tag == "empty":
@@ -136,7 +134,6 @@ def _lengths(form: Element, tag: str) -> tuple[float, float, float]:
 
 
 def _color(visual: Element, link: PoseNode) -> Rgba | None:
-    """Return the diffuse or else the ambient colour of a visual; None if it has none."""
     material = find_child(visual, "material")
     if material is None:
         return None

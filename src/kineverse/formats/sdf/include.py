@@ -214,7 +214,6 @@ def _geometry(form: Geometry, line: int) -> Element:
 
 
 def _joint(joint: UrdfJoint, names: dict[str, str], robot: UrdfRobot) -> Iterator[Element]:
-    """Yield the element of a joint; none for a floating one."""
     line = joint.line
     if joint.kind == "floating":
         return

@@ -94,7 +94,6 @@ def _kind(element: Element) -> SdfJointType:
 
 
 def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
-    """Return an axis of a joint; z, with a remark, if it is missing."""
     element, remarks = node.element, node.document.remarks
     axis = find_child(element, tag)
     if axis is None:
@@ -139,7 +138,6 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
 
 
 def _magnitude(limit: Element, key: str, node: PoseNode) -> float | None:
-    """Return the limit of a velocity or an effort; None, with a remark, if it is malformed."""
     try:
         return read_child_limit(limit, key)
     except ElementError as mistake:
@@ -148,7 +146,6 @@ def _magnitude(limit: Element, key: str, node: PoseNode) -> float | None:
 
 
 def _dynamics_value(dynamics: Element, key: str, node: PoseNode) -> float:
-    """Return a number of the dynamics; 0, with a remark, if it is malformed."""
     try:
         return read_child_number(dynamics, key, 0.0)
     except ElementError as mistake:
@@ -177,7 +174,6 @@ def _direction(node: PoseNode, axis: Element) -> Vector3:
 
 
 def _mimic(node: PoseNode, axis: Element) -> MimicRelation[str] | None:
-    """Return the relation of an axis to the coordinate that it follows; None if it follows none."""
     mimic = find_child(axis, "mimic")
     if mimic is None:
         return None

@@ -204,7 +204,6 @@ def _dynamics(joint: SdfJoint, prefix: str, index: int = 0) -> tuple[tuple[str, 
 
 
 def _check_names(scene: SdfScene) -> None:
-    """Raise an error if two elements of the description would have the same name in the model."""
     frames: dict[str, str] = {MODEL_WORLD: "the world"}
     articulations: dict[str, str] = {}
 

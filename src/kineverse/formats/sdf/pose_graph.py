@@ -141,7 +141,6 @@ class SdfScope:
         return self._find(name) is not None
 
     def _find(self, name: str) -> PoseNode | None:
-        """Return the node of a name, or of a path ``a::b``; None if there is none."""
         if name == MODEL_FRAME:
             return None if self.model.kind == "world" else self.model
         if name == "world" and self.model.kind == "world":
@@ -222,7 +221,6 @@ def check_sdf_name(name: str, element: Element, version: SdfVersion) -> None:
 
 
 def _is_reserved(name: str) -> bool:
-    """Return True for names such as ``__this__``."""
     return len(name) >= 4 and name.startswith("__") and name.endswith("__")
 
 
@@ -285,7 +283,6 @@ def _attach_model(node: PoseNode, scope: SdfScope, canonical: str, element: Elem
 
 
 def _relate(node: PoseNode) -> None:
-    """Read the pose of a node and set the node that it is relative to."""
     scope = node.pose_scope or node.scope
     element = node.pose_element
     default = node.relative_to

@@ -96,7 +96,6 @@ def open_document(
 
 
 def _template_hint(data: str | bytes) -> str:
-    """Return a hint for documents that are templates; empty for others."""
     marks = ("<%", "{%") if isinstance(data, str) else (b"<%", b"{%")
     if any(mark in data for mark in marks):  # type: ignore[operator]  # of the same type
         return " This is a template that was not expanded: erb model.sdf.erb > model.sdf"
@@ -167,7 +166,6 @@ class SdfModelReader:
         self._graph.canonical.append((node, scope, element[1].get("canonical_link", ""), element))
 
     def _read_elements(self, element: Element, scope: SdfScope) -> None:
-        """Read the elements of a model or a world: links, models, includes, joints, then frames."""
         document = scope.document
         kind = "world" if element[0] == "world" else "model"
         parts: dict[str, list[Element]] = {tag: [] for tag in ("link", "model", "include", "joint", "frame")}
@@ -413,7 +411,6 @@ def _scene(
 
 
 def _check_leaders(joints: Sequence[SdfJoint], nodes: dict[str, PoseNode]) -> None:
-    """Check that the coordinates that joints follow exist, and are not those of joints left out."""
     coordinates = {joint.name + axis.suffix for joint in joints for axis in joint.axes}
     for joint in joints:
         for relation in (joint.gear, *(axis.mimic for axis in joint.axes)):
@@ -431,7 +428,6 @@ def _link(node: PoseNode) -> SdfLink:
 
 
 def _resolve_mimic_chains(joints: list[SdfJoint], nodes: dict[str, PoseNode]) -> list[SdfJoint]:
-    """Resolve mimic chains: each relation names the coordinate at the end of its chain."""
     relations: dict[str, MimicRelation[str]] = {}
     owner: dict[str, str] = {}
     for joint in joints:

@@ -169,12 +169,10 @@ class UrdfLinkReader:
             links[name] = structs.replace(link, body=structs.replace(link.body, visuals=tuple(visuals)))
 
     def _shape(self, element: Element, link: Element, name: str = "", index: int = -1) -> Shape | None:
-        """Return the shape of a ``<visual>`` or ``<collision>``; None, with a remark, if it has none."""
         read = partial(self._read_shape, element, link, name, index)
         return read_or_default(read, None, f"the {label(element)} is left out", self._remarks, link)
 
     def _read_shape(self, element: Element, link: Element, name: str, index: int) -> Shape | None:
-        """Return a shape; with its appearance if ``index`` is that of a visual of the link."""
         origin = geometry = material = None
         for part in element[2]:
             tag = part[0]
@@ -197,7 +195,6 @@ class UrdfLinkReader:
         return Shape(form, pose, own_name, *appearance)
 
     def _geometry(self, geometry: Element | None, shape: Element, link: Element) -> Geometry | None:
-        """Return the geometry of a shape; None, with a remark, if it is missing or unknown."""
         if geometry is None or not geometry[2]:
             self._remarks.add(geometry or shape, "has no shape and is left out.", link)
             return None
@@ -220,7 +217,6 @@ class UrdfLinkReader:
         return None
 
     def _mesh(self, mesh: Element, link: Element) -> Mesh:
-        """Return a mesh, with a remark if its file is outside of the root folder."""
         uri = mesh[1].get("filename")
         if not uri:
             raise ElementError(mesh, "has no filename; the specification requires it.")
@@ -254,7 +250,6 @@ class UrdfLinkReader:
         )
 
     def _inertia(self, inertial: Element, link: Element) -> Inertia:
-        """Return the inertia of a link; a missing tensor is zero."""
         mass_element, tensor = find_child(inertial, "mass"), find_child(inertial, "inertia")
         mass = 0.0 if mass_element is None else read_attribute_number(mass_element, "value", 0.0)
         if mass < 0.0:

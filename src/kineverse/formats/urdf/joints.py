@@ -98,7 +98,6 @@ def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderW
 
 
 def _dynamics(dynamics: Element | None) -> UrdfDynamics:
-    """Return damping and friction; zero if they are missing."""
     if dynamics is None:
         return FRICTIONLESS
     return UrdfDynamics(
@@ -107,7 +106,6 @@ def _dynamics(dynamics: Element | None) -> UrdfDynamics:
 
 
 def _kind(element: Element, remarks: ReaderWarnings) -> UrdfJointType:
-    """Return the type of a joint, which may also be ``spherical``, with a remark."""
     kind = element[1].get("type")
     if kind is None:
         raise ElementError(
@@ -171,7 +169,6 @@ def _limits(
     version: tuple[int, int],
     remarks: ReaderWarnings,
 ) -> UrdfLimits:
-    """Return the limits of a joint; none, with a remark, if a required ``<limit>`` is missing."""
     if limit is None:
         if kind in ("revolute", "prismatic"):
             mistake = ElementError(
@@ -311,7 +308,6 @@ def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController 
 
 
 def _mimic(mimic: Element) -> UrdfMimic:
-    """Return the joint that is followed, by its name in the file, and the factors."""
     joint = mimic[1].get("joint")
     if not joint:
         raise ElementError(mimic, "does not name a joint.")

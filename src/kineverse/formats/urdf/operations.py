@@ -143,14 +143,12 @@ def _axis_joint(
 
 
 def _mimic_position(joint: UrdfJoint, joint_name: Callable[[str], str]) -> Expression | None:
-    """Return the position of a joint that mimics another one; None for an independent joint."""
     if joint.mimic is None:
         return None
     return joint.mimic.multiplier * position(joint_name(joint.mimic.joint)) + joint.mimic.offset
 
 
 def _dynamics(joint: UrdfJoint) -> tuple[tuple[str, float], ...]:
-    """Return the dynamics of a joint as pairs of name and value, without those that are missing."""
     values = {
         "effort": joint.limits.effort,
         "acceleration": joint.limits.acceleration,
@@ -220,8 +218,6 @@ def _assign_names(
 
 
 class _TakenPrefixes:
-    """Container of all taken names and their prefixes, the names above them."""
-
     def __init__(self, taken: set[str]) -> None:
         self._taken = {
             "/".join(parts[:k])

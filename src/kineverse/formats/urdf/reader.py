@@ -100,8 +100,6 @@ def parse_urdf(
 
 
 class _Document:
-    """Links and joints of a document, collected while it is parsed."""
-
     def __init__(self, folder: str, root: str, remarks: ReaderWarnings):
         self.links: dict[str, UrdfLink] = {}
         self.joints: dict[str, UrdfJoint] = {}

@@ -89,7 +89,6 @@ class UrdfBodyWriter:
                 self._remark(f"the colours of what is to be touched of '{name}' are left out")
 
     def _shape(self, link: Tag, tag: str, shape: Shape, name: str) -> Tag | None:
-        """Add a visual or collision shape; None, with a remark, if URDF has no such shape."""
         if isinstance(shape.geometry, (Ellipsoid, Cone)):
             self._remark(f"URDF has no {shape.geometry.kind}: one of '{name}' is left out ({tag})")
             return None
@@ -225,7 +224,6 @@ class UrdfWriter:
         return None
 
     def _root_link(self) -> LinkDescription | None:
-        """Return the link that is fixed at the world's origin and carries all others; None without one."""
         roots = [link for link in self._description.links if link.parent == WORLD]
         if len(roots) != 1 or self._description.world_body != NO_BODY:
             return None
@@ -347,7 +345,6 @@ class UrdfWriter:
     def _limit(
         self, element: Tag, name: str, kind: str, bounds: JointBounds, known: Mapping[str, Any]
     ) -> None:
-        """Add the ``<limit>`` of a joint, unless it has none and its kind requires none."""
         effort, max_velocity = _number(known, "effort"), bounds.max_velocity
         newer = {key: _number(known, key) for key in _NEWER}
         has_range = kind in ("revolute", "prismatic") or not bounds.is_unbounded
@@ -383,6 +380,5 @@ def _axis_key(joint: JointDescription) -> tuple[str, bool, tuple[float, ...]]:
 
 
 def _number(dynamics: object, key: str) -> float | None:
-    """Return a number of the dynamics of a joint; None if it is missing or no number."""
     value = dynamics.get(key) if isinstance(dynamics, dict) else None
     return float(value) if isinstance(value, (int, float)) and not math.isnan(value) else None
