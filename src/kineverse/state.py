@@ -20,6 +20,7 @@ from kineverse.errors import (
     UnknownAttributeError,
     UnknownNameError,
     duplicate_value_error,
+    list_some,
     suggest,
     unknown_attribute_error,
 )
@@ -131,7 +132,6 @@ class State(Mapping[Symbol, float]):
             ) from None
 
     def _known(self, key: object) -> Symbol:
-        """Return the symbol of a key; raise a KeyError if there is none."""
         if not isinstance(key, str):
             if key in self._values:
                 return key  # type: ignore[return-value]
@@ -172,8 +172,7 @@ class State(Mapping[Symbol, float]):
         values = [s.value if v is None else v for s, v in zip(symbols, held, strict=True)]
         missing = [str(s) for s, value in zip(symbols, values, strict=True) if value is None]
         if missing:
-            more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
-            raise UnknownNameError(f"No value is given for {', '.join(map(repr, missing[:12]))}{more}.")
+            raise UnknownNameError(f"No value is given for {list_some(map(repr, missing), 12)}.")
         return np.array(values, dtype=np.float64)
 
     def __contains__(self, key: object) -> bool:

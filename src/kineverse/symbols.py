@@ -256,6 +256,11 @@ def parse_symbol_name(name: str) -> tuple[str, int]:
     )
 
 
+def sort_symbols(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
+    """Return symbols sorted by path and order."""
+    return tuple(sorted(symbols, key=lambda s: s.sort_key))
+
+
 def check_symbols(symbols: Iterable[object]) -> Sequence[Symbol]:
     """Return the symbols as a sequence, and raise for other objects."""
     if isinstance(symbols, Symbol):

@@ -77,7 +77,6 @@ class Authority:
         self._load()
 
     def _load(self) -> None:
-        """Make the model by linking the operations of the store."""
         with no_collection():
             stored = self._store.operations()
             entries = [operation_from_bytes(blob).at(place) for place, blob, _ in stored]
@@ -181,7 +180,6 @@ class Authority:
             self._batch.clear()
 
     def _find_answer(self, key: tuple[str, int]) -> EditAnswer | None:
-        """Return the answer to an edit that was asked before."""
         known = self._answers.get(key)
         if known is not None:
             return known
@@ -194,7 +192,6 @@ class Authority:
         return None if stored is None else Committed(*stored)
 
     def _answer(self, request: protocol.ChangeRequest) -> Result:
-        """Make one edit, if it can be made."""
         revision = self.revision
         self._seconds = dict[str, float]()
         try:
@@ -209,7 +206,6 @@ class Authority:
         return Result(Committed(self.revision, self.chain), commit, self._seconds)
 
     def _make(self, request: protocol.EditRequest) -> MadeCommit | None:
-        """Make an edit of a client; None if it does nothing."""
         begin = perf_counter()
         self._check_base(request)
         changes, history = request.changes, self.model.history
@@ -232,7 +228,6 @@ class Authority:
         return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net))
 
     def _check_base(self, request: protocol.EditRequest) -> None:
-        """Check that the client knows the present model, or one of the last."""
         base, now = request.base, self.revision
         if request.strict and base < now:
             who = self._revisions.who_made(now)
@@ -347,7 +342,6 @@ class Authority:
         return MadeCommit(commit, Published(self.epoch, self.chain, data), self._diffs.pop())
 
     def _find_replaced(self, tag: str) -> Replaced:
-        """Return what an edit will replace under a tag."""
         history = self.model.history
         entry = history.entries.get(tag)
         if entry is None:
@@ -446,7 +440,6 @@ def _reads_any(entry: HistoryEntry, cells: set[tuple[str, str]]) -> bool:
 
 
 def _find_own(changes: NetChanges) -> list[str]:
-    """Return the operations that an edit itself puts or removes."""
     again = {*changes.rerun}
     return [
         *changes.removed,

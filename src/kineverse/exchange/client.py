@@ -261,7 +261,6 @@ class LiveModel(Model):
             self._finish_edit(connection.ask_edit(request))
 
     def _propose(self, edit: Edit, strict: bool) -> list[protocol.EditRequest]:
-        """Return an open edit as a request; none if it does nothing."""
         changes, connection = edit.net(), self.exchange
         if changes.is_empty:
             return []
@@ -324,7 +323,6 @@ class LiveModel(Model):
         ).start()
 
     def _receive(self, data: bytes) -> None:
-        """Adopt a commit that was published."""
         published = protocol.decode_published(data)
         commit = protocol.decode_commit(published.commit)
         with self._following:
@@ -352,7 +350,6 @@ class LiveModel(Model):
         connection.advance(commit.revision, published.chain)
 
     def _close_gap(self) -> None:
-        """Ask for what was missed, and adopt it."""
         connection = self.exchange
         with self._following:
             while True:
@@ -412,7 +409,6 @@ class LiveModel(Model):
         connection.hear(beat)
 
     def _notice(self, sign: tuple[str, bool]) -> None:
-        """Note that a server has come or gone."""
         key, is_there = sign
         connection = self.exchange
         if is_there:

@@ -288,7 +288,6 @@ class Server:
             return []
 
     def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
-        """Return the commits of parts, by the ids of their views."""
         made = [result.commit for result in results if result.commit is not None]
         if not made:
             return []

@@ -444,7 +444,6 @@ class Views:
         return [(view, changes) for view, changes in changed if changes is not None]
 
     def _find_keys(self, diff: Diff) -> set[Key]:
-        """Return the keys of a commit, and enter its changes into the index."""
         history = self._model.history
         keys: set[Key] = set()
         for tag in diff.tags:

@@ -225,7 +225,7 @@ def _applied(
     if file_format is not None:
         file = FileContent(source.path, content, prefix or None, root, strict, source.shipped, arguments)
         if file_format.exact:
-            for entry in file_format.entries(file):
+            for entry in file_format.operations(file):
                 yield edit.link(entry)
             return
         operations = file_format.operations(file)

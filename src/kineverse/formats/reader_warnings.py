@@ -48,6 +48,14 @@ class ReaderWarnings(Struct):
         of = "" if owner is element else f"{label(element)} "
         self.fault(element[3], f"{label(owner)}: {of}{mistake.message.rstrip('. ')}; {taken}.")
 
+    @contextmanager
+    def passing_over(self, owner: Element | None = None) -> Iterator[None]:
+        """Warn about a mistake in the block, whose element is passed over."""
+        try:
+            yield
+        except ElementError as mistake:
+            self.repair(mistake, "it is passed over", owner)
+
     def fault(self, line: int, text: str, kind: type[Fault] = Fault) -> None:
         """Add a warning about a mistake in a line."""
         self.texts.append(kind(f"line {line}, {text}"))

@@ -115,7 +115,6 @@ def _known_path(symbol: Symbol, known: set[str]) -> str:
 
 
 def _driven_coordinates(model: ModelView, paths: set[str]) -> set[str]:
-    """Return the paths of all coordinates that move with the given ones, including these."""
     rates = model.rates
     result = set(paths)
     for coordinate, row in rates.items():

@@ -156,7 +156,7 @@ class CurveApproximation:
             turns = [(angle, distance + whole) for angle, distance in turns]
             for k, error in errors.items():
                 motion = found.motions[k]
-                if _is_translation(motion):
+                if isinstance(motion, JointMotion) and not motion.is_rotation:
                     shift += error
                 else:
                     turns.append((error, float(np.linalg.norm(motion.point)) + sum(reaches[k + 1 :])))
@@ -176,10 +176,6 @@ class CurveApproximation:
         amount = motion.coefficients
         span = enclose_curve(lambda where: taylor_polynomial(amount, taylor_variable(where)), lower, upper)
         return max(abs(span[0]), abs(span[1])) + error
-
-
-def _is_translation(motion: JointMotion | QuaternionMotion) -> bool:
-    return isinstance(motion, JointMotion) and not motion.is_rotation
 
 
 def find_term_symbols(term: Term) -> list[Symbol]:
@@ -209,13 +205,12 @@ class MinimaxFit:
     """Polynomial approximation of a curve over an interval.
 
     ``error`` is a certified upper bound of the largest difference, ``sampled`` the largest difference at a
-    sampled point. ``largest`` bounds the magnitude of the polynomial.
+    sampled point.
     """
 
     polynomial: Coefficients
     error: float
     sampled: float
-    largest: float
 
 
 def chebyshev_points(lower: float, upper: float) -> Matrix:
@@ -232,12 +227,10 @@ def fit_polynomial(
     polynomial = _remez(x, values, lower, upper, degree)
     found = np.polynomial.polynomial.polyval(x, polynomial)
     sampled = float(np.abs(found - values).max())
-    largest = float(np.abs(values).max()) + sampled
     if sampled > tolerance:
-        return MinimaxFit(polynomial, math.inf, sampled, largest)
+        return MinimaxFit(polynomial, math.inf, sampled)
     error = bound_error(curve, polynomial, lower, upper, sampled, _NEGLIGIBLE * tolerance)
-    extent = enclose_curve(lambda where: taylor_polynomial(polynomial, taylor_variable(where)), lower, upper)
-    return MinimaxFit(polynomial, error, sampled, max(abs(extent[0]), abs(extent[1])))
+    return MinimaxFit(polynomial, error, sampled)
 
 
 def bound_error(
@@ -300,11 +293,9 @@ def _evaluate_series(here: TaylorSeries, around: TaylorSeries, low: float, high:
     middle = (low + high) / 2
     away = round_outwards(low - middle, high - middle)
     total = ZERO_INTERVAL
-    for k in range(count):
-        coefficient = around[k] if k == count - 1 else here[k]
-        total = interval_add(
-            total, interval_multiply(coefficient, interval_power(away, (k, k)) if k else (1.0, 1.0))
-        )
+    for k, coefficient in enumerate((*here[: count - 1], around[count - 1])):
+        power = interval_power(away, (k, k)) if k else (1.0, 1.0)
+        total = interval_add(total, interval_multiply(coefficient, power))
     return max(total[0], value[0]), min(total[1], value[1])
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.graph import leaves, topological_order
 from kineverse.expressions.node import Augment
-from kineverse.formats.description import JointBounds, JointDescription, RobotDescription, SumLimit
+from kineverse.formats.description import JointDescription, RobotDescription, SumLimit
 from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
 
@@ -144,7 +144,8 @@ def assign_limits(
             unsupported.leave_out(item.name, "limits a speed differently in its two directions")
     for joint in description.joints:
         if joint.bounds.lower > joint.bounds.upper:
-            unsupported.refuse(joint.name, f"cannot be anywhere: {_format_bounds(joint.bounds)}")
+            bounds = f"{joint.bounds.lower:g} and {joint.bounds.upper:g}"
+            unsupported.refuse(joint.name, f"cannot be anywhere: its limits leave nothing between {bounds}")
 
 
 def _is_about_joint(joint: JointDescription, coordinate: Symbol, item: CoordinateLimit) -> bool:
@@ -152,10 +153,6 @@ def _is_about_joint(joint: JointDescription, coordinate: Symbol, item: Coordinat
         return False
     offset = 0.0 if item.symbol.order else joint.coefficients[0]
     return (offset, joint.coefficients[1]) == (item.offset, item.slope)
-
-
-def _format_bounds(bounds: JointBounds) -> str:
-    return f"its limits leave nothing between {bounds.lower:g} and {bounds.upper:g}"
 
 
 def has_given_gradient(expression: Expression) -> bool:

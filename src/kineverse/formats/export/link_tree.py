@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from kineverse.articulations.multi_axis import orientation
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import UnknownNameError, list_some, suggest
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.formats.description import (
@@ -298,11 +298,9 @@ class LinkTreeBuilder:
             return factor
         if isinstance(factor, OneAxisTransform):
             amount = self.resolve(factor.amount)
-            return (
-                factor
-                if amount is factor.amount
-                else OneAxisTransform(factor.direction, amount, factor.is_rotation)
-            )
+            if amount is factor.amount:
+                return factor
+            return OneAxisTransform(factor.direction, amount, factor.is_rotation)
         return self.resolve(factor)
 
     def _independent_motions(self, chains: Mapping[str, MotionChain]) -> dict[Symbol, tuple[str, int]]:
@@ -422,10 +420,8 @@ class LinkTreeBuilder:
         for coordinate, row in self._rates.items():
             if coordinate in quaternions:
                 continue
-            owner = next(
-                (n for n, r in self.model.articulations.items() if coordinate in r.coordinates),
-                str(coordinate),
-            )
+            owners = (n for n, r in self.model.articulations.items() if coordinate in r.coordinates)
+            owner = next(owners, str(coordinate))
             if owner in self._left_out or str(coordinate) in self._left_out:
                 continue
             driven.setdefault(owner, set()).update(map(str, row))
@@ -436,9 +432,7 @@ class LinkTreeBuilder:
 
     def _add_remarks(self) -> None:
         if self.model.data:
-            names = list(self.model.data)
-            more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-            self.remarks.append(f"data are not written: {', '.join(names[:4])}{more}")
+            self.remarks.append(f"data are not written: {list_some(self.model.data, 4)}")
         for name in self._left_out:
             self.remarks.append(f"'{name}' is left out, as asked for")
 

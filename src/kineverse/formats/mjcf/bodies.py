@@ -42,6 +42,7 @@ from .elements import ElementRemark, MjcfElement
 from .meshes import place_mesh
 from .mujoco_api import mujoco
 
+_JOINT_KINDS: tuple[MjcfJointType, ...] = ("free", "ball", "slide", "hinge")  # in the order of mjtJoint
 _VISIBLE_GROUPS = range(3)  # geom groups that MuJoCo's viewers show by default
 
 _DEFAULT_COLOR = [0.5, 0.5, 0.5, 1.0]
@@ -232,15 +233,10 @@ class MjcfBodies:
             for count, number in enumerate(numbers):
                 name = self.body_names[body] + ("" if len(numbers) == 1 else f"/joint{count}")
                 names[number] = self._unique_joints.invent(name, self._where(self._joint_nodes[number]))
-        kinds = {int(mujoco().mjtJoint.mjJNT_BALL): "ball", int(mujoco().mjtJoint.mjJNT_FREE): "free"}
         for number in range(m.njnt):
-            kind: MjcfJointType = kinds.get(int(m.jnt_type[number]), "hinge")  # type: ignore[assignment]  # as above
             name, where = names[number], self._where(self._joint_nodes[number])
-            clash = [
-                f"{name}/{suffix}"
-                for suffix in COORDINATE_SUFFIXES[kind]
-                if f"{name}/{suffix}" in self._unique_joints
-            ]
+            coordinates = [f"{name}/{suffix}" for suffix in COORDINATE_SUFFIXES[self._kind(number)]]
+            clash = [coordinate for coordinate in coordinates if coordinate in self._unique_joints]
             if clash:
                 problem = f"its coordinate would be called {quote(clash[0])} here, as a joint is. Rename one"
                 names[number] = self._unique_joints.replace(f"{name}_joint", where, problem)
@@ -291,13 +287,11 @@ class MjcfBodies:
         name = self._unique_joints.invent(f"{self.body_names[number]}/{FREE_JOINT}", where)
         return MjcfJoint(name, "free", self.body_names[number], home=(0.0,) * 6 + (1.0,), where=where)
 
+    def _kind(self, number: int) -> MjcfJointType:
+        return _JOINT_KINDS[int(self._model.jnt_type[number])]
+
     def _joint(self, number: int) -> MjcfJoint:
-        m, kinds = self._model, mujoco().mjtJoint
-        kind: MjcfJointType = {
-            int(kinds.mjJNT_HINGE): "hinge",
-            int(kinds.mjJNT_SLIDE): "slide",
-            int(kinds.mjJNT_BALL): "ball",
-        }.get(int(m.jnt_type[number]), "free")  # type: ignore[assignment]  # mypy widens literals in a dict
+        m, kind = self._model, self._kind(number)
         name, where = self.joint_names[number], self._where(self._joint_nodes[number])
         lower = upper = None
         if m.jnt_limited[number] and kind != "free":

@@ -247,24 +247,21 @@ class MjcfBodyWriter:
         if isinstance(form, Mesh):
             mesh = self._mesh(form)
             return None if mesh is None else {"type": "mesh", "mesh": mesh}
-        sizes: dict[type, tuple[str, tuple[float, ...]]] = {}
+        size: tuple[float, ...] = ()
         if isinstance(form, Box):
-            x, y, z = form.size
-            sizes[Box] = "box", (x / 2, y / 2, z / 2)
+            size = tuple(edge / 2 for edge in form.size)
         elif isinstance(form, Sphere):
-            sizes[Sphere] = "sphere", (form.radius,)
+            size = (form.radius,)
         elif isinstance(form, (Cylinder, Capsule)):
-            sizes[type(form)] = form.kind, (form.radius, form.length / 2)
+            size = (form.radius, form.length / 2)
         elif isinstance(form, Ellipsoid):
-            sizes[Ellipsoid] = "ellipsoid", form.radii
-        if type(form) not in sizes:
-            self._remark(f"MJCF has no {form.kind}: one of '{name}' is left out")
+            size = form.radii
+        if not size or not all(s > 0 or math.isnan(s) for s in size):
+            self._remark(
+                f"MJCF has no {form.kind}{' of size 0' if size else ''}: one of '{name}' is left out"
+            )
             return None
-        kind, size = sizes[type(form)]
-        if not all(s > 0 or math.isnan(s) for s in size):
-            self._remark(f"MJCF has no {kind} of size 0: one of '{name}' is left out")
-            return None
-        return {"type": kind, "size": size}
+        return {"type": form.kind, "size": size}
 
     def _mesh(self, mesh: Mesh) -> str | None:
         file = self.files.mesh_reference(mesh)

@@ -25,14 +25,8 @@ from .mujoco_api import mujoco
 from .preprocess import PreprocessedMjcf
 
 _CHECKED_ARRAYS = (
-    "body_pos",
-    "body_quat",
-    "jnt_pos",
-    "jnt_axis",
-    "qpos0",
-    "site_pos",
-    "site_quat",
-    "eq_data",
+    *("body_pos", "body_quat", "jnt_pos", "jnt_axis"),
+    *("qpos0", "site_pos", "site_quat", "eq_data"),
 )
 
 
@@ -99,12 +93,11 @@ def _try_compile(
         if files:
             raise _MeshError(str(error)) from None
         raise
-    meshes = replacement.meshes
     left_out = {geom.id: "is left out: a height field is no shape here." for geom in height_fields}
-    for geom in meshes.unknown_size:
+    for geom in replacement.unknown_size:
         left_out[geom.id] = "is left out: its size is that of a mesh that is not there."
-    unknown_inertia = frozenset(body.id for body in meshes.unknown_inertia)
-    return CompiledMjcf(spec, model, prepared, meshes.assets, left_out, unknown_inertia, strength, home)
+    unknown_inertia = frozenset(body.id for body in replacement.unknown_inertia)
+    return CompiledMjcf(spec, model, prepared, replacement.assets, left_out, unknown_inertia, strength, home)
 
 
 def _prepare_shapes(spec: Any) -> list[Any]:

@@ -155,7 +155,7 @@ def add_speeds(custom: Tag, joints: Iterable[JointDescription]) -> bool:
         min_velocity, max_velocity = joint.bounds.min_velocity, joint.bounds.max_velocity
         if (min_velocity, max_velocity) != (-math.inf, math.inf):
             numeric = custom.add("numeric", name=f"{SPEED_PREFIX}{joint.name}")
-            numeric.attributes["data"] = format_range(min_velocity, max_velocity)
+            numeric.attributes["data"] = f"{min_velocity!r} {max_velocity!r}"
             result = True
     return result
 
@@ -189,10 +189,3 @@ def _as_tuple_or_text(tuple_tag: Tag) -> Tag:
     elements = [[tag.attributes.get(key, "0") for key in TUPLE_ATTRIBUTES] for tag in tuple_tag.inside]
     data = json.dumps(elements, ensure_ascii=False)
     return Tag("text", {"name": tuple_tag.attributes["name"], "data": data})
-
-
-def format_range(lower: float, upper: float) -> str:
-    """Return the ends of a range, which may be infinite, as text."""
-    return " ".join(
-        "inf" if end == math.inf else "-inf" if end == -math.inf else repr(end) for end in (lower, upper)
-    )

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from kineverse.errors import suggest
 from kineverse.formats.description import DisjointSets
@@ -24,6 +25,7 @@ from kineverse.formats.xml_values import (
     read_child_limit,
     read_child_number,
     read_child_text,
+    read_or_default,
     read_text,
 )
 from kineverse.model.body import Vector3
@@ -106,10 +108,14 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         remarks.add(element, f"has no <{tag}>; it is z, the specification's default.")
         return SdfAxis(suffix=suffix)
     limit, dynamics = find_child(axis, "limit"), find_child(axis, "dynamics")
+    read = partial(read_or_default, remarks=remarks, owner=element)
     lower = upper = velocity = effort = None
     if limit is not None:
         lower, upper = read_child_limit(limit, "lower"), read_child_limit(limit, "upper")
-        velocity, effort = (_magnitude(limit, key, node) for key in ("velocity", "effort"))
+        velocity, effort = (
+            read(partial(read_child_limit, limit, key), None, "it bounds nothing")
+            for key in ("velocity", "effort")
+        )
     if kind == "continuous":
         lower = upper = None
     if lower is not None and upper is not None and lower > upper:
@@ -121,7 +127,8 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         lower = upper = None
     values = [] if effort is None or effort < 0.0 else [("effort", effort)]
     if dynamics is not None:
-        found = [(key, _dynamics_value(dynamics, key, node)) for key in _DYNAMICS]
+        reads = ((key, partial(read_child_number, dynamics, key, 0.0)) for key in _DYNAMICS)
+        found = [(key, read(number, 0.0, "0 is taken")) for key, number in reads]
         has_spring = any(value for key, value in found if key == "spring_stiffness")
         values += [(k, v) for k, v in found if v or (has_spring and k == "spring_reference")]
     if find_child(axis, "initial_position") is not None and read_child_number(axis, "initial_position"):
@@ -135,22 +142,6 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         suffix,
         None if kind == "ball" else _mimic(node, axis),
     )
-
-
-def _magnitude(limit: Element, key: str, node: PoseNode) -> float | None:
-    try:
-        return read_child_limit(limit, key)
-    except ElementError as mistake:
-        node.document.remarks.repair(mistake, "it bounds nothing", node.element)
-        return None
-
-
-def _dynamics_value(dynamics: Element, key: str, node: PoseNode) -> float:
-    try:
-        return read_child_number(dynamics, key, 0.0)
-    except ElementError as mistake:
-        node.document.remarks.repair(mistake, "0 is taken", node.element)
-        return 0.0
 
 
 def _direction(node: PoseNode, axis: Element) -> Vector3:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.formats.xml_reader import Element, ElementError, label, quote
@@ -18,7 +18,7 @@ class ModelNames:
 
     def __init__(self, model: ModelView, prefix: str) -> None:
         self._frames = dict(model.frames)
-        self._prefix = f"{prefix}/" if prefix else ""
+        self.prefix = f"{prefix}/" if prefix else ""  # with its slash
         self._free = {str(s) for s in model.degrees_of_freedom}
         self.articulations: Mapping[str, Articulation] = dict(model.articulations)
         self._above = {a.child: name for name, a in self.articulations.items()}
@@ -27,21 +27,11 @@ class ModelNames:
 
     def link(self, element: Element, key: str) -> str:
         """Return the frame of the link that an attribute names."""
-        said = required(element, key)
-        name = self._prefix + said
-        self._sought[said] = self._sought.get(said, False) or name in self._frames
-        if name not in self._frames:
-            raise self._unknown(element, said, "link", self._frames)
-        return name
+        return self._find(element, key, "link", self._frames)
 
     def joint(self, element: Element, key: str = "name") -> str:
         """Return the articulation of the joint that an attribute names."""
-        said = required(element, key)
-        name = self._prefix + said
-        self._sought[said] = self._sought.get(said, False) or name in self.articulations
-        if name not in self.articulations:
-            raise self._unknown(element, said, "joint", self.articulations)
-        return name
+        return self._find(element, key, "joint", self.articulations)
 
     def joint_above(self, link: str) -> str | None:
         """Return the articulation that has a frame as its child; None if there is none."""
@@ -79,14 +69,6 @@ class ModelNames:
         joints = [j for frame in (*rising, *falling) if (j := self._above.get(frame)) is not None]
         return frames, joints
 
-    def child_links(self, joints: Iterable[str]) -> list[str]:
-        """Return the frames that articulations move."""
-        return [self.articulations[joint].child for joint in joints]
-
-    def links_pattern(self) -> str:
-        """Return the pattern of the bodies of the robot."""
-        return f"{self._prefix}*"
-
     def check_robot(self, source: str) -> None:
         """Raise an UnknownNameError if nothing that was sought is in the model: the prefix is another one."""
         if not self._sought or any(self._sought.values()):
@@ -97,11 +79,11 @@ class ModelNames:
         hint = (
             f"There is one below prefix {' and below '.join(map(repr, prefixes[:4]))}: give it as prefix=."
             if prefixes
-            else suggest(self._prefix + first, known, "link or joint")
+            else suggest(self.prefix + first, known, "link or joint")
         )
         raise UnknownNameError(
             f"{source}: the model has no link or joint of this description below the prefix "
-            f"'{self._prefix.rstrip('/')}', such as {quote(first)}. {hint}"
+            f"'{self.prefix.rstrip('/')}', such as {quote(first)}. {hint}"
         )
 
     def _ancestors(self, frame: str) -> list[str]:
@@ -111,12 +93,17 @@ class ModelNames:
             frame = self._frames[frame].parent
         return result
 
-    def _unknown(self, element: Element, said: str, what: str, known: Mapping[str, object]) -> ElementError:
+    def _find(self, element: Element, key: str, what: str, known: Mapping[str, object]) -> str:
+        said = required(element, key)
+        name = self.prefix + said
+        self._sought[said] = self._sought.get(said, False) or name in known
+        if name in known:
+            return name
         if (what, said) not in self._near and len(self._near) < _MOST_SUGGESTIONS:
-            below = [name[len(self._prefix) :] for name in known if name.startswith(self._prefix)]
+            below = [name[len(self.prefix) :] for name in known if name.startswith(self.prefix)]
             self._near[what, said] = f" ({suggest(said, below, what).rstrip('.')})"
         hint = self._near.get((what, said), "")
-        return ElementError(element, f"{quote(said)} is no {what} of the model{hint}.")
+        raise ElementError(element, f"{quote(said)} is no {what} of the model{hint}.")
 
 
 def optional(element: Element, key: str) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from kineverse.errors import FormatError, UnknownNameError
+from kineverse.errors import UnknownNameError
 from kineverse.formats.files import read_file
 from kineverse.formats.names import check_prefix
 from kineverse.formats.reader_warnings import ReaderWarnings
@@ -77,8 +77,7 @@ def parse_srdf(
         _check_root(root)
         document = _SemanticDocument(root, ModelNames(model, prefix or ""), remarks)
     except ElementError as mistake:
-        where = f"{source}, line {mistake.element[3]}, {label(mistake.element)}"
-        raise FormatError(f"{where}: {mistake.message}") from None
+        raise mistake.located(source) from None
     return document.result
 
 
@@ -126,7 +125,7 @@ class _SemanticDocument:
         result: dict[str, VirtualJoint] = {}
         seen: dict[str, Element] = {}
         for element in self._elements("virtual_joint"):
-            try:
+            with self._remarks.passing_over():
                 if not add_unique(seen, element, self._remarks):
                     continue
                 name, kind = required(element, "name"), required(element, "type")
@@ -134,26 +133,20 @@ class _SemanticDocument:
                     raise ElementError(element, f"type={quote(kind)} is none of {', '.join(_VIRTUAL_KINDS)}.")
                 child = self._names.link(element, "child_link")
                 result[name] = VirtualJoint(name, kind, required(element, "parent_frame"), child)
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
         return result
 
     def _passive_joints(self) -> tuple[str, ...]:
         found: dict[str, None] = {}
         for element in self._elements("passive_joint"):
-            try:
+            with self._remarks.passing_over():
                 found[self._names.joint(element)] = None
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
         return tuple(found)
 
     def _groups(self, virtual: dict[str, VirtualJoint], passive: tuple[str, ...]) -> dict[str, SrdfGroup]:
         elements: dict[str, Element] = {}
         for element in self._elements("group"):
-            try:
+            with self._remarks.passing_over():
                 add_unique(elements, element, self._remarks)
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
         return GroupResolver(elements, self._names, virtual, self._remarks).resolve(passive)
 
     def _rules(self) -> tuple[CollisionRule, ...]:
@@ -161,11 +154,9 @@ class _SemanticDocument:
         rules: list[CollisionRule] = []
         warned: set[str] = set()
         for element in self._elements("disable_default_collisions"):
-            try:
+            with self._remarks.passing_over():
                 link = self._names.link(element, "link")
-                rules.append((link, self._names.links_pattern(), False, "off by default"))
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
+                rules.append((link, f"{self._names.prefix}*", False, "off by default"))
         for tag, check in (("enable_collisions", True), ("disable_collisions", False)):
             for element in self._elements(tag):
                 try:
@@ -184,7 +175,7 @@ class _SemanticDocument:
         result: dict[str, EndEffector] = {}
         seen: dict[str, Element] = {}
         for element in self._elements("end_effector"):
-            try:
+            with self._remarks.passing_over():
                 if not add_unique(seen, element, self._remarks):
                     continue
                 name, group = required(element, "name"), required(element, "group")
@@ -199,33 +190,28 @@ class _SemanticDocument:
                         f"has its parent_link {quote(parent)} in its own group, which MoveIt refuses.",
                     )
                 result[name] = EndEffector(name, group, parent, above)
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
         return result
 
     def _states(self, groups: dict[str, SrdfGroup]) -> dict[str, dict[str, float]]:
         states: dict[str, dict[str, float]] = {}
         by_group: dict[str, dict[str, dict[str, float]]] = {}
         for element in self._elements("group_state"):
-            try:
+            with self._remarks.passing_over():
                 name, group = required(element, "name"), required(element, "group")
                 if group not in groups:
                     raise ElementError(element, f"group={quote(group)} is no group of this file.")
                 own = by_group.setdefault(group, {})
                 if name in own:
                     raise ElementError(element, f"is a state of the group {quote(group)} already.")
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
-                continue
-            own[name] = values = self._values(element)
-            together = states.setdefault(name, {})
-            differing = [c for c, value in values.items() if together.setdefault(c, value) != value]
-            if differing:
-                self._remarks.add(
-                    element,
-                    f"differs from the state of that name of another group, about {quote(differing[0])}; "
-                    "in states the first one counts.",
-                )
+                own[name] = values = self._values(element)
+                together = states.setdefault(name, {})
+                differing = [c for c, value in values.items() if together.setdefault(c, value) != value]
+                if differing:
+                    self._remarks.add(
+                        element,
+                        f"differs from the state of that name of another group, about {quote(differing[0])}; "
+                        "in states the first one counts.",
+                    )
         for group, own in by_group.items():
             groups[group] = replace(groups[group], states=own)
         return states
@@ -236,11 +222,9 @@ class _SemanticDocument:
             if part[0] != "joint":
                 self._remarks.add(part, "is ignored: a state has joints only.", state)
                 continue
-            try:
+            with self._remarks.passing_over(state):
                 joint = self._names.joint(part)
                 values.update(self._joint_values(part, joint))
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER, state)
         return values
 
     def _joint_values(self, part: Element, joint: str) -> dict[str, float]:
@@ -269,8 +253,6 @@ class _SemanticDocument:
 
 
 MOST_GROUPS = 1000  # each may contain all the others, so the result grows with the square
-
-PASSED_OVER = "it is passed over"
 
 
 @dataclass
@@ -331,8 +313,8 @@ class GroupResolver:
                     continue
                 inner = optional(part, "name") if part[0] == "group" else ""
                 if inner in open_names:
-                    mistake = ElementError(part, "contains itself.")
-                    self._remarks.repair(mistake, PASSED_OVER, self._elements[name])
+                    with self._remarks.passing_over(self._elements[name]):
+                        raise ElementError(part, "contains itself.")
                 elif inner in self._elements and inner not in done:
                     stack.append((inner, iter(self._elements[inner][2])))
                     open_names.add(inner)
@@ -341,10 +323,8 @@ class GroupResolver:
     def _resolve(self, group: Element) -> _Members:
         members = _Members()
         for part in group[2]:
-            try:
+            with self._remarks.passing_over(group):
                 self._add(members, part, group)
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER, group)
         return members
 
     def _add(self, members: _Members, part: Element, group: Element) -> None:
@@ -383,7 +363,7 @@ class GroupResolver:
             joint = [] if above is None else [above]
         else:
             joint = [self._names.joint(part)]
-        members.add(joint, self._names.child_links(joint))
+        members.add(joint, [self._names.articulations[name].child for name in joint])
 
 
 def _list(groups: Mapping[str, Element]) -> str:

@@ -99,14 +99,12 @@ class UrdfMaterials:
             red, green, blue, alpha = parse_numbers(text, 4)
         except ValueError as error:
             mistake = ElementError(color, f"rgba={quote(text)} {error}.")
-        else:
-            return ((red, green, blue, alpha), file)
-        try:
-            red, green, blue, alpha = parse_numbers(" ".join(text.split()[:4]), 4)
-        except ValueError:
-            self._remarks.repair(mistake, "it is no colour", owner)
-            return (None, file)
-        self._remarks.repair(mistake, "the first four are taken", owner)
+            try:
+                red, green, blue, alpha = parse_numbers(" ".join(text.split()[:4]), 4)
+            except ValueError:
+                self._remarks.repair(mistake, "it is no colour", owner)
+                return (None, file)
+            self._remarks.repair(mistake, "the first four are taken", owner)
         return ((red, green, blue, alpha), file)
 
 
@@ -173,15 +171,7 @@ class UrdfLinkReader:
         return read_or_default(read, None, f"the {label(element)} is left out", self._remarks, link)
 
     def _read_shape(self, element: Element, link: Element, name: str, index: int) -> Shape | None:
-        origin = geometry = material = None
-        for part in element[2]:
-            tag = part[0]
-            if tag == "origin":
-                origin = origin or part
-            elif tag == "geometry":
-                geometry = geometry or part
-            elif tag == "material":
-                material = material or part
+        origin, geometry, material = (find_child(element, tag) for tag in ("origin", "geometry", "material"))
         form = self._geometry(geometry, element, link)
         if form is None:
             return None
@@ -227,27 +217,14 @@ class UrdfLinkReader:
 
     def _scale(self, mesh: Element, link: Element) -> Vector3:
         """Return the scale of a mesh; one factor or four factors are read as other parsers read them."""
-        words = mesh[1].get("scale", "").split()
+        words, default = mesh[1].get("scale", "").split(), _UNSCALED
+        read = partial(read_or_default, remarks=self._remarks, owner=link)
         if len(words) in (1, 4):
-            x, y, z = words * 3 if len(words) == 1 else words[:3]
-            corrected = (mesh[0], {"scale": f"{x} {y} {z}"}, mesh[2], mesh[3])
-            default = read_or_default(
-                lambda: read_attribute_vector(corrected, "scale"),
-                _UNSCALED,
-                "it is not scaled",
-                self._remarks,
-                link,
-            )
-        else:
-            default = _UNSCALED
+            scale = " ".join(words * 3 if len(words) == 1 else words[:3])
+            corrected = (mesh[0], {"scale": scale}, mesh[2], mesh[3])
+            default = read(partial(read_attribute_vector, corrected, "scale"), _UNSCALED, "it is not scaled")
         shown = " ".join(f"{factor:g}" for factor in default)
-        return read_or_default(
-            lambda: read_attribute_vector(mesh, "scale", _UNSCALED),
-            default,
-            f"{shown} is taken",
-            self._remarks,
-            link,
-        )
+        return read(partial(read_attribute_vector, mesh, "scale", _UNSCALED), default, f"{shown} is taken")
 
     def _inertia(self, inertial: Element, link: Element) -> Inertia:
         mass_element, tensor = find_child(inertial, "mass"), find_child(inertial, "inertia")
@@ -257,16 +234,8 @@ class UrdfLinkReader:
         origin = read_origin(find_child(inertial, "origin"), link, self._version, self._remarks)
         if tensor is None:
             return Inertia(mass, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), origin)
-        ixx, ixy, ixz = (
-            read_attribute_number(tensor, "ixx", 0.0),
-            read_attribute_number(tensor, "ixy", 0.0),
-            read_attribute_number(tensor, "ixz", 0.0),
-        )
-        iyy, iyz, izz = (
-            read_attribute_number(tensor, "iyy", 0.0),
-            read_attribute_number(tensor, "iyz", 0.0),
-            read_attribute_number(tensor, "izz", 0.0),
-        )
+        keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        ixx, ixy, ixz, iyy, iyz, izz = (read_attribute_number(tensor, key, 0.0) for key in keys)
         return Inertia(mass, (ixx, ixy, ixz, iyy, iyz, izz), origin)
 
 

@@ -284,18 +284,11 @@ def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController 
     """Return the safety controller of a joint; its soft limits have to overlap the limits."""
     if safety is None:
         return None
-    lower, upper = (
-        read_attribute_number(safety, "soft_lower_limit", 0.0),
-        read_attribute_number(safety, "soft_upper_limit", 0.0),
-    )
+    keys = ("soft_lower_limit", "soft_upper_limit", "k_position")
+    lower, upper, gain = (read_attribute_number(safety, key, 0.0) for key in keys)
     if lower > upper:
         raise ElementError(safety, f"has soft_lower_limit={lower!r} above soft_upper_limit={upper!r}.")
-    result = UrdfSafetyController(
-        lower,
-        upper,
-        read_attribute_number(safety, "k_position", 0.0),
-        read_attribute_number(safety, "k_velocity"),
-    )
+    result = UrdfSafetyController(lower, upper, gain, read_attribute_number(safety, "k_velocity"))
     if limits.lower is None or limits.upper is None or not result.has_limits:
         return result
     if upper < limits.lower or lower > limits.upper:
@@ -358,12 +351,6 @@ def resolve_mimic_joints(joints: Iterable[UrdfJoint], remarks: ReaderWarnings) -
         for joint in joints
         if joint.mimic is not None
     }
-    resolved = resolve_mimic_chains(following, refuse, check=check)
-    return [
-        replace(joint, mimic=UrdfMimic(end.leader, end.multiplier, end.offset))
-        if (end := resolved.get(joint.name))
-        else joint
-        if joint.mimic is None
-        else replace(joint, mimic=None)
-        for joint in joints
-    ]
+    resolved = resolve_mimic_chains(following, refuse, check=check).items()
+    ends = {name: UrdfMimic(end.leader, end.multiplier, end.offset) for name, end in resolved}
+    return [j if j.mimic is None else replace(j, mimic=ends.get(j.name)) for j in joints]

@@ -13,7 +13,6 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
 from kineverse.formats.names import NumberedNames
 from kineverse.formats.reader_warnings import ReaderWarnings
@@ -113,7 +112,7 @@ class _Document:
         try:
             self._version = _version(root, self.remarks)
         except ElementError as mistake:
-            raise self._error(mistake, root) from None
+            raise mistake.located(self.remarks.source, root) from None
         self._xacro = _xacro_prefix(root)
         self._reader = UrdfLinkReader(self._folder, self._version, self.remarks, self._root)
         return self._read_element
@@ -124,11 +123,12 @@ class _Document:
         try:
             hint = _warn_unknown_elements(root, self._unknown_elements, bool(self.joints), self.remarks)
         except ElementError as mistake:
-            raise self._error(mistake, mistake.element) from None
+            raise mistake.located(self.remarks.source) from None
         if not self.links:
             declared = any(key.startswith("xmlns:") and "xacro" in value for key, value in root[1].items())
             hint += f" {XACRO_HINT}" if declared else ""
-            raise self._error(ElementError(root, f"has no <link>; a robot has at least one.{hint}"), root)
+            empty = ElementError(root, f"has no <link>; a robot has at least one.{hint}")
+            raise empty.located(self.remarks.source)
         return hint
 
     def _read_element(self, element: Element) -> None:
@@ -146,7 +146,7 @@ class _Document:
             elif tag != "sensor":
                 self._unknown_elements.append(element)
         except ElementError as mistake:
-            raise self._error(mistake, element) from None
+            raise mistake.located(self.remarks.source, element) from None
 
     def _add_joint(self, joint: UrdfJoint, element: Element) -> None:
         """Add a joint; of a fixed joint and another of the same name, the fixed one is renamed."""
@@ -162,11 +162,6 @@ class _Document:
         if other.kind == "fixed" and joint.kind != "fixed":
             self.joints[name], joint = joint, other
         self.joints[fixed] = replace(joint, name=fixed)
-
-    def _error(self, mistake: ElementError, owner: Element) -> FormatError:
-        part = "" if mistake.element is owner else f"{label(mistake.element)} "
-        where = f"{self.remarks.source}, line {mistake.element[3]}, {label(owner)}"
-        return FormatError(f"{where}: {part}{mistake.message}")
 
 
 def _add(by_name: dict[str, T], name: str, part: T, element: Element) -> None:

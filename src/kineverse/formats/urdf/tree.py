@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kineverse.errors import FormatError, suggest
+from kineverse.errors import FormatError, list_some, suggest
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.xml_reader import quote
 from kineverse.model.frame import WORLD
@@ -63,11 +63,10 @@ def order_from_root(
 
     roots = [link for link in links if link.name not in joint_above]
     if len(roots) > 1:
-        shown = ", ".join(f"{quote(link.name)} (line {link.line})" for link in roots[:_SHOWN])
-        more = f" and {len(roots) - _SHOWN} more" if len(roots) > _SHOWN else ""
+        shown = list_some((f"{quote(link.name)} (line {link.line})" for link in roots), _SHOWN)
         text = (
             f"<link name={quote(roots[1].name)}>: there are {len(roots)} links without a parent, "
-            f"where one root is expected: {shown}{more}. Connect them by joints.{hint}"
+            f"where one root is expected: {shown}. Connect them by joints.{hint}"
         )
         if remarks.strict:
             raise FormatError(f"{source}, line {roots[1].line}, {text}")
@@ -78,11 +77,9 @@ def order_from_root(
         loop = _loop(next(joint for joint in joints if joint.child not in reached), joint_above)
         shown = " -> ".join(f"{quote(joint.name)}" for joint in loop[:_SHOWN])
         more = f" and {len(loop) - _SHOWN} more" if len(loop) > _SHOWN else ""
-        cycle = (
-            f"the joints {shown}{more} lead in a circle"
-            if len(loop) > 1
-            else "its child link is its own parent"
-        )
+        cycle = f"the joints {shown}{more} lead in a circle"
+        if len(loop) == 1:
+            cycle = "its child link is its own parent"
         text = f"{cycle}. URDF describes trees only: remove a joint.{hint}"
         if remarks.strict or not roots:
             raise FormatError(f"{_location(source, loop[0])}: {text}")

@@ -185,12 +185,8 @@ class UrdfWriter:
     def __init__(self, description: RobotDescription, path: Path, unsupported: UnsupportedFeatures) -> None:
         self._description, self._path, self._unsupported = description, path, unsupported
         self._links = TakenNames([WORLD, *(link.name for link in description.links)])
-        self._joints = TakenNames(
-            [
-                *(link.fixed_joint_name for link in description.links),
-                *(joint.name for joint in description.joints),
-            ]
-        )
+        fixed = [link.fixed_joint_name for link in description.links]
+        self._joints = TakenNames([*fixed, *(joint.name for joint in description.joints)])
         self._bodies = UrdfBodyWriter(path.absolute().parent, description.remarks)
         self._root = Tag("robot", {"name": path.name.removesuffix(path.suffix) or "model"})
 
@@ -302,13 +298,9 @@ class UrdfWriter:
         return (name, "planar", n) if same and not any(axes[2].point) else None
 
     def _axis_joint(self, joint: JointDescription, parent: str, child: str, pose: Matrix) -> None:
-        kind = (
-            "prismatic"
-            if not joint.is_rotation
-            else "continuous"
-            if joint.bounds.is_unbounded
-            else "revolute"
-        )
+        kind = "prismatic"
+        if joint.is_rotation:
+            kind = "continuous" if joint.bounds.is_unbounded else "revolute"
         element = self._joint(joint.name, kind, parent, child, pose, joint.axis)
         self._limit(element, joint.name, kind, joint.bounds, joint.dynamics)
         if joint.coefficients != IDENTITY_COEFFICIENTS or not joint.is_independent:

@@ -34,7 +34,6 @@ class Commit:
 
     @cached_property
     def _changed(self) -> dict[str, dict[str, Change]]:
-        """Changes of frames and rates by name."""
         kinds = (FRAMES, RATES)
         return {kind: {c.name: c for c in self.diff.changes if c.kind == kind} for kind in kinds}
 

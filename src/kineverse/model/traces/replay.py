@@ -64,7 +64,6 @@ def writes_agree(
 
 
 def _pairs(kind: str, a: Any, b: Any) -> list[ExpressionPair] | None:
-    """Return the expressions at equal places of two values; None if the values differ otherwise."""
     if a is b:
         return []
     if kind == FRAMES:
@@ -81,7 +80,6 @@ def _nothing(_: Expression) -> float:
 
 
 def _without_numbers(kind: str, value: Any) -> Any:
-    """Return a written value with expressions in place of its numbers."""
     if kind == ARTICULATIONS:
         return replace(value, dynamics=_without_numbers(DATA, value.dynamics))
     if kind != DATA:
@@ -93,7 +91,6 @@ def _without_numbers(kind: str, value: Any) -> Any:
 
 
 def _close(pairs: list[ExpressionPair]) -> bool:
-    """Return whether expressions and their gradients agree at a few states."""
     values: list[ExpressionPair] = []
     for a, b in pairs:
         if a.shape != b.shape:
