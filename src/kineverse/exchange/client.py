@@ -44,8 +44,7 @@ _LOG = logging.getLogger(__name__)
 _OWN_COMMIT = 0.05
 """Time in which the publication of an own edit is waited for before the server is asked for it [s]."""
 
-_BACK_OFF = 0.002
-"""Longest pause after the first conflict of a repeated edit [s]."""
+_BACK_OFF = 0.002  # longest pause after the first conflict of a repeated edit [s]
 
 R = TypeVar("R")
 
@@ -284,11 +283,8 @@ class LiveModel(Model):
             if answer.reason == "stale":
                 self._close_gap()
             if answer.reason in ("conflict", "stale"):
-                named = {
-                    "tags": (answer.tag,) if answer.tag else (),
-                    "paths": (answer.path,) if answer.path else (),
-                }
-                raise ConflictError(answer.message, revision=answer.revision, who=answer.who, **named)
+                named = (filter(None, [answer.tag]), filter(None, [answer.path]))
+                raise ConflictError(answer.message, *named, answer.revision, answer.who)
             raise EditError(answer.message)
         connection = self.exchange
         first = 0.0 if self._wish.is_part else _OWN_COMMIT  # a part may have nothing of it

@@ -40,8 +40,7 @@ Source: TypeAlias = str | os.PathLike[str] | Model
 
 MOST_TOGETHER, LONGEST_WAIT = 200, 0.002
 """Most edits that are stored together, and the longest time for which waiting ones are collected [s]."""
-BEAT = 0.5
-"""Time between two signs of life [s]."""
+BEAT = 0.5  # time between two signs of life [s]
 STAGES = ("receive", "decode", "check", "fold", "encode", "persist", "publish", "answer")
 """Stages of an edit, in order; their times are in the status."""
 _COLLECTION = 5.0  # time between two collections of garbage [s]
@@ -476,18 +475,12 @@ class Server:
 
     # -- who is there --------------------------------------------------------------------------------------
 
-    def _announce(self, announced: protocol.Announce) -> protocol.Done:
+    def _announce(self, new: protocol.Announce) -> protocol.Done:
         with self._lock:
-            if announced.endpoint:
-                self._sources[announced.source] = protocol.SourceStatus(
-                    announced.source,
-                    announced.endpoint,
-                    announced.coordinates,
-                    announced.offset,
-                    announced.client,
-                )
-            else:
-                self._sources.pop(announced.source, None)
+            self._sources.pop(new.source, None)
+            if new.endpoint:
+                about = new.source, new.endpoint, new.coordinates, new.offset, new.client
+                self._sources[new.source] = protocol.SourceStatus(*about)
         self._publish_beat()
         return protocol.Done(time.time())
 

@@ -39,8 +39,7 @@ from .address import UNIX_SOCKETS, Claim, check_server_name
 from .protocol import SourceStatus
 from .transport import Messages, NoAnswerError, Questions, Transport
 
-THROUGH_SERVER: Final = "server"
-"""Endpoint of sources that send through the model server only."""
+THROUGH_SERVER: Final = "server"  # endpoint of sources that send through the model server only
 
 _HEADER: Final = struct.Struct("<QQQdd")  # layout, run, number, stamp, time of sending
 _VALUE: Final = np.dtype("<f8")

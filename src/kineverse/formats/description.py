@@ -37,15 +37,6 @@ class JointBounds:
     max_velocity: float = math.inf
     soft: tuple[float, float] | None = None
 
-    def intersect_positions(self, lower: float, upper: float) -> None:
-        """Intersect the limits of the position with a range."""
-        self.lower, self.upper = max(self.lower, lower), min(self.upper, upper)
-
-    def intersect_velocities(self, min_velocity: float, max_velocity: float) -> None:
-        """Intersect the limits of the velocity with a range."""
-        self.min_velocity = max(self.min_velocity, min_velocity)
-        self.max_velocity = min(self.max_velocity, max_velocity)
-
     @property
     def is_unbounded(self) -> bool:
         """True if the position has no limits."""

@@ -150,7 +150,9 @@ def load(
     source, given = _arguments(source, arguments)
     found = locate_model(source)
     content = _content(found)
-    remembered = _stands_alone(found, content)
+    file_format = _format(found, content)
+    reference = None if file_format is None else file_format.reference
+    stands_alone = not reference or reference not in content.replace(b"\0", b"")  # UTF-16 has two bytes
     below = _root(found, root)
     key = found, prefix, hashlib.blake2b(content).digest(), below, strict, loops
     known = _REMEMBERED.pop(key, None)
@@ -165,7 +167,7 @@ def load(
             if not is_document or isinstance(error, FormatError | MissingDependencyError):
                 raise
             raise FormatError(f"{found.path}: its operations cannot be applied: {error}") from error
-        if len(content) > LARGEST_REMEMBERED or not remembered:
+        if len(content) > LARGEST_REMEMBERED or not stands_alone:
             return model
         known = model.snapshot(), remarks
     else:
@@ -262,11 +264,3 @@ def _format(source: Source, content: bytes) -> FileFormat | None:
     if file_format is None:
         raise unsupported_format_error(source.path)
     return file_format
-
-
-def _stands_alone(source: Source, content: bytes) -> bool:
-    """Return whether a model follows from its file alone, and not from files that it refers to."""
-    file_format = _format(source, content)
-    if file_format is None or not file_format.reference:
-        return True
-    return file_format.reference not in content.replace(b"\0", b"")  # UTF-16 has two bytes a letter

@@ -122,7 +122,8 @@ class LoopClosures:
                     if now is not None and abs(now - value) > _MOVED:
                         moved[symbol] = value, now
         if moved:
-            warn(self._format_moved(moved))
+            shown = list_some((f"'{s}' from {a:.6g} to {b:.6g}" for s, (a, b) in moved.items()), _SHOWN)
+            warn([f"{self.source}: its home is moved to where limits and loops hold: {shown}."])
 
     def _close_home(self, moved: dict[Symbol, tuple[float, float]]) -> Iterator[str]:
         """Move the home of coordinates to where kept loops close; add old and new values to ``moved``."""
@@ -155,20 +156,12 @@ class LoopClosures:
         except NoSolutionError:
             return None
 
-    def _format_moved(self, moved: dict[Symbol, tuple[float, float]]) -> list[str]:
-        listed = list_some((f"'{s}' from {a:.6g} to {b:.6g}" for s, (a, b) in moved.items()), _SHOWN)
-        return [f"{self.source}: its home is moved to where limits and loops hold: {listed}."]
-
     def _moving_rows(self, loop: CloseLoop) -> tuple[str, ...]:
         """Return the mask of a loop without rows that are constant and zero but for rounding in the file."""
         all_rows = self._rows(loop)
-        constant = [
-            axis
-            for axis in loop.mask
-            if not any(rows[axis].symbols for rows in all_rows)
-            and APART < max(abs(float(rows[axis])) for rows in all_rows) <= CLOSED
-        ]
-        return tuple(axis for axis in loop.mask if axis not in constant)
+        still = [axis for axis in loop.mask if not any(rows[axis].symbols for rows in all_rows)]
+        gaps = {axis: max(abs(float(rows[axis])) for rows in all_rows) for axis in still}
+        return tuple(axis for axis in loop.mask if not APART < gaps.get(axis, 0.0) <= CLOSED)
 
     def _rows(self, loop: CloseLoop) -> list[dict[str, Expression]]:
         rates = self.model.rates

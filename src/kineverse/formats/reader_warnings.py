@@ -8,6 +8,8 @@ from contextvars import ContextVar
 
 from msgspec import Struct, field
 
+from kineverse.errors import FormatError
+
 from .xml_reader import Element, ElementError, label
 
 _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
@@ -55,6 +57,12 @@ class ReaderWarnings(Struct):
             yield
         except ElementError as mistake:
             self.repair(mistake, "it is passed over", owner)
+
+    def mistake(self, line: int, text: str, taken: str) -> None:
+        """Add a warning about a mistake in a line, with what is done instead; an error if strict."""
+        if self.strict:
+            raise FormatError(f"{self.source}, line {line}, {text}")
+        self.fault(line, f"{text.rstrip('.')}; {taken}.")
 
     def fault(self, line: int, text: str, kind: type[Fault] = Fault) -> None:
         """Add a warning about a mistake in a line."""

@@ -45,7 +45,9 @@ def save(
         write = registry.import_entry(file_format.write)
         written: WrittenFile = write(model, target, leave_out, _checked(tolerance), strict)
     except FormatError as error:
-        raise _named(target, error) from None
+        if str(error).startswith(f"{target.name} "):
+            raise
+        raise FormatError(f"{target.name} is not written. {error}") from None
     _put(target, written)
     warn(f"{target.name}: {remark}" for remark in written.remarks)
     return SaveResult(target, written.remarks, written.errors, dict(written.left_out))
@@ -95,13 +97,6 @@ def _checked(tolerance: object) -> float | None:
     if tolerance is None or (number is not None and number > 0):
         return number
     raise InvalidValueError(f"A tolerance is a positive number [m] and [rad], or None, not {tolerance!r}.")
-
-
-def _named(target: Path, error: FormatError) -> FormatError:
-    text = str(error)
-    return (
-        error if text.startswith(f"{target.name} ") else FormatError(f"{target.name} is not written. {text}")
-    )
 
 
 def _target(path: Any) -> Path:

@@ -46,12 +46,10 @@ class FrameDependence:
             name = self._frames[name].parent
         moving = self._moving_ancestors[name]
         for frame in reversed(above):
-            moving = (*moving, frame) if self._moves_in_parent(frame) else moving
+            stays = self._paths.isdisjoint(_paths_in_parent(self._frames[frame]))
+            moving = moving if stays else (*moving, frame)
             self._moving_ancestors[frame] = moving
         return moving
-
-    def _moves_in_parent(self, name: str) -> bool:
-        return not self._paths.isdisjoint(_paths_in_parent(self._frames[name]))
 
 
 def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symbol, tuple[str, ...]]:

@@ -133,19 +133,21 @@ def assign_limits(
                 item.name, f"is about '{item.symbol}', which is the position or speed of no joint"
             )
             continue
+        bounds = joint.bounds
         if not item.symbol.order:
-            if kind == "soft_limits" and joint.name == owner and joint.bounds.soft is None:
-                joint.bounds.soft = low, high
+            if kind == "soft_limits" and joint.name == owner and bounds.soft is None:
+                bounds.soft = low, high
             else:
-                joint.bounds.intersect_positions(low, high)
+                bounds.lower, bounds.upper = max(bounds.lower, low), min(bounds.upper, high)
         elif target.one_way_speeds or low == -high:
-            joint.bounds.intersect_velocities(low, high)
+            bounds.min_velocity = max(bounds.min_velocity, low)
+            bounds.max_velocity = min(bounds.max_velocity, high)
         else:
             unsupported.leave_out(item.name, "limits a speed differently in its two directions")
     for joint in description.joints:
         if joint.bounds.lower > joint.bounds.upper:
-            bounds = f"{joint.bounds.lower:g} and {joint.bounds.upper:g}"
-            unsupported.refuse(joint.name, f"cannot be anywhere: its limits leave nothing between {bounds}")
+            ends = f"{joint.bounds.lower:g} and {joint.bounds.upper:g}"
+            unsupported.refuse(joint.name, f"cannot be anywhere: its limits leave nothing between {ends}")
 
 
 def _is_about_joint(joint: JointDescription, coordinate: Symbol, item: CoordinateLimit) -> bool:

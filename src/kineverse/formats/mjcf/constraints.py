@@ -15,7 +15,7 @@ from kineverse.model.body import Pose
 from .bodies import MjcfBodies, mujoco_pose
 from .compiled_document import CompiledMjcf
 from .custom_elements import merge_loop_closures
-from .description import MjcfClosure, MjcfCoupling, MjcfDynamics, MjcfTendon, Quartic
+from .description import MjcfClosure, MjcfCoupling, MjcfDynamics, MjcfTendon
 from .elements import ElementRemark, MjcfElement
 from .held_bodies import compute_rest_poses
 from .mujoco_api import mujoco
@@ -55,7 +55,8 @@ class MjcfConstraints:
             if not model.eq_active0[number]:
                 remark(self._nodes.get(number), "is left out: it is not active.")
             elif kind == kinds.mjEQ_JOINT:
-                couplings.append(self._joint_coupling(number))
+                rest = model.qpos0[model.jnt_qposadr]
+                couplings.append(self._coupling(number, bodies.joint_names, rest))
             elif kind == kinds.mjEQ_TENDON:
                 tendon_couplings += self._tendon_coupling(number)
             elif kind == kinds.mjEQ_CONNECT:
@@ -90,10 +91,6 @@ class MjcfConstraints:
     def _where(self, node: MjcfElement | None) -> str:
         return "" if node is None else node.where
 
-    def _joint_coupling(self, number: int) -> MjcfCoupling:
-        m = self._model
-        return self._coupling(number, self._bodies.joint_names, m.qpos0[m.jnt_qposadr])
-
     def _tendon_coupling(self, number: int) -> Iterator[MjcfCoupling]:
         coupling = self._coupling(number, self._tendon_names, self._model.tendon_length0)
         if coupling.follower in self._known and (coupling.leader is None or coupling.leader in self._known):
@@ -104,19 +101,16 @@ class MjcfConstraints:
     def _coupling(self, number: int, names: Sequence[str], rest: npt.NDArray[np.float64]) -> MjcfCoupling:
         m = self._model
         follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
+        a, b, c, d, e = m.eq_data[number][:5].tolist()
         return MjcfCoupling(
             self._names[number],
             names[follower],
             names[leader] if leader >= 0 else None,
-            self._quartic(number),
+            (a, b, c, d, e),
             float(rest[follower]),
             float(rest[leader]) if leader >= 0 else 0.0,
             self._where(self._nodes.get(number)),
         )
-
-    def _quartic(self, number: int) -> Quartic:
-        a, b, c, d, e = self._model.eq_data[number][:5].tolist()
-        return a, b, c, d, e
 
     def _closure(self, number: int, kind: Literal["connect", "weld"]) -> Iterator[MjcfClosure]:
         """Yield a connect or weld equality, unless it is redundant or holds a mocap body."""

@@ -93,7 +93,11 @@ class MeshReplacement:
         contents: dict[str, bytes] = {}
         missing: dict[str, bool] = {}
         if wanted:
-            self._make({geom.meshname for geom, _ in needed})
+            found = [
+                self._prepared.files[self._nodes[name]] for name in sorted({g.meshname for g, _ in needed})
+            ]
+            plugins = [reference for reference in dict.fromkeys(found) if reference.plugin]
+            self._made = make_plugin_meshes(plugins) if plugins else {}
         for geom, body in needed:
             name = geom.meshname
             if name not in missing:
@@ -137,12 +141,6 @@ class MeshReplacement:
         if rule == kinds.mjINERTIAFROMGEOM_AUTO:
             return not body.explicitinertial
         return bool(rule == kinds.mjINERTIAFROMGEOM_TRUE)
-
-    def _make(self, names: set[str]) -> None:
-        found = [self._prepared.files[self._nodes[name]] for name in sorted(names)]
-        plugins = [reference for reference in dict.fromkeys(found) if reference.plugin]
-        if plugins:
-            self._made = make_plugin_meshes(plugins)
 
     def _content(self, name: str) -> bytes | Triangles | None:
         """Return the content of a mesh file, or the triangles that a plugin makes.

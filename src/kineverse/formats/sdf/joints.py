@@ -200,13 +200,6 @@ def _pitch(element: Element) -> float:
     return pitch
 
 
-def find_reference_body(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> PoseNode:
-    """Return the reference link of a gearbox's angles."""
-    part = find_child(node.element, "gearbox_reference_body")
-    assert part is not None
-    return attachments[node.scope.find(read_text(part), part, node.element)]
-
-
 _PARALLEL = 1e-4
 _HINGE_TYPES = ("revolute", "continuous")
 
@@ -235,7 +228,9 @@ def resolve_gearboxes(
                 node.document.remarks.repair(mistake, "it is left out")
             result[index] = None
             continue
-        body = find_reference_body(node, attachments)
+        part = find_child(node.element, "gearbox_reference_body")
+        assert part is not None
+        body = attachments[node.scope.find(read_text(part), part, node.element)]
         with node.document.locate_errors(node.element):
             ratio = read_child_number(node.element, "gearbox_ratio", 1.0)
         if not ratio:
@@ -352,17 +347,16 @@ def _outwards(
 
 def reverse_joint(joint: SdfJoint) -> SdfJoint:
     """Return a joint with parent and child exchanged: the same coordinates about opposite axes."""
+    axes = []
+    for axis in reversed(joint.axes):
+        x, y, z = axis.xyz
+        axes.append(replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z)))
     return replace(
         joint,
         parent=joint.child,
         child=joint.parent,
         pose_in_parent=joint.pose_in_child,
         pose_in_child=joint.pose_in_parent,
-        axes=tuple(_negate_axis(axis) for axis in reversed(joint.axes)),
+        axes=tuple(axes),
         is_reversed=not joint.is_reversed,
     )
-
-
-def _negate_axis(axis: SdfAxis) -> SdfAxis:
-    x, y, z = axis.xyz
-    return replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z))

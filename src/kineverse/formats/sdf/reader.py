@@ -66,7 +66,10 @@ def open_document(
             data, source, texts=True, on_recoverable_error=None if strict else reader_warnings.fault
         )
     except FormatError as error:
-        raise FormatError(f"{error}{_template_hint(data)}") from None
+        marks = ("<%", "{%") if isinstance(data, str) else (b"<%", b"{%")
+        is_template = any(mark in data for mark in marks)  # type: ignore[operator]  # of the same type
+        hint = " This is a template that was not expanded: erb model.sdf.erb > model.sdf"
+        raise FormatError(f"{error}{hint if is_template else ''}") from None
     document = SdfDocument(source, folder, _LATEST, reader_warnings, root_folder)
     # Up to version 1.2, the root element was <gazebo>.
     if root[0] not in ("sdf", "gazebo"):
@@ -81,13 +84,6 @@ def open_document(
     if not _OLDEST <= document.version <= _LATEST:
         document.refuse(root, f"version={quote(version)} is not one that is read; 1.2 to 1.12 are.")
     return document, root
-
-
-def _template_hint(data: str | bytes) -> str:
-    marks = ("<%", "{%") if isinstance(data, str) else (b"<%", b"{%")
-    if any(mark in data for mark in marks):  # type: ignore[operator]  # of the same type
-        return " This is a template that was not expanded: erb model.sdf.erb > model.sdf"
-    return ""
 
 
 class SdfModelReader:
@@ -369,18 +365,11 @@ def _scene(
     static = [attachments[model].path for model in static_models]
     roots, ordered, loops = build_spanning_tree(links, joints, static, remark)
     _check_leaders((*ordered, *loops), nodes)
-    frames = tuple(
-        SdfFrame(
-            node.path,
-            attachments[node].path or WORLD,
-            pose_between(attachments[node], node),
-            node.element[3],
-            node.document.source,
-        )
-        for node in graph.nodes
-        if node.is_named_frame and node.kind in ("frame", "model")
-    )
-    return SdfScene(links, frames, roots, ordered, loops, document.source, tuple(remarks))
+    frames = []
+    for node in (node for node in graph.nodes if node.is_named_frame and node.kind in ("frame", "model")):
+        link, place = attachments[node], (node.element[3], node.document.source)
+        frames.append(SdfFrame(node.path, link.path or WORLD, pose_between(link, node), *place))
+    return SdfScene(links, tuple(frames), roots, ordered, loops, document.source, tuple(remarks))
 
 
 def _check_leaders(joints: Sequence[SdfJoint], nodes: dict[str, PoseNode]) -> None:

@@ -18,8 +18,7 @@ from kineverse.model.read_recorder import ABSENT, Read, Reads, unknown_name_erro
 if TYPE_CHECKING:
     from kineverse.model.history import History, HistoryEntry
 
-BEFORE_ALL = -1 << 200
-"""Place before those of all entries."""
+BEFORE_ALL = -1 << 200  # place before those of all entries
 
 _PLACE = attrgetter("place")
 _LISTED = 10

@@ -137,7 +137,8 @@ def replay_agrees(
                 if step.query.kind in EXPRESSION_QUERIES:
                     others.append(substitute_results(step.query, others).ask(model))
                 else:
-                    others.append(_perturb(change, step.query, reply) if place in free else reply)
+                    changed = (change(step.query, i, part) for i, part in enumerate(reply.parts))
+                    others.append(QueryResult(reply.rest, tuple(changed)) if place in free else reply)
             traced = trace.compute_writes(others).writes()
         except KineverseError:
             continue  # the perturbation is not valid for the trace
@@ -153,10 +154,6 @@ def replay_agrees(
         if not writes_agree(traced, written):
             return False
     return True
-
-
-def _perturb(change: Perturbation, query: Query, reply: QueryResult) -> QueryResult:
-    return QueryResult(reply.rest, tuple(change(query, i, part) for i, part in enumerate(reply.parts)))
 
 
 def _perturb_value(query: Query, place: int, part: Expression | float) -> Expression | float:
