@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
+from kineverse._runtime import Closing
 from kineverse._version import __version__
 from kineverse.errors import ConflictError, EditError, OfflineError
 from kineverse.formats import entries_from_bytes
@@ -85,7 +86,7 @@ def include_live(edit: Edit, source: str, prefix: str | None = None) -> list[str
     return [edit.link(entry) for entry in entries_from_bytes(joined.document, prefix)]
 
 
-class LiveModel(Model):
+class LiveModel(Model, Closing):
     """Model that a server keeps, from ``kv.load("live:NAME")``.
 
     It reads like any model and is edited like any: ``with model.edit() as edit:`` ends when the edit is
@@ -236,12 +237,6 @@ class LiveModel(Model):
     def close(self) -> None:
         """End the connection; reading goes on. A second call has no effect, and a script need not call it."""
         self._finish()
-
-    def __enter__(self) -> LiveModel:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _check_not_edited(self) -> None:
         """Raise an EditError if this thread edits the model, which gets no commits meanwhile."""

@@ -18,6 +18,7 @@ import numpy as np
 from msgspec import structs
 
 from kineverse._checks import as_entries, as_tolerance, check_flag
+from kineverse._runtime import Closing
 from kineverse._version import __version__
 from kineverse.errors import FormatError, InvalidValueError, KineverseError, UnknownNameError
 from kineverse.formats import entry_to_bytes
@@ -131,7 +132,7 @@ def _include(edit: Edit, given: Sequence[Source]) -> None:
             edit.include(source)
 
 
-class Server:
+class Server(Closing):
     """Running model server, from :func:`serve`.
 
     Attributes
@@ -215,12 +216,6 @@ class Server:
                 for client in [*self._backups]:
                     self._drop_backup(client)
                 self._opened.close()
-
-    def __enter__(self) -> Server:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # -- edits ---------------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.model.body import Body, Vector3
+from kineverse.model.body import NO_BODY, Body, Vector3
 from kineverse.model.registry import FrameDeviation
 from kineverse.symbols import Symbol
 
@@ -20,7 +20,6 @@ Matrix: TypeAlias = npt.NDArray[np.float64]
 Coefficients: TypeAlias = tuple[float, ...]  # coefficients of the powers of a coordinate, constant first
 
 IDENTITY_COEFFICIENTS: Coefficients = (0.0, 1.0)
-NO_BODY = Body()
 
 
 @dataclass

@@ -204,6 +204,9 @@ class Body(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     inertia: Inertia | None = None
 
 
+NO_BODY = Body()  # neither shapes nor inertia
+
+
 def is_empty_body(body: Body) -> bool:
     """Return whether a body has neither shapes nor inertia."""
     return not body.visuals and not body.collisions and body.inertia is None

@@ -15,7 +15,6 @@ from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
-    NO_BODY,
     BallJointDescription,
     JointDescription,
     LinkDescription,
@@ -29,7 +28,7 @@ from kineverse.intervals.graph import TermGraph
 from kineverse.loops.equations import AXES
 from kineverse.loops.loop_records import LOOP_KINDS, LoopRecord, find_loops
 from kineverse.model.articulation import Articulation
-from kineverse.model.body import Pose
+from kineverse.model.body import NO_BODY, Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView

@@ -18,7 +18,6 @@ from msgspec.structs import replace
 from kineverse.errors import FormatError
 from kineverse.formats import poses
 from kineverse.formats.description import (
-    NO_BODY,
     BallJointDescription,
     JointDescription,
     LinkDescription,
@@ -30,6 +29,7 @@ from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
 from kineverse.formats.names import TakenNames
 from kineverse.formats.poses import unit_quaternion
 from kineverse.formats.xml_writer import Tag, format_xml
+from kineverse.model.body import NO_BODY
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 

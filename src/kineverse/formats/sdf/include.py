@@ -211,5 +211,5 @@ def _axis(joint: UrdfJoint, xyz: Vector3, names: dict[str, str]) -> Element:
     ]
     if mimic is not None:
         follows = (_number("multiplier", mimic.multiplier), _number("offset", mimic.offset))
-        parts.append(_element("mimic", *follows, joint=names[mimic.joint]))
+        parts.append(_element("mimic", *follows, joint=names[mimic.leader]))
     return _element("axis", *parts)

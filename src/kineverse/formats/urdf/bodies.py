@@ -24,6 +24,7 @@ from kineverse.formats.xml_values import (
     read_origin,
 )
 from kineverse.model.body import (
+    NO_BODY,
     Body,
     Box,
     Capsule,
@@ -115,7 +116,6 @@ def _format_appearance(appearance: Appearance) -> str:
 
 
 _UNSCALED = (1.0, 1.0, 1.0)
-_EMPTY_BODY = Body()
 
 
 class UrdfLinkReader:
@@ -154,7 +154,7 @@ class UrdfLinkReader:
                 else:
                     self._remarks.add(part, "is ignored: another one came first.", element)
         if not visuals and not collisions and inertia is None:
-            return UrdfLink(name, _EMPTY_BODY, element[3])
+            return UrdfLink(name, NO_BODY, element[3])
         return UrdfLink(name, Body(tuple(visuals), tuple(collisions), inertia), element[3])
 
     def assign_materials(self, links: dict[str, UrdfLink]) -> None:

@@ -37,7 +37,6 @@ from .description import (
     UrdfJoint,
     UrdfJointType,
     UrdfLimits,
-    UrdfMimic,
     UrdfSafetyController,
 )
 
@@ -300,11 +299,11 @@ def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController 
     return result
 
 
-def _mimic(mimic: Element) -> UrdfMimic:
+def _mimic(mimic: Element) -> MimicRelation[str]:
     joint = mimic[1].get("joint")
     if not joint:
         raise ElementError(mimic, "does not name a joint.")
-    return UrdfMimic(
+    return MimicRelation(
         joint, read_attribute_number(mimic, "multiplier", 1.0), read_attribute_number(mimic, "offset", 0.0)
     )
 
@@ -346,11 +345,6 @@ def resolve_mimic_joints(joints: Iterable[UrdfJoint], remarks: ReaderWarnings) -
             return False
         return True
 
-    following = {
-        joint.name: MimicRelation(joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
-        for joint in joints
-        if joint.mimic is not None
-    }
-    resolved = resolve_mimic_chains(following, refuse, check=check).items()
-    ends = {name: UrdfMimic(end.leader, end.multiplier, end.offset) for name, end in resolved}
+    following = {joint.name: joint.mimic for joint in joints if joint.mimic is not None}
+    ends = resolve_mimic_chains(following, refuse, check=check)
     return [j if j.mimic is None else replace(j, mimic=ends.get(j.name)) for j in joints]

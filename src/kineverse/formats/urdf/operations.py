@@ -119,7 +119,7 @@ def _joint_operations(
     if joint.kind == "planar":
         yield Planar(**common)
         return
-    follows = None if mimic is None else mimic.multiplier * position(joint_name(mimic.joint)) + mimic.offset
+    follows = None if mimic is None else mimic.multiplier * position(joint_name(mimic.leader)) + mimic.offset
     yield AXIS_JOINTS[joint.kind](**common, position=follows)
     if safety is not None and safety.has_limits:
         q = position(name) if follows is None else follows

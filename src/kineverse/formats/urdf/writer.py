@@ -22,7 +22,6 @@ from kineverse.articulations.multi_axis import rotation_from_z
 from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
-    NO_BODY,
     BallJointDescription,
     JointBounds,
     JointDescription,
@@ -34,12 +33,13 @@ from kineverse.formats.description import (
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
 from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
 from kineverse.formats.names import TakenNames
-from kineverse.formats.poses import ROTATION_TOLERANCE, rpy_angles
+from kineverse.formats.poses import IDENTITY, ROTATION_TOLERANCE, rpy_angles
 from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.resource_paths import mesh_reference
 from kineverse.formats.xml_writer import Tag, format_xml
 from kineverse.lie import translation
 from kineverse.model.body import (
+    NO_BODY,
     Body,
     Box,
     Capsule,
@@ -59,7 +59,6 @@ from kineverse.model.model_view import ModelView
 from .operations import urdf_operations
 from .reader import parse_urdf
 
-_IDENTITY = Pose()
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -138,7 +137,7 @@ class UrdfBodyWriter:
 
 def add_origin(element: Tag, pose: Pose) -> None:
     """Add the ``<origin>`` of an element, unless it is the identity."""
-    if pose == _IDENTITY:
+    if pose == IDENTITY:
         return
     matrix = pose.matrix
     rpy = rpy_angles(matrix)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from kineverse._checks import as_entries
+from kineverse._runtime import Closing
 from kineverse.errors import ExpressionError
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Pose
@@ -179,7 +180,7 @@ _EVERYTHING = CommitFilter()
 
 
 @dataclass(frozen=True, eq=False)
-class Listener:
+class Listener(Closing):
     """Callback with its filter; :meth:`close` unregisters it."""
 
     callback: Callback
@@ -189,12 +190,6 @@ class Listener:
     def close(self) -> None:
         """Unregister the callback; a second call has no effect."""
         self.registry.remove(self)
-
-    def __enter__(self) -> Listener:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 Witness = Callable[[Commit], None]
