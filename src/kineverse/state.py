@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from kineverse._checks import real_number
+from kineverse._checks import as_number, real_number
 from kineverse._synonyms import STATE_SYNONYMS
 from kineverse.errors import (
     DuplicateNameError,
@@ -85,7 +84,7 @@ class State(Mapping[Symbol, float]):
         stamp: float | None,
         source: str,
     ) -> None:
-        if stamp is not None and not _is_number(stamp):
+        if stamp is not None and as_number(stamp) is None:
             raise InvalidValueError(f"The stamp of a state is a time in seconds, not {stamp!r}.")
         write = object.__setattr__
         write(self, "_values", values)
@@ -314,13 +313,6 @@ def _number(symbol: Symbol, value: Any) -> float:
     if number != number:
         raise InvalidValueError(f"The value of '{symbol}' is NaN.")
     return number
-
-
-def _is_number(value: object) -> bool:
-    try:
-        return not math.isnan(real_number(value))
-    except (TypeError, ValueError, OverflowError):
-        return False
 
 
 def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
