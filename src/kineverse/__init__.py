@@ -88,7 +88,6 @@ if TYPE_CHECKING:
 
 
 def _list_names_below() -> dict[str, str]:
-    """Return the public names of all packages and modules of the face, with their full names."""
     import importlib  # for start-up time
 
     below: dict[str, str] = {}
@@ -101,18 +100,9 @@ def _list_names_below() -> dict[str, str]:
 
 
 _PACKAGES = (
-    *(
-        "exchange",
-        "symbols",
-        "control",
-        "estimation",
-        "geometry",
-        "grasping",
-        "manipulation",
-        "planning",
-        "reasoning",
-    ),
-    *("worlds", "expressions", "spatial", "logic", "errors", "loops", "formats", "model", "articulations"),
+    *("exchange", "symbols", "control", "estimation", "geometry", "grasping", "manipulation", "planning"),
+    *("reasoning", "worlds", "expressions", "spatial", "logic", "errors"),
+    *("loops", "formats", "model", "articulations"),
 )
 """Packages and modules of the face; a name that several have is that of the last one."""
 

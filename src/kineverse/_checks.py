@@ -28,13 +28,19 @@ def real_number(value: Any) -> float:
     return float(value)
 
 
-def finite_number(value: Any) -> float | None:
-    """Return a finite number as a float; None for infinities, NaN and other values."""
+def as_number(value: Any) -> float | None:
+    """Return a real number as a float, infinities included; None for NaN and other values."""
     try:
         number = real_number(value)
     except (TypeError, ValueError, OverflowError):
         return None
-    return number if math.isfinite(number) else None
+    return None if math.isnan(number) else number
+
+
+def finite_number(value: Any) -> float | None:
+    """Return a finite number as a float; None for infinities, NaN and other values."""
+    number = as_number(value)
+    return number if number is not None and math.isfinite(number) else None
 
 
 def as_tolerance(given: float, subject: str = "A tolerance") -> float:

@@ -7,7 +7,7 @@ import gc
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
-from typing import Concatenate, ParamSpec, Protocol, TypeVar
+from typing import Concatenate, ParamSpec, Protocol, Self, TypeVar
 
 
 class no_collection:  # noqa: N801
@@ -25,6 +25,19 @@ class no_collection:  # noqa: N801
     def __exit__(self, *_: object) -> None:
         if self._collecting:
             gc.enable()
+
+
+class Closing:
+    """Context manager that is closed at the end of its block."""
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class CallLock(_thread.RLock):  # type: ignore[misc]  # final for type checkers only

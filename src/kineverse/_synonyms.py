@@ -63,19 +63,8 @@ MODEL_SYNONYMS = _by_name(
 )
 
 EDIT_METHODS = (
-    "add_frame",
-    "apply",
-    "attach",
-    "close_loop",
-    "constrain",
-    "insert",
-    "net",
-    "remove",
-    "replace",
-    "savepoint",
-    "set_rate",
-    "undo",
-    "write",
+    *("add_frame", "apply", "attach", "close_loop", "constrain", "insert", "net"),
+    *("remove", "replace", "savepoint", "set_rate", "undo", "write"),
 )
 
 EDIT_SYNONYMS = _by_name(

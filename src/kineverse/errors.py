@@ -201,6 +201,13 @@ def summarize_error(error: Exception, advice: bool = True) -> str:
 _LONGEST = 100
 
 
+def list_some(texts: Iterable[object], most: int) -> str:
+    """Return the first of some texts, and how many others there are: ``a, b and 3 more``."""
+    listed = list(map(str, texts))
+    more = f" and {len(listed) - most} more" if len(listed) > most else ""
+    return ", ".join(listed[:most]) + more
+
+
 def suggest(name: str, available: Iterable[str], what: str = "name", limit: int = 12) -> str:
     """Return the part of an error message that lists similar names, or the available ones.
 
@@ -224,8 +231,7 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
     close += [n for n in parts if n not in close][: max(0, 4 - len(close))]
     if close:
         return f"Did you mean {' or '.join(_shorten(repr(n)) for n in close)}?"
-    more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return f"Available: {', '.join(map(_shorten, names[:limit]))}{more}."
+    return f"Available: {list_some(map(_shorten, names), limit)}."
 
 
 def unknown_attribute_error(

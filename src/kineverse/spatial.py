@@ -234,7 +234,6 @@ def _split_factor(part: SX) -> tuple[float, SX]:
 
 
 def _without_axis(transform: Expression) -> Expression:
-    """Return a transform as a plain matrix expression."""
     if not isinstance(transform, OneAxisTransform):
         return transform
     return from_casadi(transform._sx, transform.shape, transform._nodes)

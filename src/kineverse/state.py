@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from kineverse._checks import real_number
+from kineverse._checks import as_number, real_number
 from kineverse._synonyms import STATE_SYNONYMS
 from kineverse.errors import (
     DuplicateNameError,
@@ -20,6 +19,7 @@ from kineverse.errors import (
     UnknownAttributeError,
     UnknownNameError,
     duplicate_value_error,
+    list_some,
     suggest,
     unknown_attribute_error,
 )
@@ -84,7 +84,7 @@ class State(Mapping[Symbol, float]):
         stamp: float | None,
         source: str,
     ) -> None:
-        if stamp is not None and not _is_number(stamp):
+        if stamp is not None and as_number(stamp) is None:
             raise InvalidValueError(f"The stamp of a state is a time in seconds, not {stamp!r}.")
         write = object.__setattr__
         write(self, "_values", values)
@@ -131,7 +131,6 @@ class State(Mapping[Symbol, float]):
             ) from None
 
     def _known(self, key: object) -> Symbol:
-        """Return the symbol of a key; raise a KeyError if there is none."""
         if not isinstance(key, str):
             if key in self._values:
                 return key  # type: ignore[return-value]
@@ -172,8 +171,7 @@ class State(Mapping[Symbol, float]):
         values = [s.value if v is None else v for s, v in zip(symbols, held, strict=True)]
         missing = [str(s) for s, value in zip(symbols, values, strict=True) if value is None]
         if missing:
-            more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
-            raise UnknownNameError(f"No value is given for {', '.join(map(repr, missing[:12]))}{more}.")
+            raise UnknownNameError(f"No value is given for {list_some(map(repr, missing), 12)}.")
         return np.array(values, dtype=np.float64)
 
     def __contains__(self, key: object) -> bool:
@@ -315,13 +313,6 @@ def _number(symbol: Symbol, value: Any) -> float:
     if number != number:
         raise InvalidValueError(f"The value of '{symbol}' is NaN.")
     return number
-
-
-def _is_number(value: object) -> bool:
-    try:
-        return not math.isnan(real_number(value))
-    except (TypeError, ValueError, OverflowError):
-        return False
 
 
 def as_state(values: StateLike, known: Iterable[Symbol]) -> State:

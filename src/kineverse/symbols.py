@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import casadi as ca
 
-from kineverse._checks import real_number
+from kineverse._checks import as_number
 from kineverse.errors import ExpressionError, InvalidValueError
 from kineverse.expressions.expression import NO_NODES, SYMBOLS, Expression
 
@@ -213,12 +213,9 @@ def parameter(path: str, value: float) -> Symbol:
 
     ``D`` of a parameter is empty. Parameters of one path with different values are different symbols.
     """
-    if isinstance(value, bool):
+    number = None if isinstance(value, bool) else as_number(value)
+    if number is None:
         raise InvalidValueError(f"Parameter '{path}' needs a number as its value, not {value!r}.")
-    try:
-        number = real_number(value)
-    except (TypeError, ValueError, OverflowError):
-        raise InvalidValueError(f"Parameter '{path}' needs a number as its value, not {value!r}.") from None
     return Symbol(path, 0, "parameter", number)
 
 
@@ -254,6 +251,11 @@ def parse_symbol_name(name: str) -> tuple[str, int]:
         f"{name[:200]!r}: ':{suffix[:40]}' is not an order; write {', '.join(ORDER_NAMES[1:])} or, from "
         f"{len(ORDER_NAMES)} on, a number."
     )
+
+
+def sort_symbols(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
+    """Return symbols sorted by path and order."""
+    return tuple(sorted(symbols, key=lambda s: s.sort_key))
 
 
 def check_symbols(symbols: Iterable[object]) -> Sequence[Symbol]:

@@ -12,7 +12,8 @@ from urdf_texts import LIMIT, joint, model_of, pair, robot
 
 import kineverse as kv
 from kineverse.errors import FormatError
-from kineverse.formats.urdf import UrdfDynamics, UrdfLimits, UrdfMimic, UrdfSafetyController, parse_urdf
+from kineverse.formats.mimic import MimicRelation
+from kineverse.formats.urdf import UrdfDynamics, UrdfLimits, UrdfSafetyController, parse_urdf
 
 
 def test_defaults_are_those_of_the_specification():
@@ -169,7 +170,7 @@ def test_safety_mimic_and_dynamics_are_read():
     )
     b = parse_urdf(text).joints[1]
     assert b.safety == UrdfSafetyController(-0.5, 0.5, 7.0, 5.0)
-    assert b.mimic == UrdfMimic("a", -2.0, 0.1)
+    assert b.mimic == MimicRelation("a", -2.0, 0.1)
     assert b.dynamics == UrdfDynamics(3.0, 0.0)
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from urdf_texts import joint, robot
 
 from kineverse.errors import FormatError
-from kineverse.formats.urdf import UrdfMimic, parse_urdf
+from kineverse.formats.mimic import MimicRelation
+from kineverse.formats.urdf import parse_urdf
 
 FACTOR = st.integers(-3000, 3000).map(lambda thousandths: thousandths / 1000)
 
@@ -35,7 +36,7 @@ def test_mimic_chain_is_the_composition_of_its_relations(data):
     for i, (multiplier, offset) in enumerate(factors):
         value = multiplier * value + offset
         mimic = joints[f"j{i + 1}"].mimic
-        assert mimic.joint == "j0"
+        assert mimic.leader == "j0"
         assert math.isclose(mimic.multiplier * q + mimic.offset, value, rel_tol=1e-9, abs_tol=1e-9)
 
 
@@ -46,7 +47,7 @@ def test_mimic_defaults_are_multiplier_one_and_offset_zero():
         links=3,
     )
     description = parse_urdf(text)
-    assert description.joints[1].mimic == UrdfMimic("a", 1.0, 0.0)
+    assert description.joints[1].mimic == MimicRelation("a", 1.0, 0.0)
     assert description.dof == 1
 
 
@@ -69,7 +70,7 @@ def test_mimic_cycles_are_refused_and_shown():
     with pytest.raises(FormatError, match='it mimics itself, by way of "a" -> "b" -> "c"'):
         parse_urdf(text, strict=True)
     read = parse_urdf(text)
-    assert {joint.name: joint.mimic and joint.mimic.joint for joint in read.joints} == {
+    assert {joint.name: joint.mimic and joint.mimic.leader for joint in read.joints} == {
         "a": "c",
         "b": "c",
         "c": None,
@@ -90,7 +91,7 @@ def test_broken_mimic_chain_error_names_the_joint(caplog):
     with caplog.at_level("WARNING", "kineverse.formats"):
         mimics = {joint.name: joint.mimic for joint in parse_urdf(text).joints}
         parse_urdf(text.replace("finger_jiont", "a"))  # a cycle is a remark
-    assert mimics == {"a": None, "b": UrdfMimic("a"), "finger_joint": None}
+    assert mimics == {"a": None, "b": MimicRelation("a"), "finger_joint": None}
     (heard,) = caplog.messages
     assert '<joint name="a">: it mimics "finger_jiont"' in heard
     assert heard.endswith("; it moves by itself. Did you mean 'finger_joint'?")

@@ -200,7 +200,7 @@ def test_chain_of_thirty_thousand_links_is_read():
     description = parse_urdf(text)
     assert len(description.links) == length + 1
     assert description.joints[-1].name == f"j{length - 1}"
-    assert description.joints[-1].mimic.joint == "j0"
+    assert description.joints[-1].mimic.leader == "j0"
     assert description.joints[-1].mimic.offset == length - 1
     assert description.dof == 1
 

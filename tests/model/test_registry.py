@@ -97,7 +97,7 @@ def test_every_entry_can_be_imported():
     entries = [*registry._SHORTHANDS.values(), *registry._SERVICES.values()]
     for scheme in registry._SCHEMES.values():
         entries += [scheme.load, scheme.include]
-    for one in registry._COLLECTIONS.values():
+    for one in registry.COLLECTIONS.values():
         entries += filter(None, (one.list_names, one.build, one.find_document, one.accept))
     entries += [registry._FORMATS]
     entries += [text for one in registry.list_formats() for text in (one.read, one.write) if text]

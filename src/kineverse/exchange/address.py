@@ -208,7 +208,6 @@ def _socket_endpoint(folder: Path, stem: str) -> str:
 
 
 def _read_place(folder: Path, stem: str) -> tuple[str, str] | None:
-    """Return endpoint and secret from the file of a server; None without one."""
     try:
         found = json.loads((folder / f"{stem}.json").read_text("utf-8"))
         return str(found["endpoint"]), str(found["secret"])

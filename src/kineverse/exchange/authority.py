@@ -10,12 +10,14 @@ from __future__ import annotations
 import logging
 import secrets
 import time
+from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from time import perf_counter
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from kineverse._runtime import no_collection
 from kineverse.errors import EditError, FormatError, KineverseError, suggest
@@ -23,13 +25,14 @@ from kineverse.formats import entry_to_bytes, operation_from_bytes
 from kineverse.formats.document import OpaqueOperation
 from kineverse.model import Diff, Edit, Model, NetChanges, PlacedEntry
 from kineverse.model.history import History, HistoryEntry
+from kineverse.model.operation import Cell
+from kineverse.model.read_recorder import ABSENT, Read, differs
 
 from . import protocol
 from .conflicts import KEPT, RefusedError, Revisions
 from .meshes import ServedFiles, put_contents
 from .protocol import CommitMessage, Committed, Published, Refused
 from .store import Replaced, Store, StoredCommit
-from .stored_undo import computes, find_inverse
 from .views import LOAD_THE_WHOLE, is_partial
 
 _LOG = logging.getLogger(__name__)
@@ -77,7 +80,6 @@ class Authority:
         self._load()
 
     def _load(self) -> None:
-        """Make the model by linking the operations of the store."""
         with no_collection():
             stored = self._store.operations()
             entries = [operation_from_bytes(blob).at(place) for place, blob, _ in stored]
@@ -181,7 +183,6 @@ class Authority:
             self._batch.clear()
 
     def _find_answer(self, key: tuple[str, int]) -> EditAnswer | None:
-        """Return the answer to an edit that was asked before."""
         known = self._answers.get(key)
         if known is not None:
             return known
@@ -194,7 +195,6 @@ class Authority:
         return None if stored is None else Committed(*stored)
 
     def _answer(self, request: protocol.ChangeRequest) -> Result:
-        """Make one edit, if it can be made."""
         revision = self.revision
         self._seconds = dict[str, float]()
         try:
@@ -209,7 +209,6 @@ class Authority:
         return Result(Committed(self.revision, self.chain), commit, self._seconds)
 
     def _make(self, request: protocol.EditRequest) -> MadeCommit | None:
-        """Make an edit of a client; None if it does nothing."""
         begin = perf_counter()
         self._check_base(request)
         changes, history = request.changes, self.model.history
@@ -232,7 +231,6 @@ class Authority:
         return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net))
 
     def _check_base(self, request: protocol.EditRequest) -> None:
-        """Check that the client knows the present model, or one of the last."""
         base, now = request.base, self.revision
         if request.strict and base < now:
             who = self._revisions.who_made(now)
@@ -278,7 +276,7 @@ class Authority:
         """
         history = self.model.history
         edit.adopt(replace(changes, put=tuple(_unlinked(placed) for placed in changes.put)))
-        run = [placed.entry for placed in changes.put if computes(placed.entry)]
+        run = [placed.entry for placed in changes.put if _computes(placed.entry)]
         for entry in run:
             history.mark_outdated(entry.tag)
         history.settle()
@@ -347,7 +345,6 @@ class Authority:
         return MadeCommit(commit, Published(self.epoch, self.chain, data), self._diffs.pop())
 
     def _find_replaced(self, tag: str) -> Replaced:
-        """Return what an edit will replace under a tag."""
         history = self.model.history
         entry = history.entries.get(tag)
         if entry is None:
@@ -366,7 +363,7 @@ class Authority:
             raise RefusedError("unknown", message)
         if revision in kept:
             return self._fold(request, lambda edit: self._take_back(edit, revision), kept[revision])
-        net = find_inverse(self._store, self.model.history, revision)
+        net = _find_inverse(self._store, self.model.history, revision)
         return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net))
 
     def _take_back(self, edit: Edit, revision: int) -> None:
@@ -394,7 +391,7 @@ def _decode(request: protocol.EditRequest) -> tuple[PlacedEntry, ...]:
         if is_partial(entry):
             message = f"Of the operation {tag!r} the client has only a part. {LOAD_THE_WHOLE}"
             raise RefusedError("refused", message, tag)
-        if isinstance(operation, OpaqueOperation) and operation.frozen and not computes(entry):
+        if isinstance(operation, OpaqueOperation) and operation.frozen and not _computes(entry):
             message = f"The operation {tag!r} is frozen, and does not say by what it has read."
             raise RefusedError("malformed", message, tag)
     put_contents(entries, request.files)
@@ -404,7 +401,7 @@ def _decode(request: protocol.EditRequest) -> tuple[PlacedEntry, ...]:
 def _unlinked(placed: PlacedEntry) -> PlacedEntry:
     """Return an entry that does not take what there is when it is linked as what it has read."""
     entry = placed.entry
-    if not computes(entry):
+    if not _computes(entry):
         return placed
     other = HistoryEntry(entry.tag, entry.operation, entry.place, entry.reads, dict(entry.writes))
     return replace(placed, entry=other)
@@ -446,7 +443,6 @@ def _reads_any(entry: HistoryEntry, cells: set[tuple[str, str]]) -> bool:
 
 
 def _find_own(changes: NetChanges) -> list[str]:
-    """Return the operations that an edit itself puts or removes."""
     again = {*changes.rerun}
     return [
         *changes.removed,
@@ -473,3 +469,98 @@ def _as_answer(error: Exception, who: str) -> Refused:
             message = f"The edit has failed in the server, with {type(error).__name__}: {error}"
             error = RefusedError("failed", message)
     return error.answer
+
+
+# -- undo, by what the store has kept of commits -------------------------------------------------------------
+
+_PLACE = attrgetter("place")
+_UNKNOWN: Final = object()
+
+
+def _find_inverse(store: Store, history: History, revision: int) -> NetChanges:
+    """Return the changes that take back a commit of a store, which has all commits of a model.
+
+    If a later commit has changed one of its operations, or what a frozen one had read, it is in conflict with
+    that (RefusedError).
+    """
+    data, replaced = store.commit_of(revision)
+    commit: CommitMessage = protocol.decode_commit(data)
+    changes = commit.changes
+    messages = store.last_commits(store.revision - revision, store.revision + 1)
+    later: list[CommitMessage] = [protocol.decode_commit(one) for one in messages]  # the newest first
+    put: list[PlacedEntry] = []
+    removed = {old.tag for old in replaced if old.blob is None}
+    gone = {*removed, *changes.moved}
+    for old in sorted(replaced, key=_PLACE):
+        _check_unchanged(history, revision, old.tag, old.tag in changes.removed, later)
+        if old.blob is not None:
+            entry = operation_from_bytes(old.blob)
+            if _computes(entry) and not _has_trace(entry):
+                _check_unread(store, history, entry, later)
+            put.append(PlacedEntry(entry, _find_anchor(history, old, put, gone)))
+    again = tuple(placed.entry.tag for placed in put if placed.entry.tag in history.entries)
+    moved = tuple(tag for tag in changes.moved if tag in again)
+    return NetChanges(tuple(put), again, (), moved, tuple(sorted(removed)))
+
+
+def _computes(entry: HistoryEntry) -> bool:
+    """Return whether an operation depends on more of what it reads than on its being there."""
+    kinds = {*entry.reads.cells.values()}
+    return _has_trace(entry) or bool(entry.reads.listings or kinds - {Read.EXISTENCE})
+
+
+def _has_trace(entry: HistoryEntry) -> bool:
+    return isinstance(entry.operation, OpaqueOperation) and entry.operation.trace is not None
+
+
+def _check_unchanged(
+    history: History, revision: int, tag: str, was_removed: bool, later: Sequence[CommitMessage]
+) -> None:
+    for one in later:
+        of = one.changes
+        if tag in of.removed or tag in of.replaced or tag in of.moved:
+            raise _conflict(one, tag, "", f"has changed {tag!r} after revision {revision}, which did so too")
+    if was_removed == (tag in history.entries):
+        raise _conflict(later[0], tag, "", f"is after another {tag!r} than that of revision {revision}")
+
+
+def _check_unread(
+    store: Store, history: History, entry: HistoryEntry, later: Sequence[CommitMessage]
+) -> None:
+    """Check that a frozen operation finds what it has read; it does not know that itself."""
+    # The value before the first commit that touched it, and that commit.
+    then: dict[Cell, tuple[Any, CommitMessage]] = {}
+    for one in later[::-1]:
+        _, replaced = store.commit_of(one.revision)
+        old: dict[Cell, Any] = {}
+        for blob in (was.blob for was in replaced if was.blob is not None):
+            old.update(operation_from_bytes(blob).writes)
+        for now in (operation_from_bytes(placed.blob) for placed in one.changes.put):
+            # What an operation wrote before it was run again is not kept.
+            unknown = _UNKNOWN if now.tag in one.changes.rerun else ABSENT
+            old.update({cell: unknown for cell in now.writes if cell not in old})
+        then.update({cell: (value, one) for cell, value in old.items() if cell not in then})
+    for cell, (value, one) in then.items():
+        how = entry.reads.cells.get(cell)
+        now = history.head[cell[0]].get(cell[1], ABSENT)
+        is_changed = how is not None and (value is _UNKNOWN or differs(how, value, now))
+        if is_changed or cell[0] in entry.reads.listings:
+            path = "/".join(cell)
+            raise _conflict(one, entry.tag, path, f"has changed {path}, from which {entry.tag!r} was made")
+
+
+def _conflict(later: CommitMessage, tag: str, path: str, what: str) -> RefusedError:
+    message = f"Revision {later.revision}, by {later.who}, {what}. Undo it first."
+    return RefusedError("conflict", message, tag, path, later.revision, later.who)
+
+
+def _find_anchor(history: History, old: Replaced, put: Sequence[PlacedEntry], gone: set[str]) -> str | None:
+    """Return the tag after which an operation goes back: that of before, else the one at its place."""
+    put_tags = {placed.entry.tag for placed in put}
+    if old.after in put_tags or (old.after in history.entries and old.after not in gone):
+        return old.after
+    if not old.after:
+        return None
+    index = bisect_left(history.sequence, old.place, key=_PLACE)
+    earlier = (entry.tag for entry in history.sequence[:index][::-1] if entry.tag not in gone)
+    return next(earlier, None)

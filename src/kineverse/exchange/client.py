@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
+from kineverse._runtime import Closing
 from kineverse._version import __version__
 from kineverse.errors import ConflictError, EditError, OfflineError
 from kineverse.formats import entries_from_bytes
@@ -44,8 +45,7 @@ _LOG = logging.getLogger(__name__)
 _OWN_COMMIT = 0.05
 """Time in which the publication of an own edit is waited for before the server is asked for it [s]."""
 
-_BACK_OFF = 0.002
-"""Longest pause after the first conflict of a repeated edit [s]."""
+_BACK_OFF = 0.002  # longest pause after the first conflict of a repeated edit [s]
 
 R = TypeVar("R")
 
@@ -86,7 +86,7 @@ def include_live(edit: Edit, source: str, prefix: str | None = None) -> list[str
     return [edit.link(entry) for entry in entries_from_bytes(joined.document, prefix)]
 
 
-class LiveModel(Model):
+class LiveModel(Model, Closing):
     """Model that a server keeps, from ``kv.load("live:NAME")``.
 
     It reads like any model and is edited like any: ``with model.edit() as edit:`` ends when the edit is
@@ -238,12 +238,6 @@ class LiveModel(Model):
         """End the connection; reading goes on. A second call has no effect, and a script need not call it."""
         self._finish()
 
-    def __enter__(self) -> LiveModel:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _check_not_edited(self) -> None:
         """Raise an EditError if this thread edits the model, which gets no commits meanwhile."""
         if self._edit is not None and self._lock.acquire(blocking=False):
@@ -261,7 +255,6 @@ class LiveModel(Model):
             self._finish_edit(connection.ask_edit(request))
 
     def _propose(self, edit: Edit, strict: bool) -> list[protocol.EditRequest]:
-        """Return an open edit as a request; none if it does nothing."""
         changes, connection = edit.net(), self.exchange
         if changes.is_empty:
             return []
@@ -285,11 +278,8 @@ class LiveModel(Model):
             if answer.reason == "stale":
                 self._close_gap()
             if answer.reason in ("conflict", "stale"):
-                named = {
-                    "tags": (answer.tag,) if answer.tag else (),
-                    "paths": (answer.path,) if answer.path else (),
-                }
-                raise ConflictError(answer.message, revision=answer.revision, who=answer.who, **named)
+                named = (filter(None, [answer.tag]), filter(None, [answer.path]))
+                raise ConflictError(answer.message, *named, answer.revision, answer.who)
             raise EditError(answer.message)
         connection = self.exchange
         first = 0.0 if self._wish.is_part else _OWN_COMMIT  # a part may have nothing of it
@@ -324,7 +314,6 @@ class LiveModel(Model):
         ).start()
 
     def _receive(self, data: bytes) -> None:
-        """Adopt a commit that was published."""
         published = protocol.decode_published(data)
         commit = protocol.decode_commit(published.commit)
         with self._following:
@@ -352,7 +341,6 @@ class LiveModel(Model):
         connection.advance(commit.revision, published.chain)
 
     def _close_gap(self) -> None:
-        """Ask for what was missed, and adopt it."""
         connection = self.exchange
         with self._following:
             while True:
@@ -412,7 +400,6 @@ class LiveModel(Model):
         connection.hear(beat)
 
     def _notice(self, sign: tuple[str, bool]) -> None:
-        """Note that a server has come or gone."""
         key, is_there = sign
         connection = self.exchange
         if is_there:

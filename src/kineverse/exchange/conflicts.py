@@ -17,8 +17,7 @@ from kineverse.model.read_recorder import ABSENT, Read, differs
 
 from .protocol import Reason, Refused
 
-KEPT: Final = 10_000
-"""Number of revisions that edits may be behind; fewer if they are of millions of values."""
+KEPT: Final = 10_000  # number of revisions that edits may be behind; fewer if they are of millions of values
 _MOST_NOTES: Final = 4_000_000
 _LONGEST_MESSAGE: Final = 1000
 

@@ -35,8 +35,7 @@ from .state import StatePublisher, StateReader
 from .store import Store
 from .transport import NoAnswerError, Transport, check_not_forked
 
-PATIENCE = 10.0
-"""Time that an edit waits for a server that went away, before it is given up [s]."""
+PATIENCE = 10.0  # time that an edit waits for a server that went away, before it is given up [s]
 _ASK_TIMEOUT = 5.0
 _PAUSE = 0.005
 _ROUTING = 0.5

@@ -21,12 +21,9 @@ from kineverse.model.commits.net_changes import NetChanges, PlacedEntry
 from kineverse.model.history import HistoryEntry
 
 PROTOCOL: Final = 1
-MAX_BYTES: Final = 1 << 26
-"""Largest message [byte]; files are sent in parts."""
-MAX_OPERATIONS: Final = 100_000
-"""Most operations in the changes of one edit."""
-MAX_LISTED: Final = 10_000
-"""Most commits in one listing."""
+MAX_BYTES: Final = 1 << 26  # largest message [byte]; files are sent in parts
+MAX_OPERATIONS: Final = 100_000  # most operations in the changes of one edit
+MAX_LISTED: Final = 10_000  # most commits in one listing
 
 Id: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{32}$", max_length=32)]
 Name: TypeAlias = Annotated[str, Meta(min_length=1, max_length=4096)]
@@ -40,8 +37,7 @@ Link: TypeAlias = Annotated[bytes, Meta(max_length=32)]
 Sha256: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", max_length=64)]
 Tags: TypeAlias = Annotated[tuple[Name, ...], Meta(max_length=MAX_OPERATIONS)]
 
-NO_CHAIN: Final = bytes(32)
-"""Digest before the first commit."""
+NO_CHAIN: Final = bytes(32)  # digest before the first commit
 
 
 class _Message(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

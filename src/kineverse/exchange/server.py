@@ -18,6 +18,7 @@ import numpy as np
 from msgspec import structs
 
 from kineverse._checks import as_entries, as_tolerance, check_flag
+from kineverse._runtime import Closing
 from kineverse._version import __version__
 from kineverse.errors import FormatError, InvalidValueError, KineverseError, UnknownNameError
 from kineverse.formats import entry_to_bytes
@@ -40,8 +41,7 @@ Source: TypeAlias = str | os.PathLike[str] | Model
 
 MOST_TOGETHER, LONGEST_WAIT = 200, 0.002
 """Most edits that are stored together, and the longest time for which waiting ones are collected [s]."""
-BEAT = 0.5
-"""Time between two signs of life [s]."""
+BEAT = 0.5  # time between two signs of life [s]
 STAGES = ("receive", "decode", "check", "fold", "encode", "persist", "publish", "answer")
 """Stages of an edit, in order; their times are in the status."""
 _COLLECTION = 5.0  # time between two collections of garbage [s]
@@ -132,7 +132,7 @@ def _include(edit: Edit, given: Sequence[Source]) -> None:
             edit.include(source)
 
 
-class Server:
+class Server(Closing):
     """Running model server, from :func:`serve`.
 
     Attributes
@@ -217,12 +217,6 @@ class Server:
                     self._drop_backup(client)
                 self._opened.close()
 
-    def __enter__(self) -> Server:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     # -- edits ---------------------------------------------------------------------------------------------
 
     def _take_edits(self, requests: Questions) -> None:
@@ -288,7 +282,6 @@ class Server:
             return []
 
     def _commit_views(self, results: Sequence[Result]) -> list[tuple[str, protocol.Published]]:
-        """Return the commits of parts, by the ids of their views."""
         made = [result.commit for result in results if result.commit is not None]
         if not made:
             return []
@@ -477,18 +470,12 @@ class Server:
 
     # -- who is there --------------------------------------------------------------------------------------
 
-    def _announce(self, announced: protocol.Announce) -> protocol.Done:
+    def _announce(self, new: protocol.Announce) -> protocol.Done:
         with self._lock:
-            if announced.endpoint:
-                self._sources[announced.source] = protocol.SourceStatus(
-                    announced.source,
-                    announced.endpoint,
-                    announced.coordinates,
-                    announced.offset,
-                    announced.client,
-                )
-            else:
-                self._sources.pop(announced.source, None)
+            self._sources.pop(new.source, None)
+            if new.endpoint:
+                about = new.source, new.endpoint, new.coordinates, new.offset, new.client
+                self._sources[new.source] = protocol.SourceStatus(*about)
         self._publish_beat()
         return protocol.Done(time.time())
 

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kineverse._checks import as_entries, as_tolerance, finite_number
+from kineverse._runtime import Closing
 from kineverse.errors import (
     DuplicateNameError,
     InvalidValueError,
@@ -39,8 +40,7 @@ from .address import UNIX_SOCKETS, Claim, check_server_name
 from .protocol import SourceStatus
 from .transport import Messages, NoAnswerError, Questions, Transport
 
-THROUGH_SERVER: Final = "server"
-"""Endpoint of sources that send through the model server only."""
+THROUGH_SERVER: Final = "server"  # endpoint of sources that send through the model server only
 
 _HEADER: Final = struct.Struct("<QQQdd")  # layout, run, number, stamp, time of sending
 _VALUE: Final = np.dtype("<f8")
@@ -49,7 +49,7 @@ _ASK_SECONDS: Final = 1.0
 _MOST_LAYOUTS: Final = 16
 
 
-class StatePublisher:
+class StatePublisher(Closing):
     """Source of state: it sends vectors of values.
 
     Parameters
@@ -187,18 +187,12 @@ class StatePublisher:
             self._claim.release()
         self._announce(self)
 
-    def __enter__(self) -> StatePublisher:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _tell(self, requests: Questions) -> None:
         for request in requests:
             request.answer(msgspec.msgpack.encode(self._layout.names))
 
 
-class StateReader:
+class StateReader(Closing):
     """Newest values of all sources that it follows, merged by coordinate.
 
     If several sources have a coordinate, the newest value by the server's time counts. Values of a source
@@ -327,12 +321,6 @@ class StateReader:
         """Read nothing more."""
         self.follow(())
         self.is_closed = True
-
-    def __enter__(self) -> StateReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _latest(self) -> list[tuple[str, _Vector]]:
         return [(name, s.latest) for name, s in self._streams.items() if s.latest is not None]

@@ -257,7 +257,6 @@ class Store:
                 raise
 
     def _write_commit(self, new: _Contents, one: StoredCommit) -> None:
-        """Write a commit after the new contents, and bring these up to date."""
         if (one.revision, one.chain) != (new.revision + 1, protocol.chain(new.chain, one.commit)):
             raise InvalidValueError(f"The commit {one.revision} does not follow revision {new.revision}.")
         files = _files_by_tag(one)
@@ -375,7 +374,6 @@ def _create(db: sqlite3.Connection) -> None:
 
 
 def _load(db: sqlite3.Connection, path: str) -> _Contents:
-    """Read the contents of a store and check all of it."""
     with _reporting(path):
         try:
             return _read(db, path)

@@ -25,8 +25,7 @@ from kineverse.errors import InvalidValueError, MissingDependencyError, OfflineE
 
 from .address import check_endpoint
 
-LEASE: Final = 1.0
-"""Time after which a process that says nothing counts as gone [s]."""
+LEASE: Final = 1.0  # time after which a process that says nothing counts as gone [s]
 
 _USER: Final = "kineverse"
 _MOST_QUESTIONS: Final = 10_000

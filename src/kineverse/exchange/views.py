@@ -55,13 +55,10 @@ from kineverse.symbols import parse_symbol_name, symbol_name
 from .protocol import NO_CHAIN, Changes, CommitMessage, Placed, Published, encode
 from .protocol import chain as link_commits
 
-Key = tuple[str, str]
-"""Cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix."""
+Key = tuple[str, str]  # cell, or ``about`` and a coordinate, ``tag`` and a tag, ``below`` and a prefix
 
-MOST_MISSED: Final = 1000
-"""Most commits that a replica catches up with; after more, it is made anew."""
-EVERY_FRAME: Final = ("",)
-"""Frames of a wish for all frames."""
+MOST_MISSED: Final = 1000  # most commits that a replica catches up with; after more, it is made anew
+EVERY_FRAME: Final = ("",)  # frames of a wish for all frames
 LOAD_THE_WHOLE: Final = "To move it, or to run it again, load the whole model; or replace it by a new one."
 
 _ABOUT, _TAG, _BELOW = "about", "tag", "below"
@@ -444,7 +441,6 @@ class Views:
         return [(view, changes) for view, changes in changed if changes is not None]
 
     def _find_keys(self, diff: Diff) -> set[Key]:
-        """Return the keys of a commit, and enter its changes into the index."""
         history = self._model.history
         keys: set[Key] = set()
         for tag in diff.tags:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -11,7 +12,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.model.body import Body, Vector3
+from kineverse.model.body import NO_BODY, Body, Vector3
 from kineverse.model.registry import FrameDeviation
 from kineverse.symbols import Symbol
 
@@ -19,7 +20,6 @@ Matrix: TypeAlias = npt.NDArray[np.float64]
 Coefficients: TypeAlias = tuple[float, ...]  # coefficients of the powers of a coordinate, constant first
 
 IDENTITY_COEFFICIENTS: Coefficients = (0.0, 1.0)
-NO_BODY = Body()
 
 
 @dataclass
@@ -35,17 +35,6 @@ class JointBounds:
     min_velocity: float = -math.inf
     max_velocity: float = math.inf
     soft: tuple[float, float] | None = None
-
-    def intersect_positions(self, lower: float, upper: float) -> None:
-        """Intersect the limits of the position with a range."""
-        self.lower, self.upper = max(self.lower, lower), min(self.upper, upper)
-
-    def intersect_velocities(self, min_velocity: float, max_velocity: float) -> None:
-        """Intersect the limits of the velocity with a range."""
-        self.min_velocity, self.max_velocity = (
-            max(self.min_velocity, min_velocity),
-            min(self.max_velocity, max_velocity),
-        )
 
     @property
     def is_unbounded(self) -> bool:
@@ -185,13 +174,11 @@ def path_between(a: str, b: str, parents: Mapping[str, str]) -> list[str]:
 
     First from ``a`` upwards, then from ``b`` upwards. Roots have no parent.
     """
-    chains: list[list[str]] = []
-    for end in (a, b):
-        chain: list[str] = []
+
+    def chain(end: str) -> Iterator[str]:
         while end in parents:
-            chain.append(end)
+            yield end
             end = parents[end]
-        chains.append(chain)
-    first, second = chains
-    common = set(first) & set(second)
-    return [name for name in (*first, *second) if name not in common]
+
+    names = Counter((*chain(a), *chain(b)))
+    return [name for name, count in names.items() if count == 1]

@@ -34,26 +34,23 @@ def read_file(path: Path) -> bytes:
 def replace_file(path: Path, content: bytes) -> None:
     """Replace a file atomically: after an error, the old file is unchanged."""
     try:
-        _replace(Path(os.path.realpath(path)), content)
+        target = Path(os.path.realpath(path))
+        if target.exists() and not target.is_file():  # a device or a pipe, which has to stay what it is
+            target.write_bytes(content)
+            return
+        # In the folder of the target, because replacement is atomic only within one file system.
+        temporary = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex}")
+        try:
+            with open(temporary, "xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            with contextlib.suppress(FileNotFoundError):
+                shutil.copymode(target, temporary)
+            os.replace(temporary, target)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
     except (OSError, ValueError) as error:  # a name with a zero byte raises a ValueError
         reason = getattr(error, "strerror", None) or error
         raise FormatError(f"{path} cannot be written: {reason}.") from None
-
-
-def _replace(target: Path, content: bytes) -> None:
-    if target.exists() and not target.is_file():  # a device or a pipe, which has to stay what it is
-        target.write_bytes(content)
-        return
-    # In the folder of the target, because replacement is atomic only within one file system.
-    temporary = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex}")
-    try:
-        with open(temporary, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        with contextlib.suppress(FileNotFoundError):
-            shutil.copymode(target, temporary)
-        os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise

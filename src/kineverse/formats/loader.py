@@ -6,7 +6,6 @@ import hashlib
 import os
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
@@ -15,7 +14,6 @@ from kineverse.errors import FormatError, InvalidValueError, KineverseError, Mis
 from kineverse.model import registry
 from kineverse.model.edit import Edit
 from kineverse.model.model import Model, Snapshot
-from kineverse.model.operation import Operation
 from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, check_loops
 from kineverse.symbols import Symbol
 
@@ -152,16 +150,24 @@ def load(
     source, given = _arguments(source, arguments)
     found = locate_model(source)
     content = _content(found)
-    remembered = _stands_alone(found, content)
+    file_format = _format(found, content)
+    reference = None if file_format is None else file_format.reference
+    stands_alone = not reference or reference not in content.replace(b"\0", b"")  # UTF-16 has two bytes
     below = _root(found, root)
     key = found, prefix, hashlib.blake2b(content).digest(), below, strict, loops
     known = _REMEMBERED.pop(key, None)
     if known is None:
         model = Model()
-        with collect_warnings() as remarks, _blaming(found.path), no_collection(), model.edit() as edit:
-            for _ in _applied(edit, found, content, prefix, below, strict, loops, given):
-                pass
-        if len(content) > LARGEST_REMEMBERED or not remembered:
+        try:
+            with collect_warnings() as remarks, no_collection(), model.edit() as edit:
+                for _ in _applied(edit, found, content, prefix, below, strict, loops, given):
+                    pass
+        except KineverseError as error:
+            is_document = found.path.name.endswith(DOCUMENT_SUFFIXES)
+            if not is_document or isinstance(error, FormatError | MissingDependencyError):
+                raise
+            raise FormatError(f"{found.path}: its operations cannot be applied: {error}") from error
+        if len(content) > LARGEST_REMEMBERED or not stands_alone:
             return model
         known = model.snapshot(), remarks
     else:
@@ -171,19 +177,6 @@ def load(
     while len(_REMEMBERED) > MOST_REMEMBERED:
         _REMEMBERED.popitem(last=False)
     return model
-
-
-@contextmanager
-def _blaming(path: Path) -> Iterator[None]:
-    """Turn the error of a document whose operations cannot be applied into a FormatError."""
-    try:
-        yield
-    except (FormatError, MissingDependencyError):
-        raise
-    except KineverseError as error:
-        if path.name.endswith(DOCUMENT_SUFFIXES):
-            raise FormatError(f"{path}: its operations cannot be applied: {error}") from error
-        raise
 
 
 def include(
@@ -206,7 +199,6 @@ def include(
 def _arguments(
     source: str | os.PathLike[str], arguments: Mapping[str, object] | None
 ) -> tuple[str | os.PathLike[str], dict[str, str]]:
-    """Return the path of a template and its arguments, of which some may follow the path."""
     given = {str(name): str(value) for name, value in (arguments or {}).items()}
     if isinstance(source, str) and ":=" in source:
         from .xacro import split_arguments  # for start-up time, as the next
@@ -230,18 +222,18 @@ def _applied(
     loops: LoopTreatment,
     arguments: Mapping[str, str],
 ) -> Iterator[str]:
-    """Apply the operations of a source, and yield their tags."""
     prefix = source.shipped if prefix is None else prefix
     file_format = _format(source, content)
     if file_format is not None:
         file = FileContent(source.path, content, prefix or None, root, strict, source.shipped, arguments)
         if file_format.exact:
-            for entry in file_format.entries(file):
+            for entry in file_format.operations(file):
                 yield edit.link(entry)
             return
         operations = file_format.operations(file)
     else:
-        operations = _build(source, prefix or None)
+        built = registry.COLLECTIONS[source.collection].operations(source.path.name, prefix or None)
+        operations = ((operation.default_tag(), operation) for operation in built)
     if file_format is None or not file_format.loop_element:
         for tag, operation in operations:
             yield edit.apply(operation, tag)
@@ -255,13 +247,6 @@ def _applied(
     yield from closures.finish()
 
 
-def _build(source: Source, prefix: str | None) -> Iterator[tuple[str, Operation]]:
-    collection = registry.find_collection(source.collection)
-    assert collection is not None  # the source was found in it
-    for operation in collection.operations(source.path.name, prefix):
-        yield operation.default_tag(), operation
-
-
 def _root(source: Source, root: str | os.PathLike[str] | None) -> str:
     if source.collection:
         return NOWHERE if root is None else find_root(NOWHERE, root)
@@ -273,18 +258,9 @@ def _content(source: Source) -> bytes:
 
 
 def _format(source: Source, content: bytes) -> FileFormat | None:
-    """Return the format of a file; None for a model of a collection, which has no file."""
     if source.collection:
         return None
     file_format = registry.find_format(source.path.name, content)
     if file_format is None:
         raise unsupported_format_error(source.path)
     return file_format
-
-
-def _stands_alone(source: Source, content: bytes) -> bool:
-    """Return whether a model follows from its file alone, and not from files that it refers to."""
-    file_format = _format(source, content)
-    if file_format is None or not file_format.reference:
-        return True
-    return file_format.reference not in content.replace(b"\0", b"")  # UTF-16 has two bytes a letter

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 
 from kineverse import shipped
-from kineverse.errors import FormatError, UnknownNameError, suggest
+from kineverse.errors import FormatError, UnknownNameError, list_some, suggest
 from kineverse.model import registry
 
 from .root_folder import split_path_variable
@@ -61,11 +61,8 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
         If the name is no text or path, or no regular file.
     """
     if not isinstance(name, (str, os.PathLike)):
-        hint = (
-            " Bytes are read by kv.formats.from_bytes."
-            if isinstance(name, (bytes, bytearray, memoryview))
-            else ""
-        )
+        are_bytes = isinstance(name, (bytes, bytearray, memoryview))
+        hint = " Bytes are read by kv.formats.from_bytes." if are_bytes else ""
         raise FormatError(
             "A model is loaded by its name or from the path of a file, "
             f"not from {_shown(repr(name))[1:-1]}.{hint}"
@@ -74,20 +71,17 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     if text in shipped_models():
         return Source(shipped.FOLDER / f"{text}.urdf", text)
     group, _, member = text.partition("/")
-    collection = registry.find_collection(group)
+    collection = registry.COLLECTIONS.get(group)
     if collection is not None and collection.has(member):
         document = collection.document(member)
         prefix = collection.prefix or member
         return Source(Path(text), prefix, group) if document is None else Source(document, prefix)
-    if text.lstrip().startswith("<"):
+    if text.lstrip().startswith(("<", "{")):
+        is_document = text.lstrip().startswith("{")
+        advice = ", model.kv.json." if is_document else "; 'kineverse.formats.urdf.parse_urdf' reads text."
         raise UnknownNameError(
-            "This looks like the text of a description, where the name or path of a model is expected. "
-            "Write it to a file; 'kineverse.formats.urdf.parse_urdf' reads text."
-        )
-    if text.lstrip().startswith("{"):
-        raise UnknownNameError(
-            "This looks like the text of a document, where the name or path of a model is expected. "
-            "Write it to a file, model.kv.json."
+            f"This looks like the text of a {'document' if is_document else 'description'}, where the name "
+            f"or path of a model is expected. Write it to a file{advice}"
         )
     path = _expanded(text)
     if _is(path, Path.is_file):
@@ -163,11 +157,8 @@ def _only(found: list[str], name: str, folder: Path) -> str:
     top = min(f.count("/") for f in found)
     found = sorted(f for f in found if f.count("/") == top)
     if len(found) > 1:
-        more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
-        choices = ", ".join(map(repr, found[:_LISTED]))
-        raise UnknownNameError(
-            f"{name!r} is ambiguous in {folder}: {choices}{more}. Give one of these paths."
-        )
+        choices = list_some(map(repr, found), _LISTED)
+        raise UnknownNameError(f"{name!r} is ambiguous in {folder}: {choices}. Give one of these paths.")
     return found[0]
 
 
@@ -184,9 +175,8 @@ def _alike(name: str, files: list[str]) -> list[str]:
     ends = Counter(_end(p) for p in paths)
     # Folders are left out if the last part of the path is unique.
     shown = {p: _end(p) if ends[_end(p)] == 1 else p for p in paths} | {s: s for s in shipped_models()}
-    for group in registry.list_collections():
-        collection = registry.find_collection(group)
-        if collection is not None and not collection.accept:
+    for group, collection in registry.COLLECTIONS.items():
+        if not collection.accept:
             shown |= {f"{group}/{member}": f"{group}/{member}" for member in collection.names()}
     last = {_end(p).casefold() for p in shown}
     alike = sorted(end for end in last if sorted(end) == sorted(wanted))  # 'hrs', too short to be alike
@@ -213,19 +203,15 @@ def _missing_places() -> str:
 
 
 def _more_robots(searched: list[str]) -> str:
-    ways = (
-        ("example-robot-data", "install robots with 'pip install example-robot-data'"),
-        (
-            "robot_descriptions",
-            "fetch one with 'robot_descriptions pull NAME' (pip install robot_descriptions)",
-        ),
-    )
-    left = [way for place, way in ways if not any(entry.startswith(place) for entry in searched)]
+    ways = {
+        "example-robot-data": "install robots with 'pip install example-robot-data'",
+        "robot_descriptions": "fetch one by 'robot_descriptions pull NAME' (pip install robot_descriptions)",
+    }
+    left = [way for place, way in ways.items() if not any(entry.startswith(place) for entry in searched)]
     return "".join(f", or {way}" for way in left)
 
 
 def _path_hint(path: Path) -> str:
-    """Return a hint about a path that is no file: the models in that folder, or similar files next to it."""
     if _is(path, Path.is_dir):
         inside = [p.relative_to(path).as_posix() for p in islice(_files(path, 2), _LISTED)]
         return f" It is a folder; models in it: {', '.join(inside) or 'none'}."

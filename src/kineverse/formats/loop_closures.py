@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import FormatError, KineverseError, NoSolutionError
+from kineverse.errors import FormatError, KineverseError, NoSolutionError, list_some
 from kineverse.expressions.expression import Expression, array
 from kineverse.loops.close_loop import APART, CloseLoop, LoopConstraint
 from kineverse.loops.equations import residual_rows
@@ -122,7 +122,8 @@ class LoopClosures:
                     if now is not None and abs(now - value) > _MOVED:
                         moved[symbol] = value, now
         if moved:
-            warn(self._format_moved(moved))
+            shown = list_some((f"'{s}' from {a:.6g} to {b:.6g}" for s, (a, b) in moved.items()), _SHOWN)
+            warn([f"{self.source}: its home is moved to where limits and loops hold: {shown}."])
 
     def _close_home(self, moved: dict[Symbol, tuple[float, float]]) -> Iterator[str]:
         """Move the home of coordinates to where kept loops close; add old and new values to ``moved``."""
@@ -147,7 +148,6 @@ class LoopClosures:
         moved |= {s: ends for s, ends in changed.items() if abs(ends[1] - ends[0]) > _MOVED}
 
     def _at_home(self, symbol: Symbol, state: State) -> float | None:
-        """Return the value of a coordinate at the default state; None if a loop does not close there."""
         if symbol in state:
             return state[symbol]
         follows = self.model.rates.dependent.get(symbol)
@@ -156,26 +156,14 @@ class LoopClosures:
         except NoSolutionError:
             return None
 
-    def _format_moved(self, moved: dict[Symbol, tuple[float, float]]) -> list[str]:
-        listed = [f"'{s}' from {a:.6g} to {b:.6g}" for s, (a, b) in list(moved.items())[:_SHOWN]]
-        more = f" and {len(moved) - _SHOWN} more" if len(moved) > _SHOWN else ""
-        return [
-            f"{self.source}: its home is moved to where limits and loops hold: {', '.join(listed)}{more}."
-        ]
-
     def _moving_rows(self, loop: CloseLoop) -> tuple[str, ...]:
         """Return the mask of a loop without rows that are constant and zero but for rounding in the file."""
         all_rows = self._rows(loop)
-        constant = [
-            axis
-            for axis in loop.mask
-            if not any(rows[axis].symbols for rows in all_rows)
-            and APART < max(abs(float(rows[axis])) for rows in all_rows) <= CLOSED
-        ]
-        return tuple(axis for axis in loop.mask if axis not in constant)
+        still = [axis for axis in loop.mask if not any(rows[axis].symbols for rows in all_rows)]
+        gaps = {axis: max(abs(float(rows[axis])) for rows in all_rows) for axis in still}
+        return tuple(axis for axis in loop.mask if not APART < gaps.get(axis, 0.0) <= CLOSED)
 
     def _rows(self, loop: CloseLoop) -> list[dict[str, Expression]]:
-        """Return the rows of the residual by name, for each pair of frames."""
         rates = self.model.rates
         return [
             residual_rows(rates.resolve(self.model.fk(frame, to)), loop.mask)

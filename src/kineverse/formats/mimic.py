@@ -28,7 +28,6 @@ class MimicRelation(Struct, Generic[K], frozen=True):
 def resolve_mimic_chains(
     following: Mapping[K, MimicRelation[K]],
     refuse: Callable[[K, str], None],
-    shown: Callable[[K], str] = str,
     check: Callable[[K, K], bool] | None = None,
 ) -> dict[K, MimicRelation[K]]:
     """Return the relation of each follower to the independent end of its chain, with composed factors."""
@@ -40,7 +39,7 @@ def resolve_mimic_chains(
         while last in following and last not in resolved and last not in free:
             step = chain[last] = following[last]
             if step.leader in chain:
-                circle = " -> ".join(quote(shown(name)) for name in list(chain)[:8])
+                circle = " -> ".join(quote(str(name)) for name in list(chain)[:8])
                 refuse(
                     last,
                     "it mimics itself"

@@ -39,18 +39,9 @@ def _cached_pose(key: bytes) -> Pose:
     cy, sy = snap(math.cos(yaw)), snap(math.sin(yaw))
     return Pose(
         (
-            snap(cy * cp),
-            snap(cy * sp * sr - sy * cr),
-            snap(cy * sp * cr + sy * sr),
-            x,
-            snap(sy * cp),
-            snap(sy * sp * sr + cy * cr),
-            snap(sy * sp * cr - cy * sr),
-            y,
-            snap(-sp),
-            snap(cp * sr),
-            snap(cp * cr),
-            z,
+            *(snap(cy * cp), snap(cy * sp * sr - sy * cr), snap(cy * sp * cr + sy * sr), x),
+            *(snap(sy * cp), snap(sy * sp * sr + cy * cr), snap(sy * sp * cr - cy * sr), y),
+            *(snap(-sp), snap(cp * sr), snap(cp * cr), z),
         )
     )
 
@@ -75,18 +66,9 @@ def pose_from_quaternion(xyz: tuple[float, ...], xyzw: tuple[float, ...]) -> Pos
     x, y, z = xyz
     return Pose(
         (
-            snap(1.0 - 2.0 * (b * b + c * c)),
-            snap(2.0 * (a * b - c * w)),
-            snap(2.0 * (a * c + b * w)),
-            x,
-            snap(2.0 * (a * b + c * w)),
-            snap(1.0 - 2.0 * (a * a + c * c)),
-            snap(2.0 * (b * c - a * w)),
-            y,
-            snap(2.0 * (a * c - b * w)),
-            snap(2.0 * (b * c + a * w)),
-            snap(1.0 - 2.0 * (a * a + b * b)),
-            z,
+            *(snap(1.0 - 2.0 * (b * b + c * c)), snap(2.0 * (a * b - c * w)), snap(2.0 * (a * c + b * w)), x),
+            *(snap(2.0 * (a * b + c * w)), snap(1.0 - 2.0 * (a * a + c * c)), snap(2.0 * (b * c - a * w)), y),
+            *(snap(2.0 * (a * c - b * w)), snap(2.0 * (b * c + a * w)), snap(1.0 - 2.0 * (a * a + b * b)), z),
         )
     )
 

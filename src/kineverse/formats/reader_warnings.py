@@ -8,6 +8,8 @@ from contextvars import ContextVar
 
 from msgspec import Struct, field
 
+from kineverse.errors import FormatError
+
 from .xml_reader import Element, ElementError, label
 
 _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
@@ -47,6 +49,20 @@ class ReaderWarnings(Struct):
         owner = owner or element
         of = "" if owner is element else f"{label(element)} "
         self.fault(element[3], f"{label(owner)}: {of}{mistake.message.rstrip('. ')}; {taken}.")
+
+    @contextmanager
+    def passing_over(self, owner: Element | None = None) -> Iterator[None]:
+        """Warn about a mistake in the block, whose element is passed over."""
+        try:
+            yield
+        except ElementError as mistake:
+            self.repair(mistake, "it is passed over", owner)
+
+    def mistake(self, line: int, text: str, taken: str) -> None:
+        """Add a warning about a mistake in a line, with what is done instead; an error if strict."""
+        if self.strict:
+            raise FormatError(f"{self.source}, line {line}, {text}")
+        self.fault(line, f"{text.rstrip('.')}; {taken}.")
 
     def fault(self, line: int, text: str, kind: type[Fault] = Fault) -> None:
         """Add a warning about a mistake in a line."""

@@ -11,16 +11,17 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 from urllib.parse import unquote, urlsplit
 
-from msgspec import Struct, field, structs
+from msgspec import Struct, field
 
 from kineverse.errors import FormatError
-from kineverse.model.body import Body, Mesh, Shape
+from kineverse.model.body import Mesh
 
 from .reader_warnings import warn
 from .root_folder import (
@@ -104,7 +105,7 @@ def find_package(name: str, folder: Folder, root: str, inside: str = "") -> tupl
         raise FormatError(f"{quote(name)} is no name of a package.")
     log = _SearchLog()
     for package in _folders_of(name, Path(folder), (), log, root):
-        if log.trusted or _may_open(package, root, package):
+        if log.trusted or may_open(package, root, package=package):
             return package, False
     here = Path(folder).absolute()
     for place in (here, *here.parents) if inside and not log.outside else ():
@@ -117,11 +118,6 @@ def find_package(name: str, folder: Folder, root: str, inside: str = "") -> tupl
     if log.outside:
         raise outside_root_error(name, root)
     raise FormatError(_not_found_message(f"$(find {name})", name, "", log))
-
-
-def may_open(path: Folder, root: str, folder: Folder) -> bool:
-    """Return True if a description in a folder, with a root, may open a path."""
-    return _may_open(path, root, folder=folder)
 
 
 def model_paths() -> Iterator[tuple[str, Path]]:
@@ -157,7 +153,7 @@ def _locate_packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folde
                 path = package.joinpath(*parts)
                 if not os.path.isfile(path):
                     continue
-                if log.trusted or root is None or _may_open(path, root, package):
+                if log.trusted or root is None or may_open(path, root, package=package):
                     return path
                 raise outside_root_error(uri, root)
             log.without_file.append(package)
@@ -183,7 +179,7 @@ def _find_substitute(name: str, insides: list[list[str]], folder: Path, root: st
             break
         for parts in insides:
             path = place.joinpath(*parts)
-            if parts and os.path.isfile(path) and (root is None or _may_open(path, root, folder=folder)):
+            if parts and os.path.isfile(path) and (root is None or may_open(path, root, folder)):
                 if (name, str(place)) not in _said:
                     _said.add((name, str(place)))
                     warn(
@@ -208,14 +204,17 @@ class RealPaths(dict[str, str]):
         return os.path.realpath(file) if os.path.islink(file) else file
 
 
-def _may_open(
+def may_open(
     path: Folder,
     root: str,
-    package: Path | None = None,
     folder: Folder = "",
+    package: Path | None = None,
     real: RealPath = os.path.realpath,
 ) -> bool:
-    """Return True if a path leads into the root, its package, ``../meshes``, or a folder of a variable."""
+    """Return whether a path leads into the root, the package, or a folder that is allowed for all.
+
+    Those are ``../meshes`` of the description's folder, and the folders in environment variables.
+    """
     place = real(path)
     return any(is_below(place, allowed) for allowed in _allowed_folders(root, package, folder))
 
@@ -227,7 +226,7 @@ def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterato
         yield os.path.realpath(package)
     yield from mesh_folders(folder, root)
     yield from declared_roots()
-    yield from declared_folders()
+    yield from map(os.path.realpath, named_folders())
 
 
 def find_root_violation(
@@ -241,29 +240,20 @@ def find_root_violation(
         return _outside_package(uri, folder, root, real) if scheme.lower() in ("package", "model") else None
     if root == NOWHERE and not colon and not os.path.isabs(uri):
         return None  # a text without a folder: relative paths lead nowhere
-    path = (
-        Path(folder).absolute() / unquote(rest.removeprefix("localhost"))
-        if colon
-        else Path(folder).absolute() / uri
-    )
-    if "\0" in uri or _may_open(path, root, folder=folder, real=real):
+    path = Path(folder).absolute() / (unquote(rest.removeprefix("localhost")) if colon else uri)
+    if "\0" in uri or may_open(path, root, folder, real=real):
         return None
     return outside_root_error(uri, root)
 
 
 def _outside_package(uri: str, folder: Folder, root: str, real: RealPath) -> FormatError | None:
-    """Return the error for a package that is only found from a folder outside of the root."""
-    if root == NOWHERE or _may_open(folder, root, real=real):
+    if root == NOWHERE or may_open(folder, root, real=real):
         return None
     for bound in (root, None):
-        try:
+        with suppress(FormatError):
             locate_resource(uri, folder, root=bound)
-        except FormatError:
-            if bound is None:
-                return None  # there is no such package
-        else:
-            break
-    return None if bound is not None else outside_root_error(uri, root)
+            return None if bound is not None else outside_root_error(uri, root)
+    return None  # there is no such package
 
 
 def named_folders() -> Iterator[str]:
@@ -272,11 +262,6 @@ def named_folders() -> Iterator[str]:
         for variable in variables:
             for place in split_path_variable(variable):
                 yield os.path.abspath(os.path.join(place, inside))
-
-
-def declared_folders() -> Iterator[str]:
-    """Yield the real paths of the folders of packages and models in environment variables."""
-    return map(os.path.realpath, named_folders())
 
 
 def _inside(uri: str, text: str) -> list[str]:
@@ -292,7 +277,6 @@ def _inside(uri: str, text: str) -> list[str]:
 
 
 def _not_found_message(uri: str, name: str, inside: str, log: _SearchLog) -> str:
-    """Return the error message: on the first line what is missing, then the folders searched, one a line."""
     if log.without_file:
         places = [str(path) for path in dict.fromkeys(log.without_file)]
         return f"{quote(uri)}: package {quote(name)} has no file {quote(inside)}. It is at:{_lines(places)}"
@@ -320,7 +304,7 @@ def _folders_of(
             yield from _packages_below(place).get(name, ())
     for variable in _PREFIXES:
         for place in _paths_in(variable, log):
-            yield from _existing((place / "share" / name, place / name / "share" / name))
+            yield from filter(os.path.isdir, (place / "share" / name, place / name / "share" / name))
     for variable in _MODELS:
         for place in _paths_in(variable, log):
             yield from _at_or_in(place, name)
@@ -347,7 +331,7 @@ def counts_as_package(package: Path, folder: Path, root: str) -> bool:
     real, here = os.path.realpath(package), os.path.realpath(folder)
     if is_below(real, root):
         return True
-    if not _may_open(here, root):
+    if not may_open(here, root):
         return False
     if any(os.path.isfile(os.path.join(real, mark)) for mark in _MARKS):
         return True
@@ -365,18 +349,12 @@ def _at_or_in(place: Path, name: str) -> Iterator[Path]:
     """Yield the folder ``place`` if it is the package, and the package directly inside of it."""
     if place.name == name or _manifest_name(place) == name:
         yield place
-    yield from _existing((place / name,))
-
-
-def _existing(places: Iterable[Path]) -> Iterator[Path]:
-    for place in places:
-        if os.path.isdir(place):  # False, and no error, for a name that is too long
-            yield place
+    if os.path.isdir(place / name):  # False, and no error, for a name that is too long
+        yield place / name
 
 
 @lru_cache(maxsize=4096)
 def _manifest_name(folder: Path) -> str | None:
-    """Return the name in a folder's ROS manifest, None without one."""
     try:
         with (folder / "package.xml").open(encoding="utf-8", errors="replace") as manifest:
             match = re.search(r"<name>\s*([^<\s]+)\s*</name>", manifest.read(1 << 16))
@@ -444,7 +422,7 @@ def _locate_plain(uri: str, text: str, folder: Folder, search: Sequence[Folder],
     for candidate in tried:
         # No file outside is touched, not even to see if it exists.
         restricted = root if candidate is tried[0] and "\0" not in text else None
-        if restricted is not None and not _may_open(candidate, restricted, folder=folder):
+        if restricted is not None and not may_open(candidate, restricted, folder):
             left = True
         elif os.path.isfile(candidate):  # False, and no error, for a name that is too long
             return candidate
@@ -453,25 +431,6 @@ def _locate_plain(uri: str, text: str, folder: Folder, search: Sequence[Folder],
     where = [str(candidate) for candidate in dict.fromkeys(tried)]
     hint = "" if path.is_absolute() else " Paths are relative to the folder of the description."
     raise FormatError(f"{quote(text)}: there is no such file.{hint} Looked for:{_lines(where)}")
-
-
-def restrict_meshes(body: Body, root: str, where: str) -> Body:
-    """Return a body whose meshes are restricted to a root; warn about meshes outside of it."""
-
-    def shape(given: Shape) -> Shape:
-        mesh = given.geometry
-        if not isinstance(mesh, Mesh):
-            return given
-        wrong = find_root_violation(mesh.uri, mesh.folder, root)
-        if wrong is not None:
-            warn([f"{where}: names the mesh {wrong}"])
-        return structs.replace(given, geometry=structs.replace(mesh, root=root))
-
-    if not any(isinstance(given.geometry, Mesh) for given in (*body.visuals, *body.collisions)):
-        return body
-    return structs.replace(
-        body, visuals=tuple(map(shape, body.visuals)), collisions=tuple(map(shape, body.collisions))
-    )
 
 
 RemarkCallback = Callable[[str], None]

@@ -23,7 +23,8 @@ from kineverse.model.history import HistoryEntry
 from kineverse.model.operation import BODIES
 
 from .files import replace_file
-from .resource_paths import locate_mesh
+from .reader_warnings import warn
+from .resource_paths import find_root_violation, locate_mesh
 from .root_folder import NOWHERE
 
 
@@ -90,6 +91,18 @@ def map_meshes(body: Body, change: Callable[[Mesh], Mesh]) -> Body:
 
     visuals = shapes(body.visuals)
     return replace(body, visuals=visuals, collisions=shapes(body.collisions))
+
+
+def restrict_meshes(body: Body, root: str, where: str) -> Body:
+    """Return a body whose meshes are restricted to a root; warn about meshes outside of it."""
+
+    def restrict(mesh: Mesh) -> Mesh:
+        wrong = find_root_violation(mesh.uri, mesh.folder, root)
+        if wrong is not None:
+            warn([f"{where}: names the mesh {wrong}"])
+        return replace(mesh, root=root)
+
+    return map_meshes(body, restrict) if meshes_of(body) else body
 
 
 def without_places(body: Body) -> Body:

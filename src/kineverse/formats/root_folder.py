@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TypeAlias
 
 from kineverse.errors import FormatError
@@ -104,11 +103,8 @@ def _enclosing(folder: str) -> str:
             return path
         if not package and any(os.path.isfile(os.path.join(path, name)) for name in _PACKAGE):
             package = path
-        if (not package or path == os.path.dirname(package)) and _is_python(path):
-            package = path  # that of the outermost folder: those below it are its parts
+        if not package or path == os.path.dirname(package):
+            if os.path.isfile(os.path.join(path, _PYTHON)):
+                package = path  # that of the outermost folder: those below it are its parts
         path = os.path.dirname(path)
     return package
-
-
-def _is_python(folder: str) -> bool:
-    return (Path(folder) / _PYTHON).is_file()

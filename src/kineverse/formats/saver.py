@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from kineverse._checks import real_number
+from kineverse._checks import finite_number
 from kineverse.errors import FormatError, InvalidValueError
 from kineverse.model import registry
 from kineverse.model.model_view import ModelView
@@ -46,7 +45,9 @@ def save(
         write = registry.import_entry(file_format.write)
         written: WrittenFile = write(model, target, leave_out, _checked(tolerance), strict)
     except FormatError as error:
-        raise _named(target, error) from None
+        if str(error).startswith(f"{target.name} "):
+            raise
+        raise FormatError(f"{target.name} is not written. {error}") from None
     _put(target, written)
     warn(f"{target.name}: {remark}" for remark in written.remarks)
     return SaveResult(target, written.remarks, written.errors, dict(written.left_out))
@@ -92,19 +93,10 @@ def _check(target: Path) -> FileFormat:
 
 
 def _checked(tolerance: object) -> float | None:
-    try:
-        if tolerance is None or 0 < real_number(tolerance) < math.inf:
-            return None if tolerance is None else real_number(tolerance)
-    except (TypeError, ValueError, OverflowError):
-        pass
+    number = finite_number(tolerance)
+    if tolerance is None or (number is not None and number > 0):
+        return number
     raise InvalidValueError(f"A tolerance is a positive number [m] and [rad], or None, not {tolerance!r}.")
-
-
-def _named(target: Path, error: FormatError) -> FormatError:
-    text = str(error)
-    return (
-        error if text.startswith(f"{target.name} ") else FormatError(f"{target.name} is not written. {text}")
-    )
 
 
 def _target(path: Any) -> Path:

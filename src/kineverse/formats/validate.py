@@ -21,12 +21,12 @@ from kineverse.model.sampling import StateSamples
 from kineverse.state import State
 
 from .document import OpaqueOperation
+from .file_formats import is_mjcf
 from .files import read_file
 from .loader import load
 from .locate import Source, locate_model
 from .reader_warnings import Fault, collect_warnings
 from .resource_paths import locate_mesh
-from .xml_reader import read_root_tag
 
 SAMPLED_STATES = 32  # number of random states within the limits in which poses and loops are checked
 
@@ -64,7 +64,6 @@ def find_problems(model: ModelView, meshes: bool = True) -> Iterator[ModelProble
 
 
 def _find_limit_problems(model: ModelView) -> Iterator[ModelProblem]:
-    """Yield the constraints that the default state violates, and those with crossed bounds there."""
     state = model.default_state()
     crossed = set()
     varying = {name: c for name, c in model.constraints.items() if c.lower.symbols or c.upper.symbols}
@@ -281,13 +280,12 @@ def detect_format(source: Source) -> str:
     if source.collection:
         return f"model of the collection '{source.collection}'"
     if source.path.name.endswith(".xml"):
-        return "MJCF" if read_root_tag(read_file(source.path)).startswith("mujoco") else "URDF"
+        return "MJCF" if is_mjcf(source.path.name, read_file(source.path)) else "URDF"
     endings = (name for name in _FORMATS if source.path.name.endswith(name))
     return _FORMATS.get(next(endings, ""), "")
 
 
 def _document_header(source: Source) -> dict[str, int | str]:
-    """Return the version of a document, and its hash if it has one; the reader has checked both."""
     if source.collection or not source.path.name.endswith(".kv.json"):
         return {}
     head = json.loads(read_file(source.path))

@@ -90,22 +90,13 @@ def parse_arguments(words: Iterable[str]) -> dict[str, str]:
 
 _FORBIDDEN_NODES = (ast.Lambda, ast.NamedExpr, ast.Await, ast.Yield, ast.YieldFrom)
 _INNER_TYPES = (
-    types.FrameType,
-    types.CodeType,
-    types.TracebackType,
-    types.GeneratorType,
-    types.CoroutineType,
-    types.AsyncGeneratorType,
+    *(types.FrameType, types.CodeType, types.TracebackType),
+    *(types.GeneratorType, types.CoroutineType, types.AsyncGeneratorType),
 )
 # By name rather than by prefix, because data have keys such as f_max.
-_FORBIDDEN_ATTRIBUTES = frozenset(
-    (
-        "format",
-        "format_map",
-        "mro",
-        *(name for kind in _INNER_TYPES for name in dir(kind) if "_" in name and not name.startswith("_")),
-    )
-)
+_FORBIDDEN_ATTRIBUTES = {"format", "format_map", "mro"} | {
+    name for kind in _INNER_TYPES for name in dir(kind) if "_" in name and not name.startswith("_")
+}
 _FORBIDDEN_FUNCTIONS = ("type", "vars")
 
 
@@ -176,15 +167,10 @@ class _Expansion:
     def where(self) -> str:
         file, line = getattr(self._failed, "place", (self._path, 0))
         tag = getattr(self._failed, "tagName", "")
-        parts = [
-            os.path.basename(file),
-            f"line {line}" if line else "",
-            f"<{abbreviate(tag)}>" if tag else "",
-        ]
+        parts = os.path.basename(file), line and f"line {line}", tag and f"<{abbreviate(tag)}>"
         return ", ".join(part for part in parts if part)
 
     def check_arguments(self, given: Mapping[str, str], used: set[str]) -> None:
-        """Raise an error for arguments that the template neither declares nor uses."""
         self._failed = None
         unknown = [name for name in given if name not in self._declared | used]
         if unknown:
@@ -298,14 +284,8 @@ class _Expansion:
 
         expatbuilder.ExpatBuilderNS.start_element_handler = start_with_place  # type: ignore[assignment, method-assign]
         minidom._clone_node = clone_with_place  # type: ignore[attr-defined]
-        for name in (
-            "check_attrs",
-            "grab_property",
-            "grab_macro",
-            "process_include",
-            "handle_macro_call",
-            "eval_all",
-        ):
+        functions = "check_attrs grab_property grab_macro process_include handle_macro_call eval_all"
+        for name in functions.split():
             setattr(xacro, name, self._noting(getattr(xacro, name)))
 
     def _noting(self, function: Callable[..., Any]) -> Callable[..., Any]:

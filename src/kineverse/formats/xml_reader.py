@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable
 from typing import NoReturn, TypeAlias
 from xml.parsers import expat
+from xml.parsers.expat import errors
 
 from kineverse.errors import FormatError
 
@@ -40,6 +41,12 @@ class ElementError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         return ElementError, (self.element, self.message)
+
+    def located(self, source: str, owner: Element | None = None) -> FormatError:
+        """Return the error with its file and line; the element is ``owner`` or a part of it."""
+        part = "" if owner in (None, self.element) else f"{label(self.element)} "
+        where = f"{source}, line {self.element[3]}, {label(owner or self.element)}"
+        return FormatError(f"{where}: {part}{self.message}")
 
 
 def parse_xml(
@@ -268,45 +275,33 @@ def abbreviate(text: str, limit: int = 80) -> str:
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
-_CODES = expat.errors.codes
-_CUT_OFF = {_CODES[m] for m in (expat.errors.XML_ERROR_NO_ELEMENTS, expat.errors.XML_ERROR_UNCLOSED_TOKEN)}
-_DECLARATION = {_CODES[m] for m in (expat.errors.XML_ERROR_XML_DECL, expat.errors.XML_ERROR_MISPLACED_XML_PI)}
+_CUT_OFF = (errors.XML_ERROR_NO_ELEMENTS, errors.XML_ERROR_UNCLOSED_TOKEN)
+_DECLARATION = (errors.XML_ERROR_XML_DECL, errors.XML_ERROR_MISPLACED_XML_PI)
 _HINTS = {
-    _CODES[
-        expat.errors.XML_ERROR_XML_DECL
-    ]: 'The first line must read <?xml version="1.0"?>, or be left out.',
-    _CODES[expat.errors.XML_ERROR_MISPLACED_XML_PI]: (
+    errors.XML_ERROR_XML_DECL: 'The first line must read <?xml version="1.0"?>, or be left out.',
+    errors.XML_ERROR_MISPLACED_XML_PI: (
         "Nothing, not even an empty line, may come before <?xml ...?>: remove what does."
     ),
-    _CODES[expat.errors.XML_ERROR_UNDEFINED_ENTITY]: (
-        "Only &lt; &gt; &amp; &quot; &apos; and character numbers are known."
-    ),
-    _CODES[
-        expat.errors.XML_ERROR_INVALID_TOKEN
-    ]: "A character is where none can be; & and < are written &amp; and &lt;.",
-    _CODES[expat.errors.XML_ERROR_TAG_MISMATCH]: "The closing tag is not that of the element.",
-    _CODES[expat.errors.XML_ERROR_DUPLICATE_ATTRIBUTE]: "Keep one of the two attributes.",
-    _CODES[
-        expat.errors.XML_ERROR_JUNK_AFTER_DOC_ELEMENT
-    ]: "Remove what comes after the end of the root element.",
-    _CODES[expat.errors.XML_ERROR_UNKNOWN_ENCODING]: "Save the file as UTF-8.",
+    errors.XML_ERROR_UNDEFINED_ENTITY: "Only &lt; &gt; &amp; &quot; &apos; and character numbers are known.",
+    errors.XML_ERROR_INVALID_TOKEN: ("A character is where none can be; & and < are written &amp; and &lt;."),
+    errors.XML_ERROR_TAG_MISMATCH: "The closing tag is not that of the element.",
+    errors.XML_ERROR_DUPLICATE_ATTRIBUTE: "Keep one of the two attributes.",
+    errors.XML_ERROR_JUNK_AFTER_DOC_ELEMENT: "Remove what comes after the end of the root element.",
+    errors.XML_ERROR_UNKNOWN_ENCODING: "Save the file as UTF-8.",
 }
 
 
 def _describe(error: expat.ExpatError, source: str, document: list[Element], depth: int) -> str:
-    """Return the error message for text that is not XML: line, open element, reason, remedy."""
     innermost: Element | None = None
     children = document
     for _ in range(depth):
         innermost = children[-1]
         children = innermost[2]
+    reason = expat.ErrorString(error.code)
     if innermost is not None:
         inside = f", in {label(innermost)} of line {innermost[3]}"
     else:
-        inside = "" if document else ", <?xml ...?>" if error.code in _DECLARATION else ", before any element"
-    if error.code in _CUT_OFF:
-        hint = "The text is cut off."
-    else:
-        hint = _HINTS.get(error.code, "" if document else "Is this XML at all?")
+        inside = "" if document else ", <?xml ...?>" if reason in _DECLARATION else ", before any element"
+    unknown = "The text is cut off." if reason in _CUT_OFF else "" if document else "Is this XML at all?"
     where = f"{source}, line {error.lineno}, column {error.offset + 1}{inside}"
-    return f"{where}: not well-formed XML: {expat.ErrorString(error.code)}. {hint}".rstrip()
+    return f"{where}: not well-formed XML: {reason}. {_HINTS.get(reason, unknown)}".rstrip()

@@ -96,7 +96,6 @@ def _hint(text: str) -> str:
 T = TypeVar("T")
 
 _ZERO = (0.0, 0.0, 0.0)
-_IDENTITY = Pose()
 
 
 def read_attribute_number(element: Element, key: str, default: float | None = None) -> float:
@@ -118,9 +117,8 @@ def read_attribute_vector(
     if text is None:
         return _require_default(element, key, default)
     try:
-        if turns:
-            return parse_directions(text, 3)  # type: ignore[return-value]  # as many as asked for
-        return parse_numbers(text, 3)  # type: ignore[return-value]  # as many as asked for
+        x, y, z = parse_directions(text, 3) if turns else parse_numbers(text, 3)
+        return x, y, z
     except ValueError as error:
         raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
 
@@ -150,7 +148,7 @@ def read_origin(
     URDF 1.1 introduced ``quat_xyzw`` as an alternative to ``rpy``; in a file of version 1.0 it is ignored.
     """
     if origin is None:
-        return _IDENTITY
+        return poses.IDENTITY
     xyz = _read_origin_vector(origin, "xyz", owner, remarks)
     quaternion = origin[1].get("quat_xyzw")
     if quaternion is not None and version < (1, 1):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kineverse.expressions.expression import Expression
 from kineverse.symbols import Symbol
@@ -15,12 +15,9 @@ from .operation import Operation, Writes
 from .rates import RateRow
 from .read_recorder import ReadRecorder
 
-if TYPE_CHECKING:
-    pass
-
 
 @dataclass(frozen=True)
-class SetBody(Operation, document_kind="SetBody"):
+class SetBody(Operation, document_kind="SetBody", tag="body"):
     """Assignment of a body to a frame: visual and collision shapes, and inertia."""
 
     name: str
@@ -32,13 +29,9 @@ class SetBody(Operation, document_kind="SetBody"):
             model.frames[self.name]  # raises, with similar names
         return Writes(bodies={self.name: self.body})
 
-    def default_tag(self) -> str:
-        """Return ``body`` and the name of the frame."""
-        return f"body {self.name}"
-
 
 @dataclass(frozen=True)
-class SetHome(Operation, document_kind="SetHome"):
+class SetHome(Operation, document_kind="SetHome", tag="home"):
     """Assignment of the home of an articulation: default values of its coordinates [m], [rad]."""
 
     name: str
@@ -48,13 +41,9 @@ class SetHome(Operation, document_kind="SetHome"):
         """Write the record of the articulation with the new home."""
         return Writes(articulations={self.name: replace(model.articulations[self.name], home=self.home)})
 
-    def default_tag(self) -> str:
-        """Return ``home`` and the name of the articulation."""
-        return f"home {self.name}"
-
 
 @dataclass(frozen=True)
-class AddFrame(Operation, document_kind="AddFrame"):
+class AddFrame(Operation, document_kind="AddFrame", tag="frame"):
     """New frame in a parent, with an optional body."""
 
     name: str
@@ -66,13 +55,9 @@ class AddFrame(Operation, document_kind="AddFrame"):
         bodies = {} if self.body is None else {self.name: self.body}
         return Writes(frames={self.name: self.frame}, bodies=bodies)
 
-    def default_tag(self) -> str:
-        """Return ``frame`` and the name."""
-        return f"frame {self.name}"
-
 
 @dataclass(frozen=True)
-class Constrain(Operation, document_kind="Constrain"):
+class Constrain(Operation, document_kind="Constrain", tag="constraint"):
     """New constraint."""
 
     name: str
@@ -81,10 +66,6 @@ class Constrain(Operation, document_kind="Constrain"):
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the constraint."""
         return Writes(constraints={self.name: self.constraint})
-
-    def default_tag(self) -> str:
-        """Return ``constraint`` and the name."""
-        return f"constraint {self.name}"
 
 
 @dataclass(frozen=True)
@@ -104,7 +85,7 @@ class SetRate(Operation, document_kind="SetRate"):
 
 
 @dataclass(frozen=True)
-class SetData(Operation, document_kind="Write"):
+class SetData(Operation, document_kind="Write", tag="data"):
     """Assignment of a datum."""
 
     name: str
@@ -113,10 +94,6 @@ class SetData(Operation, document_kind="Write"):
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the value."""
         return Writes(data={self.name: self.value})
-
-    def default_tag(self) -> str:
-        """Return ``data`` and the name."""
-        return f"data {self.name}"
 
 
 @dataclass(frozen=True)
@@ -175,7 +152,3 @@ class SoftLimits(Operation, document_kind="SoftLimits"):
         if not self.q.symbols:
             return Writes()
         return Writes(constraints={f"{self.name}/soft_limits": (self.lower, self.q, self.upper)})
-
-    def default_tag(self) -> str:
-        """Return ``soft limits`` and the name."""
-        return f"soft limits {self.name}"

@@ -88,64 +88,57 @@ class Pose(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
         return matrix
 
 
-class _Geometry(Struct, frozen=True, tag_field="kind", omit_defaults=True, forbid_unknown_fields=True):
+class _Geometry(
+    Struct, frozen=True, tag_field="kind", tag=str.lower, omit_defaults=True, forbid_unknown_fields=True
+):
     """Geometry with the name of its kind, which documents and other formats use."""
 
     kind: ClassVar[str]
 
+    def __init_subclass__(cls) -> None:
+        cls.kind = cls.__name__.lower()
 
-class Box(_Geometry, frozen=True, tag="box"):
+
+class Box(_Geometry, frozen=True):
     """A box centred at its origin; ``size`` are the full edge lengths along x, y, z [m]."""
-
-    kind: ClassVar[str] = "box"
 
     size: Vector3
 
 
-class Cylinder(_Geometry, frozen=True, tag="cylinder"):
+class Cylinder(_Geometry, frozen=True):
     """A cylinder around z, centred at its origin; radius and length [m]."""
 
-    kind: ClassVar[str] = "cylinder"
-
     radius: Finite
     length: Finite
 
 
-class Capsule(_Geometry, frozen=True, tag="capsule"):
+class Capsule(_Geometry, frozen=True):
     """A capsule around z, centred; ``length`` is that of the cylindrical part [m]."""
 
-    kind: ClassVar[str] = "capsule"
-
     radius: Finite
     length: Finite
 
 
-class Sphere(_Geometry, frozen=True, tag="sphere"):
+class Sphere(_Geometry, frozen=True):
     """A sphere around its origin; radius [m]."""
-
-    kind: ClassVar[str] = "sphere"
 
     radius: Finite
 
 
-class Ellipsoid(_Geometry, frozen=True, tag="ellipsoid"):
+class Ellipsoid(_Geometry, frozen=True):
     """An ellipsoid around its origin; ``radii`` are the half axes along x, y, z [m]."""
-
-    kind: ClassVar[str] = "ellipsoid"
 
     radii: Vector3
 
 
-class Cone(_Geometry, frozen=True, tag="cone"):
+class Cone(_Geometry, frozen=True):
     """A cone around z, its base at -length/2 and its tip at +length/2; radius of the base and length [m]."""
-
-    kind: ClassVar[str] = "cone"
 
     radius: Finite
     length: Finite
 
 
-class Mesh(_Geometry, frozen=True, tag="mesh", eq=False):
+class Mesh(_Geometry, frozen=True, eq=False):
     """Reference to a mesh file.
 
     ``uri`` is the reference in the description (``package://...``, ``file://...`` or a path). ``folder`` is
@@ -155,8 +148,6 @@ class Mesh(_Geometry, frozen=True, tag="mesh", eq=False):
     its size [byte], where they are known. Operations in documents contain only ``uri`` and ``scale``;
     comparisons ignore ``root`` and ``content``.
     """
-
-    kind: ClassVar[str] = "mesh"
 
     uri: str
     scale: Vector3 = field(default_factory=lambda: _UNSCALED)
@@ -211,6 +202,9 @@ class Body(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     visuals: tuple[Shape, ...] = ()
     collisions: tuple[Shape, ...] = ()
     inertia: Inertia | None = None
+
+
+NO_BODY = Body()  # neither shapes nor inertia
 
 
 def is_empty_body(body: Body) -> bool:

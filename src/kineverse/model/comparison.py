@@ -154,18 +154,15 @@ def transform_of(frame: Frame) -> Pose | Expression:
     poses = [factor for factor in frame.factors if isinstance(factor, Pose)]
     if len(poses) < len(frame.factors):
         return frame.transform
-    return (
-        poses[0]
-        if len(poses) == 1
-        else Pose.from_matrix(reduce(np.matmul, (p.matrix for p in poses), np.eye(4)))
-    )
+    if len(poses) == 1:
+        return poses[0]
+    return Pose.from_matrix(reduce(np.matmul, (p.matrix for p in poses), np.eye(4)))
 
 
 # -- measuring ---------------------------------------------------------------------------------------------
 
 
 def _measure(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
-    """Return distance, angle, and both at the default state, of two parts without symbols."""
     if isinstance(a, Pose) and isinstance(b, Pose):
         return _summarize(*measure_pose_distances(a.matrix[None], b.matrix[None]))
     if (_is_number(a) and _is_number(b)) or (_are_numbers(a) and _are_numbers(b) and len(a) == len(b)):
@@ -177,7 +174,6 @@ def _measure(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
 def _measure_distance(
     pairs: Sequence[tuple[Any, Any]], samples: StateSamples
 ) -> Iterator[tuple[float, float, tuple[float, float]]]:
-    """Yield maximum distance, maximum angle, and both at the default state, for pairs of expressions."""
     sides = [tuple(as_expression(v.matrix if isinstance(v, Pose) else v) for v in (a, b)) for a, b in pairs]
     trends = [_trends(a, b) for a, b in sides]
     everything = [e for (a, b), trend in zip(sides, trends, strict=True) for e in (a, b, *trend)]
@@ -252,11 +248,7 @@ def compare_models(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
         changes=tuple(_changes(old, new)),
         added=tuple(tag for tag in later if tag not in entries),
         removed=tuple(tag for tag in entries if tag not in later),
-        replaced=tuple(
-            tag
-            for tag in common
-            if entries[tag] is not later[tag] and entries[tag].writes != later[tag].writes
-        ),
+        replaced=tuple(tag for tag in common if entries[tag].writes != later[tag].writes),
         moved=find_moved_tags(common, list(later)),
     )
 
@@ -320,13 +312,8 @@ class ModelComparison:
 
         Their poses in the old and the new parent cannot be compared.
         """
-        changes = [
-            c
-            for c in self.diff.changes
-            if isinstance(c.before, Frame)
-            and isinstance(c.after, Frame)
-            and c.before.parent != c.after.parent
-        ]
+        frames = [c for c in self.diff.changes if isinstance(c.before, Frame) and isinstance(c.after, Frame)]
+        changes = [c for c in frames if c.before.parent != c.after.parent]
         poses = samples.values([model.fk(c.name) for c in changes for model in (self.before, self.after)])
         result = {}
         for change, one, other in zip(changes, poses[::2], poses[1::2], strict=True):
@@ -336,12 +323,9 @@ class ModelComparison:
 
     def _is_redundant_record(self, change: Change) -> bool:
         record = change.after if change.before is None else change.before
-        return (
-            isinstance(record, Articulation)
-            and record.kind == "fixed"
-            and record.child in self.before.frames
-            and record.child in self.after.frames
-        )
+        if not isinstance(record, Articulation) or record.kind != "fixed":
+            return False
+        return record.child in self.before.frames and record.child in self.after.frames
 
     @property
     def equal(self) -> bool:
@@ -357,13 +341,8 @@ class ModelComparison:
         """Tags of operations by sign, ``>`` for moved ones; empty if operations are not compared."""
         if not self.operations_compared:
             return {}
-        diff = self.diff
-        return {
-            "-": diff.removed,
-            "~": tuple(filter(self._counts, diff.replaced)),
-            "+": diff.added,
-            ">": diff.moved,
-        }
+        diff, changed = self.diff, tuple(filter(self._counts, self.diff.replaced))
+        return {"-": diff.removed, "~": changed, "+": diff.added, ">": diff.moved}
 
     @cached_property
     def operations_compared(self) -> bool:

@@ -46,12 +46,10 @@ class FrameDependence:
             name = self._frames[name].parent
         moving = self._moving_ancestors[name]
         for frame in reversed(above):
-            moving = (*moving, frame) if self._moves_in_parent(frame) else moving
+            stays = self._paths.isdisjoint(_paths_in_parent(self._frames[frame]))
+            moving = moving if stays else (*moving, frame)
             self._moving_ancestors[frame] = moving
         return moving
-
-    def _moves_in_parent(self, name: str) -> bool:
-        return not self._paths.isdisjoint(_paths_in_parent(self._frames[name]))
 
 
 def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symbol, tuple[str, ...]]:
@@ -115,7 +113,6 @@ def _known_path(symbol: Symbol, known: set[str]) -> str:
 
 
 def _driven_coordinates(model: ModelView, paths: set[str]) -> set[str]:
-    """Return the paths of all coordinates that move with the given ones, including these."""
     rates = model.rates
     result = set(paths)
     for coordinate, row in rates.items():

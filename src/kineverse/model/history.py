@@ -11,6 +11,7 @@ import heapq
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter
 from typing import Any, TypeAlias
@@ -43,29 +44,19 @@ _GAP = 1 << 32
 _PLACE = attrgetter("place")
 
 
+@dataclass(slots=True, eq=False, repr=False)
 class HistoryEntry:
     """Operation at its place, with the reads and writes of its last run; immutable.
 
     ``blob`` is its form in documents, once it is known.
     """
 
-    __slots__ = ("blob", "operation", "place", "reads", "tag", "writes")
-
-    def __init__(
-        self,
-        tag: str,
-        operation: Operation,
-        place: int,
-        reads: Reads,
-        writes: dict[Cell, Any],
-        blob: bytes | None = None,
-    ) -> None:
-        self.tag = tag
-        self.operation = operation
-        self.place = place
-        self.reads = reads
-        self.writes = writes
-        self.blob = blob
+    tag: str
+    operation: Operation
+    place: int
+    reads: Reads
+    writes: dict[Cell, Any]
+    blob: bytes | None = None
 
     def at(self, place: int) -> HistoryEntry:
         """Return the entry at another place."""
@@ -117,16 +108,10 @@ class History:
             self.entries[entry.tag] = entry
             self.sequence.append(entry)
             for cell, value in entry.writes.items():
-                if cell in cells:
-                    cells[cell].append(entry)
-                else:
-                    cells[cell] = [entry]
+                cells.setdefault(cell, []).append(entry)
                 head[cell[0]][cell[1]] = value
             for cell, how in entry.reads.cells.items():
-                if cell in reading:
-                    reading[cell][entry.tag] = how
-                else:
-                    reading[cell] = {entry.tag: how}
+                reading.setdefault(cell, {})[entry.tag] = how
             for kind in entry.reads.listings:
                 self.listing[kind].add(entry.tag)
 
@@ -362,7 +347,6 @@ class History:
         )
 
     def _mark_readers(self, cell: Cell, old: Any, new: Any, place: int) -> None:
-        """Mark the readers of a write at ``place`` as outdated."""
         kind, name = cell
         writers = self.cells.get(cell, ())
         if old is ABSENT and len(writers) == 1 and cell not in self.reading and not self.listing[kind]:
@@ -383,19 +367,11 @@ class History:
             if cell in self.reading if old is ABSENT else old.parent != new.parent:
                 self._moved_frames[name, place] = None
         existence = (old is ABSENT) != (new is ABSENT)
-        for tag, how in self.reading.get(cell, {}).items():
+        readers = [tag for tag, how in self.reading.get(cell, {}).items() if how & Read.VALUE or existence]
+        for tag in (*readers, *(self.listing[kind] if existence else ())):
             reader = self.entries[tag].place
-            if (
-                reader > place
-                and (following is None or reader <= following)
-                and (how & Read.VALUE or existence)
-            ):
+            if reader > place and (following is None or reader <= following):
                 self.mark_outdated(tag)
-        if existence:
-            for tag in self.listing[kind]:
-                reader = self.entries[tag].place
-                if reader > place and (following is None or reader <= following):
-                    self.mark_outdated(tag)
 
     def list_reads(self, cells: Iterable[Cell], without: Container[str]) -> list[tuple[str, Cell, Any]]:
         """Return who else reads or lists some cells, and what each finds there, for :meth:`find_outdated`."""
@@ -543,7 +519,6 @@ class History:
         self._undo.append((self._forget, (entry,)))
 
     def _index(self, entry: HistoryEntry) -> None:
-        """Note an entry by its tag, its place and its reads."""
         self._touched.setdefault(entry.tag, None)
         self.entries[entry.tag] = entry
         if not self.sequence or self.sequence[-1].place < entry.place:

@@ -34,7 +34,7 @@ from kineverse.expressions.expression import Expression
 from kineverse.expressions.graph import lower
 from kineverse.expressions.layout import SX
 from kineverse.state import State, StateLike
-from kineverse.symbols import Symbol
+from kineverse.symbols import Symbol, sort_symbols
 
 from .rates import Rates
 
@@ -143,11 +143,7 @@ class Integrator:
             As for single calls, of shapes (N, n), (N, m) and (N,); one without N is the same for all.
         """
         n, m = len(self.symbols), len(self.speeds)
-        parts = [
-            np.asarray(q, dtype=float),
-            np.asarray(v, dtype=float),
-            np.asarray(dt, dtype=float)[..., None],
-        ]
+        parts = [*(np.asarray(x, dtype=float) for x in (q, v)), np.asarray(dt, dtype=float)[..., None]]
         if [part.shape[-1:] for part in parts] != [(n,), (m,), (1,)] or max(p.ndim for p in parts) > 2:
             shapes = ", ".join(str(part.shape) for part in parts[:2])
             raise ShapeError(f"A batch has coordinates (N, {n}) and speeds (N, {m}), not {shapes}.")
@@ -177,17 +173,11 @@ class Integrator:
                     f"The integrator has {len(target)} {what}, and the vector is of shape {numbers.shape}."
                 )
             target[:] = numbers
-        step = finite_number(dt)
-        if step is None:
-            raise InvalidValueError(f"The time step is a finite number of seconds, not {dt!r}.")
-        self._dt[0] = step
+        self._dt[0] = _check_duration(dt)
 
     def _follow(self, dt: float) -> None:
         """Repeat the last step in parts, controlled by the estimated error."""
-        step = finite_number(dt)
-        if step is None:
-            raise InvalidValueError(f"The time step is a finite number of seconds, not {dt!r}.")
-        dt = step
+        dt = _check_duration(dt)
         named = ((self.symbols, self._q, "value"), (self.speeds, self._v, "speed"))
         for symbols, numbers, what in named:
             for place in np.flatnonzero(~np.isfinite(numbers)):
@@ -235,6 +225,13 @@ class Integrator:
 
     def __repr__(self) -> str:
         return f"Integrator({len(self.symbols)} symbols, {len(self.speeds)} speeds)"
+
+
+def _check_duration(dt: float) -> float:
+    step = finite_number(dt)
+    if step is None:
+        raise InvalidValueError(f"The time step is a finite number of seconds, not {dt!r}.")
+    return step
 
 
 @functools.lru_cache(maxsize=32)
@@ -338,22 +335,20 @@ class StateIntegrator:
 
     def __init__(self, coordinates: Iterable[Symbol], rates: Rates) -> None:
         self._free = {c.derivative(): c for c in coordinates if c not in rates}
-        self._columns = _sorted({v for row in rates.values() for v in row})
+        self._columns = sort_symbols({v for row in rates.values() for v in row})
         self._speeds = {str(s): s for s in (*self._free, *self._columns)}
         self._driven = set(rates)
         self._integrator: Integrator | None = None
         if rates:
             seen = {s for row in rates.values() for g in row.values() for s in g.symbols if s not in rates}
             own = {s.derivative() for s in seen if s.has_derivative and not s.order}
-            speeds = _sorted(own.union(self._columns))
-            self._integrator = Integrator(rates, (*_sorted(rates), *_sorted(seen.difference(speeds))), speeds)
+            speeds = sort_symbols(own.union(self._columns))
+            symbols = (*sort_symbols(rates), *sort_symbols(seen.difference(speeds)))
+            self._integrator = Integrator(rates, symbols, speeds)
 
     def integrate(self, state: State, speeds: StateLike, dt: float) -> State:
         """Return the state after ``dt`` seconds."""
-        step = finite_number(dt)
-        if step is None:
-            raise InvalidValueError(f"The time step is a finite number of seconds, not {dt!r}.")
-        dt = step
+        dt = _check_duration(dt)
         given = self._given_speeds(speeds)
         free = self._free
         result = {free[v]: state[free[v]] + dt * value for v, value in given.items() if v in free}
@@ -390,7 +385,3 @@ class StateIntegrator:
                 raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
             given[speed] = finite
         return given
-
-
-def _sorted(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
-    return tuple(sorted(symbols, key=lambda s: s.sort_key))

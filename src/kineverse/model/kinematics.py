@@ -204,7 +204,6 @@ def compute_twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX
 
 
 def _add_step(found: dict[Symbol, Twist], step: ChainStep, tip: SX, sign: int, heuristic: bool) -> None:
-    """Add the twists of a moving factor at the tip, with a sign."""
     moves = _axis_twists if isinstance(step.factor, OneAxisTransform) else _twists
     for key, velocity, omega, entry_nodes in moves(step, tip, heuristic):
         if sign < 0:

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 
-from kineverse.errors import ModelError
+from kineverse.errors import ModelError, list_some
 from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
 from kineverse.expressions.layout import SX
 from kineverse.expressions.node import Node
@@ -107,7 +107,7 @@ def _no_mass(frame: str, bodies: Mapping[str, Body], lookup: FrameLookup) -> Mod
     where = "in the model" if frame == WORLD else f"at or below '{frame}'"
     if not names:
         return ModelError(f"There is no body {where}, so there is no centre of mass.")
-    shown = ", ".join(map(repr, names[:6])) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    shown = list_some(map(repr, names), 6)
     return ModelError(
         f"No body {where} has a mass, so there is no centre of mass: {shown}. A body gets one by its "
         "inertia: edit.add_frame(name, parent, transform, Body(inertia=Inertia(mass=..., tensor=...)))."

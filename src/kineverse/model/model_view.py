@@ -21,7 +21,7 @@ from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
 from . import registry
 from .constraint import TOLERANCE, Constraint, ConstraintLike, as_constraint
-from .operation import ARTICULATIONS, CONSTRAINTS
+from .operation import ARTICULATIONS, CONSTRAINTS, map_expressions
 from .registry import SaveResult
 from .symbolic_view import SymbolicView, cached_for_version
 
@@ -77,7 +77,6 @@ class ModelView(SymbolicView):
             return {name: self._carry_constraint(name, head[name]) for name in names}
 
     def _expressions(self, subject: Expression | str | Iterable[Symbol | Expression | str]) -> Any:
-        """Return a subject with poses in place of names of frames."""
         if isinstance(subject, str):
             subject = [subject]
         if isinstance(subject, Expression) or not isinstance(subject, Iterable):
@@ -184,10 +183,8 @@ class ModelView(SymbolicView):
                 c = self._head[CONSTRAINTS][name]
                 low = self._range(c.lower)[0] if known is None else self._bound(c.lower, known)
                 high = self._range(c.upper)[1] if known is None else self._bound(c.upper, known)
-                lower, upper = (
-                    max(lower, -np.inf if low is None else low),
-                    min(upper, np.inf if high is None else high),
-                )
+                lower = lower if low is None else max(lower, low)
+                upper = upper if high is None else min(upper, high)
             return float(lower) + 0.0, float(upper) + 0.0  # no -0.0, which people read
 
     def _bound(self, bound: Expression, values: State) -> float | None:
@@ -295,7 +292,6 @@ class ModelView(SymbolicView):
                 break
 
     def _no_default(self, symbol: Symbol, value: float) -> InvalidValueError:
-        """Return the error for a default value that is not finite, with the operations that cause it."""
         names = [n for n, a in self._head[ARTICULATIONS].items() if symbol in a.coordinates]
         paths = [f"{ARTICULATIONS}/{name}" for name in names]
         paths += [f"{CONSTRAINTS}/{name}" for name in self._relevance.about(symbol)]
@@ -382,11 +378,7 @@ class ModelView(SymbolicView):
                     f"The model has a constraint {name!r} already; give the extra one another name."
                 )
         checked = {name: as_constraint(value) for name, value in extra.items()}
-        carry = self.rates.carry
-        return {
-            name: Constraint(carry(c.lower), carry(c.expression), carry(c.upper))
-            for name, c in checked.items()
-        }
+        return {name: map_expressions(CONSTRAINTS, c, self.rates.carry) for name, c in checked.items()}
 
     def integrate(self, state: StateLike, speeds: StateLike, dt: float, *, clip: bool = False) -> State:
         """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integration`.
@@ -538,7 +530,9 @@ class ModelView(SymbolicView):
             model.
         """
         names = (leave_out,) if isinstance(leave_out, str) else leave_out
-        return registry.save_model(self, path, tolerance=tolerance, leave_out=names, strict=strict)
+        save = registry.find_service("save")
+        result: SaveResult = save(self, path, tolerance=tolerance, leave_out=names, strict=strict)
+        return result
 
     # -- printing ------------------------------------------------------------------------------------------
 

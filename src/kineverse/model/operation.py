@@ -27,14 +27,8 @@ if TYPE_CHECKING:
     from .history import HistoryEntry
     from .read_recorder import ReadRecorder, SeenValues
 
-FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS = (
-    "frames",
-    "bodies",
-    "articulations",
-    "constraints",
-    "rates",
-    "data",
-)
+KINDS = ("frames", "bodies", "articulations", "constraints", "rates", "data")
+FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS
 
 
 @dataclass(frozen=True)
@@ -85,16 +79,10 @@ class Writes:
         for name, frame in self.frames.items():
             value = _as_frame(name, frame)
             if any(isinstance(f, Expression) and f.nodes for f in value.factors):
-                value = Frame(
-                    value.parent,
-                    tuple(to_plain(f) if isinstance(f, Expression) else f for f in value.factors),
-                )
+                value = map_expressions(FRAMES, value, to_plain)
             result[FRAMES, name] = value
-        records: tuple[tuple[str, Mapping[str, Any]], ...] = (
-            (BODIES, self.bodies),
-            (ARTICULATIONS, self.articulations),
-        )
-        for kind, values in records:
+        records: dict[str, Mapping[str, Any]] = {BODIES: self.bodies, ARTICULATIONS: self.articulations}
+        for kind, values in records.items():
             for name, record in values.items():
                 _check_value(kind, name, record)
                 if isinstance(record, Articulation) and record.follows is not None and record.follows.nodes:
@@ -103,7 +91,7 @@ class Writes:
         for name, triple in self.constraints.items():
             c = as_constraint(triple)
             if c.lower.nodes or c.expression.nodes or c.upper.nodes:
-                c = Constraint(to_plain(c.lower), to_plain(c.expression), to_plain(c.upper))
+                c = map_expressions(CONSTRAINTS, c, to_plain)
             result[CONSTRAINTS, name] = c
         for coordinate, row in self.rates.items():
             result[RATES, str(coordinate)] = (coordinate, as_entry(coordinate, row))
@@ -136,10 +124,9 @@ def _as_frame(name: str, frame: Frame | tuple[str, TransformLike | Sequence[Tran
         raise InvalidValueError(
             f"The parent of frame {name!r} is given by its name, not by {frame.parent!r}."
         )
-    if not all(
-        isinstance(f, Pose) or (isinstance(f, Expression) and f.shape == (4, 4)) for f in frame.factors
-    ):
-        return Frame.from_transform(frame.parent, frame.factors)
+    for f in frame.factors:
+        if not isinstance(f, Pose) and not (isinstance(f, Expression) and f.shape == (4, 4)):
+            return Frame.from_transform(frame.parent, frame.factors)
     return frame
 
 
@@ -190,10 +177,13 @@ class Operation(ABC):
     document_kind: ClassVar[str]
     """Frozen name of the class in documents, in kinds of articulations and in tags."""
 
-    def __init_subclass__(cls, *, document_kind: str = "", **keywords: Any) -> None:
-        """Name a class in documents: frozen for those that ship, else its own name."""
+    _tag: ClassVar[str]
+
+    def __init_subclass__(cls, *, document_kind: str = "", tag: str = "", **keywords: Any) -> None:
+        """Name a class in documents, frozen for those that ship, else its own name; and in default tags."""
         super().__init_subclass__(**keywords)
         cls.document_kind = document_kind or cls.__name__
+        cls._tag = tag or split_words(cls.document_kind)
 
     if not TYPE_CHECKING:  # a type checker knows the keywords
 
@@ -222,9 +212,8 @@ class Operation(ABC):
 
     def default_tag(self) -> str:
         """Return the default tag: the kind, and the name of the operation if it has one."""
-        words = split_words(self.document_kind)
         name = getattr(self, "name", "")
-        return f"{words} {name}" if name else words
+        return f"{self._tag} {name}" if name else self._tag
 
 
 def split_words(kind: str) -> str:

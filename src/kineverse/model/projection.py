@@ -21,11 +21,11 @@ import numpy as np
 
 from kineverse._checks import as_tolerance
 from kineverse.compilation import compile
-from kineverse.errors import NoSolutionError, UnknownNameError, suggest
+from kineverse.errors import NoSolutionError, UnknownNameError, list_some, suggest
 from kineverse.expressions.expression import Expression, array
 from kineverse.lie import Array
 from kineverse.state import State
-from kineverse.symbols import Symbol
+from kineverse.symbols import Symbol, sort_symbols
 
 from .articulation import Articulation
 from .constraint import TOLERANCE, Constraint
@@ -58,15 +58,11 @@ class EqualityConstraints:
         self._simple = [row for row in rows if not row.equality and _limits_single(row)]
         equal = [row for row in rows if row.equality]
         moved = {s for row in equal for s in row.value.symbols if s.has_derivative}
-        self.rows: Sequence[ResidualRow] = equal + [
-            row
-            for row in rows
-            if not row.equality and not _limits_single(row) and moved & set(row.value.symbols)
-        ]
+        others = [row for row in rows if not row.equality and not _limits_single(row)]
+        others = [row for row in others if moved & set(row.value.symbols)]
+        self.rows: Sequence[ResidualRow] = equal + others
         self.count = len(equal)
-        self.symbols = tuple(
-            sorted({s for row in self.rows for s in row.value.symbols} | moved, key=lambda s: s.sort_key)
-        )
+        self.symbols = sort_symbols({s for row in self.rows for s in row.value.symbols} | moved)
         self.coordinates = tuple(s for s in self.symbols if s in moved)
 
     @cached_property
@@ -358,7 +354,6 @@ class _Search:
         return x
 
     def _evaluate_rows(self, x: Array) -> tuple[Array, Array] | None:
-        """Return the values of the rows and their derivatives; None if one is undefined."""
         found = self._equalities.evaluate_rows(self._all(x))
         if found is None:
             return None
@@ -401,22 +396,20 @@ class _Search:
         off = np.abs(self._residuals(there[0]))
         worst = [i for i in np.argsort(-off) if off[i] > self._tolerance]
         sizes = {self._equalities.rows[self._rows[i]].name: off[i] for i in worst}
-        listed = ", ".join(f"'{n}' is off by {size:.3g}" for n, size in list(sizes.items())[:4])
-        more = f" and {len(sizes) - 4} more" if len(sizes) > 4 else ""
+        listed = list_some((f"'{n}' is off by {size:.3g}" for n, size in sizes.items()), 4)
         ends = (np.isfinite(self._lower) & (x <= self._lower)) | (
             np.isfinite(self._upper) & (x >= self._upper)
         )
         moved, stopped = self._names(range(len(x))), self._names(np.flatnonzero(ends).tolist())
         fixed_symbols = sorted(str(s) for s in self._fixed if s in self._equalities.coordinates)
-        tried = [f"moved were {_format_names(moved)}" if moved else "nothing was free to move"]
-        tried += [f"at their limits are {_format_names(stopped)}"] if stopped else []
-        tried += [f"fixed were {_format_names(fixed_symbols)}"] if fixed_symbols else []
+        tried = [f"moved were {_quote(moved)}" if moved else "nothing was free to move"]
+        tried += [f"at their limits are {_quote(stopped)}"] if stopped else []
+        tried += [f"fixed were {_quote(fixed_symbols)}"] if fixed_symbols else []
         return NoSolutionError(
-            f"The state cannot be projected: at best {listed}{more}, from {_STARTS + 1} starts. "
+            f"The state cannot be projected: at best {listed}, from {_STARTS + 1} starts. "
             f"{'; '.join(tried).capitalize()}. Begin nearer to where it closes, or let more coordinates move."
         )
 
 
-def _format_names(names: Sequence[str]) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:6])
-    return shown + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+def _quote(names: Iterable[str]) -> str:
+    return list_some((f"'{name}'" for name in names), 6)

@@ -172,12 +172,10 @@ def to_plain(expression: Expression) -> Expression:
 
 
 def _parts(node: Node) -> tuple[Expression, ...]:
-    """Return the expressions that are converted before a node is."""
     return () if isinstance(node, Carried | Dependent) else node.arguments
 
 
 def _plain_image(node: Node, plain_part: Callable[[Expression], Expression]) -> Expression | None:
-    """Return the plain form of a node; None if it is plain already."""
     if isinstance(node, Carried | Dependent):
         return node.coordinate
     if isinstance(node, Composed):
@@ -189,7 +187,6 @@ def _plain_image(node: Node, plain_part: Callable[[Expression], Expression]) -> 
 
 
 def _recompose(node: Composed, plain_part: Callable[[Expression], Expression]) -> Expression | None:
-    """Return a composition over plain replacements; None if they are plain already."""
     given = node.substitution
     inner = node.arguments[0]
     source = inner if isinstance(node._inner(), Carried) else plain_part(inner)
@@ -219,9 +216,6 @@ def _subjects(node: Node) -> tuple[Expression, ...]:
 def _expression_of(node: Node) -> Expression:
     return from_casadi(node.sx, node.shape, frozenset((node,)))
 
-
-if TYPE_CHECKING:
-    pass
 
 RateRow: TypeAlias = tuple[tuple[Symbol, Expression], ...]
 RateEntry: TypeAlias = RateRow | Expression
@@ -491,7 +485,6 @@ _DEPENDING = "Coordinates that depend on themselves"
 def _sort_topologically(
     coordinates: Iterable[Symbol], through: Callable[[Symbol], list[Symbol]], problem: str
 ) -> Iterator[Symbol]:
-    """Yield coordinates in topological order; raise for a cycle."""
     done: set[Symbol] = set()
     for coordinate in coordinates:
         # Iterative search, because chains may be longer than Python's stack.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntFlag
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kineverse.errors import KineverseError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
@@ -21,7 +21,6 @@ from .rates import RateEntry, Rates, collect_symbols, to_plain
 if TYPE_CHECKING:
     from .operation import Cell
 
-V = TypeVar("V")
 _MANY = 100
 
 
@@ -154,7 +153,7 @@ class ReadRecorder:
 
     def by_kind(self, kind: str) -> Mapping[str, Any]:
         """Return one kind of data by name."""
-        return _RecordedMapping(kind, self._value_at, self._names_at, self._reads)
+        return _RecordedMapping(self, kind)
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
         """Return relative_to_T_frame, 4×4, with coordinates carried by the rates before the operation."""
@@ -208,9 +207,7 @@ class ReadRecorder:
             x = wanted.pop()
             if x.order or x in entries or not x.has_derivative:
                 continue
-            cell = (RATES, str(x))
-            self._reads.add(cell, Read.VALUE)
-            found = self._value_at(cell)
+            found = self.read((RATES, str(x)), Read.VALUE)
             if found is not ABSENT:
                 entry = entries[x] = found[1]
                 if isinstance(entry, Expression):
@@ -221,44 +218,32 @@ class ReadRecorder:
         return Rates(entries)
 
 
-class _RecordedMapping(Mapping[str, V], Generic[V]):
+class _RecordedMapping(Mapping[str, Any]):
     """Mapping of one kind of data by name, with recorded reads."""
 
-    def __init__(
-        self, kind: str, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads
-    ) -> None:
-        self._kind = kind
-        self._value_at = value_at
-        self._names_at = names_at
-        self._reads = reads
+    def __init__(self, reader: ReadRecorder, kind: str) -> None:
+        self._reader, self._kind = reader, kind
 
-    def __getitem__(self, name: str) -> V:
-        cell = (self._kind, name)
-        self._reads.add(cell, Read.VALUE)
-        value = self._value_at(cell)
+    def __getitem__(self, name: str) -> Any:
+        value = self._reader.read((self._kind, name), Read.VALUE)
         if value is ABSENT:
-            raise unknown_name_error(self._kind, name, self._names_at(self._kind))
-        result: V = value
-        return result
+            raise unknown_name_error(self._kind, name, self._reader._names_at(self._kind))
+        return value
 
     def get(self, name: str, default: Any = None) -> Any:
-        self._reads.add((self._kind, name), Read.VALUE)
-        value = self._value_at((self._kind, name))
+        value = self._reader.read((self._kind, name), Read.VALUE)
         return default if value is ABSENT else value
 
     def __contains__(self, name: object) -> bool:
         if not isinstance(name, str):
             return False
-        self._reads.add((self._kind, name), Read.EXISTENCE)
-        return self._value_at((self._kind, name)) is not ABSENT
+        return self._reader.read((self._kind, name), Read.EXISTENCE) is not ABSENT
 
     def __iter__(self) -> Iterator[str]:
-        self._reads.listings.add(self._kind)
-        return iter(self._names_at(self._kind))
+        return iter(self._reader.list_names(self._kind))
 
     def __len__(self) -> int:
-        self._reads.listings.add(self._kind)
-        return len(self._names_at(self._kind))
+        return len(self._reader.list_names(self._kind))
 
 
 def differs(how: Read, before: Any, now: Any) -> bool:

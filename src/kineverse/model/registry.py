@@ -8,7 +8,6 @@ suffix of the file, for the writer of a file, and for the shorthands of other pa
 from __future__ import annotations
 
 import importlib
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -22,8 +21,6 @@ from .operation import Operation
 
 if TYPE_CHECKING:
     from .edit import Edit
-    from .history import HistoryEntry
-    from .model_view import ModelView
 
 LoopTreatment: TypeAlias = Literal["solve", "constraint", "refuse"]
 
@@ -71,14 +68,9 @@ class FileFormat(Struct, frozen=True):
         """Return whether the format reads a file of this name and content."""
         return name.endswith(self.suffixes) if self.recognize is None else self.recognize(name, content)
 
-    def operations(self, file: FileContent) -> Iterable[tuple[str, Operation]]:
-        """Yield the operations of a file, each with its tag."""
-        result: Iterable[tuple[str, Operation]] = import_entry(self.read)(file)
-        return result
-
-    def entries(self, file: FileContent) -> Iterable[HistoryEntry]:
-        """Yield the operations of a file of an exact format, with what they read and wrote."""
-        result: Iterable[HistoryEntry] = import_entry(self.read)(file)
+    def operations(self, file: FileContent) -> Iterable[Any]:
+        """Yield the operations of a file, each with its tag; of an exact format, entries of a history."""
+        result: Iterable[Any] = import_entry(self.read)(file)
         return result
 
 
@@ -149,7 +141,7 @@ class SaveResult(Struct, frozen=True):
 
 # -- entries -------------------------------------------------------------------------------------------------
 
-_COLLECTIONS: Mapping[str, ModelCollection] = {
+COLLECTIONS: Mapping[str, ModelCollection] = {
     "articulations": ModelCollection(
         "kineverse.gallery:names",
         summary="one for each articulation",
@@ -204,15 +196,7 @@ def list_formats() -> tuple[FileFormat, ...]:
 # -- queries -------------------------------------------------------------------------------------------------
 
 
-def include_source(
-    edit: Edit,
-    source: Any,
-    prefix: str | None = None,
-    *,
-    root: Any = None,
-    strict: bool = False,
-    loops: LoopTreatment = "solve",
-) -> list[str]:
+def include_source(edit: Edit, source: Any, prefix: str | None, **options: Any) -> list[str]:
     """Append the operations of a source to an edit, and return their tags.
 
     A text ``scheme:…`` with a registered scheme is an address; any other source is a file or a name. Options
@@ -220,11 +204,10 @@ def include_source(
     """
     scheme = find_scheme(source)
     if scheme is not None:
-        check_no_file_options(root=root, strict=strict, loops=loops)
+        check_no_file_options(**options)
         added: list[str] = import_entry(scheme.include)(edit, source, prefix)
         return added
-    include = find_service("include")
-    tags: list[str] = include(edit, source, prefix, root=root, strict=strict, loops=loops)
+    tags: list[str] = find_service("include")(edit, source, prefix, **options)
     return tags
 
 
@@ -245,20 +228,6 @@ def check_no_file_options(
             )
 
 
-def save_model(
-    model: ModelView,
-    path: str | os.PathLike[str],
-    *,
-    tolerance: float | None = None,
-    leave_out: Iterable[str] = (),
-    strict: bool = False,
-) -> SaveResult:
-    """Write a model to a file, in the format that belongs to the ending of its name."""
-    write = find_service("save")
-    result: SaveResult = write(model, path, tolerance=tolerance, leave_out=leave_out, strict=strict)
-    return result
-
-
 def find_scheme(source: object) -> Scheme | None:
     """Return the scheme of an address; None if the source is no address with a registered one."""
     if not isinstance(source, str):
@@ -275,16 +244,6 @@ def find_format(name: str, content: bytes) -> FileFormat | None:
 def find_writer(name: str) -> FileFormat | None:
     """Return the format that writes files of this name; None if none does."""
     return next((one for one in list_formats() if name.endswith(one.written)), None)
-
-
-def find_collection(name: str) -> ModelCollection | None:
-    """Return the collection of models of this name; None if there is none."""
-    return _COLLECTIONS.get(name)
-
-
-def list_collections() -> tuple[str, ...]:
-    """Return the names of all collections of models."""
-    return tuple(_COLLECTIONS)
 
 
 def make_shorthand(name: str, /, **parameters: Any) -> Operation:

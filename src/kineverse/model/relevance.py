@@ -7,7 +7,7 @@ the size of the model.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from kineverse.errors import ExpressionError
@@ -26,33 +26,31 @@ class Relevance:
         self._behind = {x.path: {s.path for s in e.symbols} for x, e in dependent.items()}
         self._by_expression: defaultdict[str, dict[str, None]] = defaultdict(dict)
         self._by_bounds: defaultdict[str, dict[str, None]] = defaultdict(dict)
-        self._alone: dict[Symbol, dict[str, None]] = {}
-        self._lines: dict[Symbol, dict[str, None]] = {}
+        self._alone: defaultdict[Symbol, dict[str, None]] = defaultdict(dict)
+        self._lines: defaultdict[Symbol, dict[str, None]] = defaultdict(dict)
 
     def add(self, name: str, constraint: Constraint) -> None:
         """Add a constraint to the index."""
-        for path in self._paths(constraint):
-            self._by_expression[path][name] = None
-        for path in self._with_behind(_bounds(constraint)):
-            self._by_bounds[path][name] = None
-        if isinstance(constraint.expression, Symbol):
-            self._alone.setdefault(constraint.expression, {})[name] = None
-        elif len(constraint.expression.symbols) == 1:
-            self._lines.setdefault(constraint.expression.symbols[0], {})[name] = None
+        for names in self._groups(constraint):
+            names[name] = None
 
     def remove(self, name: str, constraint: Constraint) -> None:
         """Remove a constraint from the index."""
-        for path in self._paths(constraint):
-            self._by_expression[path].pop(name, None)
-        for path in self._with_behind(_bounds(constraint)):
-            self._by_bounds[path].pop(name, None)
-        if isinstance(constraint.expression, Symbol):
-            self._alone.get(constraint.expression, {}).pop(name, None)
-        elif len(constraint.expression.symbols) == 1:
-            self._lines.get(constraint.expression.symbols[0], {}).pop(name, None)
+        for names in self._groups(constraint):
+            names.pop(name, None)
 
-    def _paths(self, constraint: Constraint) -> set[str]:
-        return self._with_behind({s.path for s in constraint.expression.symbols})
+    def _groups(self, constraint: Constraint) -> Iterator[dict[str, None]]:
+        """Yield the names under which a constraint is found."""
+        symbols = constraint.expression.symbols
+        for path in self._with_behind({s.path for s in symbols}):
+            yield self._by_expression[path]
+        bounds = (constraint.lower, constraint.upper)
+        for path in self._with_behind({s.path for bound in bounds for s in bound.symbols}):
+            yield self._by_bounds[path]
+        if isinstance(constraint.expression, Symbol):
+            yield self._alone[constraint.expression]
+        elif len(symbols) == 1:
+            yield self._lines[symbols[0]]
 
     def _with_behind(self, paths: set[str]) -> set[str]:
         return paths.union(*(self._behind.get(path, ()) for path in paths)) if self._behind else paths
@@ -114,21 +112,12 @@ class Relevance:
                 names |= self._by_expression.get(path, {}).keys()
                 if bounds:
                     names |= self._by_bounds.get(path, {}).keys()
-            new = set()
-            for name in names - found:
-                c = constraints[name]
-                if not symbols.isdisjoint(c.symbols if bounds else c.expression.symbols):
-                    new.add(name)
+            about = {n: constraints[n] if bounds else constraints[n].expression for n in names - found}
+            new = {name for name, part in about.items() if not symbols.isdisjoint(part.symbols)}
             found |= new
             if not closure or not new:
                 return sorted(found)
-            for name in new:
-                c = constraints[name]
-                symbols = symbols | set(c.symbols if bounds else c.expression.symbols)
-
-
-def _bounds(constraint: Constraint) -> set[str]:
-    return {s.path for bound in (constraint.lower, constraint.upper) for s in bound.symbols}
+            symbols = symbols.union(*(about[name].symbols for name in new))
 
 
 class SymbolIndex:
@@ -154,8 +143,4 @@ class SymbolIndex:
 def _symbols_of(value: Frame | Constraint) -> Iterable[Symbol]:
     if isinstance(value, Constraint):
         return value.symbols
-    result: set[Symbol] = set()
-    for factor in value.factors:
-        if isinstance(factor, Expression):
-            result.update(factor.symbols)
-    return result
+    return {s for factor in value.factors if isinstance(factor, Expression) for s in factor.symbols}

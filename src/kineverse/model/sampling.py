@@ -27,10 +27,9 @@ class StateSamples:
     hold; other constraints may be violated.
     """
 
-    def __init__(self, *models: ModelView, count: int = 16, seed: int = 0) -> None:
+    def __init__(self, *models: ModelView, count: int = 16) -> None:
         self.size = count + 1
         self._models = models
-        self._seed = seed
         self._columns: dict[Symbol, Array] = {}
 
     @cached_property
@@ -58,7 +57,7 @@ class StateSamples:
         low, high = owner.limits(symbol) if owner is not None else (-np.inf, np.inf)
         low = low if np.isfinite(low) else min(default, high) - REACH
         high = high if np.isfinite(high) else max(default, low) + REACH
-        chance = np.random.default_rng([self._seed, crc32(str(symbol).encode(errors="replace"))])
+        chance = np.random.default_rng([0, crc32(str(symbol).encode(errors="replace"))])
         values = low + (high - low) * chance.random(self.size)
         values[0] = default
         return values

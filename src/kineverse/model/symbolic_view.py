@@ -24,7 +24,7 @@ from .body import Body
 from .constraint import Constraint
 from .display import as_html, as_lines
 from .frame import WORLD, Frame
-from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES, Cell
+from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES, Cell, map_expressions
 from .rates import RateEntry, Rates
 from .read_recorder import ABSENT, unknown_name_error
 from .relevance import Relevance, SymbolIndex
@@ -245,20 +245,17 @@ class SymbolicView:
             return constraint
         known = self._carried_constraints.get(name)
         if known is None:
-            known = Constraint(
-                rates.carry(constraint.lower),
-                rates.carry(constraint.expression),
-                rates.carry(constraint.upper),
-            )
-            self._carried_constraints[name] = known
+            known = self._carried_constraints[name] = map_expressions(CONSTRAINTS, constraint, rates.carry)
         return known
 
     def _eliminate_dependent(self, constraint: Constraint) -> Constraint:
         rates = self.rates
         if not any(s.position in rates.dependent for s in constraint.symbols):
             return constraint
-        parts = (constraint.lower, constraint.expression, constraint.upper)
-        return Constraint(*(rates.eliminate(rates.carry(part)) for part in parts))
+        result: Constraint = map_expressions(
+            CONSTRAINTS, constraint, lambda e: rates.eliminate(rates.carry(e))
+        )
+        return result
 
     @property
     def rates(self) -> Rates:
@@ -366,13 +363,8 @@ class SymbolicView:
             raise UnknownNameError(
                 f"There is no form {form!r}; forms are 'world_aligned', 'world' and 'body'."
             )
-        key = (
-            frame,
-            relative_to,
-            form,
-            None if symbols is None else tuple(check_symbols(symbols)),
-            heuristic,
-        )
+        columns = None if symbols is None else tuple(check_symbols(symbols))
+        key = frame, relative_to, form, columns, heuristic
         with self._lock:
             self._settle()
             known = self._jacobians.get(key)
@@ -388,10 +380,7 @@ class SymbolicView:
             base, tip = kinematics.ROOT, kinematics.place_in_world(frame, self._frame)
         else:
             to_base, to_tip = kinematics.branches(frame, relative_to, self._frame)
-            base, tip = (
-                kinematics.compose_chain(to_base, self._frame),
-                kinematics.compose_chain(to_tip, self._frame),
-            )
+            base, tip = (kinematics.compose_chain(chain, self._frame) for chain in (to_base, to_tip))
         rotation, position, columns = kinematics.compute_twists(base, tip, heuristic)
         tip_nodes = tip.nodes | base.nodes
         by_speed: dict[Symbol, Expression] = {}

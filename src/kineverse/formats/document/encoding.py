@@ -154,6 +154,7 @@ def _refuse_form() -> NoReturn:
 
 
 _QUOTED = re.compile("`([^`]*)`")
+_MARKS = re.compile(r"^(key` in `)?\$?\.?|`$|\[\.\.\.\]")  # of msgspec in a place
 _TYPES = {
     "str": "a text",
     "int": "a whole number",
@@ -175,13 +176,7 @@ def _explain(error: Exception) -> str:
     text, _, place = str(error).partition(" - at `")
     text = _QUOTED.sub(_name_type, text)
     text = text if text[1:2].isupper() else text[:1].lower() + text[1:]
-    place = (
-        place.removeprefix("key` in `")
-        .removesuffix("`")
-        .removeprefix("$")
-        .removeprefix(".")
-        .replace("[...]", "")
-    )
+    place = _MARKS.sub("", place)
     return f"{place}: {text}" if place else text
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import Any
 
 import casadi as ca
@@ -89,7 +90,7 @@ class NodeTable:
                 return self._opaque[owner]
         stored = zip(sx.sparsity().row(), sx.sparsity().get_col(), elements, strict=True)
         refs: list[int | None] = [None] * size
-        for row, column, element in sorted(stored, key=_row_and_column):
+        for row, column, element in sorted(stored, key=itemgetter(0, 1)):
             refs[row * columns + column] = self._scalar(element)
         return self._shared(("matrix", shape, tuple(refs)))
 
@@ -223,10 +224,6 @@ class NodeTable:
             raise FormatError(f"The model has more than {MAX_NODES:,} nodes, the most a document has.")
         self.nodes.append(node)
         return len(self.nodes) - 1
-
-
-def _row_and_column(stored: tuple[int, int, SX]) -> tuple[int, int]:
-    return stored[:2]
 
 
 def _floats(values: Sequence[float]) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ from kineverse.expressions import layout
 from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
 from kineverse.expressions.graph import leaves, topological_order
 from kineverse.expressions.implicit import Implicit, ImplicitFunction
-from kineverse.expressions.node import Augment, Node
+from kineverse.expressions.node import Augment
 from kineverse.expressions.nonsmooth import Extremum, Norm, Power, Select
 from kineverse.expressions.piecewise import Piecewise, check_pieces
 from kineverse.logic import And, Less, Not, Or
@@ -255,16 +255,12 @@ def _newton_work(graph: NodeGraph, residual: Expression, unknowns: tuple[Symbol,
     """
     n = len(unknowns)
     size = ca.n_nodes(residual.sx)
-    for inner in topological_order(leaves(residual)[1], _arguments_of, lambda _: False):
+    for inner in topological_order(leaves(residual)[1], lambda n: n.arguments, lambda _: False):
         size += sum(ca.n_nodes(part.sx) for part in inner.arguments)
         if isinstance(inner, Implicit):
             again = any(collect_symbols(a).intersection(unknowns) for a in inner.arguments)
             size += graph.budget.functions[inner.function.key] if again else 0
     return int((steps + 1) * (COST_OF_STEP + (n + 2) * size + n**3))
-
-
-def _arguments_of(node: Node) -> tuple[Expression, ...]:
-    return node.arguments
 
 
 def _read(graph: NodeGraph, node: Any) -> None:

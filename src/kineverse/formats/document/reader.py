@@ -11,8 +11,7 @@ from kineverse._runtime import no_collection
 from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.files import MAX_BYTES
 from kineverse.formats.names import check_prefix
-from kineverse.formats.resource_paths import restrict_meshes
-from kineverse.formats.resources import folders_by_tag, map_meshes, meshes_of
+from kineverse.formats.resources import folders_by_tag, map_meshes, meshes_of, restrict_meshes
 from kineverse.formats.root_folder import NOWHERE, find_text_root
 from kineverse.model.body import Body, Mesh
 from kineverse.model.frame import WORLD
@@ -293,7 +292,6 @@ class _Document:
         return writes
 
     def _place_meshes(self, writes: dict[Cell, Any], folders: dict[int, str]) -> None:
-        """Put meshes where the document says that their files lie."""
         count = 0
 
         def place(mesh: Mesh) -> Mesh:
@@ -329,7 +327,6 @@ class _Document:
 
 
 def _add_parents(reads: Reads, writes: dict[Cell, Any]) -> None:
-    """Add the reads of the parents that written frames need."""
     for (kind, _), value in writes.items():
         if kind == FRAMES and value.parent != WORLD and (FRAMES, value.parent) not in writes:
             reads.cells.setdefault((FRAMES, value.parent), Read.EXISTENCE)

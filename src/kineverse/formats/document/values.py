@@ -149,8 +149,9 @@ def decode_writes(
             try:
                 cell = names.cell(kind, check_name(name))
                 decoded = decode(cell[1], value, graph, names)
-                if kind == CONSTRAINTS and not is_trace and not _has_numbers(decoded):
-                    as_constraint(decoded)  # of a trace, once the values are known
+                if kind == CONSTRAINTS and not is_trace:
+                    if not (decoded.lower.sx.is_constant() and decoded.upper.sx.is_constant()):
+                        as_constraint(decoded)  # of a trace, once the values are known
             except (InvalidDocumentError, KineverseError) as error:
                 raise InvalidDocumentError(f"writes {kind}/{name[:60]}: {error}") from None
             yield cell, decoded
@@ -192,11 +193,6 @@ def _decode_articulation(
     if len(given.home) >= _QUATERNION:  # all numbers are finite
         check_home(name, result)
     return result
-
-
-def _has_numbers(constraint: Constraint) -> bool:
-    """Return whether the bounds are numbers, as most are."""
-    return bool(constraint.lower.sx.is_constant() and constraint.upper.sx.is_constant())
 
 
 def _decode_rate(name: str, given: Any, graph: NodeGraph, names: Names) -> tuple[Symbol, RateEntry]:

@@ -69,7 +69,6 @@ class CurveApproximation:
         return replace(found, motions=tuple(motions))
 
     def _fit_motion(self, motion: JointMotion) -> tuple[JointMotion, float] | str:
-        """Return a polynomial motion and the bound of its error, or the reason why there is none."""
         symbols = find_term_symbols(motion.variable)
         if len(symbols) != 1:
             names = ", ".join(map(str, symbols))
@@ -157,7 +156,7 @@ class CurveApproximation:
             turns = [(angle, distance + whole) for angle, distance in turns]
             for k, error in errors.items():
                 motion = found.motions[k]
-                if _is_translation(motion):
+                if isinstance(motion, JointMotion) and not motion.is_rotation:
                     shift += error
                 else:
                     turns.append((error, float(np.linalg.norm(motion.point)) + sum(reaches[k + 1 :])))
@@ -177,10 +176,6 @@ class CurveApproximation:
         amount = motion.coefficients
         span = enclose_curve(lambda where: taylor_polynomial(amount, taylor_variable(where)), lower, upper)
         return max(abs(span[0]), abs(span[1])) + error
-
-
-def _is_translation(motion: JointMotion | QuaternionMotion) -> bool:
-    return isinstance(motion, JointMotion) and not motion.is_rotation
 
 
 def find_term_symbols(term: Term) -> list[Symbol]:
@@ -210,13 +205,12 @@ class MinimaxFit:
     """Polynomial approximation of a curve over an interval.
 
     ``error`` is a certified upper bound of the largest difference, ``sampled`` the largest difference at a
-    sampled point. ``largest`` bounds the magnitude of the polynomial.
+    sampled point.
     """
 
     polynomial: Coefficients
     error: float
     sampled: float
-    largest: float
 
 
 def chebyshev_points(lower: float, upper: float) -> Matrix:
@@ -233,12 +227,10 @@ def fit_polynomial(
     polynomial = _remez(x, values, lower, upper, degree)
     found = np.polynomial.polynomial.polyval(x, polynomial)
     sampled = float(np.abs(found - values).max())
-    largest = float(np.abs(values).max()) + sampled
     if sampled > tolerance:
-        return MinimaxFit(polynomial, math.inf, sampled, largest)
+        return MinimaxFit(polynomial, math.inf, sampled)
     error = bound_error(curve, polynomial, lower, upper, sampled, _NEGLIGIBLE * tolerance)
-    extent = enclose_curve(lambda where: taylor_polynomial(polynomial, taylor_variable(where)), lower, upper)
-    return MinimaxFit(polynomial, error, sampled, max(abs(extent[0]), abs(extent[1])))
+    return MinimaxFit(polynomial, error, sampled)
 
 
 def bound_error(
@@ -301,11 +293,9 @@ def _evaluate_series(here: TaylorSeries, around: TaylorSeries, low: float, high:
     middle = (low + high) / 2
     away = round_outwards(low - middle, high - middle)
     total = ZERO_INTERVAL
-    for k in range(count):
-        coefficient = around[k] if k == count - 1 else here[k]
-        total = interval_add(
-            total, interval_multiply(coefficient, interval_power(away, (k, k)) if k else (1.0, 1.0))
-        )
+    for k, coefficient in enumerate((*here[: count - 1], around[count - 1])):
+        power = interval_power(away, (k, k)) if k else (1.0, 1.0)
+        total = interval_add(total, interval_multiply(coefficient, power))
     return max(total[0], value[0]), min(total[1], value[1])
 
 
@@ -315,7 +305,6 @@ def _size(a: RealInterval) -> float:
 
 
 def _remez(x: Matrix, y: Matrix, lower: float, upper: float, degree: int) -> Coefficients:
-    """Return the minimax polynomial on points by Remez' exchange of the reference points."""
     t = (2 * x - lower - upper) / (upper - lower)
     basis = np.polynomial.chebyshev.chebvander(t, degree)
     chosen = np.linspace(0, len(x) - 1, degree + 2).round().astype(int)

@@ -96,14 +96,12 @@ class UnsupportedFeatures:
         if not self._reasons:
             return
         count = len(self._reasons)
-        shown = [
-            f"'{name}' {' and '.join(reasons)}" for name, reasons in list(self._reasons.items())[:_SHOWN]
-        ]
+        listed = [f"'{name}' {' and '.join(reasons)}" for name, reasons in self._reasons.items()]
         more = f"; and {count - _SHOWN} more" if count > _SHOWN else ""
         things = "one thing" if count == 1 else f"{count} things"
         raise UnsupportedError(
             f"{file} is not written: {self.target} cannot express {things} of this model. "
-            f"{'; '.join(shown)}{more}.",
+            f"{'; '.join(listed[:_SHOWN])}{more}.",
             self.curved,
             self.strict,
         )

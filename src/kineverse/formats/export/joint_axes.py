@@ -124,7 +124,8 @@ def decompose_transform(
                 )
             motions.append(QuaternionMotion(part.factor, as_vector3(round_position(-behind[:3, 3]))))
         else:
-            behind = _clean_pose(part @ behind)
+            pose = part @ behind
+            behind = transform(round_exact(pose[:3, :3]), round_position(pose[:3, 3]))
     return MotionChain(behind, tuple(reversed(motions)))
 
 
@@ -158,13 +159,10 @@ def _matrix_entries(
 def _substitute_polynomials(
     parts: Iterable[Matrix | AnyJointMotion], converter: TrigPolynomialConverter
 ) -> Iterator[Matrix | AnyJointMotion]:
-    """Yield the parts, with motions by variables that are polynomials replaced by polynomial motions."""
     for part in parts:
-        sums = (
-            _as_polynomials(converter.convert(part.variable), converter)
-            if isinstance(part, JointMotion)
-            else None
-        )
+        sums = None
+        if isinstance(part, JointMotion):
+            sums = _as_polynomials(converter.convert(part.variable), converter)
         if sums is None or not isinstance(part, JointMotion):
             yield part
             continue
@@ -191,17 +189,8 @@ def _axis_motion(
     if sums is None:
         if _has_only_coordinates(amount, converter) and not factor.is_rotation:
             return None
-        curve = factor.amount
-        return [
-            JointMotion(
-                factor.is_rotation,
-                factor.direction,
-                ZERO_VECTOR,
-                terms.term(curve),
-                IDENTITY_COEFFICIENTS,
-                curve,
-            )
-        ]
+        line, curve = (factor.is_rotation, factor.direction, ZERO_VECTOR), factor.amount
+        return [JointMotion(*line, terms.term(curve), IDENTITY_COEFFICIENTS, curve)]
     polynomials, offset = sums
     result: list[Matrix | AnyJointMotion] = []
     if offset and not (offsets and polynomials):
@@ -217,14 +206,12 @@ def _axis_motion(
 
 
 def _has_only_coordinates(amount: TrigPolynomial, converter: TrigPolynomialConverter) -> bool:
-    """Return True if all variables of an amount are coordinates, rather than curves over them."""
     return all(converter.variables[v].op == ca.OP_PARAMETER for v in amount.variables)
 
 
 def _as_polynomials(
     amount: TrigPolynomial, converter: TrigPolynomialConverter
 ) -> tuple[dict[int, Coefficients], float] | None:
-    """Return an amount as polynomials of single coordinates and a constant; None if it is no such sum."""
     return amount.polynomials if _has_only_coordinates(amount, converter) else None
 
 
@@ -359,7 +346,3 @@ def _ellipse_motions(
         back = [JointMotion(True, axis, ZERO_VECTOR, m.variable, (0.0, -m.coefficients[1])) for m in turns]
         result += [*turns, reach, *back]
     return result
-
-
-def _clean_pose(pose: Matrix) -> Matrix:
-    return transform(round_exact(pose[:3, :3]), round_position(pose[:3, 3]))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.graph import leaves, topological_order
 from kineverse.expressions.node import Augment
-from kineverse.formats.description import JointBounds, JointDescription, RobotDescription, SumLimit
+from kineverse.formats.description import JointDescription, RobotDescription, SumLimit
 from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
 
@@ -133,30 +133,28 @@ def assign_limits(
                 item.name, f"is about '{item.symbol}', which is the position or speed of no joint"
             )
             continue
+        bounds = joint.bounds
         if not item.symbol.order:
-            if kind == "soft_limits" and joint.name == owner and joint.bounds.soft is None:
-                joint.bounds.soft = low, high
+            if kind == "soft_limits" and joint.name == owner and bounds.soft is None:
+                bounds.soft = low, high
             else:
-                joint.bounds.intersect_positions(low, high)
+                bounds.lower, bounds.upper = max(bounds.lower, low), min(bounds.upper, high)
         elif target.one_way_speeds or low == -high:
-            joint.bounds.intersect_velocities(low, high)
+            bounds.min_velocity = max(bounds.min_velocity, low)
+            bounds.max_velocity = min(bounds.max_velocity, high)
         else:
             unsupported.leave_out(item.name, "limits a speed differently in its two directions")
     for joint in description.joints:
         if joint.bounds.lower > joint.bounds.upper:
-            unsupported.refuse(joint.name, f"cannot be anywhere: {_format_bounds(joint.bounds)}")
+            ends = f"{joint.bounds.lower:g} and {joint.bounds.upper:g}"
+            unsupported.refuse(joint.name, f"cannot be anywhere: its limits leave nothing between {ends}")
 
 
 def _is_about_joint(joint: JointDescription, coordinate: Symbol, item: CoordinateLimit) -> bool:
-    """Return True if a limit is on exactly the joint's position, or on its speed."""
     if joint.symbol != coordinate or len(joint.coefficients) != 2:
         return False
     offset = 0.0 if item.symbol.order else joint.coefficients[0]
     return (offset, joint.coefficients[1]) == (item.offset, item.slope)
-
-
-def _format_bounds(bounds: JointBounds) -> str:
-    return f"its limits leave nothing between {bounds.lower:g} and {bounds.upper:g}"
 
 
 def has_given_gradient(expression: Expression) -> bool:

@@ -10,12 +10,11 @@ from typing import Literal
 import numpy as np
 
 from kineverse.articulations.multi_axis import orientation
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import UnknownNameError, list_some, suggest
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
-    NO_BODY,
     BallJointDescription,
     JointDescription,
     LinkDescription,
@@ -29,7 +28,7 @@ from kineverse.intervals.graph import TermGraph
 from kineverse.loops.equations import AXES
 from kineverse.loops.loop_records import LOOP_KINDS, LoopRecord, find_loops
 from kineverse.model.articulation import Articulation
-from kineverse.model.body import Pose
+from kineverse.model.body import NO_BODY, Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
@@ -108,7 +107,6 @@ def find_loop_joints(model: ModelView) -> Iterator[LoopJoint]:
 
 
 def _loop_joint_kind(model: ModelView, loop: LoopRecord) -> Literal["connect", "weld"] | None:
-    """Return the kind of equality that is equivalent to a loop; None if there is none."""
     if set(loop.mask) == set(AXES):
         return "weld"
     if not set(loop.mask) <= set(AXES[:3]):
@@ -221,7 +219,6 @@ class LinkTreeBuilder:
                 yield item
 
     def _check_errors(self, errors: Mapping[str, FrameDeviation]) -> None:
-        """Refuse the frame with the largest pose error, if that exceeds the tolerance."""
         assert self._tolerance is not None
         worst = max(errors, key=lambda name: max(errors[name].position, errors[name].angle), default=None)
         if worst is None:
@@ -258,7 +255,6 @@ class LinkTreeBuilder:
         return apply_substitution(expression, known) if known else expression
 
     def _decompose_frame(self, name: str, approximation: CurveApproximation | None) -> MotionChain | None:
-        """Return the transform of a frame from its parent as a motion chain; None if it is refused."""
         factors = [self._factor(f) for f in self.model.frames[name].factors]
         record = self._articulation_of(name)
         follows = record is not None and record.follows is not None
@@ -301,11 +297,9 @@ class LinkTreeBuilder:
             return factor
         if isinstance(factor, OneAxisTransform):
             amount = self.resolve(factor.amount)
-            return (
-                factor
-                if amount is factor.amount
-                else OneAxisTransform(factor.direction, amount, factor.is_rotation)
-            )
+            if amount is factor.amount:
+                return factor
+            return OneAxisTransform(factor.direction, amount, factor.is_rotation)
         return self.resolve(factor)
 
     def _independent_motions(self, chains: Mapping[str, MotionChain]) -> dict[Symbol, tuple[str, int]]:
@@ -425,10 +419,8 @@ class LinkTreeBuilder:
         for coordinate, row in self._rates.items():
             if coordinate in quaternions:
                 continue
-            owner = next(
-                (n for n, r in self.model.articulations.items() if coordinate in r.coordinates),
-                str(coordinate),
-            )
+            owners = (n for n, r in self.model.articulations.items() if coordinate in r.coordinates)
+            owner = next(owners, str(coordinate))
             if owner in self._left_out or str(coordinate) in self._left_out:
                 continue
             driven.setdefault(owner, set()).update(map(str, row))
@@ -439,9 +431,7 @@ class LinkTreeBuilder:
 
     def _add_remarks(self) -> None:
         if self.model.data:
-            names = list(self.model.data)
-            more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-            self.remarks.append(f"data are not written: {', '.join(names[:4])}{more}")
+            self.remarks.append(f"data are not written: {list_some(self.model.data, 4)}")
         for name in self._left_out:
             self.remarks.append(f"'{name}' is left out, as asked for")
 

@@ -42,6 +42,7 @@ from .elements import ElementRemark, MjcfElement
 from .meshes import place_mesh
 from .mujoco_api import mujoco
 
+_JOINT_KINDS: tuple[MjcfJointType, ...] = ("free", "ball", "slide", "hinge")  # in the order of mjtJoint
 _VISIBLE_GROUPS = range(3)  # geom groups that MuJoCo's viewers show by default
 
 _DEFAULT_COLOR = [0.5, 0.5, 0.5, 1.0]
@@ -75,7 +76,6 @@ class MjcfShapes:
         return Body(tuple(visuals), tuple(collisions), self._inertia(number))
 
     def _inertia(self, number: int) -> Inertia | None:
-        """Return the inertia of a body; None if it is unknown or zero."""
         m = self._model
         mass = float(m.body_mass[number])
         a, b, c = m.body_inertia[number].tolist()
@@ -84,7 +84,6 @@ class MjcfShapes:
         return Inertia(mass, (a, 0.0, 0.0, b, 0.0, c), mujoco_pose(m.body_ipos[number], m.body_iquat[number]))
 
     def _shape(self, geom: int, color: Rgba) -> Shape | None:
-        """Return the shape of a geom; None, with a remark, if it is left out."""
         m, kinds = self._model, mujoco().mjtGeom
         name, kind = m.geom(geom).name, m.geom_type[geom]
         pose = mujoco_pose(m.geom_pos[geom], m.geom_quat[geom])
@@ -128,7 +127,6 @@ class MjcfShapes:
 
 
 def _primitive(kind: int, size: list[float]) -> Geometry | None:
-    """Return the geometry of a primitive geom; None for other types."""
     kinds = mujoco().mjtGeom
     x, y, z = size
     if kind == kinds.mjGEOM_BOX:
@@ -235,15 +233,10 @@ class MjcfBodies:
             for count, number in enumerate(numbers):
                 name = self.body_names[body] + ("" if len(numbers) == 1 else f"/joint{count}")
                 names[number] = self._unique_joints.invent(name, self._where(self._joint_nodes[number]))
-        kinds = {int(mujoco().mjtJoint.mjJNT_BALL): "ball", int(mujoco().mjtJoint.mjJNT_FREE): "free"}
         for number in range(m.njnt):
-            kind: MjcfJointType = kinds.get(int(m.jnt_type[number]), "hinge")  # type: ignore[assignment]  # as above
             name, where = names[number], self._where(self._joint_nodes[number])
-            clash = [
-                f"{name}/{suffix}"
-                for suffix in COORDINATE_SUFFIXES[kind]
-                if f"{name}/{suffix}" in self._unique_joints
-            ]
+            coordinates = [f"{name}/{suffix}" for suffix in COORDINATE_SUFFIXES[self._kind(number)]]
+            clash = [coordinate for coordinate in coordinates if coordinate in self._unique_joints]
             if clash:
                 problem = f"its coordinate would be called {quote(clash[0])} here, as a joint is. Rename one"
                 names[number] = self._unique_joints.replace(f"{name}_joint", where, problem)
@@ -290,18 +283,15 @@ class MjcfBodies:
         )
 
     def _mocap_joint(self, number: int) -> MjcfJoint:
-        """Return the free joint of a mocap body, whose pose programs set."""
         where = self._where(self._body_nodes[number])
         name = self._unique_joints.invent(f"{self.body_names[number]}/{FREE_JOINT}", where)
         return MjcfJoint(name, "free", self.body_names[number], home=(0.0,) * 6 + (1.0,), where=where)
 
+    def _kind(self, number: int) -> MjcfJointType:
+        return _JOINT_KINDS[int(self._model.jnt_type[number])]
+
     def _joint(self, number: int) -> MjcfJoint:
-        m, kinds = self._model, mujoco().mjtJoint
-        kind: MjcfJointType = {
-            int(kinds.mjJNT_HINGE): "hinge",
-            int(kinds.mjJNT_SLIDE): "slide",
-            int(kinds.mjJNT_BALL): "ball",
-        }.get(int(m.jnt_type[number]), "free")  # type: ignore[assignment]  # mypy widens literals in a dict
+        m, kind = self._model, self._kind(number)
         name, where = self.joint_names[number], self._where(self._joint_nodes[number])
         lower = upper = None
         if m.jnt_limited[number] and kind != "free":

@@ -66,7 +66,6 @@ class MeshFiles:
         return file_reference(file, self._folder, self._remark)
 
     def _find_or_convert(self, mesh: Mesh) -> str | None:
-        """Return the reference to a mesh file that MuJoCo reads; None, with a remark, if there is none."""
         try:
             file = Path(os.path.abspath(locate_mesh(mesh)))
         except FormatError as error:
@@ -96,7 +95,6 @@ class MeshFiles:
         return f"{self._mesh_folder.name}/{name}"
 
     def _is_taken(self, path: Path, content: bytes) -> bool:
-        """Return True if a path is that of another mesh or of an existing file with different content."""
         if path in self.converted:
             return self.converted[path] != content
         try:
@@ -238,7 +236,6 @@ class MjcfBodyWriter:
             geom.give("rgba", shape.color)
 
     def _name(self, shape: Shape, owner: str) -> str | None:
-        """Return the name of a shape; None, with a remark, if it is taken."""
         if not shape.name or shape.name in self._names:
             if shape.name:
                 self._remark(f"a shape of '{owner}' has no name, since there is another '{shape.name}'")
@@ -247,31 +244,26 @@ class MjcfBodyWriter:
         return shape.name
 
     def _geometry(self, form: Geometry, name: str) -> dict[str, Any] | None:
-        """Return the geom attributes of a geometry; None, with a remark, if MJCF has no such geometry."""
         if isinstance(form, Mesh):
             mesh = self._mesh(form)
             return None if mesh is None else {"type": "mesh", "mesh": mesh}
-        sizes: dict[type, tuple[str, tuple[float, ...]]] = {}
+        size: tuple[float, ...] = ()
         if isinstance(form, Box):
-            x, y, z = form.size
-            sizes[Box] = "box", (x / 2, y / 2, z / 2)
+            size = tuple(edge / 2 for edge in form.size)
         elif isinstance(form, Sphere):
-            sizes[Sphere] = "sphere", (form.radius,)
+            size = (form.radius,)
         elif isinstance(form, (Cylinder, Capsule)):
-            sizes[type(form)] = form.kind, (form.radius, form.length / 2)
+            size = (form.radius, form.length / 2)
         elif isinstance(form, Ellipsoid):
-            sizes[Ellipsoid] = "ellipsoid", form.radii
-        if type(form) not in sizes:
-            self._remark(f"MJCF has no {form.kind}: one of '{name}' is left out")
+            size = form.radii
+        if not size or not all(s > 0 or math.isnan(s) for s in size):
+            self._remark(
+                f"MJCF has no {form.kind}{' of size 0' if size else ''}: one of '{name}' is left out"
+            )
             return None
-        kind, size = sizes[type(form)]
-        if not all(s > 0 or math.isnan(s) for s in size):
-            self._remark(f"MJCF has no {kind} of size 0: one of '{name}' is left out")
-            return None
-        return {"type": kind, "size": size}
+        return {"type": form.kind, "size": size}
 
     def _mesh(self, mesh: Mesh) -> str | None:
-        """Return the name of the asset of a mesh, which is added if it is new; None if it is left out."""
         file = self.files.mesh_reference(mesh)
         if file is None:
             return None
@@ -284,7 +276,6 @@ class MjcfBodyWriter:
         return self._meshes[key]
 
     def _material(self, shape: Shape) -> str | None:
-        """Return the name of the material of a textured shape; None if its texture is left out."""
         mesh = shape.geometry if isinstance(shape.geometry, Mesh) else Mesh("")
         key = shape.color, shape.texture, mesh.folder, mesh.root
         if key not in self._materials:

@@ -25,14 +25,8 @@ from .mujoco_api import mujoco
 from .preprocess import PreprocessedMjcf
 
 _CHECKED_ARRAYS = (
-    "body_pos",
-    "body_quat",
-    "jnt_pos",
-    "jnt_axis",
-    "qpos0",
-    "site_pos",
-    "site_quat",
-    "eq_data",
+    *("body_pos", "body_quat", "jnt_pos", "jnt_axis"),
+    *("qpos0", "site_pos", "site_quat", "eq_data"),
 )
 
 
@@ -84,7 +78,6 @@ def _try_compile(
     remark: ElementRemark,
     with_files: bool = True,
 ) -> CompiledMjcf:
-    """Compile a document with or without the mesh files that inertia and sizes depend on."""
     spec = mujoco_api.parse_spec(prepared, source)
     strength, home = joint_efforts(spec), _home(spec)
     if spec.actuators or spec.keys:
@@ -100,12 +93,11 @@ def _try_compile(
         if files:
             raise _MeshError(str(error)) from None
         raise
-    meshes = replacement.meshes
     left_out = {geom.id: "is left out: a height field is no shape here." for geom in height_fields}
-    for geom in meshes.unknown_size:
+    for geom in replacement.unknown_size:
         left_out[geom.id] = "is left out: its size is that of a mesh that is not there."
-    unknown_inertia = frozenset(body.id for body in meshes.unknown_inertia)
-    return CompiledMjcf(spec, model, prepared, meshes.assets, left_out, unknown_inertia, strength, home)
+    unknown_inertia = frozenset(body.id for body in replacement.unknown_inertia)
+    return CompiledMjcf(spec, model, prepared, replacement.assets, left_out, unknown_inertia, strength, home)
 
 
 def _prepare_shapes(spec: Any) -> list[Any]:
@@ -121,7 +113,6 @@ def _prepare_shapes(spec: Any) -> list[Any]:
 
 
 def _home(spec: Any) -> npt.NDArray[np.float64] | None:
-    """Return the joint positions of the key ``home``; None if there is none."""
     for key in spec.keys:
         if key.name == "home" and len(key.qpos):
             return np.array(key.qpos, dtype=float)
@@ -159,7 +150,6 @@ def _strength(actuator: Any) -> float:
 
 
 def _limited(flag: Any, limits: Any) -> bool:
-    """Return True if MuJoCo applies a range."""
     kinds = mujoco().mjtLimited
     return bool(flag == kinds.mjLIMITED_TRUE or (flag == kinds.mjLIMITED_AUTO and limits[0] < limits[1]))
 

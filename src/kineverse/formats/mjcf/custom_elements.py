@@ -133,7 +133,6 @@ def _swap_ends(closure: MjcfClosure) -> MjcfClosure:
 
 
 def _parse_range(text: str) -> tuple[float, float] | None:
-    """Return the two numbers of a range; None if the text is none."""
     try:
         lower, upper = map(float, text.split())
     except ValueError:
@@ -142,7 +141,6 @@ def _parse_range(text: str) -> tuple[float, float] | None:
 
 
 def _object_names(node: MjcfElement, kind: str, dependent: bool | None = None) -> Iterator[str]:
-    """Yield the names of one type of objects in a tuple; only dependent or independent ones on request."""
     for element in node.children:
         attributes = element.attributes
         is_dependent = attributes.get("prm", "0") not in ("0", "")
@@ -157,7 +155,7 @@ def add_speeds(custom: Tag, joints: Iterable[JointDescription]) -> bool:
         min_velocity, max_velocity = joint.bounds.min_velocity, joint.bounds.max_velocity
         if (min_velocity, max_velocity) != (-math.inf, math.inf):
             numeric = custom.add("numeric", name=f"{SPEED_PREFIX}{joint.name}")
-            numeric.attributes["data"] = format_range(min_velocity, max_velocity)
+            numeric.attributes["data"] = f"{min_velocity!r} {max_velocity!r}"
             result = True
     return result
 
@@ -191,10 +189,3 @@ def _as_tuple_or_text(tuple_tag: Tag) -> Tag:
     elements = [[tag.attributes.get(key, "0") for key in TUPLE_ATTRIBUTES] for tag in tuple_tag.inside]
     data = json.dumps(elements, ensure_ascii=False)
     return Tag("text", {"name": tuple_tag.attributes["name"], "data": data})
-
-
-def format_range(lower: float, upper: float) -> str:
-    """Return the ends of a range, which may be infinite, as text."""
-    return " ".join(
-        "inf" if end == math.inf else "-inf" if end == -math.inf else repr(end) for end in (lower, upper)
-    )

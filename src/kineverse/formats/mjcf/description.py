@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from kineverse.formats.poses import IDENTITY
-from kineverse.model.body import Body, Pose, Vector3
+from kineverse.model.body import NO_BODY, Body, Pose, Vector3
 
 MjcfJointType: TypeAlias = Literal["hinge", "slide", "ball", "free"]
 MjcfDynamics: TypeAlias = tuple[tuple[str, float], ...]
 Quartic: TypeAlias = tuple[float, float, float, float, float]
-
-_EMPTY_BODY = Body()
 
 WORLD = "world"  # name of the root body
 
@@ -63,7 +61,7 @@ class MjcfLink:
     parent: str
     pose: Pose = IDENTITY
     joints: tuple[MjcfJoint, ...] = ()
-    body: Body = _EMPTY_BODY
+    body: Body = NO_BODY
     where: str = ""
 
 

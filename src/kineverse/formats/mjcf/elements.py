@@ -69,14 +69,8 @@ def read_tree(
     """Return the root element of a document, with includes replaced by the content of their files."""
 
     def parsed(data: str | bytes, source: str) -> Element:
-        return parse_xml(
-            data,
-            source,
-            depth=MAX_ELEMENT_DEPTH,
-            on_recoverable_error=None
-            if on_recoverable_error is None
-            else partial(on_recoverable_error, source),
-        )
+        fault = partial(on_recoverable_error, source) if on_recoverable_error else None
+        return parse_xml(data, source, depth=MAX_ELEMENT_DEPTH, on_recoverable_error=fault)
 
     top = parsed(data, source)
     _check_root(top, source)

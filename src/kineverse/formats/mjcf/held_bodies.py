@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from kineverse.formats.description import DisjointSets
-from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
+from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose, pose_from_rpy
 from kineverse.model.body import Pose
 
 from .description import WORLD, MjcfClosure, MjcfLink, MjcfScene
@@ -62,7 +62,6 @@ class _HeldBodies:
         return (frame, pose) if site is None else (site.parent, compose_poses(site.pose, pose))
 
     def _attach_to(self, closure: MjcfClosure, holder: tuple[str, Pose], held: tuple[str, Pose]) -> bool:
-        """Attach the free body at one end to the link at the other end; return False if it is not free."""
         name, end = held
         while not self.links[name].joints and name != WORLD:
             end, name = compose_poses(self.links[name].pose, end), self.links[name].parent
@@ -80,7 +79,7 @@ class _HeldBodies:
         x, y, z = (p - q for p, q in zip(parent_end.rows[3::4], rotated_end.rows[3::4], strict=True))
         anchor = end.rows[3], end.rows[7], end.rows[11]
         ball = replace(link.joints[0], kind="ball", anchor=anchor, home=())
-        pose = compose_poses(Pose((1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z)), rotation)
+        pose = compose_poses(pose_from_rpy((x, y, z), (0.0, 0.0, 0.0)), rotation)
         self.links[name] = replace(link, parent=parent, pose=pose, joints=(ball,))
         return True
 
@@ -90,7 +89,6 @@ def _is_free(link: MjcfLink) -> bool:
 
 
 def _outwards(links: Iterable[MjcfLink]) -> tuple[MjcfLink, ...]:
-    """Return links from the world outwards, depth first."""
     below: dict[str, list[MjcfLink]] = {}
     world = []
     for link in links:

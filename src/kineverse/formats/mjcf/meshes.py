@@ -11,7 +11,7 @@ may crash: a torus of radius 0 does. So these meshes are made in a process of it
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -48,21 +48,12 @@ class MeshAsset:
     quaternion: tuple[float, ...]
 
 
-@dataclass(slots=True)
-class MjcfMeshes:
-    """Meshes of a specification, by name.
-
-    ``unknown_inertia`` are the bodies whose inertia depends on a missing file, ``unknown_size`` the geoms
-    whose size does.
-    """
-
-    assets: dict[str, MeshAsset] = field(default_factory=dict)
-    unknown_inertia: list[Any] = field(default_factory=list)
-    unknown_size: list[Any] = field(default_factory=list)
-
-
 class MeshReplacement:
-    """Replacement of mesh files in a specification by boxes, or by their content where it matters."""
+    """Replacement of mesh files in a specification by boxes, or by their content where it matters.
+
+    ``assets`` are the meshes by name, ``unknown_inertia`` the bodies whose inertia depends on a missing file,
+    and ``unknown_size`` the geoms whose size does.
+    """
 
     def __init__(
         self,
@@ -74,7 +65,9 @@ class MeshReplacement:
     ) -> None:
         self._spec, self._prepared, self._remark = spec, prepared, remark
         self._folder, self._root = folder, root
-        self.meshes = MjcfMeshes()
+        self.assets: dict[str, MeshAsset] = {}
+        self.unknown_inertia: list[Any] = []
+        self.unknown_size: list[Any] = []
         self._made: dict[MeshReference, Triangles | str] = {}
         self._nodes: dict[str, MjcfElement] = {}
         self._boxes: dict[str, tuple[Any, list[float], list[int]]] = {}
@@ -84,7 +77,7 @@ class MeshReplacement:
                 continue
             self._nodes[mesh.name] = node
             placement = (tuple(map(float, v)) for v in (mesh.scale, mesh.refpos, mesh.refquat))
-            self.meshes.assets[mesh.name] = MeshAsset(prepared.files[node].uri, *placement)
+            self.assets[mesh.name] = MeshAsset(prepared.files[node].uri, *placement)
             mesh.scale, mesh.refpos, mesh.refquat = _IDENTITY_PLACEMENT
             self._boxes[mesh.name] = mesh, list(mesh.uservert), list(mesh.userface)
 
@@ -93,14 +86,18 @@ class MeshReplacement:
 
         If files are not wanted or cannot be read, their boxes remain, and inertia and sizes are unknown.
         """
-        self.meshes.unknown_inertia, self.meshes.unknown_size = [], []
+        self.unknown_inertia, self.unknown_size = [], []
         needed = [
             (geom, body) for body in self._spec.bodies for geom in body.geoms if self._needs_file(geom, body)
         ]
         contents: dict[str, bytes] = {}
         missing: dict[str, bool] = {}
         if wanted:
-            self._make({geom.meshname for geom, _ in needed})
+            found = [
+                self._prepared.files[self._nodes[name]] for name in sorted({g.meshname for g, _ in needed})
+            ]
+            plugins = [reference for reference in dict.fromkeys(found) if reference.plugin]
+            self._made = make_plugin_meshes(plugins) if plugins else {}
         for geom, body in needed:
             name = geom.meshname
             if name not in missing:
@@ -109,11 +106,11 @@ class MeshReplacement:
                 self._set_content(name, content, contents)
             if missing[name]:
                 if geom.type != mujoco().mjtGeom.mjGEOM_MESH:
-                    self.meshes.unknown_size.append(geom)
-                if not any(body is other for other in self.meshes.unknown_inertia) and body.name != "world":
-                    self.meshes.unknown_inertia.append(body)
+                    self.unknown_size.append(geom)
+                if not any(body is other for other in self.unknown_inertia) and body.name != "world":
+                    self.unknown_inertia.append(body)
         self._spec.assets = contents
-        for body in self.meshes.unknown_inertia:
+        for body in self.unknown_inertia:
             self._keep_frame(body)
         return any(not is_missing for is_missing in missing.values())
 
@@ -130,7 +127,6 @@ class MeshReplacement:
             joint.align = kinds.mjALIGNFREE_FALSE
 
     def _needs_file(self, geom: Any, body: Any) -> bool:
-        """Return True if the inertia of a body or the size of a geom depends on a mesh file."""
         if geom.meshname not in self._nodes:
             return False
         engine, compiler = mujoco(), self._spec.compiler
@@ -145,12 +141,6 @@ class MeshReplacement:
         if rule == kinds.mjINERTIAFROMGEOM_AUTO:
             return not body.explicitinertial
         return bool(rule == kinds.mjINERTIAFROMGEOM_TRUE)
-
-    def _make(self, names: set[str]) -> None:
-        found = [self._prepared.files[self._nodes[name]] for name in sorted(names)]
-        plugins = [reference for reference in dict.fromkeys(found) if reference.plugin]
-        if plugins:
-            self._made = make_plugin_meshes(plugins)
 
     def _content(self, name: str) -> bytes | Triangles | None:
         """Return the content of a mesh file, or the triangles that a plugin makes.
@@ -180,7 +170,7 @@ class MeshReplacement:
 
     def _set_content(self, name: str, content: bytes | Triangles | None, contents: dict[str, bytes]) -> None:
         """Set a mesh to a file of some content, to triangles, or to its box if there is neither."""
-        asset = self.meshes.assets[name]
+        asset = self.assets[name]
         mesh, *box = self._boxes[name]
         if content is None:
             mesh.file, (mesh.uservert, mesh.userface) = "", box

@@ -112,19 +112,15 @@ def find_load_error(root: Tag, folder: Path, converted: Mapping[Path, bytes]) ->
 def find_blamed_mesh(error: str, root: Tag) -> str | None:
     """Return the file of the mesh that an error is about; None for other errors."""
     names = {name.lower() for name in _MESH_NAME.findall(error)}
-    for tag in _assets(root):
+    assets = [tag for part in root.inside if part.name == "asset" for tag in part.inside]
+    for tag in assets:
         file = tag.attributes.get("file", "")
         if tag.name == "mesh" and (tag.attributes["name"] in names or Path(file).name in error):
             return file
     return None
 
 
-def _assets(root: Tag) -> list[Tag]:
-    return [tag for part in root.inside if part.name == "asset" for tag in part.inside]
-
-
 def _with_absolute_files(root: Tag, folder: Path, copies: Mapping[Path, Path]) -> Tag:
-    """Return a document with absolute paths of its assets; those of temporary copies where there are some."""
     inside = []
     for part in root.inside:
         if part.name == "asset":

@@ -16,7 +16,7 @@ from kineverse.expressions.expression import array
 from kineverse.expressions.gradient import total_derivative
 from kineverse.formats.description import path_between
 from kineverse.formats.names import NameMap
-from kineverse.formats.poses import IDENTITY, compose_poses
+from kineverse.formats.poses import IDENTITY, compose_poses, pose_from_rpy
 from kineverse.loops.close_loop import CloseLoop
 from kineverse.loops.equations import AXES
 from kineverse.model.basic_operations import AddFrame, Constrain, SetBody, SetHome
@@ -29,7 +29,7 @@ from kineverse.model.registry import FileContent
 from kineverse.spatial import axis_angle
 from kineverse.symbols import position, symbol_name
 
-from .description import COORDINATE_SUFFIXES, WORLD, MjcfClosure, MjcfCoupling, MjcfJoint, MjcfLink, MjcfScene
+from .description import COORDINATE_SUFFIXES, WORLD, MjcfClosure, MjcfJoint, MjcfLink, MjcfScene
 from .equalities import FollowerJoints, Tendon, TendonCoupling
 from .held_bodies import attach_held_bodies
 from .reader import parse_mjcf
@@ -101,7 +101,6 @@ def _home_position(joint: MjcfJoint, model_name: NameMap) -> Iterator[tuple[str,
 
 
 def _nonzero_rest(joint: MjcfJoint, model_name: NameMap) -> Iterator[tuple[str, float]]:
-    """Yield the coordinates of a joint that are not zero in the reference configuration of its equalities."""
     if joint.kind in ("ball", "free"):
         yield symbol_name(f"{model_name(joint.name)}/qw", 0), 1.0
     elif joint.reference:
@@ -146,13 +145,18 @@ def mjcf_operations(scene: MjcfScene, prefix: str | None = None) -> Iterator[Ope
             dynamics=tendon.dynamics,
         )
     for coupling in scene.tendon_couplings:
-        yield _tendon_coupling(coupling, model_name)
-    for link in scene.links:
-        for joint in link.joints:
-            if joint.name not in followers and (
-                any(joint.home[:6]) or _is_home_outside(joint, scene.has_home)
-            ):
-                yield SetHome(model_name(joint.name), joint.home)
+        yield TendonCoupling(
+            name=model_name(coupling.name),
+            tendon=model_name(coupling.follower),
+            leader=None if coupling.leader is None else model_name(coupling.leader),
+            coefficients=coupling.coefficients,
+            rest=coupling.rest,
+            leader_rest=coupling.leader_rest,
+        )
+    for joint in (joint for link in scene.links for joint in link.joints):
+        is_needed = any(joint.home[:6]) or _is_home_outside(joint, scene.has_home)
+        if is_needed and joint.name not in followers:
+            yield SetHome(model_name(joint.name), joint.home)
 
 
 def _link(link: MjcfLink, model_name: NameMap, followers: FollowerJoints) -> Iterator[Operation]:
@@ -228,10 +232,7 @@ def _angle_limit(name: str, angle: float) -> Constrain:
 
 
 def _translation(point: Vector3) -> Pose:
-    if not any(point):
-        return IDENTITY
-    x, y, z = point
-    return Pose((1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z))
+    return pose_from_rpy(point, (0.0, 0.0, 0.0)) if any(point) else IDENTITY
 
 
 def _motion_from_reference(joint: MjcfJoint) -> Pose:
@@ -239,15 +240,3 @@ def _motion_from_reference(joint: MjcfJoint) -> Pose:
         return Pose.from_matrix(axis_angle(joint.axis, -joint.reference))
     x, y, z = (-joint.reference * a for a in joint.axis)
     return _translation((x, y, z))
-
-
-def _tendon_coupling(coupling: MjcfCoupling, model_name: NameMap) -> TendonCoupling:
-    leader = None if coupling.leader is None else model_name(coupling.leader)
-    return TendonCoupling(
-        name=model_name(coupling.name),
-        tendon=model_name(coupling.follower),
-        leader=leader,
-        coefficients=coupling.coefficients,
-        rest=coupling.rest,
-        leader_rest=coupling.leader_rest,
-    )

@@ -35,11 +35,7 @@ _SECTIONS = frozenset(
 _ELEMENTS = frozenset(("plugin", "flexcomp", "skin", "texture", "light", "camera", "layer"))
 _FLEXIBLE = frozenset(("flex", "flexvert", "flexstrain"))
 _REMARKS = {
-    "deformable": "is left out: what bends has no frames here.",
-    "flexcomp": "is left out: what bends has no frames here.",
-    "flex": "is left out: what bends has no frames here.",
-    "flexvert": "is left out: what bends has no frames here.",
-    "flexstrain": "is left out: what bends has no frames here.",
+    **dict.fromkeys(("deformable", "flexcomp", *_FLEXIBLE), "is left out: what bends has no frames here."),
     "plugin": "is left out: plugins are not loaded.",
     "contact": "is left out: which pairs are allowed to touch is not read.",
 }
@@ -56,19 +52,8 @@ _MAX_RESOLUTION = 200  # largest parameter of a mesh of MuJoCo, which has its sq
 _INLINE = ("vertex", "normal", "texcoord", "face")
 _NAMES = frozenset(
     (
-        *(
-            "name",
-            "class",
-            "childclass",
-            "prefix",
-            "file",
-            "model",
-            "mesh",
-            "material",
-            "body",
-            "body1",
-            "body2",
-        ),
+        *("name", "class", "childclass", "prefix", "file", "model", "mesh", "material"),
+        *("body", "body1", "body2"),
         *("joint", "joint1", "joint2", "jointinparent", "tendon", "tendon1", "tendon2", "geom", "actuator"),
         *("site", "site1", "site2", "sidesite", "refsite", "cranksite", "slidersite", "target"),
     )
@@ -114,7 +99,6 @@ def remove_unsupported(
 
 
 def _check_numbers(node: MjcfElement, key: str, value: str) -> None:
-    """Refuse an attribute with a NaN or with numbers that are too large."""
     if not _NOT_NUMBERS.isdisjoint(value.lower().split()):
         node.refuse(f"{key}={quote(value)} has a NaN, where a number is expected.")
     if key == "count" or not _LARGE.search(value):
@@ -130,7 +114,6 @@ def _check_numbers(node: MjcfElement, key: str, value: str) -> None:
 
 
 def _is_large(word: str) -> bool:
-    """Return True for an infinite number, or one beyond :data:`LARGEST`."""
     try:
         number = float.fromhex(word) if "x" in word.lower() else float(word)
     except OverflowError:
@@ -144,7 +127,6 @@ def _is_large(word: str) -> bool:
 def _is_removed(
     node: MjcfElement, unwanted: frozenset[str], remark: Callable[[MjcfElement, str], None]
 ) -> bool:
-    """Return True for an element to remove, with a remark where that changes the model."""
     if node.tag not in unwanted:
         return False
     if node.tag in _REMARKS:
@@ -153,26 +135,21 @@ def _is_removed(
 
 
 def _mesh_directory(root: MjcfElement) -> tuple[str, bool]:
-    """Return ``meshdir`` and ``strippath`` of the compiler settings."""
     meshdir, strip_paths = "", False
     for node in root.children:
         if node.tag == "compiler":
-            meshdir = node.attributes.get("assetdir", meshdir)
-            meshdir = node.attributes.get("meshdir", meshdir)
+            meshdir = node.attributes.get("meshdir", node.attributes.get("assetdir", meshdir))
             strip_paths = node.attributes.get("strippath", str(strip_paths)).lower() == "true"
     return meshdir, strip_paths
 
 
 def _plugin_instances(root: MjcfElement) -> dict[str, MeshReference]:
-    result: dict[str, MeshReference] = {}
-    for section in root.children:
-        if section.tag != "extension":
-            continue
-        for plugin in section.children:
-            for instance in plugin.children:
-                name = instance.attributes.get("name", "")
-                result[name] = _plugin_reference(plugin.attributes.get("plugin", ""), instance)
-    return result
+    plugins = [plugin for part in root.children if part.tag == "extension" for plugin in part.children]
+    return {
+        instance.attributes.get("name", ""): _plugin_reference(plugin.attributes.get("plugin", ""), instance)
+        for plugin in plugins
+        for instance in plugin.children
+    }
 
 
 def _plugin_reference(plugin: str, owner: MjcfElement) -> MeshReference:
@@ -209,7 +186,6 @@ def _replace_mesh(
 
 
 def _is_small(params: str) -> bool:
-    """Return True if a mesh of these parameters has few enough triangles to be generated."""
     try:
         return all(float(word) <= _MAX_RESOLUTION for word in params.split())
     except ValueError:  # MuJoCo reports it

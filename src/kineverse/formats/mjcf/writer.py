@@ -18,7 +18,6 @@ from msgspec.structs import replace
 from kineverse.errors import FormatError
 from kineverse.formats import poses
 from kineverse.formats.description import (
-    NO_BODY,
     BallJointDescription,
     JointDescription,
     LinkDescription,
@@ -30,11 +29,12 @@ from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
 from kineverse.formats.names import TakenNames
 from kineverse.formats.poses import unit_quaternion
 from kineverse.formats.xml_writer import Tag, format_xml
+from kineverse.model.body import NO_BODY
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 
 from .body_writer import MjcfBodyWriter, add_pose
-from .custom_elements import ENDS, MASSLESS, add_loop, add_names, add_speeds, format_range
+from .custom_elements import ENDS, MASSLESS, add_loop, add_names, add_speeds
 from .mujoco_api import find_blamed_mesh, find_load_error
 
 MJCF_CAPABILITIES = FormatCapabilities(
@@ -83,13 +83,8 @@ def to_mjcf(
         error = find_load_error(root, path.absolute().parent, writer.converted)
         if error is None:
             content = format_xml(root, [*description.remarks, *description.error_lines])
-            return WrittenFile(
-                content,
-                tuple(description.remarks),
-                description.errors,
-                unsupported.left_out,
-                writer.converted,
-            )
+            known = tuple(description.remarks), description.errors, unsupported.left_out
+            return WrittenFile(content, *known, writer.converted)
         file = find_blamed_mesh(error, root)
         if file is None or file in excluded:
             raise FormatError(f"MuJoCo does not open what would be written: {error}.")
@@ -208,21 +203,17 @@ class MjcfWriter:
                     self._qpos.append(self._home_position(joint))
 
     def _freejoint_name(self, link: LinkDescription) -> str | None:
-        """Return the name of the free joint of a link; None if the link does not move freely in the world."""
         if link.parent != WORLD or len(link.joints) != 4:
             return None
         *slides, ball = link.joints
         if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
             return None
         for joint, axis, c in zip(slides, _AXES, "xyz", strict=True):
-            if (
-                not isinstance(joint, JointDescription)
-                or joint.is_rotation
-                or not joint.is_independent
-                or joint.axis != axis
-            ):
+            if not isinstance(joint, JointDescription) or joint.is_rotation or joint.axis != axis:
                 return None
-            if joint.name != f"{ball.name}/{c}" or not joint.bounds.is_unbounded or joint.dynamics:
+            if joint.name != f"{ball.name}/{c}" or not joint.is_independent:
+                return None
+            if joint.dynamics or not joint.bounds.is_unbounded:
                 return None
         return ball.name
 
@@ -269,19 +260,13 @@ class MjcfWriter:
         equality, names = Tag("equality"), TakenNames()
         for joint in self._description.joints:
             if not joint.is_independent:
-                coefficients = [*joint.coefficients, 0.0, 0.0, 0.0, 0.0][:5]
-                equality.add(
-                    "joint",
-                    name=names.take(joint.name),
-                    joint1=joint.name,
-                    joint2=joint.symbol.path,
-                    polycoef=coefficients,
-                    solref=_TIE_SOLREF,
-                    solimp=_TIE_SOLIMP,
-                )
-        for frame in dict.fromkeys(
-            end for loop in self._description.loops for pair in loop.ends for end in pair
-        ):
+                name, coefficients = names.take(joint.name), [*joint.coefficients, 0.0, 0.0, 0.0, 0.0][:5]
+                tie = equality.add("joint", name=name, joint1=joint.name, joint2=joint.symbol.path)
+                tie.give("polycoef", coefficients)
+                tie.give("solref", _TIE_SOLREF)
+                tie.give("solimp", _TIE_SOLIMP)
+        ends = (end for loop in self._description.loops for pair in loop.ends for end in pair)
+        for frame in dict.fromkeys(ends):
             self._bodies_by_name[frame].add("site", name=self._end_sites.setdefault(frame, f"{frame}/end"))
         for loop in self._description.loops:
             for k, (frame, to) in enumerate(loop.ends):
@@ -330,7 +315,6 @@ def _group_joints(
 
 
 def _unless_zero(point: Iterable[float]) -> Iterable[float] | None:
-    """Return a point, or None for the origin, which is the default."""
     return point if any(point) else None
 
 
@@ -338,4 +322,4 @@ def _range(lower: float, upper: float) -> str:
     """Return a range as text; MuJoCo requires different ends."""
     if lower == upper:
         upper += 1e-15 * max(1.0, abs(lower))
-    return format_range(lower, upper)
+    return f"{lower!r} {upper!r}"

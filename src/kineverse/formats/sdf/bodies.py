@@ -7,6 +7,7 @@ remark.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from kineverse.formats.poses import IDENTITY, compose_poses
 from kineverse.formats.resource_paths import find_root_violation
@@ -18,6 +19,7 @@ from kineverse.formats.xml_values import (
     read_child_text,
     read_child_vector,
     read_element_pose,
+    read_or_default,
     read_text,
 )
 from kineverse.model.body import (
@@ -66,7 +68,6 @@ def read_sdf_body(link: PoseNode) -> Body:
 
 
 def _shape(element: Element, link: PoseNode) -> Shape | None:
-    """Return a visual or collision shape; None if it has no geometry."""
     geometry = find_child(element, "geometry")
     form = None if geometry is None else _geometry(geometry, element, link)
     if form is None:
@@ -83,7 +84,6 @@ def _shape(element: Element, link: PoseNode) -> Shape | None:
 
 
 def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | None:
-    """Return the geometry of a shape; None, with a remark, if it is empty or unknown."""
     form = geometry[2][0] if geometry[2] else None
     tag = "empty" if form is None else form[0]
     if form is None or tag == "empty":
@@ -100,9 +100,9 @@ def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | N
     if tag != "mesh":
         remarks.add(form, f"cannot be said here; the {label(shape)} is left out.", link.element)
         return None
-    uri = read_child_text(form, "uri") or (
-        read_child_text(form, "filename") if link.document.version < (1, 3) else ""
-    )
+    uri = read_child_text(form, "uri")
+    if not uri and link.document.version < (1, 3):
+        uri = read_child_text(form, "filename")
     if not uri:
         raise ElementError(form, "has no <uri>; the specification requires it.")
     if find_child(form, "submesh") is not None:
@@ -111,11 +111,8 @@ def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | N
     violation = find_root_violation(uri, folder, root)
     if violation is not None:
         remarks.add(form, f"names {violation}", link.element)
-    try:
-        scale = read_child_vector(form, "scale", _UNSCALED)
-    except ElementError as mistake:
-        remarks.repair(mistake, "it is not scaled", link.element)
-        scale = _UNSCALED
+    read = partial(read_child_vector, form, "scale", _UNSCALED)
+    scale = read_or_default(read, _UNSCALED, "it is not scaled", remarks, link.element)
     return Mesh(uri, scale, folder, root)
 
 
@@ -136,7 +133,6 @@ def _lengths(form: Element, tag: str) -> tuple[float, float, float]:
 
 
 def _color(visual: Element, link: PoseNode) -> Rgba | None:
-    """Return the diffuse or else the ambient colour of a visual; None if it has none."""
     material = find_child(visual, "material")
     if material is None:
         return None

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from kineverse.formats.mimic import MimicRelation
-from kineverse.model.body import Body, Pose, Vector3
+from kineverse.formats.poses import IDENTITY
+from kineverse.model.body import NO_BODY, Body, Pose, Vector3
 
 SdfJointType: TypeAlias = Literal[
     "fixed", "revolute", "continuous", "prismatic", "screw", "universal", "revolute2", "ball", "gearbox"
@@ -30,9 +31,6 @@ AXIS_COUNT: dict[SdfJointType, int] = {
 """Number of axes of a joint of each type."""
 
 WORLD = "world"  # name of the world in place of a link; reserved in SDF
-
-_IDENTITY = Pose()
-_EMPTY_BODY = Body()
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +67,8 @@ class SdfJoint:
     kind: SdfJointType
     parent: str
     child: str
-    pose_in_parent: Pose = _IDENTITY
-    pose_in_child: Pose = _IDENTITY
+    pose_in_parent: Pose = IDENTITY
+    pose_in_child: Pose = IDENTITY
     axes: tuple[SdfAxis, ...] = ()
     pitch: float = 0.0
     gear: MimicRelation[str] | None = None
@@ -84,8 +82,8 @@ class SdfLink:
     """Link, with its pose in the world while all positions are zero."""
 
     name: str
-    body: Body = _EMPTY_BODY
-    pose: Pose = _IDENTITY
+    body: Body = NO_BODY
+    pose: Pose = IDENTITY
     static: bool = False
     line: int = 0
     source: str = ""
@@ -97,7 +95,7 @@ class SdfFrame:
 
     name: str
     parent: str
-    pose: Pose = _IDENTITY
+    pose: Pose = IDENTITY
     line: int = 0
     source: str = ""
 

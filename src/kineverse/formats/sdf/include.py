@@ -18,19 +18,7 @@ from kineverse.formats.urdf.reader import parse_urdf
 from kineverse.formats.xml_reader import TEXT, Element, parse_xml, quote
 from kineverse.formats.xml_values import read_text
 from kineverse.formats.xml_writer import format_numbers
-from kineverse.model.body import (
-    Box,
-    Capsule,
-    Cone,
-    Cylinder,
-    Ellipsoid,
-    Geometry,
-    Inertia,
-    Mesh,
-    Pose,
-    Shape,
-    Sphere,
-)
+from kineverse.model.body import Geometry, Mesh, Pose, Shape, Vector3
 
 from .description import WORLD
 from .pose_graph import MODEL_FRAME, SdfVersion
@@ -139,9 +127,14 @@ def read_urdf_as_sdf(content: bytes, source: str, folder: str, root: str, strict
     links = {link.name for link in robot.links}
     names = {j.name: f"{j.name}_joint" if j.name in links else j.name for j in robot.joints}
     children = [_link(link, above.get(link.name), names) for link in robot.links if link.name != WORLD]
-    for joint in robot.joints:
-        children += _joint(joint, names, robot)
-    return _element("model", *children, line=1, name=robot.name or "robot")
+    children += [_joint(joint, names, robot) for joint in robot.joints if joint.kind != "floating"]
+    return _with_line(_element("model", *children, name=robot.name or "robot"), 1)
+
+
+def _with_line(element: Element, line: int) -> Element:
+    """Return an element whose line, and those of all parts without one, is that of the URDF."""
+    tag, attributes, children, own = element
+    return tag, attributes, [_with_line(child, own or line) for child in children], own or line
 
 
 def _element(tag: str, *children: Element, text: str = "", line: int = 0, **attributes: str) -> Element:
@@ -150,27 +143,30 @@ def _element(tag: str, *children: Element, text: str = "", line: int = 0, **attr
     return tag, attributes, list(children), line
 
 
-def _number(tag: str, value: float | tuple[float, ...], line: int) -> Element:
-    return _element(tag, text=format_numbers(value), line=line)
+def _number(tag: str, value: float | tuple[float, ...]) -> Element:
+    return _element(tag, text=format_numbers(value))
 
 
-def _pose(pose: Pose, line: int, relative_to: str = "") -> Element:
+def _pose(pose: Pose, relative_to: str = "") -> Element:
     matrix = pose.matrix
     numbers = (*matrix[:3, 3].tolist(), *rpy_angles(matrix))
-    return _element("pose", text=format_numbers(numbers), line=line, relative_to=relative_to)
+    return _element("pose", text=format_numbers(numbers), relative_to=relative_to)
 
 
 def _link(link: UrdfLink, joint: UrdfJoint | None, names: dict[str, str]) -> Element:
-    line, parts = link.line, []
+    parts = []
     if joint is not None and joint.kind == "floating":
-        parts.append(_pose(joint.origin, line, _frame(joint.parent)))
+        parts.append(_pose(joint.origin, _frame(joint.parent)))
     elif joint is not None:
-        parts.append(_pose(Pose(), line, names[joint.name]))
-    if link.body.inertia is not None:
-        parts.append(_inertial(link.body.inertia, line))
+        parts.append(_pose(Pose(), names[joint.name]))
+    inertia = link.body.inertia
+    if inertia is not None:
+        moments = [_number(key, value) for key, value in zip(_TENSOR, inertia.tensor, strict=True)]
+        tensor = _element("inertia", *moments)
+        parts.append(_element("inertial", _pose(inertia.origin), _number("mass", inertia.mass), tensor))
     for tag, shapes in (("visual", link.body.visuals), ("collision", link.body.collisions)):
-        parts += [_shape(tag, f"{tag}_{k}", shape, line) for k, shape in enumerate(shapes)]
-    return _element("link", *parts, line=line, name=link.name)
+        parts += [_shape(tag, f"{tag}_{k}", shape) for k, shape in enumerate(shapes)]
+    return _element("link", *parts, line=link.line, name=link.name)
 
 
 def _frame(link: str) -> str:
@@ -178,84 +174,42 @@ def _frame(link: str) -> str:
     return MODEL_FRAME if link == WORLD else link
 
 
-def _inertial(inertia: Inertia, line: int) -> Element:
-    moments = [_number(k, v, line) for k, v in zip(_TENSOR, inertia.tensor, strict=True)]
-    return _element(
-        "inertial",
-        _pose(inertia.origin, line),
-        _number("mass", inertia.mass, line),
-        _element("inertia", *moments, line=line),
-        line=line,
-    )
-
-
-def _shape(tag: str, name: str, shape: Shape, line: int) -> Element:
-    parts = [_pose(shape.origin, line), _element("geometry", _geometry(shape.geometry, line), line=line)]
+def _shape(tag: str, name: str, shape: Shape) -> Element:
+    parts = [_pose(shape.origin), _element("geometry", _geometry(shape.geometry))]
     if shape.color is not None:
-        parts.append(_element("material", _number("diffuse", shape.color, line), line=line))
-    return _element(tag, *parts, line=line, name=shape.name or name)
+        parts.append(_element("material", _number("diffuse", shape.color)))
+    return _element(tag, *parts, name=shape.name or name)
 
 
-def _geometry(form: Geometry, line: int) -> Element:
+def _geometry(form: Geometry) -> Element:
     if isinstance(form, Mesh):
-        uri = _element("uri", text=form.uri, line=line)
-        return _element("mesh", uri, _number("scale", form.scale, line), line=line)
-    sizes: dict[str, float | tuple[float, ...]]
-    if isinstance(form, Box):
-        sizes = {"size": form.size}
-    elif isinstance(form, Sphere):
-        sizes = {"radius": form.radius}
-    elif isinstance(form, (Cylinder, Capsule, Cone)):
-        sizes = {"radius": form.radius, "length": form.length}
-    else:
-        assert isinstance(form, Ellipsoid)
-        sizes = {"radii": form.radii}
-    return _element(form.kind, *(_number(k, v, line) for k, v in sizes.items()), line=line)
+        return _element("mesh", _element("uri", text=form.uri), _number("scale", form.scale))
+    sizes = [_number(key, getattr(form, key)) for key in form.__struct_fields__]
+    return _element(form.kind, *sizes)
 
 
-def _joint(joint: UrdfJoint, names: dict[str, str], robot: UrdfRobot) -> Iterator[Element]:
-    """Yield the element of a joint; none for a floating one."""
-    line = joint.line
-    if joint.kind == "floating":
-        return
+def _joint(joint: UrdfJoint, names: dict[str, str], robot: UrdfRobot) -> Element:
     if joint.kind in ("planar", "spherical"):
         raise FormatError(
-            f"{robot.source}, line {line}, <joint name={quote(joint.name)}>: is {joint.kind}, which no joint "
-            "of an SDF is. Load this file by itself."
+            f"{robot.source}, line {joint.line}, <joint name={quote(joint.name)}>: is {joint.kind}, which no "
+            "joint of an SDF is. Load this file by itself."
         )
-    parts = [
-        _pose(joint.origin, line, _frame(joint.parent)),
-        _element("parent", text=joint.parent, line=line),
-        _element("child", text=joint.child, line=line),
-    ]
+    parts = [_pose(joint.origin, _frame(joint.parent))]
+    parts += [_element(role, text=link) for role, link in (("parent", joint.parent), ("child", joint.child))]
     if joint.axis is not None:
-        parts.append(_axis(joint, names))
-    yield _element("joint", *parts, line=line, name=names[joint.name], type=joint.kind)
+        parts.append(_axis(joint, joint.axis, names))
+    return _element("joint", *parts, line=joint.line, name=names[joint.name], type=joint.kind)
 
 
-def _axis(joint: UrdfJoint, names: dict[str, str]) -> Element:
-    assert joint.axis is not None
-    line, limits = joint.line, joint.limits
-    bounds = {
-        "lower": limits.lower,
-        "upper": limits.upper,
-        "effort": limits.effort,
-        "velocity": limits.velocity,
-    }
+def _axis(joint: UrdfJoint, xyz: Vector3, names: dict[str, str]) -> Element:
+    limits, dynamics, mimic = joint.limits, joint.dynamics, joint.mimic
+    bounds = {key: getattr(limits, key) for key in ("lower", "upper", "effort", "velocity")}
     parts = [
-        _number("xyz", joint.axis, line),
-        _element("limit", *(_number(k, v, line) for k, v in bounds.items() if v is not None), line=line),
-        _element(
-            "dynamics",
-            _number("damping", joint.dynamics.damping, line),
-            _number("friction", joint.dynamics.friction, line),
-            line=line,
-        ),
+        _number("xyz", xyz),
+        _element("limit", *(_number(key, value) for key, value in bounds.items() if value is not None)),
+        _element("dynamics", _number("damping", dynamics.damping), _number("friction", dynamics.friction)),
     ]
-    if joint.mimic is not None:
-        follows = [
-            _number("multiplier", joint.mimic.multiplier, line),
-            _number("offset", joint.mimic.offset, line),
-        ]
-        parts.append(_element("mimic", *follows, line=line, joint=names[joint.mimic.joint]))
-    return _element("axis", *parts, line=line)
+    if mimic is not None:
+        follows = (_number("multiplier", mimic.multiplier), _number("offset", mimic.offset))
+        parts.append(_element("mimic", *follows, joint=names[mimic.leader]))
+    return _element("axis", *parts)

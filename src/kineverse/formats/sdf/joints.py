@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from kineverse.errors import suggest
 from kineverse.formats.description import DisjointSets
@@ -24,6 +25,7 @@ from kineverse.formats.xml_values import (
     read_child_limit,
     read_child_number,
     read_child_text,
+    read_or_default,
     read_text,
 )
 from kineverse.model.body import Vector3
@@ -94,7 +96,6 @@ def _kind(element: Element) -> SdfJointType:
 
 
 def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
-    """Return an axis of a joint; z, with a remark, if it is missing."""
     element, remarks = node.element, node.document.remarks
     axis = find_child(element, tag)
     if axis is None:
@@ -107,10 +108,14 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         remarks.add(element, f"has no <{tag}>; it is z, the specification's default.")
         return SdfAxis(suffix=suffix)
     limit, dynamics = find_child(axis, "limit"), find_child(axis, "dynamics")
+    read = partial(read_or_default, remarks=remarks, owner=element)
     lower = upper = velocity = effort = None
     if limit is not None:
         lower, upper = read_child_limit(limit, "lower"), read_child_limit(limit, "upper")
-        velocity, effort = (_magnitude(limit, key, node) for key in ("velocity", "effort"))
+        velocity, effort = (
+            read(partial(read_child_limit, limit, key), None, "it bounds nothing")
+            for key in ("velocity", "effort")
+        )
     if kind == "continuous":
         lower = upper = None
     if lower is not None and upper is not None and lower > upper:
@@ -122,7 +127,8 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         lower = upper = None
     values = [] if effort is None or effort < 0.0 else [("effort", effort)]
     if dynamics is not None:
-        found = [(key, _dynamics_value(dynamics, key, node)) for key in _DYNAMICS]
+        reads = ((key, partial(read_child_number, dynamics, key, 0.0)) for key in _DYNAMICS)
+        found = [(key, read(number, 0.0, "0 is taken")) for key, number in reads]
         has_spring = any(value for key, value in found if key == "spring_stiffness")
         values += [(k, v) for k, v in found if v or (has_spring and k == "spring_reference")]
     if find_child(axis, "initial_position") is not None and read_child_number(axis, "initial_position"):
@@ -136,24 +142,6 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         suffix,
         None if kind == "ball" else _mimic(node, axis),
     )
-
-
-def _magnitude(limit: Element, key: str, node: PoseNode) -> float | None:
-    """Return the limit of a velocity or an effort; None, with a remark, if it is malformed."""
-    try:
-        return read_child_limit(limit, key)
-    except ElementError as mistake:
-        node.document.remarks.repair(mistake, "it bounds nothing", node.element)
-        return None
-
-
-def _dynamics_value(dynamics: Element, key: str, node: PoseNode) -> float:
-    """Return a number of the dynamics; 0, with a remark, if it is malformed."""
-    try:
-        return read_child_number(dynamics, key, 0.0)
-    except ElementError as mistake:
-        node.document.remarks.repair(mistake, "0 is taken", node.element)
-        return 0.0
 
 
 def _direction(node: PoseNode, axis: Element) -> Vector3:
@@ -177,7 +165,6 @@ def _direction(node: PoseNode, axis: Element) -> Vector3:
 
 
 def _mimic(node: PoseNode, axis: Element) -> MimicRelation[str] | None:
-    """Return the relation of an axis to the coordinate that it follows; None if it follows none."""
     mimic = find_child(axis, "mimic")
     if mimic is None:
         return None
@@ -213,13 +200,6 @@ def _pitch(element: Element) -> float:
     return pitch
 
 
-def find_reference_body(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> PoseNode:
-    """Return the reference link of a gearbox's angles."""
-    part = find_child(node.element, "gearbox_reference_body")
-    assert part is not None
-    return attachments[node.scope.find(read_text(part), part, node.element)]
-
-
 _PARALLEL = 1e-4
 _HINGE_TYPES = ("revolute", "continuous")
 
@@ -248,7 +228,9 @@ def resolve_gearboxes(
                 node.document.remarks.repair(mistake, "it is left out")
             result[index] = None
             continue
-        body = find_reference_body(node, attachments)
+        part = find_child(node.element, "gearbox_reference_body")
+        assert part is not None
+        body = attachments[node.scope.find(read_text(part), part, node.element)]
         with node.document.locate_errors(node.element):
             ratio = read_child_number(node.element, "gearbox_ratio", 1.0)
         if not ratio:
@@ -365,17 +347,16 @@ def _outwards(
 
 def reverse_joint(joint: SdfJoint) -> SdfJoint:
     """Return a joint with parent and child exchanged: the same coordinates about opposite axes."""
+    axes = []
+    for axis in reversed(joint.axes):
+        x, y, z = axis.xyz
+        axes.append(replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z)))
     return replace(
         joint,
         parent=joint.child,
         child=joint.parent,
         pose_in_parent=joint.pose_in_child,
         pose_in_child=joint.pose_in_parent,
-        axes=tuple(_negate_axis(axis) for axis in reversed(joint.axes)),
+        axes=tuple(axes),
         is_reversed=not joint.is_reversed,
     )
-
-
-def _negate_axis(axis: SdfAxis) -> SdfAxis:
-    x, y, z = axis.xyz
-    return replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z))

@@ -10,25 +10,12 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from kineverse.articulations import (
-    Ball,
-    Continuous,
-    Fixed,
-    Floating,
-    Gearbox,
-    Limits,
-    OneDofJoint,
-    Prismatic,
-    Revolute,
-    Screw,
-    Universal,
-)
+from kineverse import articulations
 from kineverse.errors import FormatError
-from kineverse.expressions.expression import Expression
 from kineverse.formats.description import path_between
-from kineverse.formats.mimic import MimicRelation
 from kineverse.formats.names import NameMap
 from kineverse.formats.poses import IDENTITY, invert_pose, is_identity
+from kineverse.formats.urdf.operations import AXIS_JOINTS
 from kineverse.formats.xml_reader import quote
 from kineverse.loops.close_loop import CloseLoop
 from kineverse.loops.equations import AXES
@@ -40,14 +27,9 @@ from kineverse.model.operation import Operation
 from kineverse.model.registry import FileContent
 from kineverse.symbols import position, symbol_name
 
-from .description import WORLD, SdfAxis, SdfJoint, SdfScene
+from .description import WORLD, SdfAxis, SdfFrame, SdfJoint, SdfLink, SdfScene
 from .reader import parse_sdf
 
-_AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
-    "revolute": Revolute,
-    "continuous": Continuous,
-    "prismatic": Prismatic,
-}
 _PERPENDICULAR = 1e-6
 
 
@@ -73,7 +55,7 @@ def sdf_operations(scene: SdfScene, prefix: str | None = None) -> Iterator[Opera
         name = model_name(root.link)
         if root.free:
             free = f"{name}/free"
-            yield Floating(name=free, parent=MODEL_WORLD, child=name, origin=poses[root.link])
+            yield articulations.Floating(name=free, parent=MODEL_WORLD, child=name, origin=poses[root.link])
         else:
             yield AddFrame(name, Frame(MODEL_WORLD, (poses[root.link],)))
         if root.link in bodies:
@@ -132,33 +114,25 @@ def _motions(joint: SdfJoint, model_name: NameMap, child: str) -> Iterator[Opera
         "origin": IDENTITY if is_identity(joint.pose_in_parent) else joint.pose_in_parent,
     }
     if joint.kind == "fixed":
-        yield Fixed(**common)
+        yield articulations.Fixed(**common)
     elif joint.kind == "ball":
-        yield Ball(**common, dynamics=_dynamics(joint, ""))
+        yield articulations.Ball(**common, dynamics=_dynamics(joint, ""))
     elif joint.kind == "gearbox":
         (axis,) = joint.axes
         assert joint.gear is not None
-        driver = position(model_name(joint.gear.leader))
-        yield Gearbox(
-            **common,
-            axis=axis.xyz,
-            driver=driver,
-            ratio=joint.gear.multiplier,
-            offset=joint.gear.offset,
-            lower=axis.lower,
-            upper=axis.upper,
-            velocity=axis.velocity,
-            dynamics=axis.dynamics,
-        )
+        driver, given = position(model_name(joint.gear.leader)), _axis(axis, model_name)
+        del given["position"]  # it follows from that of the driver
+        ratio, offset = joint.gear.multiplier, joint.gear.offset
+        yield articulations.Gearbox(**common, **given, driver=driver, ratio=ratio, offset=offset)
     elif joint.kind in ("universal", "revolute2"):
         yield from _two_axes(joint, common, model_name)
     else:
         (axis,) = joint.axes
         given = _axis(axis, model_name)
         if joint.kind == "screw":
-            yield Screw(**common, **given, pitch=joint.pitch)
+            yield articulations.Screw(**common, **given, pitch=joint.pitch)
         else:
-            yield _AXIS_JOINTS[joint.kind](**common, **given)
+            yield AXIS_JOINTS[joint.kind](**common, **given)
 
 
 def _two_axes(joint: SdfJoint, common: dict[str, Any], model_name: NameMap) -> Iterator[Operation]:
@@ -167,20 +141,22 @@ def _two_axes(joint: SdfJoint, common: dict[str, Any], model_name: NameMap) -> I
     cosine = math.fsum(a * b for a, b in zip(first.xyz, second.xyz, strict=True))
     independent = first.mimic is None and second.mimic is None
     if joint.kind == "universal" and independent and not joint.is_reversed and abs(cosine) <= _PERPENDICULAR:
-        yield Universal(
+        yield articulations.Universal(
             **common,
             first=first.xyz,
             second=second.xyz,
-            first_limits=Limits(first.lower, first.upper, first.velocity),
-            second_limits=Limits(second.lower, second.upper, second.velocity),
+            first_limits=articulations.Limits(first.lower, first.upper, first.velocity),
+            second_limits=articulations.Limits(second.lower, second.upper, second.velocity),
             dynamics=(*_dynamics(joint, "first/", 0), *_dynamics(joint, "second/", 1)),
         )
         return
     name = common["name"]
     between = name + first.suffix
-    yield Revolute(**(common | {"name": name + first.suffix, "child": between}), **_axis(first, model_name))
+    yield articulations.Revolute(
+        **(common | {"name": name + first.suffix, "child": between}), **_axis(first, model_name)
+    )
     own = {"name": name + second.suffix, "parent": between, "child": common["child"], "origin": IDENTITY}
-    yield Revolute(**own, **_axis(second, model_name))
+    yield articulations.Revolute(**own, **_axis(second, model_name))
 
 
 def _axis(axis: SdfAxis, model_name: NameMap) -> dict[str, Any]:
@@ -189,13 +165,11 @@ def _axis(axis: SdfAxis, model_name: NameMap) -> dict[str, Any]:
         "lower": axis.lower,
         "upper": axis.upper,
         "velocity": axis.velocity,
-        "position": None if axis.mimic is None else _mimic_position(axis.mimic, model_name),
+        "position": None
+        if axis.mimic is None
+        else axis.mimic.multiplier * position(model_name(axis.mimic.leader)) + axis.mimic.offset,
         "dynamics": axis.dynamics,
     }
-
-
-def _mimic_position(mimic: MimicRelation[str], model_name: NameMap) -> Expression:
-    return mimic.multiplier * position(model_name(mimic.leader)) + mimic.offset
 
 
 def _dynamics(joint: SdfJoint, prefix: str, index: int = 0) -> tuple[tuple[str, float], ...]:
@@ -204,37 +178,28 @@ def _dynamics(joint: SdfJoint, prefix: str, index: int = 0) -> tuple[tuple[str, 
 
 
 def _check_names(scene: SdfScene) -> None:
-    """Raise an error if two elements of the description would have the same name in the model."""
     frames: dict[str, str] = {MODEL_WORLD: "the world"}
     articulations: dict[str, str] = {}
 
-    def take(taken: dict[str, str], name: str, element: str, line: int, source: str) -> None:
-        other = taken.setdefault(name, f"{element} of line {line}")
-        if other != f"{element} of line {line}" or not name:
+    def take(taken: dict[str, str], name: str, what: str, part: SdfLink | SdfFrame | SdfJoint) -> None:
+        other = taken.setdefault(name, f"{what} of line {part.line}")
+        if other != f"{what} of line {part.line}" or not name:
             raise FormatError(
-                f"{source}, line {line}: {element} would be called {quote(name)} here, as {other} is. "
+                f"{part.source}, line {part.line}: {what} would be called {quote(name)} here, as {other} is. "
                 "Rename one of them."
             )
 
     for link in scene.links:
-        take(frames, link.name, "the link", link.line, link.source)
+        take(frames, link.name, "the link", link)
     for frame in scene.frames:
-        take(frames, frame.name, "the frame", frame.line, frame.source)
+        take(frames, frame.name, "the frame", frame)
     free = {root.link for root in scene.roots if root.free}
     for link in scene.links:
         if link.name in free:
-            take(articulations, f"{link.name}/free", "the free motion of the link", link.line, link.source)
-    both = [(joint, False) for joint in scene.joints] + [(joint, True) for joint in scene.loops]
-    for joint, closes in both:
-        take(articulations, joint.name, "the joint", joint.line, joint.source)
-        two = len(joint.axes) == 2
-        for axis in joint.axes if two else ():
-            take(
-                articulations,
-                joint.name + axis.suffix,
-                f"the {axis.suffix[1:]} axis",
-                joint.line,
-                joint.source,
-            )
-        if closes or not is_identity(joint.pose_in_child):
-            take(frames, joint.name, "the frame of the joint", joint.line, joint.source)
+            take(articulations, f"{link.name}/free", "the free motion of the link", link)
+    for joint in (*scene.joints, *scene.loops):
+        take(articulations, joint.name, "the joint", joint)
+        for axis in joint.axes if len(joint.axes) == 2 else ():
+            take(articulations, joint.name + axis.suffix, f"the {axis.suffix[1:]} axis", joint)
+        if joint in scene.loops or not is_identity(joint.pose_in_child):
+            take(frames, joint.name, "the frame of the joint", joint)

@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal, NoReturn, TypeAlias
 
-from kineverse.errors import FormatError, suggest
+from kineverse.errors import suggest
 from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import NOWHERE
-from kineverse.formats.xml_reader import TEXT, Element, ElementError, find_child, label, quote
+from kineverse.formats.xml_reader import TEXT, Element, ElementError, find_child, quote
 from kineverse.formats.xml_values import read_element_pose, read_text
 from kineverse.model.body import Pose
 
@@ -55,13 +55,11 @@ class SdfDocument:
         try:
             yield
         except ElementError as mistake:
-            part = "" if mistake.element is owner else f"{label(mistake.element)} "
-            where = f"{self.source}, line {mistake.element[3]}, {label(owner)}"
-            raise FormatError(f"{where}: {part}{mistake.message}") from None
+            raise mistake.located(self.source, owner) from None
 
     def refuse(self, element: Element, message: str) -> NoReturn:
         """Raise an error about an element."""
-        raise FormatError(f"{self.source}, line {element[3]}, {label(element)}: {message}")
+        raise ElementError(element, message).located(self.source)
 
 
 @dataclass(slots=True, eq=False)
@@ -123,17 +121,11 @@ class SdfScope:
         result = self._find(name)
         if result is None:
             available = [*self.names, *(f"{m}::{n}" for m, inner in self.inner.items() for n in inner.names)]
-            reserved = name != MODEL_FRAME and _is_reserved(name)
+            problem = f"which does not exist in this scope. {suggest(name, available, 'name')}"
+            if name != MODEL_FRAME and _is_reserved(name):
+                problem = "a reserved name that means nothing here."
             with self.document.locate_errors(owner):
-                raise ElementError(
-                    element,
-                    f"refers to {quote(name)}, "
-                    + (
-                        "a reserved name that means nothing here."
-                        if reserved
-                        else f"which does not exist in this scope. {suggest(name, available, 'name')}"
-                    ),
-                )
+                raise ElementError(element, f"refers to {quote(name)}, {problem}")
         return result
 
     def has(self, name: str) -> bool:
@@ -141,7 +133,6 @@ class SdfScope:
         return self._find(name) is not None
 
     def _find(self, name: str) -> PoseNode | None:
-        """Return the node of a name, or of a path ``a::b``; None if there is none."""
         if name == MODEL_FRAME:
             return None if self.model.kind == "world" else self.model
         if name == "world" and self.model.kind == "world":
@@ -222,7 +213,6 @@ def check_sdf_name(name: str, element: Element, version: SdfVersion) -> None:
 
 
 def _is_reserved(name: str) -> bool:
-    """Return True for names such as ``__this__``."""
     return len(name) >= 4 and name.startswith("__") and name.endswith("__")
 
 
@@ -266,8 +256,7 @@ def _attach(node: PoseNode) -> None:
     elif node.kind == "frame" and node.is_named_frame:
         name = node.document.early_attribute(node.element, "attached_to")
         target = node.scope.find(name, node.element, node.element) if name else node.scope.model
-        node.attached_to = target
-        node.relative_to = target
+        node.attached_to = node.relative_to = target
 
 
 def _attach_model(node: PoseNode, scope: SdfScope, canonical: str, element: Element) -> None:
@@ -285,13 +274,10 @@ def _attach_model(node: PoseNode, scope: SdfScope, canonical: str, element: Elem
 
 
 def _relate(node: PoseNode) -> None:
-    """Read the pose of a node and set the node that it is relative to."""
     scope = node.pose_scope or node.scope
     element = node.pose_element
-    default = node.relative_to
-    if default is None:
-        default = node.attached_to if node.kind == "joint" else scope.model
-    node.relative_to = default
+    if node.relative_to is None:
+        node.relative_to = node.attached_to if node.kind == "joint" else scope.model
     if element is None:
         return
     with scope.document.locate_errors(node.element):
@@ -301,9 +287,8 @@ def _relate(node: PoseNode) -> None:
         node.relative_to = reference
 
 
-def check_cycles(nodes: Iterable[PoseNode]) -> None:
+def check_cycles(nodes: Sequence[PoseNode]) -> None:
     """Check that no node refers to itself by ``attached_to`` or ``relative_to``."""
-    nodes = list(nodes)
     for key in ("attached_to", "relative_to"):
         done: set[PoseNode] = set()
         for node in nodes:

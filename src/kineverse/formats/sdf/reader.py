@@ -11,7 +11,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
 
 from kineverse.errors import FormatError
 from kineverse.formats.files import MAX_BYTES, read_file
@@ -44,28 +43,17 @@ _OLDEST, _LATEST = (1, 2), (1, 12)
 _IGNORED = ("actor", "population", "road", "plugin")
 
 
-def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
-_KNOWN_ELEMENTS = {
-    "model": _words(
-        "static self_collide allow_auto_disable frame pose link joint plugin gripper include model "
-        "model_state enable_wind"
-    ),
-    "world": _words(
-        "name audio wind gravity magnetic_field atmosphere physics scene light frame model actor plugin "
-        "joint road spherical_coordinates state population gui include"
-    ),
-    "link": _words(
-        "gravity enable_wind self_collide kinematic must_be_base_link velocity_decay frame pose inertial "
-        "collision visual sensor projector audio_sink audio_source battery light particle_emitter"
-    ),
-    "joint": _words(
-        "parent child gearbox_ratio gearbox_reference_body thread_pitch screw_thread_pitch axis axis2 "
-        "physics frame pose sensor"
-    ),
+_ELEMENTS = {
+    "model": """static self_collide allow_auto_disable frame pose link joint plugin gripper include model
+        model_state enable_wind""",
+    "world": """name audio wind gravity magnetic_field atmosphere physics scene light frame model actor plugin
+        joint road spherical_coordinates state population gui include""",
+    "link": """gravity enable_wind self_collide kinematic must_be_base_link velocity_decay frame pose inertial
+        collision visual sensor projector audio_sink audio_source battery light particle_emitter""",
+    "joint": """parent child gearbox_ratio gearbox_reference_body thread_pitch screw_thread_pitch axis axis2
+        physics frame pose sensor""",
 }
+_KNOWN_ELEMENTS = {kind: frozenset(tags.split()) for kind, tags in _ELEMENTS.items()}
 
 
 def open_document(
@@ -78,7 +66,10 @@ def open_document(
             data, source, texts=True, on_recoverable_error=None if strict else reader_warnings.fault
         )
     except FormatError as error:
-        raise FormatError(f"{error}{_template_hint(data)}") from None
+        marks = ("<%", "{%") if isinstance(data, str) else (b"<%", b"{%")
+        is_template = any(mark in data for mark in marks)  # type: ignore[operator]  # of the same type
+        hint = " This is a template that was not expanded: erb model.sdf.erb > model.sdf"
+        raise FormatError(f"{error}{hint if is_template else ''}") from None
     document = SdfDocument(source, folder, _LATEST, reader_warnings, root_folder)
     # Up to version 1.2, the root element was <gazebo>.
     if root[0] not in ("sdf", "gazebo"):
@@ -95,14 +86,6 @@ def open_document(
     return document, root
 
 
-def _template_hint(data: str | bytes) -> str:
-    """Return a hint for documents that are templates; empty for others."""
-    marks = ("<%", "{%") if isinstance(data, str) else (b"<%", b"{%")
-    if any(mark in data for mark in marks):  # type: ignore[operator]  # of the same type
-        return " This is a template that was not expanded: erb model.sdf.erb > model.sdf"
-    return ""
-
-
 class SdfModelReader:
     """Reader of models, and of those that they include, into a pose graph."""
 
@@ -112,14 +95,6 @@ class SdfModelReader:
         self._root, self._strict = root, strict
         self._open_files: list[Path] = []
         self._included_bytes = 0
-
-    def read_world(self, element: Element, scope: SdfScope) -> None:
-        """Read the elements of a world."""
-        self._read_elements(element, scope)
-
-    def read_include(self, element: Element, scope: SdfScope) -> None:
-        """Read an include at the top of a file."""
-        self._include(element, scope)
 
     def read_model(self, element: Element, outer: SdfScope, alone: bool = False) -> PoseNode:
         """Read a model into a scope; the names of a model that is alone in its file get no prefix."""
@@ -163,10 +138,10 @@ class SdfModelReader:
         node.pose_element, node.pose_scope = find_child(pose_owner, "pose"), outer
         if frame:
             self._graph.placements.append((node, scope, frame, element))
-        self._read_elements(element, scope)
+        self.read_elements(element, scope)
         self._graph.canonical.append((node, scope, element[1].get("canonical_link", ""), element))
 
-    def _read_elements(self, element: Element, scope: SdfScope) -> None:
+    def read_elements(self, element: Element, scope: SdfScope) -> None:
         """Read the elements of a model or a world: links, models, includes, joints, then frames."""
         document = scope.document
         kind = "world" if element[0] == "world" else "model"
@@ -187,7 +162,7 @@ class SdfModelReader:
         for part in parts["model"]:
             self.read_model(part, scope)
         for part in parts["include"]:
-            self._include(part, scope)
+            self.include(part, scope)
         for part in parts["joint"]:
             node = self._add("joint", part, scope, self._name(part, document))
             for inner in part[2]:
@@ -197,8 +172,7 @@ class SdfModelReader:
 
     def _warn_unknown(self, part: Element, owner: Element, document: SdfDocument, kind: str) -> None:
         tag = part[0]
-        if tag.startswith("xacro:"):
-            document.refuse(part, "is xacro that was not expanded; expand it first: xacro in.sdf > out.sdf")
+        _refuse_xacro(part, document)
         if kind == "world" and tag in _IGNORED:
             document.remarks.add(part, "is left out.", owner)
         elif tag not in _KNOWN_ELEMENTS[kind]:
@@ -232,7 +206,7 @@ class SdfModelReader:
         self._graph.nodes.append(node)
         return node
 
-    def _include(self, include: Element, scope: SdfScope) -> None:
+    def include(self, include: Element, scope: SdfScope) -> None:
         """Read the file of an include as a model, or merge its model into the scope."""
         document = scope.document
         part = find_child(include, "uri")
@@ -255,15 +229,17 @@ class SdfModelReader:
                 include, f"with it, more than {MAX_BYTES} bytes are included, the most that is read."
             )
         if path.suffix == ".urdf":
-            inner, root = self._open_urdf(content, path.name, folder)
+            warnings = ReaderWarnings(path.name, self._remarks, self._strict)
+            inner = SdfDocument(path.name, folder, _LATEST, warnings, self._root)
+            model = read_urdf_as_sdf(content, path.name, folder, self._root, self._strict)
+            root: Element = ("sdf", {}, [model], 1)
         else:
             inner, root = open_document(content, path.name, folder, self._remarks, self._root, self._strict)
         models = [element for element in root[2] if element[0] == "model"]
-        if len(models) != 1 and not models:
-            others = [element for element in root[2] if element[0] in ("light", "actor")]
-            if others:
-                document.remarks.add(include, f"is left out: it is a <{others[0][0]}>.")
-                return
+        others = [element for element in root[2] if element[0] in ("light", "actor")]
+        if others and not models:
+            document.remarks.add(include, f"is left out: it is a <{others[0][0]}>.")
+            return
         if len(models) != 1:
             inner.refuse(root, f"is included, and has {len(models)} models where one is expected.")
         with inner.locate_errors(models[0]):
@@ -289,17 +265,10 @@ class SdfModelReader:
             self._model(models[0], scope, inner, name, include=include)
         self._open_files.pop()
 
-    def _open_urdf(self, content: bytes, source: str, folder: str) -> tuple[SdfDocument, Element]:
-        warnings = ReaderWarnings(source, self._remarks, self._strict)
-        model = read_urdf_as_sdf(content, source, folder, self._root, self._strict)
-        return SdfDocument(source, folder, _LATEST, warnings, self._root), ("sdf", {}, [model], 1)
 
-
-def make_root_scope(document: SdfDocument, element: Element) -> SdfScope:
-    """Return the scope of the world."""
-    scope = SdfScope("", document)
-    scope.model = PoseNode("world", "", scope, element)
-    return scope
+def _refuse_xacro(element: Element, document: SdfDocument) -> None:
+    if element[0].startswith("xacro:"):
+        document.refuse(element, "is xacro that was not expanded; expand it first: xacro in.sdf > out.sdf")
 
 
 def read_sdf(
@@ -345,7 +314,8 @@ def parse_sdf(
     root_folder = find_text_root(folder, root)
     document, top = open_document(text, source, folder, remarks, root_folder, strict)
     graph = PoseGraph()
-    scope = make_root_scope(document, top)
+    scope = SdfScope("", document)
+    scope.model = PoseNode("world", "", scope, top)
     static_models = _read(document, top, SdfModelReader(graph, remarks, root_folder, strict), scope)
     resolve_pose_graph(graph)
     attachments = resolve_attachments(graph.nodes, scope.model)
@@ -357,22 +327,19 @@ def _read(document: SdfDocument, root: Element, reader: SdfModelReader, scope: S
     worlds = [element for element in root[2] if element[0] == "world"]
     models = [element for element in root[2] if element[0] in ("model", "include")]
     for element in root[2]:
-        if element[0].startswith("xacro:"):
-            document.refuse(
-                element, "is xacro that was not expanded; expand it first: xacro in.sdf > out.sdf"
-            )
+        _refuse_xacro(element, document)
         if element[0] not in ("world", "model", "include"):
             document.remarks.add(element, "is left out.")
     if worlds:
         for element in (*worlds[1:], *models):
             document.remarks.add(element, "is left out: the first world of the file is the one that is read.")
-        reader.read_world(worlds[0], scope)
+        reader.read_elements(worlds[0], scope)
         return []
     if not models:
         document.refuse(root, "has neither a model nor a world.")
     for element in models:
         if element[0] == "include":
-            reader.read_include(element, scope)
+            reader.include(element, scope)
         else:
             reader.read_model(element, scope, alone=len(models) == 1)
     return scope.models
@@ -398,22 +365,14 @@ def _scene(
     static = [attachments[model].path for model in static_models]
     roots, ordered, loops = build_spanning_tree(links, joints, static, remark)
     _check_leaders((*ordered, *loops), nodes)
-    frames = tuple(
-        SdfFrame(
-            node.path,
-            attachments[node].path or WORLD,
-            pose_between(attachments[node], node),
-            node.element[3],
-            node.document.source,
-        )
-        for node in graph.nodes
-        if node.is_named_frame and node.kind in ("frame", "model")
-    )
-    return SdfScene(links, frames, roots, ordered, loops, document.source, tuple(remarks))
+    frames = []
+    for node in (node for node in graph.nodes if node.is_named_frame and node.kind in ("frame", "model")):
+        link, place = attachments[node], (node.element[3], node.document.source)
+        frames.append(SdfFrame(node.path, link.path or WORLD, pose_between(link, node), *place))
+    return SdfScene(links, tuple(frames), roots, ordered, loops, document.source, tuple(remarks))
 
 
 def _check_leaders(joints: Sequence[SdfJoint], nodes: dict[str, PoseNode]) -> None:
-    """Check that the coordinates that joints follow exist, and are not those of joints left out."""
     coordinates = {joint.name + axis.suffix for joint in joints for axis in joint.axes}
     for joint in joints:
         for relation in (joint.gear, *(axis.mimic for axis in joint.axes)):
@@ -431,7 +390,6 @@ def _link(node: PoseNode) -> SdfLink:
 
 
 def _resolve_mimic_chains(joints: list[SdfJoint], nodes: dict[str, PoseNode]) -> list[SdfJoint]:
-    """Resolve mimic chains: each relation names the coordinate at the end of its chain."""
     relations: dict[str, MimicRelation[str]] = {}
     owner: dict[str, str] = {}
     for joint in joints:
@@ -444,11 +402,7 @@ def _resolve_mimic_chains(joints: list[SdfJoint], nodes: dict[str, PoseNode]) ->
     if not relations:
         return joints
 
-    def refuse(coordinate: str, reason: str) -> NoReturn:
-        node = nodes[owner[coordinate]]
-        node.refuse(reason)
-
-    ends = resolve_mimic_chains(relations, refuse)
+    ends = resolve_mimic_chains(relations, lambda name, reason: nodes[owner[name]].refuse(reason))
     result = []
     for joint in joints:
         if any(joint.name + axis.suffix in relations for axis in joint.axes):

@@ -14,16 +14,17 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from kineverse.errors import FormatError, UnknownNameError
+from kineverse.errors import UnknownNameError, suggest
 from kineverse.formats.files import read_file
 from kineverse.formats.names import check_prefix
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.xml_reader import Element, ElementError, label, parse_xml, quote
 from kineverse.formats.xml_values import parse_number
+from kineverse.model.articulation import Articulation
+from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 
 from .description import CollisionRule, EndEffector, Srdf, SrdfGroup, VirtualJoint
-from .model_names import ModelNames, optional, required
 
 _IGNORED = frozenset(("link_sphere_approximation", "joint_property"))
 _VIRTUAL_KINDS = ("fixed", "planar", "floating")
@@ -77,8 +78,7 @@ def parse_srdf(
         _check_root(root)
         document = _SemanticDocument(root, ModelNames(model, prefix or ""), remarks)
     except ElementError as mistake:
-        where = f"{source}, line {mistake.element[3]}, {label(mistake.element)}"
-        raise FormatError(f"{where}: {mistake.message}") from None
+        raise mistake.located(source) from None
     return document.result
 
 
@@ -126,7 +126,7 @@ class _SemanticDocument:
         result: dict[str, VirtualJoint] = {}
         seen: dict[str, Element] = {}
         for element in self._elements("virtual_joint"):
-            try:
+            with self._remarks.passing_over():
                 if not add_unique(seen, element, self._remarks):
                     continue
                 name, kind = required(element, "name"), required(element, "type")
@@ -134,26 +134,20 @@ class _SemanticDocument:
                     raise ElementError(element, f"type={quote(kind)} is none of {', '.join(_VIRTUAL_KINDS)}.")
                 child = self._names.link(element, "child_link")
                 result[name] = VirtualJoint(name, kind, required(element, "parent_frame"), child)
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
         return result
 
     def _passive_joints(self) -> tuple[str, ...]:
         found: dict[str, None] = {}
         for element in self._elements("passive_joint"):
-            try:
+            with self._remarks.passing_over():
                 found[self._names.joint(element)] = None
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
         return tuple(found)
 
     def _groups(self, virtual: dict[str, VirtualJoint], passive: tuple[str, ...]) -> dict[str, SrdfGroup]:
         elements: dict[str, Element] = {}
         for element in self._elements("group"):
-            try:
+            with self._remarks.passing_over():
                 add_unique(elements, element, self._remarks)
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
         return GroupResolver(elements, self._names, virtual, self._remarks).resolve(passive)
 
     def _rules(self) -> tuple[CollisionRule, ...]:
@@ -161,11 +155,9 @@ class _SemanticDocument:
         rules: list[CollisionRule] = []
         warned: set[str] = set()
         for element in self._elements("disable_default_collisions"):
-            try:
+            with self._remarks.passing_over():
                 link = self._names.link(element, "link")
-                rules.append((link, self._names.links_pattern(), False, "off by default"))
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
+                rules.append((link, f"{self._names.prefix}*", False, "off by default"))
         for tag, check in (("enable_collisions", True), ("disable_collisions", False)):
             for element in self._elements(tag):
                 try:
@@ -184,7 +176,7 @@ class _SemanticDocument:
         result: dict[str, EndEffector] = {}
         seen: dict[str, Element] = {}
         for element in self._elements("end_effector"):
-            try:
+            with self._remarks.passing_over():
                 if not add_unique(seen, element, self._remarks):
                     continue
                 name, group = required(element, "name"), required(element, "group")
@@ -199,33 +191,28 @@ class _SemanticDocument:
                         f"has its parent_link {quote(parent)} in its own group, which MoveIt refuses.",
                     )
                 result[name] = EndEffector(name, group, parent, above)
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
         return result
 
     def _states(self, groups: dict[str, SrdfGroup]) -> dict[str, dict[str, float]]:
         states: dict[str, dict[str, float]] = {}
         by_group: dict[str, dict[str, dict[str, float]]] = {}
         for element in self._elements("group_state"):
-            try:
+            with self._remarks.passing_over():
                 name, group = required(element, "name"), required(element, "group")
                 if group not in groups:
                     raise ElementError(element, f"group={quote(group)} is no group of this file.")
                 own = by_group.setdefault(group, {})
                 if name in own:
                     raise ElementError(element, f"is a state of the group {quote(group)} already.")
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER)
-                continue
-            own[name] = values = self._values(element)
-            together = states.setdefault(name, {})
-            differing = [c for c, value in values.items() if together.setdefault(c, value) != value]
-            if differing:
-                self._remarks.add(
-                    element,
-                    f"differs from the state of that name of another group, about {quote(differing[0])}; "
-                    "in states the first one counts.",
-                )
+                own[name] = values = self._values(element)
+                together = states.setdefault(name, {})
+                differing = [c for c, value in values.items() if together.setdefault(c, value) != value]
+                if differing:
+                    self._remarks.add(
+                        element,
+                        f"differs from the state of that name of another group, about {quote(differing[0])}; "
+                        "in states the first one counts.",
+                    )
         for group, own in by_group.items():
             groups[group] = replace(groups[group], states=own)
         return states
@@ -236,11 +223,9 @@ class _SemanticDocument:
             if part[0] != "joint":
                 self._remarks.add(part, "is ignored: a state has joints only.", state)
                 continue
-            try:
+            with self._remarks.passing_over(state):
                 joint = self._names.joint(part)
                 values.update(self._joint_values(part, joint))
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER, state)
         return values
 
     def _joint_values(self, part: Element, joint: str) -> dict[str, float]:
@@ -268,9 +253,112 @@ class _SemanticDocument:
                     self._remarks.add(element, "is ignored: SRDF does not know it.")
 
 
-MOST_GROUPS = 1000  # each may contain all the others, so the result grows with the square
+_MOST_SUGGESTIONS = 50  # unknown names for which similar ones are looked up, which takes a while
 
-PASSED_OVER = "it is passed over"
+
+class ModelNames:
+    """Frames and articulations of a robot in a model, by their names in its files."""
+
+    def __init__(self, model: ModelView, prefix: str) -> None:
+        self._frames = dict(model.frames)
+        self.prefix = f"{prefix}/" if prefix else ""  # with its slash
+        self._free = {str(s) for s in model.degrees_of_freedom}
+        self.articulations: Mapping[str, Articulation] = dict(model.articulations)
+        self.above = {a.child: name for name, a in self.articulations.items()}
+        self._near: dict[tuple[str, str], str] = {}
+        self._sought: dict[str, bool] = {}
+
+    def link(self, element: Element, key: str) -> str:
+        """Return the frame of the link that an attribute names."""
+        return self._find(element, key, "link", self._frames)
+
+    def joint(self, element: Element, key: str = "name") -> str:
+        """Return the articulation of the joint that an attribute names."""
+        return self._find(element, key, "joint", self.articulations)
+
+    def moving_joint_above(self, link: str) -> str | None:
+        """Return the nearest articulation that moves a frame; None if there is none."""
+        for frame in self._ancestors(link):
+            joint = self.above.get(frame)
+            if joint is not None and self.is_moving(joint):
+                return joint
+        return None
+
+    def is_moving(self, joint: str) -> bool:
+        """Return whether an articulation moves: it has coordinates, or follows others."""
+        record = self.articulations[joint]
+        return bool(record.coordinates or record.speeds or record.follows is not None)
+
+    def free_coordinates(self, joint: str) -> list[str]:
+        """Return the names of the free coordinates of an articulation."""
+        return [str(s) for s in self.articulations[joint].coordinates if str(s) in self._free]
+
+    def chain(self, base: str, tip: str) -> tuple[list[str], list[str]]:
+        """Return the frames between two frames, both included, and the articulations between them.
+
+        The way goes up from the base to the common ancestor and down to the tip.
+        """
+        up, down = self._ancestors(base), self._ancestors(tip)
+        on_the_way_up = set(up)
+        shared = next((frame for frame in down if frame in on_the_way_up), None)
+        if shared is None:
+            raise UnknownNameError(f"'{base}' and '{tip}' are joined by nothing but the world")
+        rising, falling = up[: up.index(shared)], down[: down.index(shared)][::-1]
+        frames = [*rising, shared, *falling]
+        joints = [j for frame in (*rising, *falling) if (j := self.above.get(frame)) is not None]
+        return frames, joints
+
+    def check_robot(self, source: str) -> None:
+        """Raise an UnknownNameError if nothing that was sought is in the model: the prefix is another one."""
+        if not self._sought or any(self._sought.values()):
+            return
+        first, known = next(iter(self._sought)), {*self._frames, *self.articulations}
+        prefixes = sorted(name.removesuffix(f"/{first}") for name in known if name.endswith(f"/{first}"))
+        prefixes += [""] if first in known else []
+        hint = (
+            f"There is one below prefix {' and below '.join(map(repr, prefixes[:4]))}: give it as prefix=."
+            if prefixes
+            else suggest(self.prefix + first, known, "link or joint")
+        )
+        raise UnknownNameError(
+            f"{source}: the model has no link or joint of this description below the prefix "
+            f"'{self.prefix.rstrip('/')}', such as {quote(first)}. {hint}"
+        )
+
+    def _ancestors(self, frame: str) -> list[str]:
+        result = []
+        while frame != WORLD:
+            result.append(frame)
+            frame = self._frames[frame].parent
+        return result
+
+    def _find(self, element: Element, key: str, what: str, known: Mapping[str, object]) -> str:
+        said = required(element, key)
+        name = self.prefix + said
+        self._sought[said] = self._sought.get(said, False) or name in known
+        if name in known:
+            return name
+        if (what, said) not in self._near and len(self._near) < _MOST_SUGGESTIONS:
+            below = [name[len(self.prefix) :] for name in known if name.startswith(self.prefix)]
+            self._near[what, said] = f" ({suggest(said, below, what).rstrip('.')})"
+        hint = self._near.get((what, said), "")
+        raise ElementError(element, f"{quote(said)} is no {what} of the model{hint}.")
+
+
+def optional(element: Element, key: str) -> str:
+    """Return an attribute of an element without blanks around it, as MoveIt takes names; empty if missing."""
+    return element[1].get(key, "").strip()
+
+
+def required(element: Element, key: str) -> str:
+    """Return an attribute of an element without blanks around it."""
+    said = optional(element, key)
+    if not said:
+        raise ElementError(element, f"has no {key}; {label(element).split()[0].strip('<>')} needs one.")
+    return said
+
+
+MOST_GROUPS = 1000  # each may contain all the others, so the result grows with the square
 
 
 @dataclass
@@ -331,8 +419,8 @@ class GroupResolver:
                     continue
                 inner = optional(part, "name") if part[0] == "group" else ""
                 if inner in open_names:
-                    mistake = ElementError(part, "contains itself.")
-                    self._remarks.repair(mistake, PASSED_OVER, self._elements[name])
+                    with self._remarks.passing_over(self._elements[name]):
+                        raise ElementError(part, "contains itself.")
                 elif inner in self._elements and inner not in done:
                     stack.append((inner, iter(self._elements[inner][2])))
                     open_names.add(inner)
@@ -341,10 +429,8 @@ class GroupResolver:
     def _resolve(self, group: Element) -> _Members:
         members = _Members()
         for part in group[2]:
-            try:
+            with self._remarks.passing_over(group):
                 self._add(members, part, group)
-            except ElementError as mistake:
-                self._remarks.repair(mistake, PASSED_OVER, group)
         return members
 
     def _add(self, members: _Members, part: Element, group: Element) -> None:
@@ -353,7 +439,7 @@ class GroupResolver:
             self._add_joint(members, part)
         elif tag == "link":
             link = names.link(part, "name")
-            above = names.joint_above(link)
+            above = names.above.get(link)
             members.add([] if above is None else [above], [link])
         elif tag == "chain":
             base, tip = names.link(part, "base_link"), names.link(part, "tip_link")
@@ -365,7 +451,8 @@ class GroupResolver:
         elif tag == "group":
             inner = required(part, "name")
             if inner not in self._elements:
-                raise ElementError(part, f"is no group of this file; {_list(self._elements)}.")
+                named = ", ".join(quote(name) for name in list(self._elements)[:8])
+                raise ElementError(part, f"is no group of this file; there are {named}.")
             # A group that contains itself has been reported already.
             found = self._members.get(inner, _Members())
             members.add(list(found.joints), list(found.links))
@@ -383,12 +470,7 @@ class GroupResolver:
             joint = [] if above is None else [above]
         else:
             joint = [self._names.joint(part)]
-        members.add(joint, self._names.child_links(joint))
-
-
-def _list(groups: Mapping[str, Element]) -> str:
-    named = ", ".join(quote(name) for name in list(groups)[:8])
-    return f"there are {named}" if named else "there is none"
+        members.add(joint, [self._names.articulations[name].child for name in joint])
 
 
 def add_unique(elements: dict[str, Element], element: Element, remarks: ReaderWarnings) -> bool:

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
         UrdfJoint as UrdfJoint,
         UrdfLimits as UrdfLimits,
         UrdfLink as UrdfLink,
-        UrdfMimic as UrdfMimic,
         UrdfRobot as UrdfRobot,
         UrdfSafetyController as UrdfSafetyController,
     )

@@ -24,6 +24,7 @@ from kineverse.formats.xml_values import (
     read_origin,
 )
 from kineverse.model.body import (
+    NO_BODY,
     Body,
     Box,
     Capsule,
@@ -99,14 +100,12 @@ class UrdfMaterials:
             red, green, blue, alpha = parse_numbers(text, 4)
         except ValueError as error:
             mistake = ElementError(color, f"rgba={quote(text)} {error}.")
-        else:
-            return ((red, green, blue, alpha), file)
-        try:
-            red, green, blue, alpha = parse_numbers(" ".join(text.split()[:4]), 4)
-        except ValueError:
-            self._remarks.repair(mistake, "it is no colour", owner)
-            return (None, file)
-        self._remarks.repair(mistake, "the first four are taken", owner)
+            try:
+                red, green, blue, alpha = parse_numbers(" ".join(text.split()[:4]), 4)
+            except ValueError:
+                self._remarks.repair(mistake, "it is no colour", owner)
+                return (None, file)
+            self._remarks.repair(mistake, "the first four are taken", owner)
         return ((red, green, blue, alpha), file)
 
 
@@ -117,7 +116,6 @@ def _format_appearance(appearance: Appearance) -> str:
 
 
 _UNSCALED = (1.0, 1.0, 1.0)
-_EMPTY_BODY = Body()
 
 
 class UrdfLinkReader:
@@ -156,7 +154,7 @@ class UrdfLinkReader:
                 else:
                     self._remarks.add(part, "is ignored: another one came first.", element)
         if not visuals and not collisions and inertia is None:
-            return UrdfLink(name, _EMPTY_BODY, element[3])
+            return UrdfLink(name, NO_BODY, element[3])
         return UrdfLink(name, Body(tuple(visuals), tuple(collisions), inertia), element[3])
 
     def assign_materials(self, links: dict[str, UrdfLink]) -> None:
@@ -169,21 +167,11 @@ class UrdfLinkReader:
             links[name] = structs.replace(link, body=structs.replace(link.body, visuals=tuple(visuals)))
 
     def _shape(self, element: Element, link: Element, name: str = "", index: int = -1) -> Shape | None:
-        """Return the shape of a ``<visual>`` or ``<collision>``; None, with a remark, if it has none."""
         read = partial(self._read_shape, element, link, name, index)
         return read_or_default(read, None, f"the {label(element)} is left out", self._remarks, link)
 
     def _read_shape(self, element: Element, link: Element, name: str, index: int) -> Shape | None:
-        """Return a shape; with its appearance if ``index`` is that of a visual of the link."""
-        origin = geometry = material = None
-        for part in element[2]:
-            tag = part[0]
-            if tag == "origin":
-                origin = origin or part
-            elif tag == "geometry":
-                geometry = geometry or part
-            elif tag == "material":
-                material = material or part
+        origin, geometry, material = (find_child(element, tag) for tag in ("origin", "geometry", "material"))
         form = self._geometry(geometry, element, link)
         if form is None:
             return None
@@ -197,7 +185,6 @@ class UrdfLinkReader:
         return Shape(form, pose, own_name, *appearance)
 
     def _geometry(self, geometry: Element | None, shape: Element, link: Element) -> Geometry | None:
-        """Return the geometry of a shape; None, with a remark, if it is missing or unknown."""
         if geometry is None or not geometry[2]:
             self._remarks.add(geometry or shape, "has no shape and is left out.", link)
             return None
@@ -220,7 +207,6 @@ class UrdfLinkReader:
         return None
 
     def _mesh(self, mesh: Element, link: Element) -> Mesh:
-        """Return a mesh, with a remark if its file is outside of the root folder."""
         uri = mesh[1].get("filename")
         if not uri:
             raise ElementError(mesh, "has no filename; the specification requires it.")
@@ -231,30 +217,16 @@ class UrdfLinkReader:
 
     def _scale(self, mesh: Element, link: Element) -> Vector3:
         """Return the scale of a mesh; one factor or four factors are read as other parsers read them."""
-        words = mesh[1].get("scale", "").split()
+        words, default = mesh[1].get("scale", "").split(), _UNSCALED
+        read = partial(read_or_default, remarks=self._remarks, owner=link)
         if len(words) in (1, 4):
-            x, y, z = words * 3 if len(words) == 1 else words[:3]
-            corrected = (mesh[0], {"scale": f"{x} {y} {z}"}, mesh[2], mesh[3])
-            default = read_or_default(
-                lambda: read_attribute_vector(corrected, "scale"),
-                _UNSCALED,
-                "it is not scaled",
-                self._remarks,
-                link,
-            )
-        else:
-            default = _UNSCALED
+            scale = " ".join(words * 3 if len(words) == 1 else words[:3])
+            corrected = (mesh[0], {"scale": scale}, mesh[2], mesh[3])
+            default = read(partial(read_attribute_vector, corrected, "scale"), _UNSCALED, "it is not scaled")
         shown = " ".join(f"{factor:g}" for factor in default)
-        return read_or_default(
-            lambda: read_attribute_vector(mesh, "scale", _UNSCALED),
-            default,
-            f"{shown} is taken",
-            self._remarks,
-            link,
-        )
+        return read(partial(read_attribute_vector, mesh, "scale", _UNSCALED), default, f"{shown} is taken")
 
     def _inertia(self, inertial: Element, link: Element) -> Inertia:
-        """Return the inertia of a link; a missing tensor is zero."""
         mass_element, tensor = find_child(inertial, "mass"), find_child(inertial, "inertia")
         mass = 0.0 if mass_element is None else read_attribute_number(mass_element, "value", 0.0)
         if mass < 0.0:
@@ -262,16 +234,8 @@ class UrdfLinkReader:
         origin = read_origin(find_child(inertial, "origin"), link, self._version, self._remarks)
         if tensor is None:
             return Inertia(mass, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), origin)
-        ixx, ixy, ixz = (
-            read_attribute_number(tensor, "ixx", 0.0),
-            read_attribute_number(tensor, "ixy", 0.0),
-            read_attribute_number(tensor, "ixz", 0.0),
-        )
-        iyy, iyz, izz = (
-            read_attribute_number(tensor, "iyy", 0.0),
-            read_attribute_number(tensor, "iyz", 0.0),
-            read_attribute_number(tensor, "izz", 0.0),
-        )
+        keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        ixx, ixy, ixz, iyy, iyz, izz = (read_attribute_number(tensor, key, 0.0) for key in keys)
         return Inertia(mass, (ixx, ixy, ixz, iyy, iyz, izz), origin)
 
 

@@ -10,7 +10,9 @@ from typing import Literal, TypeAlias
 
 from msgspec import Struct
 
-from kineverse.model.body import Body, Pose, Vector3
+from kineverse.formats.mimic import MimicRelation
+from kineverse.formats.poses import IDENTITY
+from kineverse.model.body import NO_BODY, Body, Pose, Vector3
 
 UrdfJointType: TypeAlias = Literal[
     "fixed", "revolute", "continuous", "prismatic", "planar", "floating", "spherical"
@@ -32,9 +34,6 @@ DOF_BY_TYPE: dict[UrdfJointType, int] = {
 
 SPECIFIED_TYPES = tuple(kind for kind in DOF_BY_TYPE if kind != "spherical")
 """Joint types of the specification."""
-
-_IDENTITY = Pose()
-_EMPTY_BODY = Body()
 
 
 class UrdfLimits(Struct, frozen=True):
@@ -78,18 +77,6 @@ class UrdfSafetyController(Struct, frozen=True):
         return self.soft_lower < self.soft_upper
 
 
-class UrdfMimic(Struct, frozen=True):
-    """Position of a joint that follows another: ``multiplier * joint + offset``.
-
-    Chains are resolved: ``joint`` is the independent joint at the end of the chain, and the factors are
-    composed.
-    """
-
-    joint: str
-    multiplier: float = 1.0
-    offset: float = 0.0
-
-
 class UrdfDynamics(Struct, frozen=True):
     """Damping [N s/m] or [N m s/rad] and static friction [N] or [N m] of a joint."""
 
@@ -107,18 +94,18 @@ class UrdfJoint(Struct, frozen=True):
     a unit vector in the joint's frame: the axis of rotation, the direction of translation, or the normal of
     the plane; None for joints without axis. The ``limits`` of a planar joint hold for both directions in the
     plane; those of a floating joint are an effort only. ``mimic`` and soft limits are defined for joints of
-    one DoF.
+    one DoF; ``mimic`` is the relation to the independent joint at the end of its chain.
     """
 
     name: str
     kind: UrdfJointType
     parent: str
     child: str
-    origin: Pose = _IDENTITY
+    origin: Pose = IDENTITY
     axis: Vector3 | None = None
     limits: UrdfLimits = UNLIMITED
     safety: UrdfSafetyController | None = None
-    mimic: UrdfMimic | None = None
+    mimic: MimicRelation[str] | None = None
     dynamics: UrdfDynamics = FRICTIONLESS
     line: int = 0
 
@@ -127,7 +114,7 @@ class UrdfLink(Struct, frozen=True):
     """Link: a frame and the body attached to it."""
 
     name: str
-    body: Body = _EMPTY_BODY
+    body: Body = NO_BODY
     line: int = 0
 
 

@@ -37,7 +37,6 @@ from .description import (
     UrdfJoint,
     UrdfJointType,
     UrdfLimits,
-    UrdfMimic,
     UrdfSafetyController,
 )
 
@@ -98,7 +97,6 @@ def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderW
 
 
 def _dynamics(dynamics: Element | None) -> UrdfDynamics:
-    """Return damping and friction; zero if they are missing."""
     if dynamics is None:
         return FRICTIONLESS
     return UrdfDynamics(
@@ -107,7 +105,6 @@ def _dynamics(dynamics: Element | None) -> UrdfDynamics:
 
 
 def _kind(element: Element, remarks: ReaderWarnings) -> UrdfJointType:
-    """Return the type of a joint, which may also be ``spherical``, with a remark."""
     kind = element[1].get("type")
     if kind is None:
         raise ElementError(
@@ -171,7 +168,6 @@ def _limits(
     version: tuple[int, int],
     remarks: ReaderWarnings,
 ) -> UrdfLimits:
-    """Return the limits of a joint; none, with a remark, if a required ``<limit>`` is missing."""
     if limit is None:
         if kind in ("revolute", "prismatic"):
             mistake = ElementError(
@@ -287,18 +283,11 @@ def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController 
     """Return the safety controller of a joint; its soft limits have to overlap the limits."""
     if safety is None:
         return None
-    lower, upper = (
-        read_attribute_number(safety, "soft_lower_limit", 0.0),
-        read_attribute_number(safety, "soft_upper_limit", 0.0),
-    )
+    keys = ("soft_lower_limit", "soft_upper_limit", "k_position")
+    lower, upper, gain = (read_attribute_number(safety, key, 0.0) for key in keys)
     if lower > upper:
         raise ElementError(safety, f"has soft_lower_limit={lower!r} above soft_upper_limit={upper!r}.")
-    result = UrdfSafetyController(
-        lower,
-        upper,
-        read_attribute_number(safety, "k_position", 0.0),
-        read_attribute_number(safety, "k_velocity"),
-    )
+    result = UrdfSafetyController(lower, upper, gain, read_attribute_number(safety, "k_velocity"))
     if limits.lower is None or limits.upper is None or not result.has_limits:
         return result
     if upper < limits.lower or lower > limits.upper:
@@ -310,12 +299,11 @@ def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController 
     return result
 
 
-def _mimic(mimic: Element) -> UrdfMimic:
-    """Return the joint that is followed, by its name in the file, and the factors."""
+def _mimic(mimic: Element) -> MimicRelation[str]:
     joint = mimic[1].get("joint")
     if not joint:
         raise ElementError(mimic, "does not name a joint.")
-    return UrdfMimic(
+    return MimicRelation(
         joint, read_attribute_number(mimic, "multiplier", 1.0), read_attribute_number(mimic, "offset", 0.0)
     )
 
@@ -357,17 +345,6 @@ def resolve_mimic_joints(joints: Iterable[UrdfJoint], remarks: ReaderWarnings) -
             return False
         return True
 
-    following = {
-        joint.name: MimicRelation(joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
-        for joint in joints
-        if joint.mimic is not None
-    }
-    resolved = resolve_mimic_chains(following, refuse, check=check)
-    return [
-        replace(joint, mimic=UrdfMimic(end.leader, end.multiplier, end.offset))
-        if (end := resolved.get(joint.name))
-        else joint
-        if joint.mimic is None
-        else replace(joint, mimic=None)
-        for joint in joints
-    ]
+    following = {joint.name: joint.mimic for joint in joints if joint.mimic is not None}
+    ends = resolve_mimic_chains(following, refuse, check=check)
+    return [j if j.mimic is None else replace(j, mimic=ends.get(j.name)) for j in joints]

@@ -13,10 +13,9 @@ from dataclasses import replace
 from typing import Any
 
 from kineverse import articulations
-from kineverse.articulations import Continuous, Fixed, OneDofJoint, Prismatic, Revolute
+from kineverse.articulations import Continuous, Fixed, OneDofJoint, Planar, Prismatic, Revolute
 from kineverse.articulations import Joint as JointOperation
 from kineverse.errors import FormatError
-from kineverse.expressions.expression import Expression
 from kineverse.formats.names import NumberedNames, drop_empty_parts
 from kineverse.formats.reader_warnings import Fault, warn
 from kineverse.formats.xml_reader import quote
@@ -31,10 +30,15 @@ from kineverse.symbols import position
 from .description import UrdfJoint, UrdfLink, UrdfRobot
 from .reader import parse_urdf
 
-_AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
+AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
     "revolute": Revolute,
     "continuous": Continuous,
     "prismatic": Prismatic,
+}
+_FREE_JOINTS: dict[str, type[JointOperation]] = {
+    "fixed": Fixed,
+    "floating": articulations.Floating,
+    "spherical": articulations.Ball,
 }
 _SUFFIXES = {
     "planar": ("x", "y", "angle"),
@@ -107,50 +111,22 @@ def _joint_operations(
         "origin": joint.origin,
         "dynamics": _dynamics(joint),
     }
-    if joint.kind == "fixed":
-        yield Fixed(**common)
-    elif joint.kind == "floating":
-        yield articulations.Floating(**common)
-    elif joint.kind == "spherical":
-        yield articulations.Ball(**common)
-    elif joint.kind == "planar":
-        assert joint.axis is not None
-        limits = joint.limits
-        yield articulations.Planar(
-            **common, axis=joint.axis, lower=limits.lower, upper=limits.upper, velocity=limits.velocity
-        )
-    else:
-        mimic_position = _mimic_position(joint, joint_name)
-        yield _axis_joint(joint, common, mimic_position)
-        safety = joint.safety
-        if safety is not None and safety.has_limits:
-            q = position(name) if mimic_position is None else mimic_position
-            yield SoftLimits(name, q, safety.soft_lower, safety.soft_upper)
-
-
-def _axis_joint(
-    joint: UrdfJoint, common: dict[str, Any], mimic_position: Expression | None
-) -> JointOperation:
-    assert joint.axis is not None
-    return _AXIS_JOINTS[joint.kind](
-        **common,
-        axis=joint.axis,
-        lower=joint.limits.lower,
-        upper=joint.limits.upper,
-        velocity=joint.limits.velocity,
-        position=mimic_position,
-    )
-
-
-def _mimic_position(joint: UrdfJoint, joint_name: Callable[[str], str]) -> Expression | None:
-    """Return the position of a joint that mimics another one; None for an independent joint."""
-    if joint.mimic is None:
-        return None
-    return joint.mimic.multiplier * position(joint_name(joint.mimic.joint)) + joint.mimic.offset
+    if joint.kind in _FREE_JOINTS:
+        yield _FREE_JOINTS[joint.kind](**common)
+        return
+    limits, safety, mimic = joint.limits, joint.safety, joint.mimic
+    common |= {"axis": joint.axis, "lower": limits.lower, "upper": limits.upper, "velocity": limits.velocity}
+    if joint.kind == "planar":
+        yield Planar(**common)
+        return
+    follows = None if mimic is None else mimic.multiplier * position(joint_name(mimic.leader)) + mimic.offset
+    yield AXIS_JOINTS[joint.kind](**common, position=follows)
+    if safety is not None and safety.has_limits:
+        q = position(name) if follows is None else follows
+        yield SoftLimits(name, q, safety.soft_lower, safety.soft_upper)
 
 
 def _dynamics(joint: UrdfJoint) -> tuple[tuple[str, float], ...]:
-    """Return the dynamics of a joint as pairs of name and value, without those that are missing."""
     values = {
         "effort": joint.limits.effort,
         "acceleration": joint.limits.acceleration,
@@ -213,22 +189,8 @@ def _assign_names(
         clash = [f"{name}/{s}" for s in _SUFFIXES.get(joint.kind, ()) if f"{name}/{s}" in taken]
         if clash:
             problem = f"its coordinate {quote(clash[0])} has the name of another joint"
-            everywhere = _TakenPrefixes(taken)
+            split = [other.split("/") for other in taken]
+            everywhere = {"/".join(parts[: k + 1]) for parts in split for k in range(len(parts))}
             joints[joint.name] = rename("joint", joint, problem, f"{name}_joint", everywhere)
             taken.add(joints[joint.name])
     return links, joints
-
-
-class _TakenPrefixes:
-    """Container of all taken names and their prefixes, the names above them."""
-
-    def __init__(self, taken: set[str]) -> None:
-        self._taken = {
-            "/".join(parts[:k])
-            for name in taken
-            for parts in [name.split("/")]
-            for k in range(1, len(parts) + 1)
-        }
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._taken

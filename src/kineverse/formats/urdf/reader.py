@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from msgspec.structs import replace
 
-from kineverse.errors import FormatError
+from kineverse.errors import FormatError, list_some, suggest
 from kineverse.formats.files import read_file
 from kineverse.formats.names import NumberedNames
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import find_text_root
 from kineverse.formats.xml_reader import Element, ElementError, Visit, label, parse_xml, quote
+from kineverse.model.frame import WORLD
 
 from .bodies import UrdfLinkReader
 from .description import UrdfJoint, UrdfLink, UrdfRobot
 from .joints import read_urdf_joint, resolve_mimic_joints
-from .tree import keep_one_parent, order_from_root
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))
@@ -100,8 +101,6 @@ def parse_urdf(
 
 
 class _Document:
-    """Links and joints of a document, collected while it is parsed."""
-
     def __init__(self, folder: str, root: str, remarks: ReaderWarnings):
         self.links: dict[str, UrdfLink] = {}
         self.joints: dict[str, UrdfJoint] = {}
@@ -115,7 +114,7 @@ class _Document:
         try:
             self._version = _version(root, self.remarks)
         except ElementError as mistake:
-            raise self._error(mistake, root) from None
+            raise mistake.located(self.remarks.source, root) from None
         self._xacro = _xacro_prefix(root)
         self._reader = UrdfLinkReader(self._folder, self._version, self.remarks, self._root)
         return self._read_element
@@ -126,11 +125,12 @@ class _Document:
         try:
             hint = _warn_unknown_elements(root, self._unknown_elements, bool(self.joints), self.remarks)
         except ElementError as mistake:
-            raise self._error(mistake, mistake.element) from None
+            raise mistake.located(self.remarks.source) from None
         if not self.links:
             declared = any(key.startswith("xmlns:") and "xacro" in value for key, value in root[1].items())
             hint += f" {XACRO_HINT}" if declared else ""
-            raise self._error(ElementError(root, f"has no <link>; a robot has at least one.{hint}"), root)
+            empty = ElementError(root, f"has no <link>; a robot has at least one.{hint}")
+            raise empty.located(self.remarks.source)
         return hint
 
     def _read_element(self, element: Element) -> None:
@@ -148,7 +148,7 @@ class _Document:
             elif tag != "sensor":
                 self._unknown_elements.append(element)
         except ElementError as mistake:
-            raise self._error(mistake, element) from None
+            raise mistake.located(self.remarks.source, element) from None
 
     def _add_joint(self, joint: UrdfJoint, element: Element) -> None:
         """Add a joint; of a fixed joint and another of the same name, the fixed one is renamed."""
@@ -164,11 +164,6 @@ class _Document:
         if other.kind == "fixed" and joint.kind != "fixed":
             self.joints[name], joint = joint, other
         self.joints[fixed] = replace(joint, name=fixed)
-
-    def _error(self, mistake: ElementError, owner: Element) -> FormatError:
-        part = "" if mistake.element is owner else f"{label(mistake.element)} "
-        where = f"{self.remarks.source}, line {mistake.element[3]}, {label(owner)}"
-        return FormatError(f"{where}: {part}{mistake.message}")
 
 
 def _add(by_name: dict[str, T], name: str, part: T, element: Element) -> None:
@@ -244,3 +239,116 @@ def _xacro_prefix(root: Element) -> str:
         if key.startswith("xmlns:") and value.rstrip("/#").endswith("xacro"):
             return key[len("xmlns:") :] + ":"
     return "xacro:"
+
+
+# -- tree ----------------------------------------------------------------------------------------------------
+
+_SHOWN = 8
+
+
+def keep_one_parent(joints: Sequence[UrdfJoint], remarks: ReaderWarnings) -> list[UrdfJoint]:
+    """Return the joints with one parent joint for each link: the last by name, as in urdfdom."""
+    joint_above: dict[str, UrdfJoint] = {}
+    for joint in joints:
+        other = joint_above.setdefault(joint.child, joint)
+        if other is joint:
+            continue
+        text = (
+            f"its child link {quote(joint.child)} has a parent already, by the joint {quote(other.name)} on "
+            f"line {other.line}. URDF describes trees only: a link has one parent."
+        )
+        kept, dropped = (joint, other) if joint.name.encode() > other.name.encode() else (other, joint)
+        joint_above[joint.child] = kept
+        remarks.mistake(joint.line, f"{_label(joint)}: {text}", f"{quote(dropped.name)} is left out")
+    return [joint for joint in joints if joint_above[joint.child] is joint]
+
+
+def order_from_root(
+    links: Sequence[UrdfLink], joints: Sequence[UrdfJoint], remarks: ReaderWarnings, hint: str = ""
+) -> tuple[tuple[str, ...], tuple[UrdfJoint, ...], list[UrdfLink]]:
+    """Return the roots, the joints from the roots outwards, and the links that they reach.
+
+    Siblings are in the order of the file.
+    """
+    source = remarks.source
+    links = _with_world(links, joints, remarks)
+    lines = {link.name: link.line for link in links}
+    joints_below: dict[str, list[UrdfJoint]] = {}
+    joint_above: dict[str, UrdfJoint] = {}
+    for joint in joints:
+        for role, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in lines:
+                raise FormatError(
+                    f"{source}, line {joint.line}, {_label(joint)}: its {role} link {quote(name)} does not "
+                    f"exist; every link needs a <link> element of its own. {suggest(name, lines, 'link')}"
+                )
+        joint_above[joint.child] = joint
+        joints_below.setdefault(joint.parent, []).append(joint)
+
+    roots = [link for link in links if link.name not in joint_above]
+    if len(roots) > 1:
+        shown = list_some((f"{quote(link.name)} (line {link.line})" for link in roots), _SHOWN)
+        text = (
+            f"<link name={quote(roots[1].name)}>: there are {len(roots)} links without a parent, "
+            f"where one root is expected: {shown}. Connect them by joints.{hint}"
+        )
+        remarks.mistake(roots[1].line, text, "all of them stand where the first does")
+    ordered = [joint for root in roots for joint in _outwards(root.name, joints_below)]
+    reached = {root.name for root in roots} | {joint.child for joint in ordered}
+    if len(ordered) != len(joints):
+        loop = _loop(next(joint for joint in joints if joint.child not in reached), joint_above)
+        shown = " -> ".join(f"{quote(joint.name)}" for joint in loop[:_SHOWN])
+        more = f" and {len(loop) - _SHOWN} more" if len(loop) > _SHOWN else ""
+        cycle = f"the joints {shown}{more} lead in a circle"
+        if len(loop) == 1:
+            cycle = "its child link is its own parent"
+        text = f"{_label(loop[0])}: {cycle}. URDF describes trees only: remove a joint.{hint}"
+        if not roots:
+            raise FormatError(f"{source}, line {loop[0].line}, {text}")
+        left = len(links) - len(reached)
+        remarks.mistake(loop[0].line, text, f"{left} links that no root holds are left out")
+    return tuple(root.name for root in roots), tuple(ordered), [k for k in links if k.name in reached]
+
+
+def _with_world(
+    links: Sequence[UrdfLink], joints: Sequence[UrdfJoint], remarks: ReaderWarnings
+) -> Sequence[UrdfLink]:
+    """Return the links, with the world if it is a parent without a link of its own, as in Drake."""
+    joint = next((joint for joint in joints if joint.parent == WORLD), None)
+    if joint is None or remarks.strict or any(link.name == WORLD for link in links):
+        return links
+    remarks.fault(
+        joint.line,
+        f"{_label(joint)}: its parent link {quote(WORLD)} has no <link> element of its own; it is the world.",
+    )
+    return [UrdfLink(WORLD, line=joint.line), *links]
+
+
+def _outwards(root: str, joints_below: dict[str, list[UrdfJoint]]) -> list[UrdfJoint]:
+    ordered: list[UrdfJoint] = []
+    stack = joints_below.get(root, [])[::-1]
+    while stack:
+        joint = stack.pop()
+        ordered.append(joint)
+        stack.extend(reversed(joints_below.get(joint.child, ())))
+    return ordered
+
+
+def _loop(start: UrdfJoint, joint_above: dict[str, UrdfJoint]) -> list[UrdfJoint]:
+    """Return the joints of the cycle that ``start`` is in or below, beginning with the first in the file."""
+    joint, visited = start, {start.name}
+    while True:
+        joint = joint_above[joint.parent]
+        if joint.name in visited:
+            break
+        visited.add(joint.name)
+    loop = [joint]
+    while (above := joint_above[loop[-1].parent]) is not joint:
+        loop.append(above)
+    loop.reverse()
+    first = min(range(len(loop)), key=lambda index: loop[index].line)
+    return loop[first:] + loop[:first]
+
+
+def _label(joint: UrdfJoint) -> str:
+    return f"<joint name={quote(joint.name)}>"

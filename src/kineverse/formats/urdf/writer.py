@@ -22,7 +22,6 @@ from kineverse.articulations.multi_axis import rotation_from_z
 from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
-    NO_BODY,
     BallJointDescription,
     JointBounds,
     JointDescription,
@@ -34,12 +33,13 @@ from kineverse.formats.description import (
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
 from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
 from kineverse.formats.names import TakenNames
-from kineverse.formats.poses import ROTATION_TOLERANCE, rpy_angles
+from kineverse.formats.poses import IDENTITY, ROTATION_TOLERANCE, rpy_angles
 from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.resource_paths import mesh_reference
 from kineverse.formats.xml_writer import Tag, format_xml
 from kineverse.lie import translation
 from kineverse.model.body import (
+    NO_BODY,
     Body,
     Box,
     Capsule,
@@ -59,7 +59,6 @@ from kineverse.model.model_view import ModelView
 from .operations import urdf_operations
 from .reader import parse_urdf
 
-_IDENTITY = Pose()
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -89,7 +88,6 @@ class UrdfBodyWriter:
                 self._remark(f"the colours of what is to be touched of '{name}' are left out")
 
     def _shape(self, link: Tag, tag: str, shape: Shape, name: str) -> Tag | None:
-        """Add a visual or collision shape; None, with a remark, if URDF has no such shape."""
         if isinstance(shape.geometry, (Ellipsoid, Cone)):
             self._remark(f"URDF has no {shape.geometry.kind}: one of '{name}' is left out ({tag})")
             return None
@@ -139,7 +137,7 @@ class UrdfBodyWriter:
 
 def add_origin(element: Tag, pose: Pose) -> None:
     """Add the ``<origin>`` of an element, unless it is the identity."""
-    if pose == _IDENTITY:
+    if pose == IDENTITY:
         return
     matrix = pose.matrix
     rpy = rpy_angles(matrix)
@@ -186,12 +184,8 @@ class UrdfWriter:
     def __init__(self, description: RobotDescription, path: Path, unsupported: UnsupportedFeatures) -> None:
         self._description, self._path, self._unsupported = description, path, unsupported
         self._links = TakenNames([WORLD, *(link.name for link in description.links)])
-        self._joints = TakenNames(
-            [
-                *(link.fixed_joint_name for link in description.links),
-                *(joint.name for joint in description.joints),
-            ]
-        )
+        fixed = [link.fixed_joint_name for link in description.links]
+        self._joints = TakenNames([*fixed, *(joint.name for joint in description.joints)])
         self._bodies = UrdfBodyWriter(path.absolute().parent, description.remarks)
         self._root = Tag("robot", {"name": path.name.removesuffix(path.suffix) or "model"})
 
@@ -225,7 +219,6 @@ class UrdfWriter:
         return None
 
     def _root_link(self) -> LinkDescription | None:
-        """Return the link that is fixed at the world's origin and carries all others; None without one."""
         roots = [link for link in self._description.links if link.parent == WORLD]
         if len(roots) != 1 or self._description.world_body != NO_BODY:
             return None
@@ -304,13 +297,9 @@ class UrdfWriter:
         return (name, "planar", n) if same and not any(axes[2].point) else None
 
     def _axis_joint(self, joint: JointDescription, parent: str, child: str, pose: Matrix) -> None:
-        kind = (
-            "prismatic"
-            if not joint.is_rotation
-            else "continuous"
-            if joint.bounds.is_unbounded
-            else "revolute"
-        )
+        kind = "prismatic"
+        if joint.is_rotation:
+            kind = "continuous" if joint.bounds.is_unbounded else "revolute"
         element = self._joint(joint.name, kind, parent, child, pose, joint.axis)
         self._limit(element, joint.name, kind, joint.bounds, joint.dynamics)
         if joint.coefficients != IDENTITY_COEFFICIENTS or not joint.is_independent:
@@ -347,7 +336,6 @@ class UrdfWriter:
     def _limit(
         self, element: Tag, name: str, kind: str, bounds: JointBounds, known: Mapping[str, Any]
     ) -> None:
-        """Add the ``<limit>`` of a joint, unless it has none and its kind requires none."""
         effort, max_velocity = _number(known, "effort"), bounds.max_velocity
         newer = {key: _number(known, key) for key in _NEWER}
         has_range = kind in ("revolute", "prismatic") or not bounds.is_unbounded
@@ -383,6 +371,5 @@ def _axis_key(joint: JointDescription) -> tuple[str, bool, tuple[float, ...]]:
 
 
 def _number(dynamics: object, key: str) -> float | None:
-    """Return a number of the dynamics of a joint; None if it is missing or no number."""
     value = dynamics.get(key) if isinstance(dynamics, dict) else None
     return float(value) if isinstance(value, (int, float)) and not math.isnan(value) else None

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from kineverse.errors import EditError, KineverseError, ModelError, UnknownNameError
+from kineverse.errors import EditError, KineverseError, ModelError, UnknownNameError, list_some
 from kineverse.model.frame import WORLD
 from kineverse.model.operation import FRAMES, Cell, may_override, overwrite_error
 from kineverse.model.read_recorder import ABSENT, Read, Reads, unknown_name_error
@@ -18,8 +18,7 @@ from kineverse.model.read_recorder import ABSENT, Read, Reads, unknown_name_erro
 if TYPE_CHECKING:
     from kineverse.model.history import History, HistoryEntry
 
-BEFORE_ALL = -1 << 200
-"""Place before those of all entries."""
+BEFORE_ALL = -1 << 200  # place before those of all entries
 
 _PLACE = attrgetter("place")
 _LISTED = 10
@@ -167,9 +166,7 @@ def refused_error(history: History, failures: Mapping[str, KineverseError]) -> E
         lines.append(f"  and {len(failures) - _LISTED} more operations.")
     needing = _dependents(history, failures)
     if needing:
-        some = ", ".join(map(repr, needing[:_FEW]))
-        more = f" and {len(needing) - _FEW} more" if len(needing) > _FEW else ""
-        lines.append(f"What these write is needed by {some}{more}.")
+        lines.append(f"What these write is needed by {list_some(map(repr, needing), _FEW)}.")
     listed = "\n".join(lines)
     return EditError(
         f"The edit is refused, because these operations cannot be applied:\n{listed}", dict(failures)

@@ -9,6 +9,7 @@ from contextlib import suppress
 from typing import Generic, NamedTuple, TypeVar
 
 from kineverse._checks import as_count, as_tolerance
+from kineverse._runtime import Closing
 from kineverse.errors import EditError, ExpressionError
 from kineverse.model.model import Model, Snapshot
 from kineverse.symbols import Symbol
@@ -71,7 +72,7 @@ class BuiltValue(NamedTuple, Generic[T]):
     version: int
 
 
-class Follower(Generic[T]):
+class Follower(Closing, Generic[T]):
     """Value that follows a model, from :func:`kineverse.follow`; :meth:`close` ends that.
 
     Attributes
@@ -149,12 +150,6 @@ class Follower(Generic[T]):
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
-
-    def __enter__(self) -> Follower[T]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _hear(self, commit: Commit) -> None:
         is_relevant = self._filter.select(commit) is not None

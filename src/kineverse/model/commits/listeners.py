@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from kineverse._checks import as_entries
+from kineverse._runtime import Closing
 from kineverse.errors import ExpressionError
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Pose
@@ -34,7 +35,6 @@ class Commit:
 
     @cached_property
     def _changed(self) -> dict[str, dict[str, Change]]:
-        """Changes of frames and rates by name."""
         kinds = (FRAMES, RATES)
         return {kind: {c.name: c for c in self.diff.changes if c.kind == kind} for kind in kinds}
 
@@ -180,7 +180,7 @@ _EVERYTHING = CommitFilter()
 
 
 @dataclass(frozen=True, eq=False)
-class Listener:
+class Listener(Closing):
     """Callback with its filter; :meth:`close` unregisters it."""
 
     callback: Callback
@@ -190,12 +190,6 @@ class Listener:
     def close(self) -> None:
         """Unregister the callback; a second call has no effect."""
         self.registry.remove(self)
-
-    def __enter__(self) -> Listener:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 Witness = Callable[[Commit], None]

@@ -195,7 +195,6 @@ def _find_place(history: History, placed: PlacedEntry) -> int:
 
 
 def _find_fault(changes: NetChanges) -> str:
-    """Return what is wrong with the form of net changes, else an empty text."""
     groups = (changes.replaced, changes.rerun, changes.moved, changes.removed)
     for group in (changes.put, *groups):
         if not isinstance(group, tuple | list):

@@ -64,7 +64,6 @@ def writes_agree(
 
 
 def _pairs(kind: str, a: Any, b: Any) -> list[ExpressionPair] | None:
-    """Return the expressions at equal places of two values; None if the values differ otherwise."""
     if a is b:
         return []
     if kind == FRAMES:
@@ -81,7 +80,6 @@ def _nothing(_: Expression) -> float:
 
 
 def _without_numbers(kind: str, value: Any) -> Any:
-    """Return a written value with expressions in place of its numbers."""
     if kind == ARTICULATIONS:
         return replace(value, dynamics=_without_numbers(DATA, value.dynamics))
     if kind != DATA:
@@ -93,7 +91,6 @@ def _without_numbers(kind: str, value: Any) -> Any:
 
 
 def _close(pairs: list[ExpressionPair]) -> bool:
-    """Return whether expressions and their gradients agree at a few states."""
     values: list[ExpressionPair] = []
     for a, b in pairs:
         if a.shape != b.shape:
@@ -140,7 +137,8 @@ def replay_agrees(
                 if step.query.kind in EXPRESSION_QUERIES:
                     others.append(substitute_results(step.query, others).ask(model))
                 else:
-                    others.append(_perturb(change, step.query, reply) if place in free else reply)
+                    changed = (change(step.query, i, part) for i, part in enumerate(reply.parts))
+                    others.append(QueryResult(reply.rest, tuple(changed)) if place in free else reply)
             traced = trace.compute_writes(others).writes()
         except KineverseError:
             continue  # the perturbation is not valid for the trace
@@ -156,10 +154,6 @@ def replay_agrees(
         if not writes_agree(traced, written):
             return False
     return True
-
-
-def _perturb(change: Perturbation, query: Query, reply: QueryResult) -> QueryResult:
-    return QueryResult(reply.rest, tuple(change(query, i, part) for i, part in enumerate(reply.parts)))
 
 
 def _perturb_value(query: Query, place: int, part: Expression | float) -> Expression | float:

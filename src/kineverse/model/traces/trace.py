@@ -103,7 +103,6 @@ class ReadNode(Node):
         return repr((listener and listener.serial, query, part, steps))
 
     def _look(self, how: Access) -> Expression:
-        """Record an access, and return the expression it stands for."""
         if not self.arguments:
             raise ModelError("A trace has no value before it is run.")
         # The symbols of gradient entries do not follow from those of the expression.

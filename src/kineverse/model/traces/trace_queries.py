@@ -15,7 +15,7 @@ from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.graph import structural_hash
 from kineverse.model.articulation import Articulation
-from kineverse.model.body import Body, Pose
+from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES
@@ -117,11 +117,6 @@ def _articulation(model: ReadRecorder, name: str) -> QueryResult:
     return QueryResult((names, _split((a.dynamics, a.follows), parts)), tuple(parts))
 
 
-def _join_articulation(rest: Any, parts: Sequence[Any]) -> Articulation:
-    names, others = rest
-    return Articulation(*names, *_join(others, parts))
-
-
 def _frame(model: ReadRecorder, name: str) -> QueryResult:
     frame = model.frames[name]
     return QueryResult(frame.parent, (frame.transform[:3],))
@@ -143,15 +138,6 @@ def _constraint(model: ReadRecorder, name: str) -> QueryResult:
     return QueryResult(None, (c.lower, c.expression, c.upper))
 
 
-def _body(model: ReadRecorder, name: str) -> QueryResult:
-    body: Body = model.bodies[name]
-    return QueryResult(body, ())
-
-
-def _names(model: ReadRecorder, kind: str) -> QueryResult:
-    return QueryResult(tuple(model.by_kind(kind)), ())
-
-
 def _homogeneous(upper: Expression) -> Expression:
     # The last row of a transform is constant, and its zeros should stay structural.
     return as_expression(np.concatenate([upper, as_expression([[0.0, 0.0, 0.0, 1.0]])]))
@@ -167,11 +153,13 @@ def _rest(rest: Any, parts: Sequence[Any]) -> Any:
 
 QUERY_KINDS: dict[str, QueryKind] = {
     "exists": QueryKind(lambda model, kind, name: QueryResult(name in model.by_kind(kind), ()), _rest, 2),
-    "names": QueryKind(_names, _rest, 1),
+    "names": QueryKind(lambda model, kind: QueryResult(tuple(model.by_kind(kind)), ()), _rest, 1),
     "frame": QueryKind(_frame, lambda rest, parts: Frame(rest, (_homogeneous(parts[0]),)), 1),
     "factors": QueryKind(_factors, _join_factors, 1),
-    "body": QueryKind(_body, _rest, 1),
-    "articulation": QueryKind(_articulation, _join_articulation, 1),
+    "body": QueryKind(lambda model, name: QueryResult(model.bodies[name], ()), _rest, 1),
+    "articulation": QueryKind(
+        _articulation, lambda rest, parts: Articulation(*rest[0], *_join(rest[1], parts)), 1
+    ),
     "constraint": QueryKind(_constraint, lambda rest, parts: Constraint(*parts), 1),
     "datum": QueryKind(_datum, _join, 1),
     "fk": QueryKind(

@@ -220,7 +220,6 @@ def _note_brake(constraint: Constraint, brakes: dict[Symbol, Expression]) -> str
 
 
 def _speeds_of(constraint: Constraint, rates: Rates) -> set[Symbol]:
-    """Return the free speeds of a constraint on speeds or accelerations."""
     result: set[Symbol] = set()
     for s in constraint.expression.symbols:
         if s.order:
