@@ -17,7 +17,7 @@ import pytest
 
 import kineverse as kv
 from cupboards import hinged_door
-from kineverse.cli import arguments
+from kineverse.cli import arguments, exchange, output
 from kineverse.exchange import LiveModel, Server, list_servers, serve
 from kineverse.formats import document_hash
 from kineverse.model import AddFrame, Frame
@@ -131,15 +131,22 @@ def test_history_undo_and_what_hinders_it(run: Run, live: LiveModel) -> None:
 
 
 @pytest.mark.parametrize("options", [(), ("--json",), ("--frames", "door")], ids=" ".join)
-def test_watch_prints_a_line_for_each_commit(run: Run, live: LiveModel, options: tuple[str, ...]) -> None:
+def test_watch_prints_a_line_for_each_commit(
+    run: Run, live: LiveModel, options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watched = threading.Event()
+
+    def print_and_tell(text: str) -> None:
+        output.print_line(text)
+        watched.set()
+
     def edit_when_watched() -> None:
-        end = time.monotonic() + LONG
-        while len(live.exchange.status().clients) < 2 and time.monotonic() < end:
-            time.sleep(0.01)
+        assert watched.wait(LONG)
         place(live, "shelf", 1.0)
         place(live, "cupboard", 2.0)
         place(live, "shelf", 3.0)
 
+    monkeypatch.setattr(exchange, "print_line", print_and_tell)
     editor = threading.Thread(target=edit_when_watched)
     editor.start()
     status, out, err = run("watch", "home", *options, "--count", 1 if options[:1] == ("--frames",) else 3)
