@@ -115,7 +115,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
-
     try:
         return model.save(
             arguments.target,
@@ -166,7 +165,6 @@ def _print_document(model: kv.Model) -> int:
 def _format_report(
     arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: SaveResult
 ) -> list[str]:
-
     lines = [f"{arguments.source} → {arguments.target}", f"  {format_contents(model)}, {_format_size(size)}"]
     if saved.errors:
         lines.append(f"  {_approximation_errors(saved)}")

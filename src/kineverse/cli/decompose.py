@@ -122,7 +122,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
-
     options: dict[str, Any] = {}
     if arguments.error is not None:
         options["error"] = parse_length(arguments.error)
@@ -243,7 +242,6 @@ def _outcome_to_json(task: MeshTask, outcome: DecompositionOutcome) -> dict[str,
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-
     def describe(entry: CacheEntry) -> tuple[dict[str, Any], tuple[str, ...]]:
         made = entry.decomposition.made
         when = time.strftime("%Y-%m-%d %H:%M", time.localtime(made))

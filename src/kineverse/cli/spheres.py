@@ -164,7 +164,6 @@ def _format_links(links: Sequence[LinkCover]) -> list[str]:
 
 
 def _format_row(name: str, links: Sequence[tuple[LinkCover, SphereCover]]) -> tuple[str, ...]:
-
     seconds = sum(link.seconds for link, _ in links)
     return (
         name,
@@ -221,7 +220,6 @@ def _view(
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-
     def describe(one: CachedCover) -> tuple[dict[str, Any], tuple[str, ...]]:
         spheres, protrusion = len(one.cover), one.cover.protrusion
         facts = {"name": one.name, "spheres": spheres, "protrusion": protrusion}
