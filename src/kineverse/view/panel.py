@@ -11,7 +11,7 @@ from .animation import VelocityDrive
 from .html import Html, HtmlBox, element, format_missing_meshes, format_significant, format_violations
 from .proximity_panel import ProximityPanel
 from .scene import ViewerScene
-from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step
+from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step, on_input
 
 BEYOND = 0.2  # fraction of their range by which sliders are widened on demand, to violate limits
 MOST_UNFOLDED = 100  # with at most so many degrees of freedom all groups are unfolded at first
@@ -140,9 +140,7 @@ class Panel:
         degrees = gui.add_checkbox("degrees", self.degrees, hint="Show angles in degrees instead of radians.")
         degrees.on_update(lambda event: self._convert(event.target.value))
         self.playing = gui.add_checkbox("play", False, hint="Move everything through its range.")
-        self.playing.on_update(
-            lambda event: on_play(event.target.value) if event.client is not None else None
-        )
+        on_input(self.playing, on_play)
 
     def _add_sliders(self, values: Mapping[str, float]) -> None:
         groups: dict[str, list[str]] = {}
@@ -197,7 +195,14 @@ class Panel:
             hint=f"{name}, {about}",
         )
         slider.precision = _count_digits(low, high)
-        slider.on_update(lambda event: self._set(call, name, limits[name], event))
+
+        def move(shown: float) -> None:
+            value = float(shown) / self._factor(name)
+            # A limit that is converted between units and back changes by rounding, and would be violated.
+            near = [limit for limit in limits[name] if abs(value - limit) < 1e-12]
+            call(name, near[0] if near else value)
+
+        on_input(slider, move)
         return slider
 
     def _label(self, name: str, limits: tuple[float, float], locked: bool = False) -> str:
@@ -224,17 +229,6 @@ class Panel:
 
     def _value(self, name: str) -> float:
         return float(self._sliders[name].value) / self._factor(name)
-
-    def _set(
-        self, call: Callable[[str, float], None], name: str, limits: tuple[float, float], event: Any
-    ) -> None:
-        # Values set by this program come back as events without a client.
-        if event.client is None:
-            return
-        value = float(event.target.value) / self._factor(name)
-        # A limit that is converted between units and back changes by rounding, and would be violated.
-        near = [limit for limit in limits if abs(value - limit) < 1e-12]
-        call(name, near[0] if near else value)
 
     def _lock(self, values: Mapping[str, float]) -> None:
         """Mark the coordinates that are locked at these values, and disable their sliders."""

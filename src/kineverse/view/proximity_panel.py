@@ -33,6 +33,7 @@ from .proximity import (
     format_millimetres,
 )
 from .scene import ViewerScene
+from .sliders import on_input
 
 LINES = 12  # lines of the list; further pairs are counted, not listed
 EXCLUDED_LINES = 5  # excluded bodies and shapes that are named with the reason; further ones are counted
@@ -195,15 +196,13 @@ class ProximityPanel:
             self._report = HtmlBox(gui, Html())
         self._controls = near, radius, only, ignored, decomposed
         for control in self._controls:
-            control.on_update(self._apply_controls)
+            on_input(control, self._apply_controls)
 
-    def _apply_controls(self, event: Any) -> None:
-        # Values set by this program come back as events without a client.
-        if event.client is not None:
-            request = ProximityRequest(*(control.value for control in self._controls))
-            self._scene.decompose(request.decomposed)
-            self.worker.set_request(request)
-            self._write_report()
+    def _apply_controls(self, _: Any) -> None:
+        request = ProximityRequest(*(control.value for control in self._controls))
+        self._scene.decompose(request.decomposed)
+        self.worker.set_request(request)
+        self._write_report()
 
     def _apply(self, request: ProximityRequest) -> None:
         with self._lock:

@@ -8,8 +8,9 @@ some frame by one radian a unit is an angle, one that shifts a frame by one metr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
@@ -117,6 +118,12 @@ UNIT_TOLERANCE = 1e-5
 
 PROBE_DISTANCES = (0.0, 1.0, -1.0, 0.1, -0.1)
 """Distances of the probed states from the given values; the later ones are used if earlier ones fail."""
+
+
+def on_input(control: Any, call: Callable[[Any], object]) -> None:
+    """Have a call with the value of a control whenever a browser sets it."""
+    # Values set by this program come back as events without a client.
+    control.on_update(lambda event: call(event.target.value) if event.client is not None else None)
 
 
 def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -> dict[str, str]:
