@@ -204,8 +204,9 @@ def _render_table(console: Console, cells: Sequence[Sequence[str]], sides: Seque
 
     table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, header_style="bold")
     for k, (title, side) in enumerate(zip(cells[0], sides, strict=True)):
-        justify = "right" if side == ">" else "left"
-        table.add_column(Text(title), justify=justify, no_wrap=k == 0, overflow="fold")
+        table.add_column(
+            Text(title), justify="right" if side == ">" else "left", no_wrap=k == 0, overflow="fold"
+        )
     for row in cells[1:]:
         table.add_row(*(Text(escape_controls(cell)) for cell in row))
     with console.capture() as captured:
