@@ -60,7 +60,7 @@ def follow(controller: Controller, state: kv.State, seconds: float) -> tuple[kv.
     return state, commands
 
 
-def solve_by_osqp(problem: Any, soft: Any, weight: float, linear: float) -> tuple[Any, Any]:
+def solve_by_osqp(problem: Any, soft: Any, weight: float) -> tuple[Any, Any]:
     """Return minimiser and multipliers of a quadratic program; penalties of soft rows are of slacks."""
     import osqp
 
@@ -75,7 +75,7 @@ def solve_by_osqp(problem: Any, soft: Any, weight: float, linear: float) -> tupl
     solver = osqp.OSQP()
     solver.setup(
         scipy.sparse.csc_matrix(np.triu(cost)),
-        np.concatenate([f, np.full(2 * k, linear)]),
+        np.concatenate([f, np.zeros(2 * k)]),
         scipy.sparse.csc_matrix(C),
         np.concatenate([lower, np.zeros(2 * k)]),
         np.concatenate([upper, np.full(2 * k, np.inf)]),

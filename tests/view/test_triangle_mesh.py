@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -120,6 +122,5 @@ def test_concatenate_meshes_shifts_indices_and_keeps_colours_only_if_all_have_so
     both = concatenate_meshes([box, mark])
     assert volume(both) == pytest.approx(volume(box) + volume(mark))
     assert both.colors is None
-    painted = [s.with_colors(np.ones((len(s.faces), 4))) for s in (box, mark)]
+    painted = [replace(s, colors=np.ones((len(s.faces), 4))) for s in (box, mark)]
     assert concatenate_meshes(painted).colors.shape == (len(both.faces), 4)
-    assert painted[0].without_colors().colors is None

@@ -43,11 +43,8 @@ class Base(Joint):
     def frames(self) -> dict[str, Frame]:
         """Frame of the base, by its name."""
         x, y, angle = self.coordinates
-        return {
-            self.child: Frame.from_transform(
-                self.parent, (self.origin, translation(x, y, 0), rotation_z(angle))
-            )
-        }
+        pose = self.origin, translation(x, y, 0), rotation_z(angle)
+        return {self.child: Frame.from_transform(self.parent, pose)}
 
     def check_wheels(self, paths: object, count: int) -> None:
         """Check that paths are different names, one for each wheel.
@@ -60,9 +57,8 @@ class Base(Joint):
         given = paths if isinstance(paths, (tuple, list)) else ()
         texts = {path for path in given if isinstance(path, str) and path}
         if len(given) != count or len(texts) != count:
-            raise InvalidValueError(
-                f"The wheels of the {self.noun} '{self.name}' are {count} different paths, not {paths!r}."
-            )
+            what = f"The wheels of the {self.noun} '{self.name}'"
+            raise InvalidValueError(f"{what} are {count} different paths, not {paths!r}.")
 
     def speed_bound(self, field: str) -> float | None:
         """Return the limit of a speed in a field, None if there is none."""
@@ -71,22 +67,18 @@ class Base(Joint):
     def speed_limit(self, field: str, speed: Expression, name: str = "") -> dict[str, Constraint]:
         """Return the constraint -limit <= speed <= limit, if the field has a limit."""
         most = self.speed_bound(field)
-        return (
-            {}
-            if most is None
-            else {f"{self.name}/{name or field}": Constraint.from_expressions(-most, speed, most)}
-        )
+        if most is None:
+            return {}
+        return {f"{self.name}/{name or field}": Constraint.from_expressions(-most, speed, most)}
 
     def speed_norm_limit(
         self, field: str, components: tuple[Expression, Expression]
     ) -> dict[str, Constraint]:
         """Return the constraint ``|velocity| <= limit``, if the field has a limit."""
         most = self.speed_bound(field)
-        return (
-            {}
-            if most is None
-            else {f"{self.name}/{field}": Constraint.from_expressions(0, norm(array(components)), most)}
-        )
+        if most is None:
+            return {}
+        return {f"{self.name}/{field}": Constraint.from_expressions(0, norm(array(components)), most)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,11 +99,11 @@ class OmniBase(Base, document_kind="OmniBase"):
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame and the speed limits."""
         x, y, angle = self.coordinates
-        dx, dy, turning = speeds = tuple(c.derivative() for c in (x, y, angle))
+        dx, dy, turning = (c.derivative() for c in (x, y, angle))
         return Writes(
             frames=self.frames,
             constraints={**self.speed_norm_limit("speed", (dx, dy)), **self.speed_limit("turn", turning)},
-            articulations={self.name: self.record((x, y, angle), (0.0, 0.0, 0.0), speeds)},
+            articulations={self.name: self.record((x, y, angle))},
         )
 
 
@@ -181,7 +173,7 @@ class DifferentialDrive(Base, document_kind="DifferentialDrive"):
                 y: {left: along * np.sin(angle), right: along * np.sin(angle)},
                 angle: {left: -about, right: about},
             },
-            articulations={self.name: self.record((x, y, angle), (0.0, 0.0, 0.0), (left, right))},
+            articulations={self.name: self.record((x, y, angle), speeds=(left, right))},
         )
 
 
@@ -230,24 +222,17 @@ class Ackermann(Base, document_kind="Ackermann"):
         x, y, angle = self.coordinates
         steering, drive = position(f"{self.name}/steering"), velocity(f"{self.name}/drive")
         bound = self.speed_bound("steering_speed")
+        limits = limit_constraints(f"{self.name}/steering", steering, -self.steering, self.steering, bound)
+        speeds = drive, steering.derivative()
         return Writes(
             frames=self.frames,
-            constraints={
-                **dict(
-                    limit_constraints(f"{self.name}/steering", steering, -self.steering, self.steering, bound)
-                ),
-                **self.speed_limit("speed", drive),
-            },
+            constraints={**dict(limits), **self.speed_limit("speed", drive)},
             rates={
                 x: {drive: np.cos(angle)},
                 y: {drive: np.sin(angle)},
                 angle: {drive: np.tan(steering) / self.wheelbase},
             },
-            articulations={
-                self.name: self.record(
-                    (x, y, angle, steering), (0.0, 0.0, 0.0, 0.0), (drive, steering.derivative())
-                )
-            },
+            articulations={self.name: self.record((x, y, angle, steering), speeds=speeds)},
         )
 
 
@@ -328,7 +313,7 @@ class Mecanum(Base, document_kind="Mecanum"):
                 y: {wheel: forward[wheel] * s + sideways[wheel] * c for wheel in wheels},
                 angle: turning,
             },
-            articulations={self.name: self.record((x, y, angle), (0.0, 0.0, 0.0), wheels)},
+            articulations={self.name: self.record((x, y, angle), speeds=wheels)},
         )
 
 

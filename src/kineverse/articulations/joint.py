@@ -32,16 +32,15 @@ class PlacedOperation(Operation):
 
     def __post_init__(self) -> None:
         self.check_texts("name", "parent")
-        if isinstance(self.origin, Pose) or (
-            isinstance(self.origin, Expression) and self.origin.shape == (4, 4)
-        ):
+        given = self.origin
+        if isinstance(given, Pose) or (isinstance(given, Expression) and given.shape == (4, 4)):
             return
         try:
-            object.__setattr__(self, "origin", Pose.from_matrix(self.origin))
+            object.__setattr__(self, "origin", Pose.from_matrix(given))
         except (KineverseError, TypeError, ValueError) as error:
             raise InvalidValueError(
                 f"The origin of the {self.noun} '{self.name}' is not a pose. {error} It is a 4×4 transform: "
-                f"{_place(self.origin)}, a kv.model.Pose, or a 4×4 array of numbers."
+                f"{_place(given)}, a kv.model.Pose, or a 4×4 array of numbers."
             ) from None
 
     @property
@@ -57,9 +56,8 @@ class PlacedOperation(Operation):
     def check_lengths(self, *fields: str) -> None:
         """Check that fields are positive lengths [m]."""
         for field in fields:
-            check_joint_number(
-                getattr(self, field), f"The {field} of the {self.noun} '{self.name}'", positive=True
-            )
+            what = f"The {field} of the {self.noun} '{self.name}'"
+            check_joint_number(getattr(self, field), what, positive=True)
 
     def check_texts(self, *fields: str) -> None:
         """Check that fields are names."""
@@ -118,8 +116,8 @@ class Joint(PlacedOperation):
     def record(
         self,
         coordinates: tuple[Symbol, ...] = (),
-        home: tuple[float, ...] = (),
-        speeds: tuple[Symbol, ...] = (),
+        home: tuple[float, ...] | None = None,
+        speeds: tuple[Symbol, ...] | None = None,
         follows: Expression | None = None,
     ) -> Articulation:
         """Return the record of the articulation.
@@ -127,15 +125,16 @@ class Joint(PlacedOperation):
         Parameters
         ----------
         coordinates, home
-            Coordinates and their values at home.
+            Coordinates and their values at home, by default 0.
         speeds
-            Speeds that move them.
+            Speeds that move them, by default their derivatives.
         follows
             The position as an expression, for a joint without a coordinate of its own.
         """
-        return Articulation(
-            self.kind, self.parent, self.child, coordinates, home, speeds, self.dynamics, follows
-        )
+        home = (0.0,) * len(coordinates) if home is None else home
+        speeds = tuple(s.derivative() for s in coordinates) if speeds is None else speeds
+        ends = self.parent, self.child
+        return Articulation(self.kind, *ends, coordinates, home, speeds, self.dynamics, follows)
 
     def check_free(self, model: ReadRecorder) -> None:
         """Check that the names of the articulation and of its child are free."""
@@ -148,9 +147,8 @@ class Fixed(Joint, document_kind="Fixed"):
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame."""
-        return Writes(
-            frames={self.child: (self.parent, self.origin)}, articulations={self.name: self.record()}
-        )
+        frames = {self.child: (self.parent, self.origin)}
+        return Writes(frames=frames, articulations={self.name: self.record()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,11 +184,10 @@ class OneAxisMotion(Joint):
         The coordinate ``name`` is on record as the joint's own; any other q as an expression that it follows.
         """
         own = (q,) if isinstance(q, Symbol) and q == position(self.name) else ()
-        record = self.record(own, (0.0,) * len(own), tuple(s.derivative() for s in own), None if own else q)
         return Writes(
             frames={self.child: (self.parent, (self.origin, *self.motion(q)))},
             constraints=dict(limit_constraints(self.name, q, self.lower, self.upper, self.velocity)),
-            articulations={self.name: record},
+            articulations={self.name: self.record(own, follows=None if own else q)},
         )
 
 
@@ -236,13 +233,19 @@ def check_axis(axis: AxisLike, name: str) -> Vector3:
 
 def check_position_expression(expression: object, what: str) -> Expression:
     """Return a scalar expression of positions after checking that it is one."""
+    scalar = check_scalar(expression, what)
+    moving = [str(s) for s in scalar.symbols if s.order]
+    if moving:
+        raise InvalidValueError(f"{what} is about positions, and not about {', '.join(moving)}.")
+    return scalar
+
+
+def check_scalar(expression: object, what: str) -> Expression:
+    """Return a scalar expression after checking that it is one."""
     if not isinstance(expression, Expression):
         raise InvalidValueError(f"{what} is an expression, not {expression!r}.")
     if expression.shape:
         raise InvalidValueError(f"{what} is a scalar, not of shape {expression.shape}.")
-    moving = [str(s) for s in expression.symbols if s.order]
-    if moving:
-        raise InvalidValueError(f"{what} is about positions, and not about {', '.join(moving)}.")
     return expression
 
 

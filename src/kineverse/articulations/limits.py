@@ -53,9 +53,8 @@ def limit_constraints(
     """Yield the constraints ``name/position`` and ``name/velocity``, if there are such limits."""
     if (lower is not None or upper is not None) and q.symbols:
         try:
-            position_range = Constraint.from_expressions(
-                -math.inf if lower is None else lower, q, math.inf if upper is None else upper
-            )
+            low, high = -math.inf if lower is None else lower, math.inf if upper is None else upper
+            position_range = Constraint.from_expressions(low, q, high)
         except KineverseError as error:
             raise InvalidValueError(f"The limits of '{name}' are no range. {error}") from None
         yield f"{name}/position", position_range

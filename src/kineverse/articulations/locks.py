@@ -20,6 +20,8 @@ from kineverse.expressions.gradient import total_derivative
 from kineverse.expressions.piecewise import piecewise, spline
 from kineverse.logic import logic_and
 
+from .joint import check_joint_number, check_scalar
+
 BoundedExpression: TypeAlias = tuple[Expression, Expression, Expression]
 
 
@@ -56,13 +58,12 @@ def speed_lock(
     InvalidValueError
         For an expression that is not a scalar, a limit that is not positive, or another direction.
     """
-    rate = _scalar(speed, "The speed of a lock")
+    rate = check_scalar(speed, "The speed of a lock")
     if not any(s.order for s in rate.symbols):
         rate = total_derivative(rate)
     if not rate.symbols:
         raise InvalidValueError(f"The speed of a lock depends on coordinates, and {speed!r} does not.")
-    if not _number(max_speed, "The max_speed of a lock") > 0 or math.isinf(max_speed):
-        raise InvalidValueError(f"The max_speed of a lock is positive and finite, not {max_speed!r}.")
+    check_joint_number(max_speed, "The max_speed of a lock", positive=True)
     free = _open_condition(open_if, engaged_if)
     if blocks not in ("both", "forward", "backward"):
         raise InvalidValueError(f"A lock blocks 'both', 'forward' or 'backward', not {blocks!r}.")
@@ -109,18 +110,13 @@ def position_lock(
         For an expression that is not a scalar, bounds that leave nothing between them, NaN, or a margin that
         is not positive.
     """
-    if not _scalar(q, "The position of a lock").symbols or any(s.order for s in q.symbols):
+    if not check_scalar(q, "The position of a lock").symbols or any(s.order for s in q.symbols):
         raise InvalidValueError(f"The position of a lock is an expression of positions, not {q!r}.")
-    if not _number(margin, "The margin of a lock") > 0 or math.isinf(margin):
-        raise InvalidValueError(f"The margin of a lock is positive and finite, not {margin!r}.")
-    low, high = (
-        None if bound is None else _bound(bound, name) for name, bound in (("lower", lower), ("upper", upper))
-    )
-    inside: list[Expression] = []
-    if low is not None:
-        inside.append(low - margin < q)
-    if high is not None:
-        inside.append(q < high + margin)
+    check_joint_number(margin, "The margin of a lock", positive=True)
+    low = None if lower is None else _bound(lower, "The lower bound of a lock")
+    high = None if upper is None else _bound(upper, "The upper bound of a lock")
+    inside = [] if low is None else [low - margin < q]
+    inside += [] if high is None else [q < high + margin]
     if not inside:
         raise InvalidValueError("The lock of a position has a lower or an upper bound, and neither is given.")
     if low is not None and high is not None and not low.symbols and not high.symbols:
@@ -156,13 +152,12 @@ def tabulated_limit(
     InvalidValueError
         For a driver that is not a scalar, or points that do not increase, are too few or NaN.
     """
-    x = _scalar(driver, "The driver of a table of limits")
+    x = check_scalar(driver, "The driver of a table of limits")
     try:
         pairs = [(float(t), float(y)) for t, y in (points.items() if isinstance(points, Mapping) else points)]
     except (TypeError, ValueError):
-        raise InvalidValueError(
-            f"A table of limits has points {{driver: limit}}, and is not {points!r:.80}."
-        ) from None
+        wanted = "has points {driver: limit}, and is not"
+        raise InvalidValueError(f"A table of limits {wanted} {points!r:.80}.") from None
     knots, values = [t for t, _ in pairs], [y for _, y in pairs]
     try:
         if smooth:
@@ -175,8 +170,10 @@ def tabulated_limit(
 
 
 def _open_condition(open_if: Expression, engaged_if: Expression | None) -> Expression:
-    free = _scalar(open_if, "The condition open_if of a lock")
-    return free if engaged_if is None else free | ~_scalar(engaged_if, "The condition engaged_if of a lock")
+    free = check_scalar(open_if, "The condition open_if of a lock")
+    if engaged_if is None:
+        return free
+    return free | ~check_scalar(engaged_if, "The condition engaged_if of a lock")
 
 
 def _bound_while_locked(free: Expression, bound: Expression | None, sign: int) -> Expression:
@@ -189,25 +186,7 @@ def _bound_while_locked(free: Expression, bound: Expression | None, sign: int) -
     return choice.augment(out, heuristic=True) if out else choice
 
 
-def _scalar(given: object, what: str) -> Expression:
-    if not isinstance(given, Expression):
-        raise InvalidValueError(f"{what} is an expression, not {given!r}.")
-    if given.shape:
-        raise InvalidValueError(f"{what} is a scalar, not of shape {given.shape}.")
-    return given
-
-
-def _bound(given: ExpressionLike, name: str) -> Expression:
-    what = f"The {name} bound of a lock"
+def _bound(given: ExpressionLike, what: str) -> Expression:
     if isinstance(given, Expression) and given.symbols:
-        return _scalar(given, what)
-    if not math.isfinite(_number(given, what)):
-        raise InvalidValueError(f"{what} is a finite number, not {given!r}.")
-    return as_expression(given)
-
-
-def _number(given: object, what: str) -> float:
-    try:
-        return float(given)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise InvalidValueError(f"{what} is a number, not {given!r}.") from None
+        return check_scalar(given, what)
+    return as_expression(check_joint_number(given, what))

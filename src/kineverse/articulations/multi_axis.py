@@ -62,15 +62,10 @@ class Planar(Joint, document_kind="Planar"):
         constraints: dict[str, Constraint] = {}
         for q in (x, y):
             constraints.update(limit_constraints(str(q), q, self.lower, self.upper, self.velocity))
-        coordinates = (x, y, angle)
         return Writes(
             frames={self.child: (self.parent, (self.origin, *motion))},
             constraints=constraints,
-            articulations={
-                self.name: self.record(
-                    coordinates, (0.0, 0.0, 0.0), tuple(c.derivative() for c in coordinates)
-                )
-            },
+            articulations={self.name: self.record((x, y, angle))},
         )
 
 
@@ -103,9 +98,8 @@ class Universal(Joint, document_kind="Universal"):
         super().__post_init__()
         for what in ("first", "second"):
             object.__setattr__(self, what, check_axis(getattr(self, what), self.name))
-            check_limits(
-                getattr(self, f"{what}_limits"), f"'{what}_limits' of the universal joint '{self.name}'"
-            )
+            field = f"{what}_limits"
+            check_limits(getattr(self, field), f"'{field}' of the universal joint '{self.name}'")
         cosine = float(np.dot(unit_axis(self.first), unit_axis(self.second)))
         if abs(cosine) > _PERPENDICULAR:
             angle = math.acos(max(-1.0, min(cosine, 1.0)))
@@ -117,7 +111,7 @@ class Universal(Joint, document_kind="Universal"):
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame and the limits."""
         self.check_free(model)
-        angles = a, b = position(f"{self.name}/first"), position(f"{self.name}/second")
+        a, b = position(f"{self.name}/first"), position(f"{self.name}/second")
         motion = (*rotation_factors(self.first, a), *rotation_factors(self.second, b))
         return Writes(
             frames={self.child: (self.parent, (self.origin, *motion))},
@@ -125,7 +119,7 @@ class Universal(Joint, document_kind="Universal"):
                 **dict(self.first_limits.constraints(f"{self.name}/first", a)),
                 **dict(self.second_limits.constraints(f"{self.name}/second", b)),
             },
-            articulations={self.name: self.record(angles, (0.0, 0.0), (a.derivative(), b.derivative()))},
+            articulations={self.name: self.record((a, b))},
         )
 
 
@@ -190,10 +184,8 @@ class Ball(Joint, document_kind="Ball"):
         size = whole @ whole
         constraints = {}
         if self.cone is not None:
-            bound = 2 * math.sin(self.cone / 2) ** 2
-            constraints[f"{self.name}/cone"] = Constraint.from_expressions(
-                -math.inf, 2 * (across @ across) / size, bound
-            )
+            bound, versine = 2 * math.sin(self.cone / 2) ** 2, 2 * (across @ across) / size
+            constraints[f"{self.name}/cone"] = Constraint.from_expressions(-math.inf, versine, bound)
         if self.twist is not None:
             c, s = math.cos(self.twist / 2), math.sin(self.twist / 2)
             excess = ((c * p) ** 2 - (s * w) ** 2) / size

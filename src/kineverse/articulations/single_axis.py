@@ -71,9 +71,8 @@ class Screw(OneDofJoint, document_kind="Screw"):
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
         """Return the factors of joint_T_child."""
-        return translation_along(unit_axis(self.axis), self.pitch / math.tau * q), *rotation_factors(
-            self.axis, q
-        )
+        along = translation_along(unit_axis(self.axis), self.pitch / math.tau * q)
+        return along, *rotation_factors(self.axis, q)
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame and the limits."""
@@ -116,9 +115,7 @@ class Cylindrical(Joint, document_kind="Cylindrical"):
                 **dict(self.slide.constraints(f"{self.name}/slide", s)),
                 **dict(self.turn.constraints(f"{self.name}/turn", angle)),
             },
-            articulations={
-                self.name: self.record((s, angle), (0.0, 0.0), (s.derivative(), angle.derivative()))
-            },
+            articulations={self.name: self.record((s, angle))},
         )
 
 

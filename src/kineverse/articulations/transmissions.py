@@ -44,9 +44,8 @@ class Transmission(OneAxisMotion):
         if isinstance(self.driver, str):
             return
         if not isinstance(self.driver, Expression):
-            raise InvalidValueError(
-                f"{self._driver_noun} is the name of an articulation or an expression, not {self.driver!r}."
-            )
+            wanted = "the name of an articulation or an expression"
+            raise InvalidValueError(f"{self._driver_noun} is {wanted}, not {self.driver!r}.")
         if not check_position_expression(self.driver, self._driver_noun).symbols:
             raise InvalidValueError(f"{self._driver_noun} is constant: {self.driver!r}.")
 
@@ -72,12 +71,10 @@ class Transmission(OneAxisMotion):
             raise UnknownNameError(f"{self._driver_noun} is missing. {error}") from None
         if record.position is None:
             names = ", ".join(f"'{s}'" for s in record.coordinates)
-            has = (
-                f"{len(record.coordinates)} coordinates, {names}; give one of them, as "
-                f"driver=kv.position('{record.coordinates[0]}')"
-                if names
-                else "no position"
-            )
+            has = "no position"
+            if names:
+                example = f"driver=kv.position('{record.coordinates[0]}')"
+                has = f"{len(record.coordinates)} coordinates, {names}; give one of them, as {example}"
             raise InvalidValueError(f"{self._driver_noun}, '{self.driver}', has {has}.")
         return record.position
 
@@ -190,14 +187,12 @@ class Cam(Transmission, document_kind="Cam"):
             try:
                 object.__setattr__(self, what, tuple(given))
             except (KineverseError, TypeError):
-                raise InvalidValueError(
-                    f"The {what} of the cam '{self.name}' are numbers, not {given!r}."
-                ) from None
+                told = f"The {what} of the cam '{self.name}' are numbers, not {given!r}."
+                raise InvalidValueError(told) from None
         for what in ("periodic", "turns"):
-            if not isinstance(getattr(self, what), (bool, np.bool_)):
-                raise InvalidValueError(
-                    f"'{what}' of the cam '{self.name}' is True or False, not {getattr(self, what)!r}."
-                )
+            flag = getattr(self, what)
+            if not isinstance(flag, (bool, np.bool_)):
+                raise InvalidValueError(f"'{what}' of the cam '{self.name}' is True or False, not {flag!r}.")
         try:
             spline(0.0, self.angles, self.values, self.periodic)
         except InvalidValueError as error:

@@ -259,9 +259,8 @@ def match_coordinates(model: ModelView, words: Iterable[str], option: str) -> li
         if any(sign in word for sign in "*?["):
             matching = [name for name in names if fnmatchcase(name, word)]
             if not matching:
-                raise UnknownNameError(
-                    f"{option} {word}: no coordinate matches. {suggest(word, names, 'coordinate')}"
-                )
+                similar = suggest(word, names, "coordinate")
+                raise UnknownNameError(f"{option} {word}: no coordinate matches. {similar}")
         found += matching
     return found
 
@@ -277,20 +276,15 @@ def _suggest_unit(text: str, kind: str, lower: float, upper: float) -> str:
     if has_unit(text):
         return ""
     name, _, number = text.rpartition("=")
-    value = float(number) if _is_plain_number(number) else math.nan
+    try:
+        value = float(number)
+    except ValueError:
+        return ""
     for unit in ALTERNATIVE_UNITS.get(kind, ()):
         if lower <= value * UNITS[unit] <= upper:
             long = "degrees" if unit == "deg" else unit
             return f"; in {long} it is --set {name.strip()}={number.strip()}{unit}"
     return ""
-
-
-def _is_plain_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 MODULES: Mapping[str, str] = MappingProxyType(
@@ -312,11 +306,8 @@ _HEAD = 1 << 16  # of a file, in which its root element begins [byte]
 
 def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> None:
     """Raise if something is missing, and name all of it with how to install it."""
-    missing = [
-        extra
-        for extra, needed in extras.items()
-        if needed and importlib.util.find_spec(MODULES[extra]) is None
-    ]
+    needed = [extra for extra, is_needed in extras.items() if is_needed]
+    missing = [extra for extra in needed if importlib.util.find_spec(MODULES[extra]) is None]
     sentences = []
     if missing:
         names = " and ".join(filter(None, [", ".join(map(repr, missing[:-1])), repr(missing[-1])]))

@@ -18,7 +18,7 @@ from kineverse.model.registry import SaveResult, find_scheme, writable_suffixes
 
 from .arguments import add_model_options, load_model
 from .diff import format_pose_difference
-from .output import format_contents, format_count, show_activity, truncate_lines
+from .output import count_contents, format_contents, format_count, show_activity, truncate_lines
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -100,12 +100,19 @@ def run(arguments: argparse.Namespace) -> int:
         model = load_model(arguments, arguments.source, arguments.prefix)
     with show_activity(f"writing {arguments.target}"):
         if to_stdout:
-            saved, size = SaveResult(Path(STDOUT)), _print_document(model)
+            content = to_json(model).encode()
+            sys.stdout.buffer.write(content)
+            sys.stdout.flush()
+            saved, size = SaveResult(Path(STDOUT)), len(content)
         else:
             saved = _save_model(model, arguments)
             size = os.path.getsize(saved.path)
     if saved.left_out:
-        print("\n".join(_omission_notes(arguments, saved)), file=sys.stderr)
+        lines = [f"  {name} {reason}" for name, reason in saved.left_out.items()]
+        count = format_count(len(lines), "thing")
+        head = f"{arguments.target} leaves out {count} that it cannot express; --strict refuses instead:"
+        shown = truncate_lines(lines, None if arguments.all else SHOWN, "  ")
+        print("\n".join([head, *shown]), file=sys.stderr)
     if arguments.json:
         print(json.dumps(_as_json(arguments, model, size, left_out, saved), allow_nan=False))
     else:
@@ -115,7 +122,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
-
     try:
         return model.save(
             arguments.target,
@@ -134,7 +140,7 @@ def check_writable(target: str, source: str, force: bool = False) -> None:
         raise FormatError("The name of the file to write is empty.")
     path = Path(target).expanduser()
     if path.is_dir():
-        inside = path / f"{_source_stem(source)}{endings[0]}"
+        inside = path / f"{Path(source).name.partition('.')[0] or 'model'}{endings[0]}"
         raise FormatError(f"{target} is a folder; name a file in it, such as {inside}.")
     if not path.name.endswith(endings):
         raise FormatError(f"{target}: no format has this suffix. Use one of {', '.join(endings)}.")
@@ -151,52 +157,28 @@ def check_writable(target: str, source: str, force: bool = False) -> None:
         raise DuplicateNameError(f"{target} exists already; --force replaces it.")
 
 
-def _source_stem(source: str) -> str:
-    return Path(source).name.partition(".")[0] or "model"
-
-
-def _print_document(model: kv.Model) -> int:
-    """Write a document to standard output, and return its size [byte]."""
-    content = to_json(model).encode()
-    sys.stdout.buffer.write(content)
-    sys.stdout.flush()
-    return len(content)
-
-
 def _format_report(
     arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: SaveResult
 ) -> list[str]:
-
     lines = [f"{arguments.source} → {arguments.target}", f"  {format_contents(model)}, {_format_size(size)}"]
     if saved.errors:
         lines.append(f"  {_approximation_errors(saved)}")
     most = None if arguments.all else SHOWN
     for when, texts in (("reading", left_out), ("writing", saved.remarks)):
         if texts:
-            lines += [
-                f"  remarks on {when}",
-                *truncate_lines([f"    {text}" for text in texts], most, "    "),
-            ]
+            lines.append(f"  remarks on {when}")
+            lines += truncate_lines([f"    {text}" for text in texts], most, "    ")
     return lines
-
-
-def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[str]:
-    """Return a line for each thing that the file leaves out, below a heading."""
-    count = format_count(len(saved.left_out), "thing")
-    lines = [f"  {name} {reason}" for name, reason in saved.left_out.items()]
-    head = f"{arguments.target} leaves out {count} that it cannot express; --strict refuses instead:"
-    return [head, *truncate_lines(lines, None if arguments.all else SHOWN, "  ")]
 
 
 def _approximation_errors(saved: SaveResult) -> str:
     errors = saved.errors
     furthest = max(errors, key=lambda name: errors[name].position)
     most_turned = max(errors, key=lambda name: errors[name].angle)
-    worst = (
-        [f"{format_pose_difference(saved.error.position, 0.0)} ({furthest})"] if saved.error.position else []
-    )
-    if saved.error.angle:
-        worst.append(f"{format_pose_difference(0.0, saved.error.angle)} ({most_turned})")
+    position, angle = saved.error.position, saved.error.angle
+    worst = [f"{format_pose_difference(position, 0.0)} ({furthest})"] if position else []
+    if angle:
+        worst.append(f"{format_pose_difference(0.0, angle)} ({most_turned})")
     return f"{format_count(len(errors), 'frame')} approximated, off by at most {' and '.join(worst)}"
 
 
@@ -204,7 +186,7 @@ def _format_size(size: int) -> str:
     for unit, factor in (("MiB", 1 << 20), ("KiB", 1 << 10)):
         if size >= factor:
             return f"{size / factor:.3g} {unit}"
-    return f"{size} byte{'' if size == 1 else 's'}"
+    return format_count(size, "byte")
 
 
 def _as_json(
@@ -215,11 +197,7 @@ def _as_json(
         "in": arguments.source,
         "out": arguments.target,
         "bytes": size,
-        "counts": {
-            "frames": len(model.frames),
-            "dof": len(model.degrees_of_freedom),
-            "constraints": len(model.constraints),
-        },
+        "counts": count_contents(model),
         "largest": {"distance": saved.error.position, "angle": saved.error.angle},
         "approximated": [
             {"name": name, "distance": error.position, "angle": error.angle} for name, error in worst_first

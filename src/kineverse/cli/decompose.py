@@ -108,9 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
     tasks, unread = _tasks(arguments)
     order = {task.mesh: k for k, task in enumerate(tasks)}
     outcomes = decompose_all([task.mesh for task in tasks], settings, limits, arguments.force, jobs)
-    results = sorted(
-        show_progress(outcomes, "decomposing", "mesh", len(tasks)), key=lambda outcome: order[outcome.mesh]
-    )
+    shown = show_progress(outcomes, "decomposing", "mesh", len(tasks))
+    results = sorted(shown, key=lambda outcome: order[outcome.mesh])
     status = WRONG_MODEL if unread else WRONG_MESH if any(o.error for o in results) else 0
     if arguments.json:
         meshes = [_outcome_to_json(task, outcome) for task, outcome in zip(tasks, results, strict=True)]
@@ -122,12 +121,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
-
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = {} if arguments.max_hulls is None else {"max_hulls": arguments.max_hulls}
     if arguments.error is not None:
         options["error"] = parse_length(arguments.error)
-    if arguments.max_hulls is not None:
-        options["max_hulls"] = arguments.max_hulls
     limits: dict[str, Any] = {}
     if arguments.timeout is not None:
         limits["seconds"] = _positive(arguments.timeout, "--timeout")
@@ -168,9 +164,8 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str
         # Otherwise the link may belong to a model that cannot be read.
         for link in links or ():
             if link not in with_meshes:
-                raise UnknownNameError(
-                    f"No link {link!r} has a mesh. {suggest(link, with_meshes, 'link with a mesh')}"
-                )
+                similar = suggest(link, with_meshes, "link with a mesh")
+                raise UnknownNameError(f"No link {link!r} has a mesh. {similar}")
     return list(tasks.values()), unread
 
 
@@ -188,7 +183,8 @@ def _model_meshes(name: str, arguments: argparse.Namespace) -> list[tuple[str, M
 def _format_results(
     tasks: Sequence[MeshTask], outcomes: Sequence[DecompositionOutcome], unread: dict[str, str]
 ) -> list[str]:
-    rows, remarks, errors = [], [], []
+    rows = []
+    remarks, errors = ["remarks"], [colorize("not decomposed", "!")]
     for task, outcome in zip(tasks, outcomes, strict=True):
         decomposition = outcome.decomposition
         if decomposition is None:
@@ -198,10 +194,8 @@ def _format_results(
         rows.append((task.name, *_format_row(decomposition), time_))
         remarks += [f"  {task.name}: {remark}" for remark in decomposition.remarks]
     sections = [format_cells(("mesh", *HEAD, "time"), rows)] if rows else []
-    sections += ["\n".join(["remarks", *remarks])] if remarks else []
-    sections += ["\n".join([colorize("not decomposed", "!"), *errors])] if errors else []
-    unread_lines = [f"  {name}: {reason}" for name, reason in unread.items()]
-    sections += ["\n".join([colorize("cannot be read", "!"), *unread_lines])] if unread else []
+    failed = [colorize("cannot be read", "!"), *(f"  {name}: {reason}" for name, reason in unread.items())]
+    sections += ["\n".join(lines) for lines in (remarks, errors, failed) if len(lines) > 1]
     return sections or ["There are no meshes."]
 
 
@@ -210,11 +204,9 @@ HEAD = ("hulls", "mesh [l]", "hulls [l]", "one hull [l]", "error [mm]", "excess 
 
 def _format_row(decomposition: Decomposition) -> tuple[str, ...]:
     a = decomposition.accuracy
-    volumes = [
-        "open" if v is None else format_number(1e3 * v) for v in (a.mesh_volume, a.volume, a.hull_volume)
-    ]
-    lengths = [format_number(1e3 * length, 3) for length in (decomposition.error, a.excess, a.uncovered)]
-    return (str(len(decomposition.hulls)), *volumes, *lengths)
+    volumes, lengths = (a.mesh_volume, a.volume, a.hull_volume), (decomposition.error, a.excess, a.uncovered)
+    litres = ("open" if volume is None else format_number(1e3 * volume) for volume in volumes)
+    return (str(len(decomposition.hulls)), *litres, *(format_number(1e3 * length, 3) for length in lengths))
 
 
 def _decomposition_to_json(decomposition: Decomposition) -> dict[str, Any]:
@@ -243,7 +235,6 @@ def _outcome_to_json(task: MeshTask, outcome: DecompositionOutcome) -> dict[str,
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-
     def describe(entry: CacheEntry) -> tuple[dict[str, Any], tuple[str, ...]]:
         made = entry.decomposition.made
         when = time.strftime("%Y-%m-%d %H:%M", time.localtime(made))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from kineverse.errors import InvalidValueError
@@ -55,10 +54,9 @@ SHOWN = 20  # number of differences of a kind printed without --all
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    for name, what in (("A", "model before"), ("B", "model after")):
-        parser.add_argument(
-            name.lower(), metavar=name, help=f"{what}: name of a shipped model, or path of a file"
-        )
+    for name, when in (("A", "before"), ("B", "after")):
+        what = f"model {when}: name of a shipped model, or path of a file"
+        parser.add_argument(name.lower(), metavar=name, help=what)
     parser.add_argument("--prefix", metavar="NAME", help="prefix of all names of both, followed by a slash")
     add_model_options(parser)
     parser.add_argument(
@@ -89,27 +87,22 @@ def run(arguments: argparse.Namespace) -> int:
         with show_activity(f"reading {source}"):
             models.append(load_model(arguments, source, arguments.prefix))
     before, after = models
-    report: BehaviourComparisonReport | ModelComparisonReport
+    most = None if arguments.all else SHOWN
+    comparison: ModelComparison | BehaviourComparison
     with show_activity("comparing"):
         if arguments.values:
-            report = BehaviourComparisonReport(BehaviourComparison(before, after, arguments.tolerance))
+            comparison = BehaviourComparison(before, after, arguments.tolerance)
         else:
-            report = ModelComparisonReport(
-                ModelComparison(before, after, arguments.tolerance, arguments.operations)
-            )
-    equal = report.comparison.equal
+            comparison = ModelComparison(before, after, arguments.tolerance, arguments.operations)
+    equal = comparison.equal
     if arguments.json:
-        answer = {
-            "before": arguments.a,
-            "after": arguments.b,
-            "equal": equal,
-            "tolerance": arguments.tolerance,
-        }
-        print(json.dumps({**answer, **report.as_json()}, allow_nan=False))
+        answer = {"before": arguments.a, "after": arguments.b, "equal": equal}
+        answer |= {"tolerance": arguments.tolerance, **_to_json(comparison)}
+        print(json.dumps(answer, allow_nan=False))
     else:
         sides = (("-", arguments.a, before), ("+", arguments.b, after))
         head = [colorize(f"{sign * 3} {name}  {format_contents(model)}", sign) for sign, name, model in sides]
-        blocks = report.blocks(None if arguments.all else SHOWN)
+        blocks = _blocks(comparison, most)
         print("\n\n".join("\n".join(block) for block in ([] if equal else head, *blocks) if block))
     return EQUAL if equal else DIFFERENT
 
@@ -127,7 +120,8 @@ def format_value(given: Any) -> str:
     if isinstance(given, int | float):
         return format_number(given, 6) if math.isfinite(given) else str(given)
     if isinstance(given, Expression):
-        return _format_expression(given)
+        number = given.is_constant and not given.shape
+        return format_value(float(given)) if number else shorten_text(repr(given), LONGEST)
     if isinstance(given, Constraint):
         return " <= ".join(map(format_value, (given.lower, given.expression, given.upper)))
     if isinstance(given, Frame):
@@ -135,7 +129,9 @@ def format_value(given: Any) -> str:
     if isinstance(given, Articulation):
         return f"{given.kind}, {given.parent} to {given.child}"
     if isinstance(given, Body):
-        return _format_body(given)
+        counts = (len(given.visuals), "visual"), (len(given.collisions), "collision shape")
+        parts = [] if given.inertia is None else [format_value(given.inertia)]
+        return ", ".join(parts + [format_count(*count) for count in counts if count[0]]) or "empty"
     if isinstance(given, Shape):
         return format_value(given.geometry)
     if isinstance(given, Mesh):
@@ -145,8 +141,7 @@ def format_value(given: Any) -> str:
     if isinstance(given, Pose):
         return f"at {' '.join(format_number(x) for x in given.rows[3::4])}"
     if names := field_names(given):
-        parts = (format_value(getattr(given, name)) for name in names)
-        return " ".join([type(given).__name__.lower(), *parts])
+        return " ".join([type(given).__name__.lower(), *(format_value(getattr(given, n)) for n in names)])
     if isinstance(given, tuple):
         return shorten_text(" ".join(map(format_value, given)), LONGEST) or "nothing"
     return shorten_text(str(given), LONGEST)
@@ -167,20 +162,6 @@ def value_to_json(given: Any) -> Any:
     return repr(given) if isinstance(given, Expression) else format_value(given)
 
 
-def _format_expression(given: Expression) -> str:
-    if given.is_constant and not given.shape:
-        return format_value(float(given))
-    return shorten_text(repr(given), LONGEST)
-
-
-def _format_body(body: Body) -> str:
-    parts = [] if body.inertia is None else [format_value(body.inertia)]
-    for count, what in ((len(body.visuals), "visual"), (len(body.collisions), "collision shape")):
-        if count:
-            parts.append(format_count(count, what))
-    return ", ".join(parts) or "empty"
-
-
 def format_delta(delta: Delta) -> list[str]:
     """Return the lines that describe the difference of one part of a value."""
     if delta.what == "place":
@@ -197,10 +178,8 @@ def format_delta(delta: Delta) -> list[str]:
         return [f"{name}is written in another way"]
     before, after = format_value(delta.before), format_value(delta.after)
     if before == after:  # equal in the printed digits, or in the printed part of a formula
-        off = format_number(delta.distance, 2)
-        return [
-            f"{name}{before}, off by {off}" if math.isfinite(delta.distance) else f"{name}{before}, otherwise"
-        ]
+        far = math.isfinite(delta.distance)
+        return [f"{name}{before}, {f'off by {format_number(delta.distance, 2)}' if far else 'otherwise'}"]
     return [f"{name}{before} → {after}"]
 
 
@@ -236,11 +215,9 @@ def format_interval(lower: float, upper: float) -> str:
 def _transform_values(delta: Delta) -> Iterator[str]:
     """Yield origins and angles of transforms whose printed values differ."""
     if isinstance(delta.before, Pose) and isinstance(delta.after, Pose):
-        sides = [
-            (_format_row(p.rows[3::4]), _format_row(roll_pitch_yaw(p.matrix)))
-            for p in (delta.before, delta.after)
-        ]
-        for name, before, after in zip(("xyz", "rpy"), *sides, strict=True):
+        rows = [(pose.rows[3::4], roll_pitch_yaw(pose.matrix)) for pose in (delta.before, delta.after)]
+        for name, *sides in zip(("xyz", "rpy"), *rows, strict=True):
+            before, after = (" ".join(map(format_number, numbers)) for numbers in sides)
             if before != after:
                 yield f"{name} {before} → {after}"
         return
@@ -248,10 +225,6 @@ def _transform_values(delta: Delta) -> Iterator[str]:
         before, after = (_transform_entry(side, row) for side in (delta.before, delta.after))
         if before != after:
             yield f"{name} = {before} → {after}"
-
-
-def _format_row(numbers: Any) -> str:
-    return " ".join(format_number(x) for x in numbers)
 
 
 def _transform_entry(side: Pose | Expression, row: int) -> str:
@@ -263,37 +236,34 @@ WORDS = {**SIGNS, ">": "moved"}
 _WIDEST = 44
 
 
-@dataclass(frozen=True)
-class ModelComparisonReport:
-    """Printable differences of two models, by value."""
-
-    comparison: ModelComparison
-
-    def blocks(self, most: int | None) -> list[list[str]]:
-        """Return the paragraphs of the report, with at most ``most`` differences each."""
-        result = [_operation_lines(self.comparison, most)] if any(self.comparison.operations.values()) else []
-        for kind in ORDER:
-            differences = self.comparison.by_kind(kind)
-            if differences:
-                result.append([colorize(kind, "bold"), *_difference_lines(differences, most)])
-        result.append(_totals(self.comparison))
-        return result
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the report as JSON data, by operation and by kind of data."""
-        operations = {WORDS[sign]: list(tags) for sign, tags in self.comparison.operations.items()}
-        return {
-            "operations": operations if self.comparison.operations_compared else None,
-            **{kind: _kind_to_json(self.comparison.by_kind(kind)) for kind in ORDER},
-            "alike": self.comparison.alike,
-        }
+def _blocks(comparison: ModelComparison | BehaviourComparison, most: int | None) -> list[list[str]]:
+    """Return the paragraphs of the report, with at most ``most`` differences each."""
+    if isinstance(comparison, BehaviourComparison):
+        return _behaviour_blocks(comparison, most)
+    result = [_name_lines("operations", comparison.operations, most)]
+    for kind in ORDER:
+        differences = comparison.by_kind(kind)
+        if differences:
+            result.append([colorize(kind, "bold"), *_difference_lines(differences, most)])
+    return [*result, _totals(comparison)]
 
 
-def _operation_lines(comparison: ModelComparison, most: int | None) -> list[str]:
-    lines = [
-        f"  {colorize(sign, sign)} {tag}" for sign, tags in comparison.operations.items() for tag in tags
-    ]
-    return [colorize("operations", "bold"), *truncate_lines(lines, most)]
+def _to_json(comparison: ModelComparison | BehaviourComparison) -> dict[str, Any]:
+    """Return the differences as JSON data, by operation and by kind of data."""
+    if isinstance(comparison, BehaviourComparison):
+        return _behaviour_to_json(comparison)
+    operations = {WORDS[sign]: list(tags) for sign, tags in comparison.operations.items()}
+    return {
+        "operations": operations if comparison.operations_compared else None,
+        **{kind: _kind_to_json(comparison.by_kind(kind)) for kind in ORDER},
+        "alike": comparison.alike,
+    }
+
+
+def _name_lines(title: str, names: Mapping[str, Iterable[str]], most: int | None) -> list[str]:
+    """Return a paragraph with names by their sign; none if there are no names."""
+    lines = [f"  {colorize(sign, sign)} {name}" for sign, side in names.items() for name in side]
+    return [colorize(title, "bold"), *truncate_lines(lines, most)] if lines else []
 
 
 def _difference_lines(differences: list[ValueDifference], most: int | None) -> list[str]:
@@ -353,98 +323,59 @@ def _delta_to_json(delta: Delta) -> dict[str, Any]:
         "what": delta.what,
         "before": value_to_json(delta.before),
         "after": value_to_json(delta.after),
-        "distance": delta.distance if math.isfinite(delta.distance) else None,
-        "angle": delta.angle if math.isfinite(delta.angle) else None,
+        **_apart_to_json(delta.distance, delta.angle),
     }
 
 
-@dataclass(frozen=True)
-class BehaviourComparisonReport:
-    """Printable differences of two models, by behaviour."""
-
-    comparison: BehaviourComparison
-
-    def blocks(self, most: int | None) -> list[list[str]]:
-        """Return the paragraphs of the report, with at most ``most`` lines each."""
-        result = []
-        for title, sides in (
-            ("frames", self.comparison.frames),
-            ("degrees of freedom", self.comparison.freedoms),
-        ):
-            lines = [
-                f"  {colorize(sign, sign)} {name}"
-                for sign, side in (("-", "removed"), ("+", "added"))
-                for name in sides[side]
-            ]
-            if lines:
-                result.append([colorize(title, "bold"), *truncate_lines(lines, most)])
-        if self.comparison.apart:
-            width = max(len(a.frame) for a in self.comparison.apart)
-            lines = [
-                f"  {colorize('~', '~')} {a.frame:<{width}}  {format_pose_difference(a.distance, a.angle)}"
-                for a in self.comparison.apart
-            ]
-            title = f"{colorize('poses', 'bold')}, at worst in {self.comparison.states} states"
-            result.append([title, *truncate_lines(lines, most)])
-        if self.comparison.ranges:
-            width = max(len(r.name) for r in self.comparison.ranges)
-            lines = [
-                f"  {colorize('~', '~')} {r.name:<{width}}  "
-                f"{format_interval(*r.before)} → {format_interval(*r.after)}"
-                for r in self.comparison.ranges
-            ]
-            result.append([colorize("limits", "bold"), *truncate_lines(lines, most)])
-        if self.comparison.helpers:
-            names = ", ".join(self.comparison.helpers[:most])
-            more = "" if most is None or len(self.comparison.helpers) <= most else ", ..."
-            result.append([f"not counted, in between and without bodies: {names}{more}"])
-        if not self.comparison.apart:
-            common = format_count(len(self.comparison.frames["common"]), "frame")
-            agree = f"{common} at the same places in {self.comparison.states} states"
-            result.append(
-                [
-                    f"{agree}, to within {format_pose_difference(*self.comparison.largest)}"
-                    if any(self.comparison.largest)
-                    else agree
-                ]
-            )
-        return result
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the report as JSON data; a distance is null if the pose exists on one side only."""
-        return {
-            "states": self.comparison.states,
-            "largest": {
-                "distance": _finite_or_none(self.comparison.largest[0]),
-                "angle": _finite_or_none(self.comparison.largest[1]),
-            },
-            "frames": {
-                "removed": self.comparison.frames["removed"],
-                "added": self.comparison.frames["added"],
-                "helpers": self.comparison.helpers,
-                "changed": [
-                    {
-                        "name": a.frame,
-                        "distance": _finite_or_none(a.distance),
-                        "angle": _finite_or_none(a.angle),
-                    }
-                    for a in self.comparison.apart
-                ],
-            },
-            "dof": {
-                "removed": self.comparison.freedoms["removed"],
-                "added": self.comparison.freedoms["added"],
-                "changed": [
-                    {
-                        "name": r.name,
-                        "before": [_finite_or_none(bound) for bound in r.before],
-                        "after": [_finite_or_none(bound) for bound in r.after],
-                    }
-                    for r in self.comparison.ranges
-                ],
-            },
-        }
+def _behaviour_blocks(comparison: BehaviourComparison, most: int | None) -> list[list[str]]:
+    states, (apart, ranges) = comparison.states, (comparison.apart, comparison.ranges)
+    result = [
+        _name_lines(title, {"-": sides["removed"], "+": sides["added"]}, most)
+        for title, sides in (("frames", comparison.frames), ("degrees of freedom", comparison.freedoms))
+    ]
+    if apart:
+        rows = [(a.frame, format_pose_difference(a.distance, a.angle)) for a in apart]
+        title = f"{colorize('poses', 'bold')}, at worst in {states} states"
+        result.append([title, *_changed_lines(rows, most)])
+    if ranges:
+        rows = [(r.name, f"{format_interval(*r.before)} → {format_interval(*r.after)}") for r in ranges]
+        result.append([colorize("limits", "bold"), *_changed_lines(rows, most)])
+    if comparison.helpers:
+        names = ", ".join(comparison.helpers[:most])
+        more = "" if most is None or len(comparison.helpers) <= most else ", ..."
+        result.append([f"not counted, in between and without bodies: {names}{more}"])
+    if not apart:
+        common = format_count(len(comparison.frames["common"]), "frame")
+        within = f", to within {format_pose_difference(*comparison.largest)}"
+        agree = f"{common} at the same places in {states} states"
+        result.append([agree + within if any(comparison.largest) else agree])
+    return result
 
 
-def _finite_or_none(number: float) -> float | None:
-    return number if math.isfinite(number) else None
+def _changed_lines(rows: Sequence[tuple[str, str]], most: int | None) -> list[str]:
+    width = max(len(name) for name, _ in rows)
+    return truncate_lines([f"  {colorize('~', '~')} {name:<{width}}  {text}" for name, text in rows], most)
+
+
+def _behaviour_to_json(comparison: BehaviourComparison) -> dict[str, Any]:
+    frames, freedoms = comparison.frames, comparison.freedoms
+    apart = [{"name": a.frame, **_apart_to_json(a.distance, a.angle)} for a in comparison.apart]
+    ranges = [
+        {"name": r.name, "before": _finite(*r.before), "after": _finite(*r.after)} for r in comparison.ranges
+    ]
+    sides = {"removed": frames["removed"], "added": frames["added"], "helpers": comparison.helpers}
+    return {
+        "states": comparison.states,
+        "largest": _apart_to_json(*comparison.largest),
+        "frames": {**sides, "changed": apart},
+        "dof": {"removed": freedoms["removed"], "added": freedoms["added"], "changed": ranges},
+    }
+
+
+def _apart_to_json(distance: float, angle: float) -> dict[str, float | None]:
+    """Return a distance [m] and an angle [rad]; they are null if a pose exists on one side only."""
+    return dict(zip(("distance", "angle"), _finite(distance, angle), strict=True))
+
+
+def _finite(*numbers: float) -> list[float | None]:
+    return [number if math.isfinite(number) else None for number in numbers]

@@ -50,21 +50,22 @@ SIGNS = (("added", "+"), ("removed", "-"), ("replaced", "~"), ("moved", "moved")
 
 
 class ServerCommand(NamedTuple):
-    """Command about model servers."""
+    """Command about model servers; it takes the name of one and ``--json``, save for some."""
 
     HELP: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
+    add_options: Callable[[argparse.ArgumentParser], object] = lambda parser: None
+    takes_name: bool = True
+    has_json: bool = True
 
-
-def _add_server(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "server", metavar="NAME", help=f"name of a server, see ls; or its address, {SCHEME}tcp/HOST:PORT/NAME"
-    )
-
-
-def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="everything, as JSON")
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the options."""
+        if self.takes_name:
+            what = f"name of a server, see ls; or its address, {SCHEME}tcp/HOST:PORT/NAME"
+            parser.add_argument("server", metavar="NAME", help=what)
+        self.add_options(parser)
+        if self.has_json:
+            parser.add_argument("--json", action="store_true", help="everything, as JSON")
 
 
 # -- what is there -------------------------------------------------------------------------------------------
@@ -106,14 +107,9 @@ LS = ServerCommand(
 examples:
   kineverse ls
   kineverse ls --json""",
-    _add_json,
     _run_ls,
+    takes_name=False,
 )
-
-
-def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_server(parser)
-    _add_json(parser)
 
 
 def _run_status(arguments: argparse.Namespace) -> int:
@@ -172,7 +168,6 @@ are behind, the sources of states, and the last edits that were refused, with th
 examples:
   kineverse status home
   kineverse status live:tcp/robot.local:7410/home --json""",
-    _add_status_arguments,
     _run_status,
 )
 
@@ -180,11 +175,9 @@ examples:
 # -- commits -------------------------------------------------------------------------------------------------
 
 
-def _add_history_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_server(parser)
+def _add_history_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", type=int, default=20, metavar="N", dest="most", help="number of commits (20)")
     parser.add_argument("--before", type=int, metavar="REVISION", help="those before a revision only")
-    _add_json(parser)
 
 
 def _run_history(arguments: argparse.Namespace) -> int:
@@ -210,16 +203,14 @@ examples:
   kineverse history home
   kineverse history home -n 100
   kineverse history home --before 40 --json""",
-    _add_history_arguments,
     _run_history,
+    _add_history_options,
 )
 
 
-def _add_watch_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_server(parser)
+def _add_watch_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", metavar="FRAME", nargs="+", help="only what concerns these frames")
     parser.add_argument("--count", type=int, metavar="N", help="end after N commits")
-    _add_json(parser)
 
 
 def _run_watch(arguments: argparse.Namespace) -> int:
@@ -274,16 +265,15 @@ examples:
   kineverse watch home
   kineverse watch home --frames kitchen/fridge_door_handle
   kineverse watch home --count 1 --json               wait for the next commit""",
-    _add_watch_arguments,
     _run_watch,
+    _add_watch_options,
 )
 
 
 # -- edits ---------------------------------------------------------------------------------------------------
 
 
-def _add_undo_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_server(parser)
+def _add_undo_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("revision", metavar="REVISION", type=int, help="number of the commit, see history")
 
 
@@ -304,13 +294,13 @@ named, and nothing is done.
 examples:
   kineverse history home
   kineverse undo home 12""",
-    _add_undo_arguments,
     _run_undo,
+    _add_undo_options,
+    has_json=False,
 )
 
 
-def _add_dump_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_server(parser)
+def _add_dump_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help="path of the new file")
 
 
@@ -345,13 +335,13 @@ examples:
   kineverse dump home home-monday.db
   kineverse serve --store home-monday.db
   kineverse dump home home.kv.json""",
-    _add_dump_arguments,
     _run_dump,
+    _add_dump_options,
+    has_json=False,
 )
 
 
-def _add_apply_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_server(parser)
+def _add_apply_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help="path of a file, or name of a shipped model")
     parser.add_argument("--prefix", metavar="PREFIX", help="prefix of all names, followed by a slash")
     add_model_options(parser)
@@ -365,9 +355,8 @@ def _run_apply(arguments: argparse.Namespace) -> int:
                 tags = model.transact(lambda edit: edit.include(arguments.file, arguments.prefix, **options))
             except DuplicateNameError as error:
                 taken = str(error).partition(";")[0].rstrip(".")
-                raise DuplicateNameError(
-                    f"{taken}. Put a prefix in front of all names with --prefix."
-                ) from None
+                advice = "Put a prefix in front of all names with --prefix."
+                raise DuplicateNameError(f"{taken}. {advice}") from None
         print_notes(truncate_lines([*dict.fromkeys(remarks)], REMARKS, ""))
         added = format_count(len(tags), "operation")
         print(f"{model.exchange.address}: {added} added, revision {model.version}")
@@ -382,8 +371,9 @@ examples:
   kineverse apply home pr2
   kineverse apply home table.urdf --prefix left
   kineverse apply home articulations/screw""",
-    _add_apply_arguments,
     _run_apply,
+    _add_apply_options,
+    has_json=False,
 )
 
 

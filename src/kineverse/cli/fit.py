@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,7 @@ from kineverse.estimation.recordings import (
 from kineverse.estimation.recordings.recorded_joint import MAX_ROTATION_STEP
 from kineverse.expressions.printing import format_number
 
-from .arguments import parse_length, parse_value, require
+from .arguments import parse_length, parse_value, print_notes, require
 from .output import format_table, show_activity
 
 if TYPE_CHECKING:
@@ -59,10 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("poses", metavar="POSES", help="path of the table")
     parser.add_argument(
-        "--parent",
-        metavar="NAME",
-        default="world",
-        help="part relative to which the child moves (world)",
+        "--parent", metavar="NAME", default="world", help="part relative to which the child moves (world)"
     )
     parser.add_argument("--child", metavar="NAME", help="part that moves; needed if there are several")
     parser.add_argument(
@@ -96,11 +92,10 @@ def run(arguments: argparse.Namespace) -> int:
     stated = None if arguments.noise is None else parse_noise(arguments.noise)
     recording = read_recording(arguments.poses, arguments.columns)
     if recording.ignored:
-        names = ", ".join(recording.ignored)
-        print(f"kineverse: note: columns that mean nothing here: {names}", file=sys.stderr)
+        print_notes([f"columns that mean nothing here: {', '.join(recording.ignored)}"])
     pair = recording.pair(arguments.parent, arguments.child)
     if pair.unpaired:
-        print(f"kineverse: note: {pair.unpaired} poses of one part without the other", file=sys.stderr)
+        print_notes([f"{pair.unpaired} poses of one part without the other"])
     if arguments.thin is not None:
         pair = pair.thin(arguments.thin)
     noise = None if stated is None else check_noise(stated, pair)
@@ -170,15 +165,19 @@ def format_fit(source: str, pair: RecordedPair, learned: RecordedJoint) -> str:
     if learned.is_ambiguous:
         verdict = f"{format_doubt(learned)}\nThe most probable one: {verdict}"
     what = "poses" if pair.child_poses.ndim == 3 else "positions"
+    turns = []
+    if pair.is_timed and best.largest_turn >= MAX_ROTATION_STEP:
+        most = format_number(math.degrees(best.largest_turn), 3)
+        turns = [f"  from one to the next it turns by up to {most} deg: it may be more turns, or fewer"]
     lines = [
         f"{pair.child} in {pair.parent}: {count} {what} ({source})",
         *_format_correlation(learned, count),
-        f"noise: {_format_noise(learned.noise)}",
+        f"noise: {_format_deviations(learned.noise)}, {'as given' if learned.noise.given else 'estimated'}",
         "",
         verdict,
         *(f"  {name:10}{value}" for name, value in _format_parameters(best)),
         *_format_outliers(best.outliers, count, what),
-        *_revolution_warning(best, pair),
+        *turns,
         "",
         *_format_ranking(found),
     ]
@@ -248,10 +247,6 @@ def _format_correlation(learned: RecordedJoint, count: int) -> list[str]:
     return lines
 
 
-def _format_noise(noise: ObservationNoise) -> str:
-    return f"{_format_deviations(noise)}, {'as given' if noise.given else 'estimated'}"
-
-
 def _format_deviations(noise: ObservationNoise) -> str:
     position = f"{format_number(1e3 * noise.position, 3)} mm"
     if noise.orientation is None:
@@ -264,9 +259,8 @@ def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
     for name in ("axis", "normal"):
         if name in fit.parameters:
             spread = _standard_deviation(fit, "axis.x", "axis.y")
-            parts.append(
-                (name, f"{_format_vector(fit, name)}   ± {format_number(math.degrees(spread), 2)} deg")
-            )
+            error = format_number(math.degrees(spread), 2)
+            parts.append((name, f"{_format_vector(fit, name)}   ± {error} deg"))
     for name in ("point", "centre"):
         if name in fit.parameters:
             spread = _standard_deviation(fit, "point.x", "point.y", "point.z")
@@ -294,43 +288,28 @@ def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str
     return [f"  {len(outliers)} of {count} {what} {do} not fit: {numbers}{more} (counted from 0)"]
 
 
-def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
-    if not pair.is_timed or fit.largest_turn < MAX_ROTATION_STEP:
-        return []
-    most = format_number(math.degrees(fit.largest_turn), 3)
-    return [f"  from one to the next it turns by up to {most} deg: it may be more turns, or fewer"]
-
-
 def joint_ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:
     """Return for each joint value its range, the standard deviation of the ends, and if it is an angle."""
     ranges = []
     for k, kind in enumerate(fit.motion.kinds):
-        values, deviations = fit.joint_values[fit.inliers, k], fit.deviations[fit.inliers, k]
-        ends = [int(np.argmin(values)), int(np.argmax(values))]
-        spread = float(deviations[ends].max())
-        ranges.append((float(values[ends[0]]), float(values[ends[1]]), spread, bool(kind)))
+        values = fit.joint_values[fit.inliers, k]
+        ends = [values.argmin(), values.argmax()]
+        spread = float(fit.deviations[fit.inliers, k][ends].max())
+        ranges.append((float(values.min()), float(values.max()), spread, bool(kind)))
     return ranges
 
 
 def _format_ranking(found: IdentificationResult) -> list[str]:
     shown = [found[name] for name, p in found.probabilities.items() if p >= _LEAST_PROBABILITY]
-    rows: list[tuple[str, ...]] = []
+    head = ["joint", "probability", "log evidence", "left [mm]", "left [deg]"]
+    rows = []
     for fit in shown:
-        angle = format_number(math.degrees(fit.rms[1]), 3) if fit.residuals.shape[1] > 3 else "-"
-        position = format_number(1e3 * fit.rms[0], 3)
-        rows.append(
-            (
-                fit.family,
-                _format_percent(fit.probability),
-                format_number(fit.log_evidence, 6),
-                position,
-                angle,
-                fit.reason,
-            )
-        )
-    head: tuple[str, ...] = ("joint", "probability", "log evidence", "left [mm]", "left [deg]", "not known")
-    if not any(fit.reason for fit in shown):
-        head, rows = head[:-1], [row[:-1] for row in rows]
+        left = [format_number(1e3 * fit.rms[0], 3), "-"]
+        if fit.residuals.shape[1] > 3:
+            left[1] = format_number(math.degrees(fit.rms[1]), 3)
+        rows.append([fit.family, _format_percent(fit.probability), format_number(fit.log_evidence, 6), *left])
+    if any(fit.reason for fit in shown):
+        head, rows = [*head, "not known"], [[*row, fit.reason] for row, fit in zip(rows, shown, strict=True)]
     lines = [format_table(head, rows, "<>>>>")]
     rest = [name for name, p in found.probabilities.items() if p < _LEAST_PROBABILITY]
     return [*lines, f"not: {', '.join(rest)}"] if rest else lines

@@ -75,16 +75,10 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(f"{arguments.frame} in {arguments.relative_to}")
         print("\n".join("  " + "".join(f"{format_number(x, 6):>12}" for x in row) for row in pose))
-        for name, numbers, unit in (
-            ("position", position, "m"),
-            ("roll pitch yaw", rpy, "rad"),
-            ("quaternion xyzw", xyzw, ""),
-        ):
-            print(
-                f"  {name:<16}"
-                + "".join(f"{format_number(x, 6):>12}" for x in numbers)
-                + f"  {unit}".rstrip()
-            )
+        rows = ("position", position, "m"), ("roll pitch yaw", rpy, "rad"), ("quaternion xyzw", xyzw, "")
+        for name, numbers, unit in rows:
+            cells = "".join(f"{format_number(x, 6):>12}" for x in numbers)
+            print(f"  {name:<16}{cells}  {unit}".rstrip())
         if used:
             print("  at " + ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()))
     print_notes(notes)

@@ -6,7 +6,7 @@ import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -67,9 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     sections = format_sections(summary, arguments.frames, arguments.constraints)
     if remarks:
-        sections.append(
-            "\n".join(["remarks", *truncate_lines([f"  {text}" for text in remarks], SHOWN, "  ")])
-        )
+        lines = truncate_lines([f"  {text}" for text in remarks], SHOWN, "  ")
+        sections.append("\n".join(["remarks", *lines]))
     print("\n\n".join(sections))
     return 0
 
@@ -88,11 +87,8 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
     if summary.unplaced:
         lines.append(f"  not finite at the default state: {', '.join(summary.unplaced)}")
     if summary.touched_as_seen:
-        bodies = (
-            "1 body has"
-            if len(summary.touched_as_seen) == 1
-            else f"{len(summary.touched_as_seen)} bodies have"
-        )
+        count = len(summary.touched_as_seen)
+        bodies = "1 body has" if count == 1 else f"{count} bodies have"
         lines.append(f"  {bodies} no collision shapes; distances are to hulls of what is seen")
     if summary.contacts:
         lines.append(_format_contacts(summary.contacts))
@@ -100,18 +96,8 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
         lines.append(f"  document, sha256 {summary.sha256}")
     sections = ["\n".join(lines)]
     if summary.freedoms:
-        rows = [
-            (
-                f.name,
-                f.unit,
-                format_number(f.lower),
-                format_number(f.upper),
-                format_number(f.default),
-                format_number(f.speed),
-            )
-            for f in summary.freedoms
-        ]
-        sections.append(format_table(("DoF", "unit", "lower", "upper", "default", "speed"), rows, "<<>>>>"))
+        rows = [(name, unit, *map(format_number, numbers)) for name, unit, *numbers in summary.freedoms]
+        sections.append(format_table(("DoF", *DofSummary._fields[1:]), rows, "<<>>>>"))
     if summary.interlocks:
         sections.append("\n".join(["interlocks", *(f"  {interlock}" for interlock in summary.interlocks)]))
     locking = {name for interlock in summary.interlocks for name in interlock.constraints}
@@ -131,10 +117,9 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
 
 def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
     """Return the summary as JSON data; missing limits are null."""
-
-    def finite(value: float) -> float | None:
-        return value + 0.0 if abs(value) < float("inf") else None
-
+    touching = None
+    if summary.contacts is not None:
+        touching = [{"a": pair.a, "b": pair.b, "distance": pair.distance} for pair in summary.contacts]
     return {
         "model": summary.name,
         "counts": {
@@ -145,37 +130,28 @@ def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
         },
         "size": {"low": summary.low, "high": summary.high, "extent": summary.extent, "mass": summary.mass},
         "frames": [{"name": name, "parent": parent} for name, parent in summary.frames.items()],
-        "dof": [
-            {
-                "name": f.name,
-                "unit": f.unit or None,
-                "lower": finite(f.lower),
-                "upper": finite(f.upper),
-                "default": finite(f.default),
-                "speed": finite(f.speed),
-            }
-            for f in summary.freedoms
-        ],
-        "constraints": [
-            {"name": c.name, "text": c.text, "symbols": c.symbols, "simple": c.simple}
-            for c in summary.constraints
-        ],
+        "dof": [_dof_to_json(freedom) for freedom in summary.freedoms],
+        "constraints": [constraint._asdict() for constraint in summary.constraints],
         **summary.interlocks.as_data(),
         **({"sha256": summary.sha256} if summary.sha256 else {}),
         "not_loaded": list(summary.problems),
         "not_finite": summary.unplaced,
         "touched_as_seen": summary.touched_as_seen,
-        "touching": None
-        if summary.contacts is None
-        else [{"a": pair.a, "b": pair.b, "distance": pair.distance} for pair in summary.contacts],
+        "touching": touching,
     }
+
+
+def _dof_to_json(freedom: DofSummary) -> dict[str, Any]:
+    name, unit, *numbers = freedom
+    finite = [value + 0.0 if abs(value) < float("inf") else None for value in numbers]
+    return {"name": name, "unit": unit or None, **dict(zip(freedom._fields[2:], finite, strict=True))}
 
 
 def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
     pair, depth = pairs[0], -pairs[0].distance
-    deepest = f"{pair.a} and {pair.b}" + (
-        f", {format_number(depth, 3)} m deep" if depth > CONTACT_DEPTH else ""
-    )
+    deepest = f"{pair.a} and {pair.b}"
+    if depth > CONTACT_DEPTH:
+        deepest += f", {format_number(depth, 3)} m deep"
     if len(pairs) == 1:
         return f"  1 pair of bodies touches at the default state: {deepest}"
     return f"  {len(pairs)} pairs of bodies touch at the default state, first {deepest}"
@@ -246,8 +222,7 @@ def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
             yield ModelProblem("contact", pair.a, text)
 
 
-@dataclass(frozen=True, slots=True)
-class DofSummary:
+class DofSummary(NamedTuple):
     """Degree of freedom: limits and default value [unit], and largest speed [unit/s]."""
 
     name: str
@@ -258,8 +233,7 @@ class DofSummary:
     speed: float
 
 
-@dataclass(frozen=True, slots=True)
-class ConstraintSummary:
+class ConstraintSummary(NamedTuple):
     """Constraint as text; ``simple`` is True if it bounds a single symbol by numbers."""
 
     name: str
@@ -305,13 +279,15 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
     ]
     corners = np.concatenate(placed or [np.array([pose[:3, 3] for pose in pose_of.values()])])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    free = model.degrees_of_freedom
-    unit = infer_units(model, values, [str(symbol) for symbol in free])
+    unit = infer_units(model, values, map(str, model.degrees_of_freedom))
     masses = (body.inertia.mass for body in model.bodies.values() if body.inertia is not None)
     return ModelSummary(
         name=name,
         frames={frame: model.frames[frame].parent for frame in model.frames},
-        freedoms=[_summarize_dof(model, symbol, unit[str(symbol)], values[str(symbol)]) for symbol in free],
+        freedoms=[
+            _summarize_dof(model, symbol, unit[str(symbol)], values[str(symbol)])
+            for symbol in model.degrees_of_freedom
+        ],
         constraints=[_summarize_constraint(key, constraint) for key, constraint in model.constraints.items()],
         low=low.tolist(),
         high=high.tolist(),
@@ -334,18 +310,12 @@ def _summarize_dof(model: ModelView, symbol: Symbol, unit: str, default: float) 
 
 
 def _summarize_constraint(name: str, constraint: Constraint) -> ConstraintSummary:
-    bounds_are_numbers = not (constraint.lower.symbols or constraint.upper.symbols)
-    only = constraint.expression.symbols[0] if len(constraint.expression.symbols) == 1 else None
-    simple = bounds_are_numbers and only is not None and bool(constraint.expression == only)
-    return ConstraintSummary(
-        name=name,
-        text=(
-            f"{_format_bound(constraint.lower)} <= {constraint.expression!r} <= "
-            f"{_format_bound(constraint.upper)}"
-        ),
-        symbols=[str(symbol) for symbol in constraint.symbols],
-        simple=simple,
-    )
+    bounded_by_numbers = not (constraint.lower.symbols or constraint.upper.symbols)
+    symbols = constraint.expression.symbols
+    simple = bounded_by_numbers and len(symbols) == 1 and bool(constraint.expression == symbols[0])
+    lower, upper = map(_format_bound, (constraint.lower, constraint.upper))
+    text = f"{lower} <= {constraint.expression!r} <= {upper}"
+    return ConstraintSummary(name, text, [str(symbol) for symbol in constraint.symbols], simple)
 
 
 def _format_bound(expression: object) -> str:

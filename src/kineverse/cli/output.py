@@ -50,16 +50,12 @@ def _replace(error: UnicodeError) -> tuple[str, int]:
     """Return a text for the characters that cannot be encoded, for :func:`codecs.register_error`."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    texts = (_transliterate(c) for c in error.object[error.start : error.end])
-    return "".join(texts), error.end
+    characters = error.object[error.start : error.end]
+    return "".join(_PLAIN.get(c) or _keep_ascii(c) or "?" for c in characters), error.end
 
 
-def _transliterate(character: str) -> str:
-    if character in _PLAIN:
-        return _PLAIN[character]
-    plain = unicodedata.normalize("NFKD", character)
-    kept = "".join(c for c in plain if c.isascii())
-    return kept or "?"
+def _keep_ascii(character: str) -> str:
+    return "".join(c for c in unicodedata.normalize("NFKD", character) if c.isascii())
 
 
 codecs.register_error(_ERRORS, _replace)
@@ -229,10 +225,16 @@ def format_cells(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return format_table(head, rows, "<" + ">" * (len(head) - 1))
 
 
-def format_contents(model: ModelView) -> str:
+def count_contents(model: ModelView) -> dict[str, int]:
     """Return the numbers of frames, degrees of freedom and constraints of a model."""
-    counts = (model.frames, "frame"), (model.degrees_of_freedom, "DoF"), (model.constraints, "constraint")
-    return ", ".join(format_count(len(items), noun) for items, noun in counts)
+    counted = {"frames": model.frames, "dof": model.degrees_of_freedom, "constraints": model.constraints}
+    return {kind: len(items) for kind, items in counted.items()}
+
+
+def format_contents(model: ModelView) -> str:
+    """Return the numbers of frames, degrees of freedom and constraints of a model as text."""
+    numbers = zip(count_contents(model).values(), ("frame", "DoF", "constraint"), strict=True)
+    return ", ".join(format_count(count, noun) for count, noun in numbers)
 
 
 def format_count(count: int, noun: str) -> str:

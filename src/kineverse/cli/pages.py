@@ -8,24 +8,17 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
-
-
-class _Page(Protocol):
-    @property
-    def address(self) -> str: ...  # pragma: no cover
 
 
 def add_page_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a command that opens a page."""
     parser.add_argument("--port", type=int, metavar="N", help="port of the page (8080, or any free one)")
     parser.add_argument(
-        "--host",
-        metavar="ADDRESS",
-        help="serve other computers: listen on this address (0.0.0.0: all)",
+        "--host", metavar="ADDRESS", help="serve other computers: listen on this address (0.0.0.0: all)"
     )
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
 
@@ -35,7 +28,7 @@ def page_options(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"port": arguments.port, **({"host": arguments.host} if arguments.host else {})}
 
 
-def print_address(page: _Page, browser: bool) -> None:
+def print_address(page: Any, browser: bool) -> None:
     """Print the address of a page, and open it if there is a display."""
     print(f"{page.address}   (Ctrl-C ends)", flush=True)
     if browser:

@@ -116,7 +116,10 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print("\n\n".join(_format_links(links)), flush=True)
     if arguments.picture is not None:
-        _write_picture(arguments.picture, model, state, links)
+        from kineverse.view.pictures import save_picture  # for start-up time
+
+        save_picture(arguments.picture, model, state, overlay=list(_drawables(links)))
+        print(f"picture: {arguments.picture}", file=sys.stderr)
     if arguments.view:
         _view(arguments, model, state, links)
     return status
@@ -164,7 +167,6 @@ def _format_links(links: Sequence[LinkCover]) -> list[str]:
 
 
 def _format_row(name: str, links: Sequence[tuple[LinkCover, SphereCover]]) -> tuple[str, ...]:
-
     seconds = sum(link.seconds for link, _ in links)
     return (
         name,
@@ -176,35 +178,20 @@ def _format_row(name: str, links: Sequence[tuple[LinkCover, SphereCover]]) -> tu
 
 
 def _to_json(links: Iterable[LinkCover], status: int) -> dict[str, Any]:
-    return {
-        "status": status,
-        "links": [
-            {"link": link.link, "shapes": len(link.items), "seconds": link.seconds, "error": link.error}
-            | ({} if link.cover is None else _cover_to_json(link.cover))
-            for link in links
-        ],
-    }
-
-
-def _cover_to_json(cover: SphereCover) -> dict[str, Any]:
-    return {
-        "protrusion": cover.protrusion,
-        "centres": cover.centres.tolist(),
-        "radii": cover.radii.tolist(),
-    }
+    answers = []
+    for one in links:
+        facts = {"link": one.link, "shapes": len(one.items), "seconds": one.seconds, "error": one.error}
+        if one.cover is not None:
+            facts["protrusion"] = one.cover.protrusion
+            facts |= {"centres": one.cover.centres.tolist(), "radii": one.cover.radii.tolist()}
+        answers.append(facts)
+    return {"status": status, "links": answers}
 
 
 def _drawables(links: Iterable[LinkCover]) -> Iterator[Any]:
     from kineverse.view.drawables import draw_cover  # for start-up time
 
     return (draw_cover(link.link, link.cover) for link in links if link.cover is not None)
-
-
-def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: Iterable[LinkCover]) -> None:
-    from kineverse.view.pictures import save_picture  # for start-up time
-
-    save_picture(path, model, state, overlay=list(_drawables(links)))
-    print(f"picture: {path}", file=sys.stderr)
 
 
 def _view(
@@ -221,12 +208,10 @@ def _view(
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-
     def describe(one: CachedCover) -> tuple[dict[str, Any], tuple[str, ...]]:
         spheres, protrusion = len(one.cover), one.cover.protrusion
-        facts = {"name": one.name, "spheres": spheres, "protrusion": protrusion}
-        row = one.name, str(spheres), format_number(1e3 * protrusion, 3)
-        return {**facts, "bytes": one.bytes}, row
+        facts = {"name": one.name, "spheres": spheres, "protrusion": protrusion, "bytes": one.bytes}
+        return facts, (one.name, str(spheres), format_number(1e3 * protrusion, 3))
 
     head, entries = ("shape", "spheres", "protrusion [mm]"), [*map(describe, list_covers())]
     return manage_cache(arguments, arguments.model, "covers", cover_folder(), clear_covers, head, entries)

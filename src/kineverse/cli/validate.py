@@ -11,7 +11,15 @@ from kineverse.geometry.shapes import import_coal
 
 from .arguments import add_model_options
 from .info import find_penetrations
-from .output import colorize, format_contents, format_count, format_table, show_progress, truncate_lines
+from .output import (
+    colorize,
+    count_contents,
+    format_contents,
+    format_count,
+    format_table,
+    show_progress,
+    truncate_lines,
+)
 
 HELP = """\
 All mistakes that kv.load tolerates with a remark are listed, and a file with mistakes counts as unreadable. A
@@ -69,12 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
     status = max(result.status for result in results)
     most = None if arguments.all else SHOWN if len(results) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:
-        print(
-            json.dumps(
-                {"status": status, "files": [validation_to_json(result) for result in results]},
-                allow_nan=False,
-            )
-        )
+        answer = {"status": status, "files": [validation_to_json(result) for result in results]}
+        print(json.dumps(answer, allow_nan=False))
     elif len(results) > 1:
         details = [format_validation(result, most) for result in results if result.status]
         print("\n\n".join([_format_results(results), *("\n".join(lines) for lines in details)]))
@@ -90,19 +94,15 @@ def format_validation(found: ValidationResult, most: int | None) -> list[str]:
     if found.error is not None:
         return [found.name, f"  {colorize('cannot be read', '!')}: {found.reason}"]
     assert found.model is not None
+    header = [f"{name} {str(fact)[:12]}" for name, fact in found.facts.items()]  # 12 digits of a hash
     lines = [
-        f"{found.name}: {_describe_format(found)}",
+        f"{found.name}: {', '.join([found.format, *header])}",
         f"  {format_contents(found.model)}, {format_count(len(found.model.bodies), 'body')}",
         f"  {_format_verdict(found)}",
     ]
     for kind, texts in _group_by_kind(found).items():
         lines += [f"  {kind}", *truncate_lines([f"    {text}" for text in texts], most, "    ")]
     return lines
-
-
-def _describe_format(found: ValidationResult) -> str:
-    """Return format and header; of a hash the first 12 digits."""
-    return ", ".join([found.format, *(f"{name} {str(fact)[:12]}" for name, fact in found.facts.items())])
 
 
 def _group_by_kind(found: ValidationResult) -> dict[str, list[str]]:
@@ -114,45 +114,30 @@ def _group_by_kind(found: ValidationResult) -> dict[str, list[str]]:
 
 
 def _format_verdict(found: ValidationResult) -> str:
-    problems, remarks = len(found.problems), len(found.remarks)
-    text = f"{problems or 'no'} problem{'' if problems == 1 else 's'}"
+    text = format_count(len(found.problems), "problem") if found.problems else "no problems"
     if found.faults:
         text = f"not read strictly: {format_count(len(found.faults), 'mistake')}, {text}"
-    remark_text = f", {remarks} remark{'' if remarks == 1 else 's'}" if remarks else ""
-    return f"{colorize(text, '!' if found.status else '+')}{remark_text}"
+    remarks = f", {format_count(len(found.remarks), 'remark')}" if found.remarks else ""
+    return f"{colorize(text, '!' if found.status else '+')}{remarks}"
 
 
 def _format_results(results: list[ValidationResult]) -> str:
-    rows = [
-        (e.name, e.format, "", "", "", "", "cannot be read")
-        if e.model is None
-        else (
-            e.name,
-            e.format,
-            str(len(e.model.frames)),
-            str(len(e.model.degrees_of_freedom)),
-            str(len(e.model.constraints)),
-            str(len(e.remarks)),
-            str(len(e.problems) + len(e.faults)),
-        )
-        for e in results
-    ]
-    return format_table(
-        ("file", "format", "frames", "DoF", "constraints", "remarks", "problems"), rows, "<<>>>>>"
-    )
+    rows = []
+    for one in results:
+        cells = [""] * 4 + ["cannot be read"]
+        if one.model is not None:
+            counts = [*count_contents(one.model).values(), len(one.remarks)]
+            cells = [str(count) for count in (*counts, len(one.problems) + len(one.faults))]
+        rows.append([one.name, one.format, *cells])
+    head = ("file", "format", "frames", "DoF", "constraints", "remarks", "problems")
+    return format_table(head, rows, "<<>>>>>")
 
 
 def validation_to_json(found: ValidationResult) -> dict[str, Any]:
     """Return the result of one file as JSON data."""
-    model = found.model
     counts = None
-    if model is not None:
-        counts = {
-            "frames": len(model.frames),
-            "dof": len(model.degrees_of_freedom),
-            "constraints": len(model.constraints),
-            "bodies": len(model.bodies),
-        }
+    if found.model is not None:
+        counts = count_contents(found.model) | {"bodies": len(found.model.bodies)}
     return {
         "file": found.name,
         "format": found.format or None,

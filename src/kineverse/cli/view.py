@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,9 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--collisions", action="store_true", help="show the collision shapes")
     parser.add_argument(
-        "--decomposed",
-        action="store_true",
-        help="for both, use the hulls of kineverse decompose",
+        "--decomposed", action="store_true", help="for both, use the hulls of kineverse decompose"
     )
     parser.add_argument("--degrees", action="store_true", help="show angles in degrees")
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
@@ -123,9 +120,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     label = read_title(arguments.model)
     recording = _read_recording(arguments)
-    model: ModelView
     if recording is not None:
-        model = recording.model
+        model: ModelView = recording.model
     else:
         model = loaded = load_model(arguments, arguments.model, follow=arguments.robot is None)
         if arguments.robot is not None:
@@ -146,11 +142,8 @@ def run(arguments: argparse.Namespace) -> int:
         return _write_picture(arguments, model, assigned, near, motion)
     from kineverse.view.viewer import Viewer  # for start-up time
 
-    options = page_options(arguments)
-    with (
-        handle_interrupts(),
-        Viewer(model, assigned, label=label, degrees=arguments.degrees, **options) as page,
-    ):
+    options = {"label": label, "degrees": arguments.degrees, **page_options(arguments)}
+    with handle_interrupts(), Viewer(model, assigned, **options) as page:
         if near is not None:
             page.collisions.show_near(near)
         if arguments.decomposed:
@@ -159,8 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
             page.collisions.show_shapes()
         print_mesh_problems(page.problems)
         if page.unplaced:
-            names = ", ".join(page.unplaced)
-            print(f"kineverse: note: not finite at this state, and hidden: {names}", file=sys.stderr)
+            print_notes([f"not finite at this state, and hidden: {', '.join(page.unplaced)}"])
         speed = {"speed": arguments.speed, "loop": arguments.loop}
         if recording is not None:
             from kineverse.view.run_overlay import play_recording  # for start-up time
@@ -195,10 +187,7 @@ def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:
             raise InvalidValueError(f"{name} is for a model; a recording has its own motion")
     recording = read_run_recording(arguments.model, root=arguments.root)
     if not recording.complete:
-        print(
-            f"kineverse: note: {arguments.model} was cut, and ends at {recording.duration:.4g} s",
-            file=sys.stderr,
-        )
+        print_notes([f"{arguments.model} was cut, and ends at {recording.duration:.4g} s"])
     return recording
 
 
@@ -231,8 +220,7 @@ def _write_picture(
 ) -> int:
     from kineverse.view.run_overlay import RecordedScene  # for start-up time
 
-    options: dict[str, Any] = {"collisions": arguments.collisions, "near": near}
-    options["decomposed"] = arguments.decomposed
+    options: dict[str, Any] = {"collisions": arguments.collisions, "decomposed": arguments.decomposed}
     if motion is not None:
         time = motion.duration if arguments.time is None else arguments.time
         if isinstance(motion, RunRecording):
@@ -242,10 +230,10 @@ def _write_picture(
             options["over"] = scene.drawing.draw_arrows(moment)
         else:
             state = state | {str(s): v for s, v in motion.at(time).items()}
-    save_picture(arguments.picture, model, state, **options)
+    save_picture(arguments.picture, model, state, near=near, **options)
     print_mesh_problems(list_mesh_problems(model))
     left_out = label_unusable_shapes(model, find_unusable_shapes(model)) if near is not None else {}
     if left_out:
-        print(f"kineverse: note: no distances to {', '.join(left_out)}", file=sys.stderr)
+        print_notes([f"no distances to {', '.join(left_out)}"])
     print(f"picture: {arguments.picture}")
     return 0

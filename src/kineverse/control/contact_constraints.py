@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -89,12 +90,9 @@ class ContactRows:
         n = self._twists.shape[2]
         owners, normals = found.body_indices[:used], found.normals[:used]
         ends = ((owners[:, 1], found.points_b[:used]), (owners[:, 0], found.points_a[:used]))
-        grows, shrinks = (
-            np.einsum(
-                "ki,kij->kj", np.hstack([normals, np.cross(p, normals)]), self._twists[self._group[owner]]
-            )
-            for owner, p in ends
-        )
+        wrenches = (np.hstack([normals, np.cross(p, normals)]) for _, p in ends)
+        twists = (self._twists[self._group[owner]] for owner, _ in ends)
+        grows, shrinks = map(partial(np.einsum, "ki,kij->kj"), wrenches, twists)
         rows = self._A[:used, :n] = grows - shrinks
         gap = found.distances[:used] - self._margins[owners[:, 0], owners[:, 1]]
         self._lower[:used] = -gain * np.maximum(gap, 0.0)
@@ -130,9 +128,7 @@ class ContactSlots:
         if not isinstance(scene, Scene):
             raise InvalidValueError(f"scene= is a kineverse.geometry.Scene of the model, not {scene!r}.")
         if not (math.isfinite(margin) and margin < radius):
-            raise InvalidValueError(
-                f"radius= is larger than margin=, not {radius!r} m for a margin of {margin!r} m."
-            )
+            raise InvalidValueError(f"radius= is above margin=, not {radius!r} m for one of {margin!r} m.")
         model = scene.model
         self._version = model.version
         self.scene, self.count = scene, count
@@ -179,9 +175,8 @@ class ContactSlots:
         bodies = self.scene.bodies
         ones, others = (tuple([names] if isinstance(names, str) else names) for names in (one, other))
         if (ones, others) not in self._selected:
-            self._selected[ones, others] = flag_between(
-                flag_matching(bodies, ones), flag_matching(bodies, others)
-            )
+            flags = (flag_matching(bodies, names) for names in (ones, others))
+            self._selected[ones, others] = flag_between(*flags)
         self._margins[self._selected[ones, others]] = margin
 
     def twist(self, body: int) -> Array:
@@ -197,18 +192,13 @@ class ContactSlots:
 
     def bind(self, H: Array, f: Array, A: Array, lower: Array) -> None:
         """Choose the arrays of the program into which :meth:`write` writes."""
-        self._rows = ContactRows(
-            self._group, self._twists.outputs[0], self._margins, *map(_contiguous, (H, f, A, lower))
-        )
+        for part in (H, f, A, lower):
+            if not part.flags.c_contiguous or part.dtype != np.float64:
+                raise InvalidValueError("Rows of contacts are written in place, into contiguous doubles.")
+        self._rows = ContactRows(self._group, self._twists.outputs[0], self._margins, H, f, A, lower)
 
     def write(self, recovery: float, weight: float = RECOVERY_WEIGHT) -> None:
         """Write the rows of the nearest pairs into the program, and the soft goals into its costs."""
         used = min(len(self.found), self.count)
         if used:
             self._rows.write(self.found, used, gain=self.gain, recovery=recovery, weight=weight)
-
-
-def _contiguous(array: Array) -> Array:
-    if not array.flags.c_contiguous or array.dtype != np.float64:
-        raise InvalidValueError("Rows of contacts are written in place, into contiguous arrays of doubles.")
-    return array

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,33 +17,14 @@ from kineverse.errors import InvalidValueError, KineverseError, NotFiniteError, 
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+if TYPE_CHECKING:
+    from .controller import Controller
+
 Speeds = dict[Symbol, float]
 DEFAULT_ACCELERATION = 2.0  # acceleration [m/s^2], [rad/s^2] by which speeds go to zero where none is given
 
 _ROUNDING = 1e-9
 logger = logging.getLogger(__name__)
-
-
-class SpeedCommand(Protocol):
-    """Command of a controller."""
-
-    @property
-    def speeds(self) -> Mapping[Symbol, float]:
-        """Speed by symbol [m/s], [rad/s]."""
-
-
-class SpeedController(Protocol):
-    """Controller that a loop can run."""
-
-    @property
-    def speeds(self) -> Sequence[Symbol]:
-        """Speeds of its commands."""
-
-    def step(self, state: State, /) -> SpeedCommand:
-        """Return the command at a state."""
-
-    def reset(self, speeds: Mapping[Symbol, float], /) -> None:
-        """Take speeds as the last command."""
 
 
 class DurationSummary(NamedTuple):
@@ -69,7 +50,7 @@ class LoopReport:
 
 
 def run_control_loop(
-    controller: SpeedController,
+    controller: Controller,
     *,
     rate: float,
     source: Callable[[], State | None],
@@ -143,7 +124,7 @@ def run_control_loop(
 class _Loop:
     def __init__(
         self,
-        controller: SpeedController,
+        controller: Controller,
         source: Callable[[], State | None],
         until: Callable[[State], bool] | None,
         on_error: Callable[[KineverseError], object] | None,
@@ -222,21 +203,16 @@ class _Loop:
         finally:
             taken = self._clock() - begin
             self._durations.append(taken)
-            self._total, self._worst, self._steps = (
-                self._total + taken,
-                max(self._worst, taken),
-                self._steps + 1,
-            )
+            self._total, self._worst = self._total + taken, max(self._worst, taken)
+            self._steps += 1
         wrong = [str(s) for s, v in speeds.items() if not math.isfinite(v)]
         if wrong:
             raise NotFiniteError(f"The controller's command is not finite for {', '.join(wrong)}.", wrong)
         return speeds
 
     def _slower(self) -> Speeds:
-        return {
-            s: v - math.copysign(min(abs(v), self._reductions.get(s, self._other)), v)
-            for s, v in self.last.items()
-        }
+        steps = {s: min(abs(v), self._reductions.get(s, self._other)) for s, v in self.last.items()}
+        return {s: v - math.copysign(steps[s], v) for s, v in self.last.items()}
 
 
 def _accelerations(
@@ -248,9 +224,8 @@ def _accelerations(
     result = dict.fromkeys(speeds, DEFAULT_ACCELERATION)
     for key, value in acceleration.items():
         if str(key) not in known:
-            raise UnknownNameError(
-                f"The controller commands no speed of '{key}'. {suggest(str(key), known, 'speed')}"
-            )
+            known_speeds = suggest(str(key), known, "speed")
+            raise UnknownNameError(f"The controller commands no speed of '{key}'. {known_speeds}")
         if not (isinstance(value, int | float) and 0 < value < math.inf):
             raise InvalidValueError(f"The acceleration of '{key}' is a positive number, not {value!r}.")
         result[known[str(key)]] = float(value)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_count
 from kineverse._runtime import CallLock, no_collection, one_at_a_time
 from kineverse.compilation import CompiledFunction
 from kineverse.compilation.function import WantedTier
@@ -120,7 +121,7 @@ class Controller:
     ) -> None:
         check_weight("smooth", smooth)
         check_weight("jerk", jerk)
-        _check_slots(contacts)
+        as_count("contacts", contacts, 0)
         _check_step(dt)
         self.model = model
         step = parameter(_DT, float(dt))
@@ -185,10 +186,8 @@ class Controller:
         self._last = self._evaluate.input[first + 1 : first + 1 + n]
         self._before = self._evaluate.input[first + 1 + n :]
         self._diagnosis = Diagnosis(model, formulation, self._program, self._evaluate, self._contacts)
-        equalities = self._program.equalities
-        self._row_names = tuple(
-            tuple(name for name in names if name not in equalities) for names in self._program.names
-        )
+        kept = (filter(lambda name: name not in self._program.equalities, n) for n in self._program.names)
+        self._row_names = tuple(map(tuple, kept))
 
     @property
     def dt(self) -> float:
@@ -212,11 +211,9 @@ class Controller:
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until everything is compiled, at most for a time [s], and return whether it is."""
-        end = None if timeout is None else perf_counter() + timeout
-        return all(
-            function.wait(None if end is None else max(0.0, end - perf_counter()))
-            for function in self._functions
-        )
+        end = math.inf if timeout is None else perf_counter() + timeout
+        rest = (None if timeout is None else max(0.0, end - perf_counter()) for _ in self._functions)
+        return all(function.wait(left) for function, left in zip(self._functions, rest, strict=True))
 
     @one_at_a_time
     def reset(self, speeds: StateLike | None = None) -> None:
@@ -433,11 +430,6 @@ def _contact_radius(dt: float) -> float:
 
 def _contact_gain(dt: float) -> float:
     return min(0.5 / dt, _CONTACT_GAIN)
-
-
-def _check_slots(count: object) -> None:
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise InvalidValueError(f"contacts= is a number of rows, 0 or more, not {count!r}.")
 
 
 def _check_step(dt: float) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -77,13 +78,10 @@ class Formulation:
         rates = model.rates
         every = dict(model.constraints)
         errors = {task: rates.carry(task.error) for task in self.tasks if isinstance(task, Goal | Hold)}
+        ranged = {self._names[task]: task.constraint for task in self.tasks if isinstance(task, Keep)}
         keeps = {
-            self._names[task]: Constraint(
-                rates.carry(c.lower), rates.carry(c.expression), rates.carry(c.upper)
-            )
-            for task in self.tasks
-            if isinstance(task, Keep)
-            for c in [task.constraint]
+            name: Constraint(*map(rates.carry, (c.lower, c.expression, c.upper)))
+            for name, c in ranged.items()
         }
         taken = [name for name in keeps if name in every]
         if taken:
@@ -103,17 +101,13 @@ class Formulation:
             for task, error in errors.items()
             if task not in about_speeds
         }
-        closures = {
-            name: rates.over_free_speeds(error.gradient(heuristic=False)) for name, error in held.items()
-        }
+        slopes = {name: error.gradient(heuristic=False) for name, error in held.items()}
+        closures = {name: rates.over_free_speeds(slope) for name, slope in slopes.items()}
         first = {s for g in (*gradients.values(), *closures.values()) for s in g}
-        brakes = {
-            f"acceleration of {speed.position}": Constraint.from_expressions(
-                -as_expression(limit), speed.derivative(), limit
-            )
-            for speed, limit in (accelerations or {}).items()
-        }
-        self._limits = every | brakes
+        self._limits = dict(every)
+        for speed, limit in (accelerations or {}).items():
+            brake = Constraint.from_expressions(-as_expression(limit), speed.derivative(), limit)
+            self._limits[f"acceleration of {speed.position}"] = brake
         result = self._rows(ranges, dt, None)
         columns = (first | set(result.speeds)) - fixed_speeds
         self.speeds: tuple[Symbol, ...] = tuple(sorted(columns, key=lambda s: s.sort_key))
@@ -132,19 +126,14 @@ class Formulation:
             if isinstance(task, Goal)
         )
         default = minimum(0.5 / as_expression(dt), 10.0)
-        holds = [
-            HoldRows(
-                self._names[task],
-                errors[task],
-                self._matrix(task, gradients[task]),
-                default if task.gain is None else self._limit_gain(task.gain),
-            )
-            for task in self.tasks
-            if isinstance(task, Hold)
-        ]
+        holds = []
+        for task in self.tasks:
+            if isinstance(task, Hold):
+                gain = default if task.gain is None else self._limit_gain(task.gain)
+                jacobian = self._matrix(task, gradients[task])
+                holds.append(HoldRows(self._names[task], errors[task], jacobian, gain))
         for name, error in held.items():
-            flat = error.ravel()
-            holds.append(HoldRows(name, flat, self._stack(closures[name], 1), default, True))
+            holds.append(HoldRows(name, error.ravel(), self._stack(closures[name], 1), default, True))
         self.holds = tuple(holds)
 
     @property
@@ -163,10 +152,8 @@ class Formulation:
     def _rows(
         self, constraints: dict[str, Constraint], dt: ExpressionLike, speeds: Sequence[Symbol] | None
     ) -> VelocityRows:
-        rates, limits = self.model.rates, self._limits
-        return velocity_rows(
-            constraints, dt, rates=rates, speeds=speeds, speed_limits=limits, recovery="allowed"
-        )
+        build = partial(velocity_rows, rates=self.model.rates, speeds=speeds, speed_limits=self._limits)
+        return build(constraints, dt, recovery="allowed")
 
     def _split_speed_goals(
         self, errors: Mapping[Goal | Hold, Expression]
@@ -230,9 +217,8 @@ class Formulation:
         """Return the Jacobian over the columns, (k, n)."""
         if not any(s in gradient for s in self.speeds):
             named = ", ".join(f"'{s}'" for s in sorted(gradient, key=lambda s: s.sort_key))
-            raise InvalidValueError(
-                f"{task!r} is moved by {named or 'no speed'} only, which fixed= keeps in place."
-            )
+            what = named or "no speed"
+            raise InvalidValueError(f"{task!r} is moved by {what} only, which fixed= keeps in place.")
         return self._stack(gradient, task.error.size)
 
     def _stack(self, gradient: dict[Symbol, Expression], count: int) -> Expression:

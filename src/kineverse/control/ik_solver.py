@@ -264,9 +264,8 @@ class InverseKinematics:
 
         def make_states() -> tuple[State, ...]:
             whole = self._home | State(assigned)
-            return tuple(
-                whole | State(dict(zip(self.coordinates, end.tolist(), strict=True))) for end in ends
-            )
+            moved = (dict(zip(self.coordinates, end.tolist(), strict=True)) for end in ends)
+            return tuple(whole | State(values) for values in moved)
 
         effort, explain = (starts, search.iterations, perf_counter() - begin), self._explain
         return IkResult(bool(found), residuals, active, contacts, *effort, make_states, explain, obstacles)
@@ -279,11 +278,8 @@ class InverseKinematics:
         search.weights[:] = 1.0
         search.evaluate()
         values = np.abs(search.outputs[5])
-        off = [
-            part.name
-            for part in program.parts
-            if not (values[search.rows[part.name]] <= part.tolerance).all()
-        ]
+        done = {p.name: (values[search.rows[p.name]] <= p.tolerance).all() for p in program.parts}
+        off = [name for name, is_done in done.items() if not is_done]
         outside = [name for name in program.keeps if result.residuals[name] > TOLERANCE]
         off += outside
         tried = f"in {result.starts} starts" if result.starts > 1 else "from the given state"

@@ -9,11 +9,11 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from kineverse.compilation import compile
 from kineverse.compilation.evaluator import Evaluator
-from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, ShapeError
+from kineverse.errors import InfeasibleError, NotFiniteError
 from kineverse.model.model_view import ModelView
 
 from .command import Command, name_contact
@@ -24,7 +24,7 @@ from .velocity_program import VelocityProgram
 if TYPE_CHECKING:
     from .contact_constraints import ContactSlots
 
-_WEIGHT = 1e6  # weight of squared violations, relative to the squared distance from the point to be near to
+_WEIGHT = 1e6  # weight of squared violations, relative to the squared length of the point
 _HARD_WEIGHT = 1e4
 _SHORTEST = 1e-12
 
@@ -53,23 +53,19 @@ class LeastViolation(NamedTuple):
 
     x: Vector  # (n,)
     violations: Vector  # (n + m,), of [x; A x]: negative below the lower bound, positive above the upper one
-    hard_rows_hold: bool
 
 
-def find_irreducible_conflict(
-    A: ArrayLike, lower: ArrayLike, upper: ArrayLike
-) -> tuple[ConflictingBound, ...]:
+def find_irreducible_conflict(A: Vector, lower: Vector, upper: Vector) -> tuple[ConflictingBound, ...]:
     """Find bounds that contradict each other, none of which can be left out.
 
     These are an irreducible infeasible subset: with all of its bounds there is no x, without any one of them
     there is. Violations y >= 0 at the point that violates ``G x <= h`` least certify by Farkas' lemma that
-    there is none: ``G'y = 0`` and ``h'y < 0``. A certificate that no other one has part of is such a subset
-    (Gleeson and Ryan 1990, "Identifying minimally infeasible subsystems of inequalities"). Where rounding
-    blurs it, one bound after the other is left out instead (Chinneck and Dravnieks 1991, "Locating minimal
-    infeasible constraint sets in linear programs"). A row with ``lower > upper`` comes first.
+    there is none: ``G'y = 0`` and ``h'y < 0``. Of their bounds, one after the other is left out if the rest
+    still contradict each other (Chinneck and Dravnieks 1991, "Locating minimal infeasible constraint sets in
+    linear programs"). A row with ``lower > upper`` comes first.
     """
-    rows, low, high = _stacked(A, lower, upper)
-    gap = low - high
+    rows = np.concatenate([np.eye(A.shape[1]), A])
+    gap = lower - upper
     worst = int(np.argmax(gap))
     if gap[worst] > 0.0:
         return ConflictingBound(worst, -1), ConflictingBound(worst, 1)
@@ -77,22 +73,17 @@ def find_irreducible_conflict(
     length = np.sqrt(np.einsum("ij,ij->i", rows, rows))
     unit = 1.0 / np.where(length > _SHORTEST, length, 1.0)
     g = np.concatenate([rows, -rows]) * np.tile(unit, 2)[:, None]
-    h = np.concatenate([high, -low]) * np.tile(unit, 2)
-    kept = np.flatnonzero(h < np.inf)
-    violations = _violations(g[kept], h[kept])
-    kept, violations = kept[violations > 0.0], violations[violations > 0.0]
-    minimal, clear = _minimal_certificate(g[kept], h[kept], violations)
-    if clear and _infeasible(g[kept[minimal]], h[kept[minimal]]):
-        kept = kept[minimal]
-    else:
-        if not _infeasible(g[kept], h[kept]):
-            kept = np.flatnonzero(h < np.inf)
-            if not _infeasible(g, h):
-                return ()
-        for one in kept:
-            rest = kept[kept != one]
-            if _infeasible(g[rest], h[rest]):
-                kept = rest
+    h = np.concatenate([upper, -lower]) * np.tile(unit, 2)
+    bounded = np.flatnonzero(h < np.inf)
+    kept = bounded[_violations(g[bounded], h[bounded]) > 0.0]
+    if not _infeasible(g[kept], h[kept]):
+        kept = bounded
+        if not _infeasible(g, h):
+            return ()
+    for one in kept:
+        rest = kept[kept != one]
+        if _infeasible(g[rest], h[rest]):
+            kept = rest
     count = len(rows)
     return tuple(
         ConflictingBound(int(i % count), 1 if i < count else -1)
@@ -100,115 +91,56 @@ def find_irreducible_conflict(
     )
 
 
-def find_least_violation(
-    A: ArrayLike,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    *,
-    hard: ArrayLike | None = None,
-    near: ArrayLike | None = None,
-) -> LeastViolation:
+def find_least_violation(A: Vector, lower: Vector, upper: Vector, hard: NDArray[np.bool_]) -> LeastViolation:
     """Find the point whose violations have the smallest sum of squares, within the hard rows.
 
-    ``hard`` is a mask (n + m,); of the points that violate equally, the nearest to ``near`` (n,) is taken.
+    ``hard`` is a mask (n + m,); of the points that violate equally, the nearest to 0 is taken.
     """
-    rows, low, high = _stacked(A, lower, upper)
-    n = rows.shape[1]
-    held = np.zeros(len(rows), bool) if hard is None else np.asarray(hard, bool)
-    close = np.zeros(n) if near is None else np.ascontiguousarray(near, float)
-    if held.shape != low.shape:
-        raise ShapeError(
-            f"hard has the shape {held.shape}, not {low.shape}: one entry per bound of [x; A x]."
-        )
-    if close.shape != (n,) or not np.isfinite(close).all():
-        raise InvalidValueError(f"near is a point of shape ({n},) without NaN, not {close}.")
-    crossed = np.flatnonzero(low > high)
+    rows = np.concatenate([np.eye(A.shape[1]), A])
+    crossed = np.flatnonzero(lower > upper)
     # Both bounds of a crossed row count, each as a row of its own.
     g = np.concatenate([rows, rows[crossed]])
-    below, above = np.append(low, np.full(len(crossed), -np.inf)), np.append(high, high[crossed])
+    below, above = np.append(lower, np.full(len(crossed), -np.inf)), np.append(upper, upper[crossed])
     above[crossed] = np.inf
-    firm = np.append(held, held[crossed])
-    x = _least_squares(g, below, above, ~firm, np.full(len(g), _WEIGHT), close)
-    holds = x is not None
+    firm = np.append(hard, hard[crossed])
+    x = _least_squares(g, below, above, ~firm, np.full(len(g), _WEIGHT))
     if x is None:
         weight = np.where(firm, _WEIGHT * _HARD_WEIGHT, _WEIGHT)
-        x = _least_squares(g, below, above, np.ones(len(g), bool), weight, close)
+        x = _least_squares(g, below, above, np.ones(len(g), bool), weight)
     if x is None:  # no soft problem is infeasible, so the numbers are out of reach for the solver
-        x, holds = close, False
+        x = np.zeros(A.shape[1])
     values = rows @ x
-    under, over = np.maximum(low - values, 0.0), np.maximum(values - high, 0.0)
-    return LeastViolation(x, np.where(over >= under, over, -under), holds)
-
-
-def _stacked(A: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Vector, Vector, Vector]:
-    """Return the rows [I; A] and their bounds, checked."""
-    a, low, high = (np.asarray(value, float) for value in (A, lower, upper))
-    if a.ndim != 2 or a.shape[1] < 1 or low.shape != (sum(a.shape),) or high.shape != low.shape:
-        raise ShapeError(
-            f"A is of shape (m, n) and its bounds of shape (n + m,), "
-            f"not {a.shape}, {low.shape} and {high.shape}."
-        )
-    if not np.isfinite(a).all() or np.isnan(low).any() or np.isnan(high).any():
-        raise InvalidValueError("A is finite, and bounds are numbers or infinite: there is a NaN.")
-    return np.concatenate([np.eye(a.shape[1]), a]), low, high
+    under, over = np.maximum(lower - values, 0.0), np.maximum(values - upper, 0.0)
+    return LeastViolation(x, np.where(over >= under, over, -under))
 
 
 def _violations(g: Vector, h: Vector) -> Vector:
     """Return the violations of ``g x <= h`` at the point of least violation, 0 where they are rounding."""
-    count, n = g.shape
-    x = _least_squares(g, np.full(count, -np.inf), h, np.ones(count, bool), np.full(count, 1e8), np.zeros(n))
+    count = len(g)
+    x = _least_squares(g, np.full(count, -np.inf), h, np.ones(count, bool), np.full(count, 1e8))
     if x is None:
         return np.ones(count)
     y = np.maximum(g @ x - h, 0.0)
     return np.where(y > 1e-9 * y.max(initial=0.0), y, 0.0)
 
 
-def _minimal_certificate(g: Vector, h: Vector, y: Vector) -> tuple[NDArray[np.intp], bool]:
-    """Reduce a certificate y > 0 of ``g x <= h`` to a vertex of ``{y >= 0, g'y = 0, h'y = -1}``."""
-    alive = np.arange(len(y))
-    if not len(y):
-        return alive, False
-    _, singular, basis = np.linalg.svd(g.T)
-    rank = int(np.sum(singular > 1e-10 * max(1.0, singular.max(initial=0.0))))
-    kernel = basis[rank:].T
-    y = kernel @ (kernel.T @ y)
-    slope = kernel.T @ h
-    if len(slope) == 0 or not h @ y < 0.0:
-        return alive, False
-    # Certificates of the same h'y differ by these directions, along which rows leave one by one.
-    moves = kernel @ np.linalg.svd(slope[None, :])[2][1:].T
-    while moves.shape[1]:
-        move = moves[:, 0] if moves[:, 0].max() >= -moves[:, 0].min() else -moves[:, 0]
-        falling = np.flatnonzero(move > 1e-9 * move.max())
-        leaving = falling[np.argmin(y[falling] / move[falling])]
-        y = y - y[leaving] / move[leaving] * move
-        column = int(np.argmax(np.abs(moves[leaving])))
-        pivot = moves[:, column] / moves[leaving, column]
-        moves = np.delete(moves - np.outer(pivot, moves[leaving]), column, axis=1)
-        alive, y, moves = np.delete(alive, leaving), np.delete(y, leaving), np.delete(moves, leaving, axis=0)
-    needed = y > 1e-7 * y.max(initial=0.0)
-    return alive[needed], bool((np.abs(y[~needed]) < 1e-9 * y.max(initial=0.0)).all())
-
-
 def _infeasible(g: Vector, h: Vector) -> bool:
     if not len(g):
         return False
-    n, none = g.shape[1], np.full(len(g), -np.inf)
-    return _least_squares(g, none, h, np.zeros(len(g), bool), np.ones(len(g)), np.zeros(n)) is None
+    none = np.full(len(g), -np.inf)
+    return _least_squares(g, none, h, np.zeros(len(g), bool), np.ones(len(g))) is None
 
 
 def _least_squares(
-    g: Vector, lower: Vector, upper: Vector, soft: NDArray[np.bool_], weight: Vector, near: Vector
+    g: Vector, lower: Vector, upper: Vector, soft: NDArray[np.bool_], weight: Vector
 ) -> Vector | None:
-    """Return the point closest to another one, subject to rows, some of them soft."""
+    """Return the point closest to 0, subject to rows, some of them soft."""
     count, n = g.shape
-    free = np.zeros(n, bool)
-    solver = QpSolver(
-        n, count, soft=np.concatenate([free, soft]), soft_weight=np.concatenate([np.ones(n), weight])
-    )
+    may_give_way, weights = np.concatenate([np.zeros(n, bool), soft]), np.concatenate([np.ones(n), weight])
+    solver = QpSolver(n, count, soft=may_give_way, soft_weight=weights)
     no_bound = np.full(n, np.inf)
     low, high = np.concatenate([-no_bound, lower]), np.concatenate([no_bound, upper])
-    solution = solver.solve(np.eye(n), -near, np.ascontiguousarray(g), low, high)
+    solution = solver.solve(np.eye(n), np.zeros(n), np.ascontiguousarray(g), low, high)
     return solution.x if solution.status == "solved" else None
 
 
@@ -261,7 +193,7 @@ class Diagnosis:
             np.vstack([A, *(row for row, _, _ in keeps)]),
             np.append(low, [below for _, below, _ in keeps]),
             np.append(high, [above for _, _, above in keeps]),
-            hard=hard,
+            hard,
         )
 
     def infeasible(self, command: Command) -> InfeasibleError:
@@ -303,17 +235,16 @@ class Diagnosis:
                 end = lower[k] if side < 0 else upper[k]
                 names = [name for name, c, *ends in simple if c == k and ends[(side + 1) // 2] == end]
             else:
-                names = list(self._names_of_row(k))
+                row = k - len(self._program.names)
+                names = [*self._program.names[k]] if row < 0 else [self._name_contact(row)]
             for name in names:
                 low, high = result.get(name, (-math.inf, math.inf))
                 result[name] = (max(low, lower[k]), high) if side < 0 else (low, min(high, upper[k]))
         return tuple(Conflict(name, self._operations(name), *map(float, e)) for name, e in result.items())
 
-    def _names_of_row(self, index: int) -> tuple[str, ...]:
-        names = self._program.names
-        if index < len(names) or self._contacts is None:
-            return names[index]
-        return (name_contact(self._contacts.found[index - len(names)]),)
+    def _name_contact(self, index: int) -> str:
+        assert self._contacts is not None
+        return name_contact(self._contacts.found[index])
 
     def _operations(self, name: str) -> tuple[str, ...]:
         history = getattr(self._model, "history", None)

@@ -93,9 +93,7 @@ class PositionProgram:
                     error = (whole.expression - whole.lower).ravel()
                     parts.append(ErrorRows(name, error, ones, TOLERANCE, True))
                 elif name in self.model.constraints:
-                    raise DuplicateNameError(
-                        f"The model has a constraint '{name}'; give the Keep another name."
-                    )
+                    raise DuplicateNameError(f"The model has a constraint '{name}'; rename the Keep.")
                 else:
                     ranges[name] = whole
             else:
@@ -119,11 +117,9 @@ class PositionProgram:
         waiting = {}
         for name, c in self.model.plain_constraints().items():
             if not any(s.order for s in c.symbols):
-                waiting[name] = (
-                    c
-                    if self.model.rates.is_empty
-                    else Constraint(*map(self.make_plain, (c.lower, c.expression, c.upper)))
-                )
+                if not self.model.rates.is_empty:
+                    c = Constraint(*map(self.make_plain, (c.lower, c.expression, c.upper)))
+                waiting[name] = c
         symbols = {name: {s for s in c.symbols if s.has_derivative} for name, c in waiting.items()}
         result = {s for part in parts for s in part.error.symbols}
         result |= {s for c in ranges.values() for s in c.symbols}
@@ -145,9 +141,8 @@ class PositionProgram:
             moved = {s.position for s in part.error.gradient(heuristic=False)}
             if part.name not in self.model.constraints and moved and moved <= still:
                 named = ", ".join(f"'{s}'" for s in sorted(moved, key=lambda s: s.sort_key))
-                raise InvalidValueError(
-                    f"'{part.name}' is moved by {named} only, which fixed= keeps in place."
-                )
+                what = f"'{part.name}' is moved by {named} only"
+                raise InvalidValueError(f"{what}, which fixed= keeps in place.")
 
     def _check_symbols(self, task: Task, expression: Expression) -> None:
         """Refuse speeds, and degrees of freedom that the model does not have."""
@@ -155,8 +150,7 @@ class PositionProgram:
             raise InvalidValueError(
                 f"{task!r} is about speeds, and inverse kinematics about positions. A Controller serves it."
             )
-        known = {s.path for s in self.model.symbols}
-        refuse_foreign_symbols(repr(task), expression, known)
+        refuse_foreign_symbols(repr(task), expression, {s.path for s in self.model.symbols})
 
     def _compile(self, errors: Expression, ranges: dict[str, Constraint]) -> None:
         n = len(self.coordinates)
@@ -195,9 +189,7 @@ class PositionProgram:
         values = array([*(errors[k] for k in range(errors.size)), *away])
         total = sum((w[k] * values[k] * values[k] for k in range(size)), ZERO)
         damping = _DAMPING * raw_min(total, as_expression(_FAR)) + _LEAST_DAMPING
-        H = array([H[i, j] + damping if i == j else H[i, j] for i in range(n) for j in range(n)]).reshape(
-            n, n
-        )
+        H = H + damping * np.eye(n)
         A = general.matrix if count else as_expression(np.zeros((0, n)))
         tolerances = [part.tolerance for part in self.parts for _ in range(part.error.size)]
         tolerances += [TOLERANCE] * len(away)

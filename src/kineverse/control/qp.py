@@ -63,35 +63,21 @@ class QpSolver:
     """Dual active-set solver DAQP (Arnström, Bemporad, Axehill 2022), started from the last active set.
 
     Its tolerance of violations is 1e-9, in the units of the rows. A violation s of a soft entry of [x; A x]
-    costs ``soft_linear s + 1/2 soft_weight s^2``; with a linear weight above the multiplier of the row, the
-    penalty is exact: a row that can be satisfied is.
+    costs ``1/2 soft_weight s^2``.
     """
 
     def __init__(
-        self,
-        n: int,
-        m: int,
-        *,
-        soft: ArrayLike | None = None,
-        soft_weight: ArrayLike = SOFT_WEIGHT,
-        soft_linear: ArrayLike = 0.0,
+        self, n: int, m: int, *, soft: ArrayLike | None = None, soft_weight: ArrayLike = SOFT_WEIGHT
     ) -> None:
         if n < 1 or m < 0:
-            raise InvalidValueError(
-                f"A quadratic program has n >= 1 unknowns and m >= 0 rows, not {n} and {m}."
-            )
+            raise InvalidValueError(f"A quadratic program has unknowns, n >= 1, and m >= 0, not {n}, {m}.")
         self.n, self.m = n, m
         self.soft = np.zeros(n + m, bool) if soft is None else np.array(soft, bool)
         if self.soft.shape != (n + m,):
-            raise ShapeError(
-                f"soft has the shape {self.soft.shape}, not ({n + m},): one entry per bound of [x; A x]."
-            )
+            raise ShapeError(f"soft has the shape {self.soft.shape}, not ({n + m},), as for [x; A x].")
         self._weight = np.broadcast_to(np.asarray(soft_weight, float), n + m).copy()
-        self._linear = np.broadcast_to(np.asarray(soft_linear, float), n + m).copy()
         if not (np.isfinite(self._weight) & (self._weight > 0)).all():
             raise InvalidValueError("The weights of soft rows are finite and above 0.")
-        if not (np.isfinite(self._linear) & (self._linear >= 0)).all():
-            raise InvalidValueError("The linear weights of soft rows are finite and at least 0.")
         self._bound: tuple[Any, ...] = (None,) * 5
         self._hard, self._any_soft = (~self.soft).astype(float), bool(self.soft.any())
         self._values, self._low, self._high = np.zeros((3, n + m))
@@ -105,9 +91,8 @@ class QpSolver:
         try:
             import daqp
         except ImportError as error:
-            raise MissingDependencyError(
-                f"Quadratic programs need daqp: {install_command('control')}"
-            ) from error
+            command = install_command("control")
+            raise MissingDependencyError(f"Quadratic programs need daqp: {command}") from error
         self._daqp: Any = daqp
         self._model: Any = None
         self._warm = False
@@ -158,9 +143,8 @@ class QpSolver:
         scale = np.concatenate([1.0 / unit, 1.0 / np.where(length > 0.0, length, 1.0)])
         scaled = np.ascontiguousarray(H * np.outer(unit, unit)), f * unit, rows * scale[self.n :, None]
         for settings in _SCALED_SETTINGS:
-            flag, x, multipliers, iterations = self._start(
-                *scaled, lower * scale, upper * scale, scale, settings
-            )
+            bounds = lower * scale, upper * scale
+            flag, x, multipliers, iterations = self._start(*scaled, *bounds, scale, settings)
             x = x * unit
             if flag >= 1 and self._satisfies(x):
                 return QpSolution(x, multipliers * scale, iterations, "solved")
@@ -189,7 +173,7 @@ class QpSolver:
         if flag < 0:
             return flag, np.zeros(self.n), np.zeros(self.n + self.m), 0
         if self._any_soft:
-            reciprocal, linear = scale**2 / self._weight, self._linear / scale
+            reciprocal, linear = scale**2 / self._weight, np.zeros_like(scale)
             model.soft_weights(reciprocal, reciprocal, linear, linear)
         x, _, flag, info = model.solve()
         return flag, x, info["lam"], info["iterations"]

@@ -62,9 +62,8 @@ def joint_weights(
     model, speeds = formulation.model, formulation.speeds
     moved = count_moved_bodies(model, speeds)
     most = max(moved.values(), default=0)
-    factors = {
-        s: as_expression(max(count / most, _LEAST_SHARE) if most else 1.0) for s, count in moved.items()
-    }
+    shares = {s: max(count / most, _LEAST_SHARE) if most else 1.0 for s, count in moved.items()}
+    factors = {s: as_expression(share) for s, share in shares.items()}
     for key, weight in (weights or {}).items():
         chosen = find_speeds(model, (key,), "weights")
         if any(s not in factors for s in chosen):
@@ -189,11 +188,8 @@ def find_posture(
     if isinstance(posture, Mapping):
         weights = {s: w for key, w in posture.items() for s in find_speeds(model, (key,), "posture")}
     else:
-        asked = {
-            task.expression
-            for task in formulation.tasks
-            if isinstance(task, Goal) and isinstance(task.expression, Symbol)
-        }
+        goals = (task.expression for task in formulation.tasks if isinstance(task, Goal))
+        asked = {goal for goal in goals if isinstance(goal, Symbol)}
         weights = {s: posture for s in formulation.speeds if s.position not in asked}
     result = {}
     for speed, weight in weights.items():
@@ -224,9 +220,8 @@ def acceleration_limits(
         limited = dict.fromkeys(model.speeds, chosen)
     for speed, limit in limited.items():
         if not (isinstance(limit, int | float) and 0 < limit < math.inf):
-            raise InvalidValueError(
-                f"The acceleration of '{speed.position}' is a positive limit, not {limit!r}."
-            )
+            name = speed.position
+            raise InvalidValueError(f"The acceleration of '{name}' is a positive limit, not {limit!r}.")
     limits = {s: as_expression(limit) for s, limit in limited.items()}
     limits |= {s: raw_min(stated[s], limit) for s, limit in limits.items() if s in stated}
     return stated, limits

@@ -76,24 +76,17 @@ class Goal:
             _check_positive(self, "speed", self.speed)
         weights = as_expression(self.weight)
         if weights.shape not in ((), self.expression.shape):
-            raise ShapeError(
-                f"{self!r}: the weight is a scalar or has shape {self.expression.shape}, not {weights.shape}."
-            )
+            shape = self.expression.shape
+            raise ShapeError(f"{self!r}: the weight is a scalar or has shape {shape}, not {weights.shape}.")
         for weight in weights.ravel():
             _check_number(self, "weight", weight, 0.0)
         if any(s.order for s in error.symbols):
             if self.speed is not None or self.rate is not None:
-                raise InvalidValueError(
-                    f"{self!r} is about speeds; speed= and rate= are for goals of positions."
-                )
+                raise InvalidValueError(f"{self!r} is about speeds; speed= and rate= are for positions.")
             if not all(any(s.order for s in entry.symbols) for entry in error.ravel()):
-                raise InvalidValueError(
-                    f"{self!r} has entries of positions and of speeds; make two goals of it."
-                )
-        if self.rate is not None and as_expression(self.rate).shape not in ((), error.shape):
-            raise ShapeError(
-                f"{self!r}: the rate has shape {as_expression(self.rate).shape}, not {error.shape}."
-            )
+                raise InvalidValueError(f"{self!r} has entries of positions and speeds; make two goals.")
+        if self.rate is not None and (shape := as_expression(self.rate).shape) not in ((), error.shape):
+            raise ShapeError(f"{self!r}: the rate has shape {shape}, not {error.shape}.")
 
     @property
     def error(self) -> Expression:
@@ -241,9 +234,7 @@ def _check_number(task: object, name: str, value: ExpressionLike, least: float) 
     if expression.shape:
         raise ShapeError(f"{task!r}: the {name} is a scalar, not of shape {expression.shape}.")
     if not expression.symbols and not (math.isfinite(float(expression)) and float(expression) >= least):
-        raise InvalidValueError(
-            f"{task!r}: the {name} is a finite number of at least {least:g}, not {value!r}."
-        )
+        raise InvalidValueError(f"{task!r}: the {name} is a finite number from {least:g}, not {value!r}.")
 
 
 _LAST_ROW = [0.0, 0.0, 0.0, 1.0]
@@ -305,9 +296,8 @@ class Target:
         try:
             return np.asarray(value, dtype=float)
         except (TypeError, ValueError) as error:
-            raise InvalidValueError(
-                f"The target '{self.name}' is a number or an array of numbers, not {value!r}."
-            ) from error
+            told = f"The target '{self.name}' is a number or an array of numbers, not {value!r}."
+            raise InvalidValueError(told) from error
 
     def _check(self, value: npt.NDArray[np.float64], shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
         if value.shape != shape:
@@ -317,9 +307,7 @@ class Target:
             raise InvalidValueError(f"The target '{self.name}' has to be finite.")
         if self._transform:
             if not _is_transform(value):
-                raise InvalidValueError(
-                    f"The target '{self.name}' takes a transform, and this matrix is not one."
-                )
+                raise InvalidValueError(f"The target '{self.name}' takes a transform; this matrix is none.")
             return flat[:12]
         return flat
 

@@ -56,9 +56,8 @@ class LockSide:
 
         A lock that is open there stays open while its keys move by less than their margins.
         """
-        back: dict[Symbol, Expression] = {
-            key: key - margins[key] * slope / (absolute(slope) + _TINY) for key, slope in self.trend.items()
-        }
+        signs = {key: slope / (absolute(slope) + _TINY) for key, slope in self.trend.items()}
+        back: dict[Symbol, Expression] = {key: key - margins[key] * sign for key, sign in signs.items()}
         trend = {key: slope.substitute(back) for key, slope in self.trend.items()}
         return LockSide(self.name, self.coordinate, self.way, self.room.substitute(back), trend)
 
@@ -83,26 +82,17 @@ def find_lock_sides(model: ModelView, goals: Iterable[Symbol]) -> list[LockSide]
 def _sides(name: str, constraint: Constraint, held: Symbol) -> Iterator[LockSide]:
     coordinate = held.position
     offset = as_expression(0.0) if constraint.order else held
-    ways: tuple[tuple[Way, str, Expression], ...] = (
-        (1, "upper", constraint.upper),
-        (-1, "lower", constraint.lower),
-    )
-    for way, side, bound in ways:
-        gradient = bound.gradient()
-        trend = {
-            speed.position: way * slope
-            for speed, slope in gradient.items()
-            if speed.order == 1 and speed.position != coordinate
-        }
+    ends: tuple[tuple[Way, str, Expression], ...]
+    ends = (1, "upper", constraint.upper), (-1, "lower", constraint.lower)
+    for way, side, bound in ends:
+        speeds = {s: slope for s, slope in bound.gradient().items() if s.order == 1}
+        trend = {s.position: way * slope for s, slope in speeds.items() if s.position != coordinate}
         if trend:
-            room, *slopes = _values_of([way * (bound - offset), *trend.values()])
+            # Without gradients of their own, since weights have no use for them.
+            columns = lower([way * (bound - offset), *trend.values()])
+            room, *slopes = (from_casadi(column[0], (), NO_NODES) for column in columns)
             result = dict(zip(trend, slopes, strict=True))
             yield LockSide(f"{name} {side}", coordinate, way, room, result)
-
-
-def _values_of(expressions: list[Expression]) -> list[Expression]:
-    """Return expressions without gradients of their own, since weights have no use for them."""
-    return [from_casadi(column[0], (), NO_NODES) for column in lower(expressions)]
 
 
 def unlock(
@@ -175,13 +165,9 @@ def unlock(
 
 
 def _margin(model: ModelView, key: Symbol, most: float) -> float:
-    limits = model.constraints_for([key])
-    ends = [
-        (float(c.lower), float(c.upper))
-        for c in limits.values()
-        if bool(c.expression == key) and not c.lower.symbols and not c.upper.symbols
-    ]
-    return min([most, *(0.05 * (high - low) for low, high in ends)])
+    own = (c for c in model.constraints_for([key]).values() if bool(c.expression == key))
+    constant = (c for c in own if not c.lower.symbols and not c.upper.symbols)
+    return min([most, *(0.05 * (float(c.upper) - float(c.lower)) for c in constant)])
 
 
 def _score(side: LockSide, behind: LockSide, need: Expression, number: int) -> Expression:
@@ -201,8 +187,7 @@ def _collect_claims(sides: list[LockSide], behind: list[LockSide], scores: list[
         for q, slope in side.trend.items():
             wanted = back.trend[q] + is_open * slope
             for way in (1, -1):
-                claim = score * _is_less(_TINY, way * wanted)
-                claims[q, way] = _larger(claims[q, way], claim) if (q, way) in claims else claim
+                _add_claim(claims, (q, way), score * _is_less(_TINY, way * wanted))
     return claims
 
 
@@ -214,17 +199,15 @@ def _wins(q: Symbol, slope: Expression, score: Expression, claims: Claims) -> Ex
 
 def _pass_demand(sides: list[LockSide], shut: list[Expression], wanted: Claims) -> list[Expression]:
     """Return the demand for each side: that for its coordinate, which is passed on while it is shut."""
-    circular = _has_circle(sides)
     known = dict(wanted)
     needs = [as_expression(0.0) for _ in sides]
-    for _ in range(_SWEEPS if circular else 1):
+    for _ in range(_SWEEPS if _has_circle(sides) else 1):
         for k, (side, is_shut) in enumerate(zip(sides, shut, strict=True)):
             needs[k] = known.get((side.coordinate, side.way), as_expression(0.0))
             passed = needs[k] * is_shut
             for q, slope in side.trend.items():
                 for way in (1, -1):
-                    claim = passed * _is_less(_TINY, way * slope)
-                    known[q, way] = _larger(known[q, way], claim) if (q, way) in known else claim
+                    _add_claim(known, (q, way), passed * _is_less(_TINY, way * slope))
     return needs
 
 
@@ -270,8 +253,8 @@ def _is_less(a: ExpressionLike, b: ExpressionLike) -> Expression:
     return binary(ca.OP_LT, as_expression(a), as_expression(b))
 
 
-def _larger(a: Expression, b: Expression) -> Expression:
-    return binary(ca.OP_FMAX, a, b)
+def _add_claim(claims: Claims, key: tuple[Symbol, Way], claim: Expression) -> None:
+    claims[key] = binary(ca.OP_FMAX, claims[key], claim) if key in claims else claim
 
 
 def _check_goals(model: ModelView, goal: Mapping[Symbol, float] | Mapping[str, float]) -> dict[Symbol, float]:

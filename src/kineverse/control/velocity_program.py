@@ -115,10 +115,7 @@ class VelocityProgram:
                 towards = POSTURE_GAIN * (middle - speed.position)
                 diagonal[i] = diagonal[i] + share * own
                 linear[i] = linear[i] - share * own * fade * towards
-        entries = [
-            hessian[i, j] + diagonal[i] if i == j else hessian[i, j] for i in range(n) for j in range(n)
-        ]
-        H = array(entries).reshape(n, n)
+        H = hessian + as_expression(np.diag(array(diagonal)))
         lower, upper = [bounds.lower[i] for i in range(n)], [bounds.upper[i] for i in range(n)]
         names: list[tuple[str, ...]] = list(bounds.names)
         if held:
@@ -166,11 +163,8 @@ class VelocityProgram:
         self.rows = len(soft)
         self.names = tuple(names)
         self.soft = np.array([False] * self.columns + soft)
-        A = (
-            array(matrix).reshape(self.rows, self.columns)
-            if matrix
-            else as_expression(np.zeros((0, self.columns)))
-        )
+        shape = self.rows, self.columns
+        A = array(matrix).reshape(*shape) if matrix else as_expression(np.zeros(shape))
         f = array(linear)
         finite = [b for b in (*lower, *upper) if not is_infinite(b)]
         check = sum((part.sum() for part in (H, f, A, array([ZERO, *finite])) if part.size), ZERO)
@@ -185,10 +179,8 @@ class VelocityProgram:
         self.function: CompiledFunction[tuple[Array, ...]]
         outputs = [H, f, A, array(lower), array(upper), array(list(residuals.values())), check, largest]
         if about_speeds:
-            outputs += [
-                as_expression(np.concatenate([g.jacobian for g in about_speeds])),
-                as_expression(np.concatenate([g.rate for g in about_speeds])),
-            ]
+            parts = [g.jacobian for g in about_speeds], [g.rate for g in about_speeds]
+            outputs += [as_expression(np.concatenate(part)) for part in parts]
         used = {s for output in outputs for s in output.symbols}
         self.inputs = arrange_inputs(used - {dt, *last, *before})
         self.function = compile(outputs, (*self.inputs, dt, *last, *before), tier=tier)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy
 
@@ -25,33 +25,27 @@ class ArrayMethods:
 
     def swapaxes(self, axis1: int, axis2: int) -> Expression:
         """Return the array with two axes exchanged."""
-        result: Expression = np.swapaxes(self, axis1, axis2)
-        return result
+        return cast("Expression", np.swapaxes(self, axis1, axis2))
 
     def squeeze(self, axis: Axis = None) -> Expression:
         """Return the array without its axes of length 1, or without the given ones."""
-        result: Expression = np.squeeze(self, axis)
-        return result
+        return cast("Expression", np.squeeze(self, axis))
 
     def diagonal(self, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Expression:
         """Return a diagonal along the last axis."""
-        result: Expression = np.diagonal(self, offset, axis1, axis2)
-        return result
+        return cast("Expression", np.diagonal(self, offset, axis1, axis2))
 
     def repeat(self, repeats: Any, axis: int | None = None) -> Expression:
         """Return the array with its elements repeated."""
-        result: Expression = np.repeat(self, repeats, axis)
-        return result
+        return cast("Expression", np.repeat(self, repeats, axis))
 
     def take(self, indices: Any, axis: int | None = None) -> Expression:
         """Return the elements at some places along an axis, or of all elements."""
-        result: Expression = np.take(self, indices, axis)
-        return result
+        return cast("Expression", np.take(self, indices, axis))
 
     def copy(self) -> Expression:
         """Return the expression itself, which is immutable."""
-        result: Expression = np.copy(self)
-        return result
+        return cast("Expression", np.copy(self))
 
     def astype(self, dtype: Any) -> Expression:
         """Return the expression itself: its values are 64-bit floats."""
@@ -72,8 +66,7 @@ class ArrayMethods:
             )
         index = place[0] if len(place) == 1 else place or 0
         whole: Any = self
-        element: Expression = whole[index] if isinstance(index, tuple) else flat[index]
-        return element
+        return cast("Expression", whole[index] if isinstance(index, tuple) else flat[index])
 
     def tolist(self) -> Any:
         """Return nested lists of scalar expressions, and a scalar as itself."""
@@ -84,57 +77,46 @@ class ArrayMethods:
 
     def sum(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
         """Return the sum over all elements, or along one axis or several."""
-        result: Expression = np.sum(self, axis=axis, keepdims=keepdims)
-        return result
+        return cast("Expression", np.sum(self, axis=axis, keepdims=keepdims))
 
     def prod(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
         """Return the product of all elements, or along one axis or several."""
-        result: Expression = np.prod(self, axis=axis, keepdims=keepdims)
-        return result
+        return cast("Expression", np.prod(self, axis=axis, keepdims=keepdims))
 
     def mean(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
         """Return the mean of all elements, or along one axis or several."""
-        result: Expression = np.mean(self, axis=axis, keepdims=keepdims)
-        return result
+        return cast("Expression", np.mean(self, axis=axis, keepdims=keepdims))
 
     def min(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
         """Return the smallest of all elements, or along one axis or several."""
-        result: Expression = np.min(self, axis=axis, keepdims=keepdims)
-        return result
+        return cast("Expression", np.min(self, axis=axis, keepdims=keepdims))
 
     def max(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
         """Return the largest of all elements, or along one axis or several."""
-        result: Expression = np.max(self, axis=axis, keepdims=keepdims)
-        return result
+        return cast("Expression", np.max(self, axis=axis, keepdims=keepdims))
 
     def cumsum(self, axis: int | None = None) -> Expression:
         """Return the sums up to each element, along an axis or of all elements in C order."""
-        result: Expression = np.cumsum(self, axis=axis)
-        return result
+        return cast("Expression", np.cumsum(self, axis=axis))
 
     def cumprod(self, axis: int | None = None) -> Expression:
         """Return the products up to each element, along an axis or of all elements in C order."""
-        result: Expression = np.cumprod(self, axis=axis)
-        return result
+        return cast("Expression", np.cumprod(self, axis=axis))
 
     def trace(self, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Expression:
         """Return the sum of a diagonal."""
-        result: Expression = np.trace(self, offset, axis1, axis2)
-        return result
+        return cast("Expression", np.trace(self, offset, axis1, axis2))
 
     # -- elementwise, and products -------------------------------------------------------------------------
 
     def clip(self, min: Any = None, max: Any = None) -> Expression:  # noqa: A002 - numpy's names
         """Return the elements limited to [min, max]."""
-        result: Expression = np.clip(self, min, max)
-        return result
+        return cast("Expression", np.clip(self, min, max))
 
     def round(self, decimals: int = 0) -> Expression:
         """Return the elements rounded to a number of decimals; of two equally near, the even one."""
-        result: Expression = np.round(self, decimals)
-        return result
+        return cast("Expression", np.round(self, decimals))
 
     def dot(self, other: ExpressionLike) -> Expression:
         """Return the sum of products over the last axis of this and the last but one of the other."""
-        result: Expression = np.dot(self, other)
-        return result
+        return cast("Expression", np.dot(self, other))

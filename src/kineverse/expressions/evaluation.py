@@ -60,9 +60,8 @@ def symbol_values(
     from kineverse.state import State
 
     if not isinstance(values, Mapping):
-        raise ExpressionError(
-            f"Values are given as a mapping {{name: number}}, not as {type(values).__name__}."
-        )
+        kind = type(values).__name__
+        raise ExpressionError(f"Values are given as a mapping {{name: number}}, not as {kind}.")
     names = [str(s) for s in symbols]
     asked = {*names, *symbols}
     given, unknown = {}, []
@@ -83,11 +82,8 @@ def symbol_values(
         raise DuplicateNameError(
             f"Several symbols have the name '{ambiguous[0]}'; give their values by symbol, not by name."
         )
-    missing = [
-        name
-        for name, symbol in zip(names, symbols, strict=True)
-        if name not in given and symbol not in given and symbol.value is None
-    ]
+    pairs = list(zip(names, symbols, strict=True))
+    missing = [n for n, s in pairs if n not in given and s not in given and s.value is None]
     if missing:
         listed = ", ".join(map(repr, missing[:10]))
         others = [repr(str(k)) for k in given if k not in asked][:10]
@@ -96,12 +92,11 @@ def symbol_values(
             + (f" Values were given for {', '.join(others)}, which do not occur here." if others else "")
         )
     vector = np.empty(len(names))
-    for i, (name, symbol) in enumerate(zip(names, symbols, strict=True)):
+    for i, (name, symbol) in enumerate(pairs):
         value = given[symbol] if symbol in given else given.get(name, symbol.value)
         if isinstance(value, Expression):
-            raise ExpressionError(
-                f"The value of '{name}' is an expression; use substitute({{symbol: expression}})."
-            )
+            hint = "use substitute({symbol: expression})"
+            raise ExpressionError(f"The value of '{name}' is an expression; {hint}.")
         try:
             vector[i] = real_number(value)
         except (TypeError, ValueError, OverflowError):

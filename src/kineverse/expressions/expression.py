@@ -144,12 +144,8 @@ class Expression(ArrayMethods):
         return (self[i] for i in range(self._shape[0]))
 
     def __getitem__(self, key: Any) -> Expression:
-        if isinstance(key, Expression) or (
-            isinstance(key, tuple) and any(isinstance(k, Expression) for k in key)
-        ):
-            raise ExpressionError(
-                "An index must be a number or a slice; use where(condition, a, b) to select."
-            )
+        if any(isinstance(k, Expression) for k in (key if isinstance(key, tuple) else (key,))):
+            raise ExpressionError("An index is a number or a slice; use where(condition, a, b) to select.")
         if type(key) is tuple and len(key) == 2 and type(key[0]) is int and type(key[1]) is int:
             if len(self._shape) == 2 and 0 <= key[0] < self._shape[0] and 0 <= key[1] < self._shape[1]:
                 return from_casadi(self._sx[key[0], key[1]], (), self._nodes)
@@ -176,9 +172,8 @@ class Expression(ArrayMethods):
         try:
             return self._rearranged(layout.indices(self._shape).reshape(wanted))
         except ValueError:
-            raise ShapeError(
-                f"An expression of shape {self._shape} cannot be reshaped to {wanted}."
-            ) from None
+            told = f"An expression of shape {self._shape} cannot be reshaped to {wanted}."
+            raise ShapeError(told) from None
 
     def ravel(self) -> Expression:
         """Return the elements in C order, shape (size,)."""
@@ -596,18 +591,16 @@ def as_expression(value: ExpressionLike) -> Expression:
     if is_special and isinstance(value, (np.ma.MaskedArray, np.matrix)):
         _refuse(value)
     if isinstance(value, (str, bytes, Mapping)) or value is None:
-        raise ExpressionError(
-            f"{value!r} is not an expression or a number. Symbols are made by kv.position('path')."
-        )
+        hint = "Symbols are made by kv.position('path')."
+        raise ExpressionError(f"{value!r} is not an expression or a number. {hint}")
     given = np.asarray(value)
     try:
         if given.dtype.kind not in "biufO":
             raise TypeError(f"its entries are of type {given.dtype}.")
         numbers = given.astype(float)
     except (TypeError, ValueError, OverflowError) as error:
-        raise ExpressionError(
-            f"{type(value).__name__} is not an expression or an array of numbers: {error}"
-        ) from None
+        kind = type(value).__name__
+        raise ExpressionError(f"{kind} is not an expression or an array of numbers: {error}") from None
     if np.isnan(numbers).any():
         raise InvalidValueError(f"NaN is not accepted as a constant (in an array of shape {numbers.shape}).")
     return from_casadi(layout.from_array(numbers), numbers.shape, NO_NODES)
@@ -648,10 +641,9 @@ def array(values: Any) -> Expression:
     if all(isinstance(v, (float, int, np.floating, np.integer)) and not isinstance(v, bool) for v in values):
         return as_expression(np.asarray(values))
     flat: list[Expression] = []
-    shape = _flatten(values, flat)
-    if shape is None:
+    full = _flatten(values, flat)
+    if full is None:
         raise ShapeError("Ragged array: entries of different shapes side by side.")
-    full = shape
     if all(not e.shape for e in flat):
         numbers = np.zeros(len(flat))
         symbolic = []
@@ -679,9 +671,8 @@ def _flatten(values: Any, flat: list[Expression], depth: int = 0) -> ArrayShape 
         flat.append(entry)
         return entry.shape
     if depth == _MOST_DIMENSIONS:
-        raise ShapeError(
-            f"Sequences are nested more than {_MOST_DIMENSIONS} deep; no array has so many dimensions."
-        )
+        most = f"more than {_MOST_DIMENSIONS} deep"
+        raise ShapeError(f"Sequences are nested {most}; no array has so many dimensions.")
     shapes = {_flatten(v, flat, depth + 1) for v in values}
     if not shapes:
         return (0,)
@@ -710,10 +701,9 @@ def binary(op: int, left: ExpressionLike, right: ExpressionLike) -> Expression:
         nodes = a._nodes | b._nodes if b._nodes else a._nodes
     else:
         nodes = b._nodes
-    if a._shape == b._shape or not b._shape or not a._shape:
-        return from_casadi(ca.SX.binary(op, a._sx, b._sx), a._shape or b._shape, nodes)
-    a, b = broadcast(a, b)
-    return from_casadi(ca.SX.binary(op, a._sx, b._sx), a._shape, nodes)
+    if a._shape != b._shape and a._shape and b._shape:
+        a, b = broadcast(a, b)
+    return from_casadi(ca.SX.binary(op, a._sx, b._sx), a._shape or b._shape, nodes)
 
 
 def broadcast(*operands: Expression) -> tuple[Expression, ...]:

@@ -253,7 +253,8 @@ def floor_divide(a: ExpressionLike, b: ExpressionLike) -> Expression:
     whole = floor(quotient)
     # Rounding may have left a quotient that should be whole slightly below it.
     whole = whole + binary(ca.OP_LT, 0.5, quotient - whole)
-    if not _nonzero_divisor(denominator):
+    divisor = denominator._sx
+    if not divisor.is_constant() or any(float(e) == 0 for e in divisor.elements()):
         by_zero = binary(ca.OP_EQ, denominator, 0.0)
         infinite = binary(ca.OP_IF_ELSE_ZERO, by_zero, sign(numerator) * math.inf)
         whole = binary(ca.OP_IF_ELSE_ZERO, unary(ca.OP_NOT, by_zero), whole) + infinite
@@ -275,19 +276,14 @@ def _with_positive_divisor(a: ExpressionLike, b: ExpressionLike) -> tuple[Expres
     return sense, sense * as_expression(a), sense * divisor
 
 
-def _nonzero_divisor(x: Expression) -> bool:
-    return bool(x._sx.is_constant()) and not any(float(e) == 0 for e in x._sx.elements())
-
-
 def rint(x: ExpressionLike) -> Expression:
     """Return the nearest integer, elementwise; of two equally near, the even one."""
     operand = as_expression(x)
     below = floor(operand)
     above_half = operand - below
     odd = binary(ca.OP_LT, 2 * floor(below / 2), below)
-    up = binary(
-        ca.OP_OR, binary(ca.OP_LT, 0.5, above_half), binary(ca.OP_AND, binary(ca.OP_EQ, above_half, 0.5), odd)
-    )
+    tie = binary(ca.OP_AND, binary(ca.OP_EQ, above_half, 0.5), odd)
+    up = binary(ca.OP_OR, binary(ca.OP_LT, 0.5, above_half), tie)
     return copysign(below + up, operand)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from kineverse.errors import ExpressionError, UnknownNameError, suggest
 
 from . import layout
-from .expression import NO_NODES, Expression, access_listener, array, as_expression, from_casadi, union_nodes
+from .expression import Expression, access_listener, array, as_expression, from_casadi, union_nodes
 from .graph import leaves, topological_order
 from .substitution import apply_substitution, dummy_symbols, rename_symbols, replace_nodes
 
@@ -117,9 +117,8 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
     opaque = [(node, entries) for node in inner if (entries := node.gradient(heuristic))]
     if not moving and not opaque:
         return {}
-    keys = sorted(
-        {s.derivative() for s in moving}.union(*(entries for _, entries in opaque)), key=lambda s: s.sort_key
-    )
+    every = {s.derivative() for s in moving}.union(*(entries for _, entries in opaque))
+    keys = sorted(every, key=lambda s: s.sort_key)
     # Shared parts determine the order of sums, and so the last bit: equal expressions share equal parts.
     elements = ca.cse(layout.column(expression._sx, expression._shape))
     if not opaque:
@@ -170,20 +169,13 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
             )
     listener = access_listener(expression)
     if listener is not None:
-        result: Expression = listener.ask(
-            "jacobian" if heuristic else "facts", expression, array(list(wanted))
-        )
+        kind = "jacobian" if heuristic else "facts"
+        result: Expression = listener.ask(kind, expression, array(list(wanted)))
         return result
     entries = gradient(expression, heuristic)
     columns = [entries.get(symbol.derivative()) for symbol in wanted]
-    if wanted and not any(column is not None for column in columns):
-        _refuse_speeds([symbol for symbol in wanted if symbol in entries])
-    return stack_columns(columns, expression._shape)
-
-
-def _refuse_speeds(speeds: Sequence[Symbol]) -> None:
-    """Raise for speeds in place of positions, for which all columns would be zero."""
-    if speeds:
+    speeds = [symbol for symbol in wanted if symbol in entries]
+    if speeds and not any(column is not None for column in columns):
         raise ExpressionError(
             f"'{speeds[0]}' is a speed, and the columns of a jacobian are named by positions: that of "
             f"'{speeds[0].integral()}' is D(e)['{speeds[0]}']. Pass positions, as model.degrees_of_freedom, "
@@ -191,6 +183,7 @@ def _refuse_speeds(speeds: Sequence[Symbol]) -> None:
             "columns for all free speeds, those of wheels as well. For the derivative by a speed "
             "itself, which is 0 here, there is partial([...])."
         )
+    return stack_columns(columns, expression._shape)
 
 
 def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
@@ -207,9 +200,8 @@ def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     entries = gradient(rename_symbols(_without_augmentation(expression), moving), False)
     back = {stand_in: s for s, stand_in in moving.items()}
     columns = [entries.get(moving.get(s, s).derivative()) for s in wanted]
-    return stack_columns(
-        [c if c is None else apply_substitution(c, back) for c in columns], expression._shape
-    )
+    renamed = [c if c is None else apply_substitution(c, back) for c in columns]
+    return stack_columns(renamed, expression._shape)
 
 
 def _without_augmentation(expression: Expression) -> Expression:
@@ -221,11 +213,8 @@ def _without_augmentation(expression: Expression) -> Expression:
 
     for node in topological_order(leaves(expression)[1], parts, plain.__contains__):
         replaced = tuple(replace_nodes(part, plain) for part in parts(node))
-        plain[node] = (
-            type(node).from_arguments(replaced, node.shape, node.options)
-            if node.own_partials
-            else replaced[0]
-        )
+        own = node.own_partials
+        plain[node] = type(node).from_arguments(replaced, node.shape, node.options) if own else replaced[0]
     return replace_nodes(expression, plain)
 
 
@@ -235,25 +224,18 @@ def stack_columns(columns: list[Expression | None], shape: layout.ArrayShape) ->
     stored = [ca.SX.zeros(size, 1) if c is None else layout.column(c._sx, c._shape) for c in columns]
     matrix = ca.horzcat(*stored) if stored else ca.SX.zeros(size, 0)
     full = (*shape, len(columns))
-    return from_casadi(_last_axis(matrix, full), full, union_nodes([c for c in columns if c is not None]))
-
-
-def _last_axis(matrix: layout.SX, shape: layout.ArrayShape) -> layout.SX:
     # The rows are the elements of the expression in C order, which is the layout of the longer shape, except
     # for a vector, which is stored as a column.
-    return matrix.T if len(shape) == 1 else matrix
+    stored_matrix = matrix if shape else matrix.T
+    return from_casadi(stored_matrix, full, union_nodes([c for c in columns if c is not None]))
 
 
 def total_derivative(expression: Expression, heuristic: bool = False) -> Expression:
     """Return ``ė = Σ D(e)[v]·v``, of the expression's shape: its rate as a function of the speeds."""
     if not expression._shape and not expression._nodes and expression._sx.is_symbolic():
         (symbol,) = expression.symbols  # the most frequent case: a limit on a joint's speed
-        return (
-            symbol.derivative()
-            if symbol.has_derivative
-            else from_casadi(layout.from_array(np.zeros(())), (), NO_NODES)
-        )
-    rate = from_casadi(layout.from_array(np.zeros(expression.shape)), expression.shape, NO_NODES)
+        return symbol.derivative() if symbol.has_derivative else as_expression(0.0)
+    rate = as_expression(np.zeros(expression.shape))
     for key, entry in gradient(expression, heuristic).items():
         rate = rate + entry * key
     return rate

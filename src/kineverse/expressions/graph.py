@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -158,14 +159,8 @@ def lower(expressions: Sequence[Expression]) -> list[SX]:
     columns = [dense_column(e) for e in expressions]
     if not columns:
         return []
-    return [ca.densify(c) for c in ca.vertsplit(ca.cse(ca.vertcat(*columns)), _offsets(columns))]
-
-
-def _offsets(columns: list[SX]) -> list[int]:
-    offsets = [0]
-    for column in columns:
-        offsets.append(offsets[-1] + column.numel())
-    return offsets
+    offsets = [0, *accumulate(column.numel() for column in columns)]
+    return [ca.densify(c) for c in ca.vertsplit(ca.cse(ca.vertcat(*columns)), offsets)]
 
 
 _PICKLING_DEPTH = 16
@@ -176,9 +171,8 @@ def structural_hash(expression: Expression) -> bytes:
     """Return a digest of shape, leaves and graph; equal for equal structure, in every process."""
     if expression._key is None:
         symbols, nodes = leaves(expression)
-        digest = hashlib.blake2b(
-            repr((expression._shape, [s.sort_key for s in symbols])).encode(), digest_size=16
-        )
+        head = repr((expression._shape, [s.sort_key for s in symbols]))
+        digest = hashlib.blake2b(head.encode(), digest_size=16)
         for node in nodes:
             digest.update(node.key)
         sx = expression._sx

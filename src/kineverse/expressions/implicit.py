@@ -68,24 +68,19 @@ class ImplicitFunction:
         if self.steps < 0:
             raise InvalidValueError(f"'{self.name}' cannot make {self.steps} steps.")
         if self.domain and len(self.domain) != len(self.inputs):
-            raise ShapeError(
-                f"'{self.name}' has {len(self.inputs)} inputs, and a domain for {len(self.domain)}."
-            )
+            counts = f"{len(self.inputs)} inputs, and a domain for {len(self.domain)}"
+            raise ShapeError(f"'{self.name}' has {counts}.")
         domain = tuple((float(lower), float(upper)) for lower, upper in self.domain)
         for (lower, upper), symbol in zip(domain, self.inputs, strict=False):
             if not lower <= upper:
-                raise InvalidValueError(
-                    f"'{self.name}': no value lies within {lower} <= {symbol} <= {upper}."
-                )
+                what = f"{lower} <= {symbol} <= {upper}"
+                raise InvalidValueError(f"'{self.name}': no value lies within {what}.")
         bounded = any(math.isfinite(end) for ends in domain for end in ends)
         object.__setattr__(self, "domain", domain if bounded else ())
         known = {*self.unknowns, *self.inputs}
         if len(known) < n + len(self.inputs):
             raise InvalidValueError(f"'{self.name}': a symbol is given twice.")
-        for what, part, allowed in (
-            ("residual", self.residual, known),
-            ("seed", self.seed, set(self.inputs)),
-        ):
+        for what, part, allowed in ("residual", self.residual, known), ("seed", self.seed, {*self.inputs}):
             strange = sorted(str(s) for s in part.symbols if s not in allowed)
             if strange:
                 raise InvalidValueError(f"'{self.name}': the {what} is about {', '.join(strange)}, too.")
@@ -119,9 +114,8 @@ class ImplicitFunction:
     def apply(self, arguments: Sequence[Expression]) -> Expression:
         """Return the unknowns, shape (n,), at other inputs than the function's own."""
         if len(arguments) != len(self.inputs):
-            raise ShapeError(
-                f"'{self.name}' is a function of {len(self.inputs)} inputs, not of {len(arguments)}."
-            )
+            counts = f"{len(self.inputs)} inputs, not of {len(arguments)}"
+            raise ShapeError(f"'{self.name}' is a function of {counts}.")
         shapes = [a.shape for a in arguments if a.shape]
         if shapes:
             raise ShapeError(f"'{self.name}' is a function of scalars, not of arrays of shape {shapes[0]}.")
@@ -196,12 +190,8 @@ class Implicit(Node):
             entries = [g.get(key) for g in gradients]
             parts = [by_inputs[:, j] * e for j, e in enumerate(entries) if e is not None]
             columns.append(sum(parts[1:], parts[0]))
-        moved = from_casadi(
-            ca.horzcat(*(ca.densify(c._sx) for c in columns)),
-            (len(x), len(keys)),
-            union_nodes(tuple(columns)),
-        )
-        solved = _solve(matrix, moved)
+        stacked = ca.horzcat(*(ca.densify(c._sx) for c in columns))
+        solved = _solve(matrix, from_casadi(stacked, (len(x), len(keys)), union_nodes(tuple(columns))))
         return {key: -solved[:, i] for i, key in enumerate(keys)}
 
 
@@ -228,9 +218,8 @@ def clamp_to_domains(expression: Expression) -> Expression:
             if symbol is not None:
                 low, high = ends.get(symbol, (-math.inf, math.inf))
                 ends[symbol] = max(low, lower), min(high, upper)
-    return apply_substitution(
-        expression, {s: maximum(low, minimum(high, s)) for s, (low, high) in ends.items()}
-    )
+    clamped = {s: maximum(low, minimum(high, s)) for s, (low, high) in ends.items()}
+    return apply_substitution(expression, clamped)
 
 
 def _symbol_of(argument: Expression) -> Symbol | None:
@@ -243,14 +232,9 @@ def _symbol_of(argument: Expression) -> Symbol | None:
 
 def implicit_nodes(expressions: Sequence[Expression]) -> tuple[Implicit, ...]:
     """Return the implicit functions in the values of expressions, inner ones first."""
-    found = [
-        node
-        for node in topological_order(
-            (n for e in expressions for n in leaves(e)[1]), lambda n: (n.value, *n.arguments), lambda _: False
-        )
-        if isinstance(node, Implicit)
-    ]
-    return tuple(dict.fromkeys(found))
+    nodes = (n for e in expressions for n in leaves(e)[1])
+    every = topological_order(nodes, lambda n: (n.value, *n.arguments), lambda _: False)
+    return tuple(dict.fromkeys(node for node in every if isinstance(node, Implicit)))
 
 
 def explain_no_solution(

@@ -58,9 +58,8 @@ def _parse_subscripts(subscripts: str, operands: Sequence[Expression]) -> tuple[
     left, arrow, right = text.partition("->")
     inputs = left.split(",")
     if len(inputs) != len(operands):
-        raise ExpressionError(
-            f"np.einsum: {subscripts!r} is about {len(inputs)} operands, not {len(operands)}."
-        )
+        counts = f"{len(inputs)} operands, not {len(operands)}"
+        raise ExpressionError(f"np.einsum: {subscripts!r} is about {counts}.")
     free = [letter for letter in ascii_letters if letter not in text]
     hidden = ""
     for place, (part, operand) in enumerate(zip(inputs, operands, strict=True)):
@@ -69,8 +68,9 @@ def _parse_subscripts(subscripts: str, operands: Sequence[Expression]) -> tuple[
         if not set(before + after) <= set(ascii_letters):
             raise ExpressionError(f"np.einsum: {part!r} in {subscripts!r} is not made of letters.")
         if missing and not (dots and 0 < missing <= len(free)):
+            shape = operand.shape
             raise ShapeError(
-                f"np.einsum: {part!r} in {subscripts!r} does not fit an operand of shape {operand.shape}."
+                f"np.einsum: {part!r} in {subscripts!r} does not fit an operand of shape {shape}."
             )
         # Axes of an ellipsis are aligned at the end, as in broadcasting.
         filled = "".join(reversed(free[:missing]))
@@ -86,9 +86,8 @@ def _parse_subscripts(subscripts: str, operands: Sequence[Expression]) -> tuple[
             )
     else:
         together = "".join(inputs)
-        output = hidden + "".join(
-            sorted(x for x in set(together) if together.count(x) == 1 and x not in hidden)
-        )
+        once = sorted(x for x in set(together) if together.count(x) == 1 and x not in hidden)
+        output = hidden + "".join(once)
     return inputs, output
 
 
@@ -191,10 +190,8 @@ def kron(a: ExpressionLike, b: ExpressionLike) -> Expression:
     n = max(x.ndim, y.ndim)
     p, q = ((1,) * (n - o.ndim) + o.shape for o in (x, y))
     pairs = list(zip(p, q, strict=True))
-    apart = x.reshape([k for i, _ in pairs for k in (i, 1)]) * y.reshape(
-        [k for _, j in pairs for k in (1, j)]
-    )
-    return apart.reshape(tuple(i * j for i, j in pairs))
+    left, right = [k for i, _ in pairs for k in (i, 1)], [k for _, j in pairs for k in (1, j)]
+    return (x.reshape(left) * y.reshape(right)).reshape(tuple(i * j for i, j in pairs))
 
 
 def cross(
@@ -227,17 +224,20 @@ def matrix_inverse(matrix: ExpressionLike) -> Expression:
 
     For homogeneous transforms use :func:`kineverse.spatial.inverse`, which is far smaller.
     """
+    a = _as_square_matrix(matrix, "an inverse")
+    return from_casadi(ca.inv(a._sx), a.shape, a._nodes)
+
+
+def _as_square_matrix(matrix: ExpressionLike, what: str) -> Expression:
     a = as_expression(matrix)
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
-        raise ShapeError(f"Only a square matrix has an inverse, not one of shape {a.shape}.")
-    return from_casadi(ca.inv(a._sx), a.shape, a._nodes)
+        raise ShapeError(f"Only a square matrix has {what}, not one of shape {a.shape}.")
+    return a
 
 
 def determinant(matrix: ExpressionLike) -> Expression:
     """Return the determinant of a square matrix, a scalar."""
-    a = as_expression(matrix)
-    if a.ndim != 2 or a.shape[0] != a.shape[1]:
-        raise ShapeError(f"Only a square matrix has a determinant, not one of shape {a.shape}.")
+    a = _as_square_matrix(matrix, "a determinant")
     n = a.shape[0]
     if not n:
         return as_expression(1.0)
@@ -268,9 +268,7 @@ def solve_linear(matrix: ExpressionLike, right: ExpressionLike) -> Expression:
 
 def matrix_power(matrix: ExpressionLike, exponent: int) -> Expression:
     """Return a square matrix to an integer power; a negative one of its inverse."""
-    a = as_expression(matrix)
-    if a.ndim != 2 or a.shape[0] != a.shape[1]:
-        raise ShapeError(f"Only a square matrix has powers, not one of shape {a.shape}.")
+    a = _as_square_matrix(matrix, "powers")
     if not isinstance(exponent, (int, np.integer)):
         raise ExpressionError(f"A matrix has whole powers, not {exponent!r}.")
     square, left = matrix_inverse(a) if exponent < 0 else a, abs(int(exponent))

@@ -162,9 +162,8 @@ class Node(ABC):
         """Return D of the node, entries of its shape."""
         known = self._gradients.get(heuristic)
         if known is None:
-            known = self._gradients[heuristic] = {
-                key: entry for key, entry in self._gradient(heuristic).items() if not entry._sx.is_zero()
-            }
+            every = self._gradient(heuristic).items()
+            known = self._gradients[heuristic] = {key: e for key, e in every if not e._sx.is_zero()}
         return known
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
@@ -183,9 +182,8 @@ class Node(ABC):
         """Return the composition: the same kind of node over the substituted arguments."""
         from .substitution import apply_substitution
 
-        return type(self).from_arguments(
-            tuple(apply_substitution(a, substitution) for a in self.arguments), self.shape, self.options
-        )
+        arguments = tuple(apply_substitution(a, substitution) for a in self.arguments)
+        return type(self).from_arguments(arguments, self.shape, self.options)
 
     def __reduce__(self) -> Any:
         return _restore, (type(self), self.arguments, self.shape, self.options)
@@ -259,9 +257,8 @@ class Augment(Node):
     def depends_on(self, substitution: Substitution) -> bool:
         """Return True if a substitution changes the node."""
         # An entry for ȧ is mapped along D(S(a)) even if the value does not contain a.
-        return super().depends_on(substitution) or any(
-            a.has_derivative and a.derivative() in self.options[2:] for a in substitution
-        )
+        replaced = (a.derivative() for a in substitution if a.has_derivative)
+        return super().depends_on(substitution) or any(speed in self.options[2:] for speed in replaced)
 
     def substitute(self, substitution: Substitution) -> Expression:
         """Return the composition of the node with a substitution."""
@@ -296,15 +293,12 @@ def augment(
         try:
             entries[key] = broadcast_to(as_expression(entry), value.shape)
         except ShapeError:
-            raise ShapeError(
-                f"The entry of '{key}' has shape {as_expression(entry).shape}; "
-                f"the expression has {value.shape}."
-            ) from None
+            shapes = f"{as_expression(entry).shape}; the expression has {value.shape}"
+            raise ShapeError(f"The entry of '{key}' has shape {shapes}.") from None
     if not replace and not entries:
         return value
     if replace:
         entries = {k: e for k, e in entries.items() if not e._sx.is_zero()}
     keys = tuple(sorted(entries, key=lambda s: s.sort_key))
-    return Augment.from_arguments(
-        (value, *(entries[k] for k in keys)), value.shape, (replace, heuristic, *keys)
-    )
+    arguments = value, *(entries[k] for k in keys)
+    return Augment.from_arguments(arguments, value.shape, (replace, heuristic, *keys))

@@ -67,11 +67,8 @@ class Select(Node):
 
 def _select(holds: Expression, if_true: Expression, if_false: Expression) -> Expression:
     """Return a selection by a comparison; CasADi keeps selections free of NaN in every derivative."""
-    return from_casadi(
-        ca.if_else(holds._sx, if_true._sx, if_false._sx),
-        holds._shape,
-        union_nodes((holds, if_true, if_false)),
-    )
+    chosen = ca.if_else(holds._sx, if_true._sx, if_false._sx)
+    return from_casadi(chosen, holds._shape, union_nodes((holds, if_true, if_false)))
 
 
 class Extremum(Node):
@@ -168,9 +165,8 @@ class Power(Node):
     @staticmethod
     def is_needed(base: SX, exponent: SX) -> bool:
         """Return True if a power may have derivatives that CasADi lacks: those at base 0."""
-        return not exponent.is_constant() and not (
-            base.is_constant() and all(float(element) for element in base.elements())
-        )
+        never_zero = base.is_constant() and all(float(element) for element in base.elements())
+        return not exponent.is_constant() and not never_zero
 
     def _value(self) -> Expression:
         return binary(ca.OP_POW, *self.arguments)

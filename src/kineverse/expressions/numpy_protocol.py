@@ -91,9 +91,8 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
     if method == "reduce" and ufunc in _REDUCTIONS and not set(options) - {"axis", "keepdims"}:
         return _REDUCTIONS[ufunc](inputs[0], options.get("axis", 0), keepdims=options.get("keepdims", False))
     if options.get("out") is not None:
-        raise ExpressionError(
-            f"np.{ufunc.__name__} cannot write expressions into an existing array of numbers."
-        )
+        name = f"np.{ufunc.__name__}"
+        raise ExpressionError(f"{name} cannot write expressions into an existing array of numbers.")
     if method != "__call__":
         reducing = ", ".join(f"np.{known.__name__}" for known in _REDUCTIONS)
         raise ExpressionError(
@@ -141,9 +140,9 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
         try:
             bound = parameters.bind(*args, **options)
         except TypeError as error:
-            raise ExpressionError(
-                f"{name} of expressions: {error}. Its parameters are {', '.join(parameters.parameters)}."
-            ) from None
+            listed = ", ".join(parameters.parameters)
+            told = f"{name} of expressions: {error}. Its parameters are {listed}."
+            raise ExpressionError(told) from None
         return _FUNCTIONS[function](*bound.args, **bound.kwargs)
     if function is np.append and len(args) > 1:
         # np.append takes two arguments instead of a sequence, and flattens both without an axis.
@@ -151,11 +150,8 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
         return apply_function(np.concatenate, (args[:2],), {"axis": axis})
     if function not in _REARRANGING and function not in _SPREADING and function not in _JOINING:
         raise _unavailable(name)
-    if (
-        not args
-        or {"out", "dtype", "casting"} & options.keys()
-        or len(args) > _BEFORE_OUT.get(function, len(args))
-    ):
+    refused = {"out", "dtype", "casting"} & options.keys()
+    if not args or refused or len(args) > _BEFORE_OUT.get(function, len(args)):
         raise ExpressionError(f"{name} takes expressions as its first argument, and neither out= nor dtype=.")
     if any(isinstance(a, Expression) for a in (*args[1:], *options.values())):
         raise ExpressionError(
@@ -222,9 +218,8 @@ def _join(function: Any, parts: Sequence[Any], args: Sequence[Any], options: Map
     blocks = numbered(parts) if function is np.block else [numbered(part) for part in parts]
     index = np.asarray(function(blocks, *args, **options))
     elements = ca.vertcat(*(layout.column(o._sx, o.shape) for o in operands))
-    return from_casadi(
-        layout.gather(elements, (offset,), index.astype(int)), index.shape, union_nodes(operands)
-    )
+    sx = layout.gather(elements, (offset,), index.astype(int))
+    return from_casadi(sx, index.shape, union_nodes(operands))
 
 
 def _leaves(parts: Any) -> list[Any]:

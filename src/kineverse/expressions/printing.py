@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -26,13 +26,8 @@ _ROWS = 40
 
 _INFIX = {ca.OP_ADD: ("+", 1), ca.OP_SUB: ("-", 1), ca.OP_MUL: ("*", 2), ca.OP_DIV: ("/", 2)}
 _COMPARISONS = {
-    ca.OP_LT: "<",
-    ca.OP_LE: "<=",
-    ca.OP_EQ: "==",
-    ca.OP_NE: "!=",
-    ca.OP_AND: "and",
-    ca.OP_OR: "or",
-}
+    ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!=", ca.OP_AND: "and", ca.OP_OR: "or",
+}  # fmt: skip
 _POWERS = (ca.OP_POW, ca.OP_CONSTPOW)
 _FUNCTIONS = {
     ca.OP_SQRT: "sqrt", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan", ca.OP_ASIN: "arcsin",
@@ -85,7 +80,8 @@ def mapping_text(gradient: Mapping[Symbol, Expression]) -> str:
     """Return a gradient in the form of a dictionary, its first entries if it has many."""
     shown, length = [], 0
     for key, entry in gradient.items():
-        shown.append(f"{key}: {_truncate(repr(entry))}")
+        text = repr(entry)
+        shown.append(f"{key}: {text if len(text) <= _LIMIT else f'{text[:_LIMIT]} ...'}")
         length += len(shown[-1])
         if length > _LONGEST_MAPPING:
             break
@@ -97,10 +93,6 @@ def mapping_html(gradient: Mapping[Symbol, Expression]) -> str:
     """Return a gradient as a table of HTML, its first entries if it has many."""
     rows = [(str(key), repr(entry)) for key, entry in itertools.islice(gradient.items(), _ROWS)]
     return html_table("D", ("speed", "entry"), rows, len(gradient))
-
-
-def _truncate(text: str) -> str:
-    return text if len(text) <= _LIMIT else f"{text[:_LIMIT]} ..."
 
 
 class _Writer:
@@ -150,9 +142,8 @@ class _Writer:
         if operation in _COMPARISONS:
             a, b = (self.write(o, depth + 1, 1) for o in operands)
             return self.grouped(f"{a} {_COMPARISONS[operation]} {b}")
-        return self.call(
-            _FUNCTIONS.get(operation, f"op{operation}"), [self.write(o, depth + 1) for o in operands]
-        )
+        name = _FUNCTIONS.get(operation, f"op{operation}")
+        return self.call(name, [self.write(o, depth + 1) for o in operands])
 
     def infix(self, operation: int, operands: list[SX], depth: int, strength: int) -> str:
         sign, own = _INFIX[operation]
@@ -223,15 +214,7 @@ class _Latex(_Writer):
 def _escape_latex(path: str) -> str:
     if len(path) == 1:
         return path
-    table: dict[str, Any] = {
-        "_": r"\_",
-        "%": r"\%",
-        "&": r"\&",
-        "#": r"\#",
-        "{": r"\{",
-        "}": r"\}",
-        "\\": r"\backslash ",
-    }
+    table = {c: f"\\{c}" for c in "_%&#{}"} | {"\\": r"\backslash "}
     return r"\mathrm{" + "".join(table.get(c, c) for c in path) + "}"
 
 

@@ -55,9 +55,8 @@ def _extremum(a: ExpressionLike, axis: Axis, which: str) -> Expression:
     if not rows.shape[0]:
         raise ShapeError("Nothing has no smallest or largest element.")
     columns = (tuple(column) for column in rows.T)
-    return array(
-        [c[0] if len(c) == 1 else Extremum.from_arguments(c, (), (which,)) for c in columns]
-    ).reshape(rest)
+    found = [c[0] if len(c) == 1 else Extremum.from_arguments(c, (), (which,)) for c in columns]
+    return array(found).reshape(rest)
 
 
 def ptp_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:

@@ -70,16 +70,14 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
             )
         replacement = as_expression(value)
         if replacement.shape:
-            raise ShapeError(
-                f"'{symbol}' is a scalar and cannot become an array of shape {replacement.shape}."
-            )
+            shape = replacement.shape
+            raise ShapeError(f"'{symbol}' is a scalar and cannot become an array of shape {shape}.")
         if replacement is not symbol:
             substitution[symbol] = replacement
     listener = access_listener(expression)
     if listener is not None and substitution:
-        result: Expression = listener.ask(
-            "substitute", expression, array(list(substitution)), array(list(substitution.values()))
-        )
+        images = array(list(substitution.values()))
+        result: Expression = listener.ask("substitute", expression, array(list(substitution)), images)
         return result
     moving = dummy_symbols(s for s, e in substitution.items() if not s.has_derivative and gradient_keys(e))
     if moving:
@@ -149,12 +147,10 @@ def replace_nodes(expression: Expression, replacements: Mapping[Node, Expression
     chosen = [n for n in nodes if n in replacements]
     if not chosen:
         return expression
-    kept = frozenset(n for n in nodes if n not in replacements).union(
-        *(replacements[n]._nodes for n in chosen)
-    )
-    (sx,) = ca.substitute(
-        [expression._sx], [n.sx for n in chosen], [ca.densify(replacements[n]._sx) for n in chosen]
-    )
+    images = [replacements[n] for n in chosen]
+    kept = frozenset(n for n in nodes if n not in replacements).union(*(e._nodes for e in images))
+    new = [ca.densify(e._sx) for e in images]
+    (sx,) = ca.substitute([expression._sx], [n.sx for n in chosen], new)
     return from_casadi(sx, expression._shape, kept)
 
 

@@ -16,8 +16,9 @@ from pathlib import Path
 
 from kineverse.errors import UnknownNameError, suggest
 
-__all__ = ["find_document", "names", "summary"]
+__all__ = ["find_document", "is_seed", "names", "summary"]
 
+LONGEST_SEED = 18  # largest number of digits of a seed in the name of a generated model
 _FOLDER = Path(__file__).parent / "scenes"
 
 
@@ -31,9 +32,13 @@ def summary(name: str) -> str:
     try:
         return _summaries()[name]
     except KeyError:
-        raise UnknownNameError(
-            f"There is no articulation {name!r} in the gallery. {suggest(name, _summaries(), 'articulation')}"
-        ) from None
+        similar = suggest(name, _summaries(), "articulation")
+        raise UnknownNameError(f"There is no articulation {name!r} in the gallery. {similar}") from None
+
+
+def is_seed(name: str) -> bool:
+    """Return whether a name is a seed: decimal digits without leading zeros."""
+    return name.isascii() and name.isdecimal() and len(name) <= LONGEST_SEED and str(int(name)) == name
 
 
 def find_document(name: str) -> Path:

@@ -23,6 +23,7 @@ import numpy as np
 from kineverse.articulations.mechanisms.mechanism import STEEL, box_shape
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.expressions.expression import Expression
+from kineverse.gallery import is_seed
 from kineverse.logic import less
 from kineverse.model.basic_operations import AddFrame, Constrain
 from kineverse.model.body import Body
@@ -35,7 +36,6 @@ from kineverse.symbols import position
 
 Join: TypeAlias = Callable[[Expression, Expression], Expression]
 
-_LARGEST_SEED = 18  # largest number of digits of a seed in a name
 _MOST_RINGS = 99
 _PARTS = (5, 41)  # range of the number of parts of a box that is given by its seed alone
 _NEGATED = 0.25  # share of negated conditions in such a box
@@ -202,13 +202,12 @@ def make_operations(box: Lockbox, prefix: str | None = None, join: Join = and_) 
 
 def make_condition(part: Slider, q: Mapping[str, Expression], join: Join = and_) -> Expression | None:
     """Return the condition under which a part is free, None if it always is."""
-    held = [
-        reduce(
-            or_, [less(c.threshold, q[c.part]) if c.beyond else less(q[c.part], c.threshold) for c in group]
-        )
-        for group in part.groups
-    ]
-    return reduce(join, held) if held else None
+
+    def holds(c: Condition) -> Expression:
+        return less(c.threshold, q[c.part]) if c.beyond else less(q[c.part], c.threshold)
+
+    free = [reduce(or_, map(holds, group)) for group in part.groups]
+    return reduce(join, free) if free else None
 
 
 def example_boxes() -> tuple[str, ...]:
@@ -221,9 +220,9 @@ def find_lockbox(name: str) -> Lockbox | None:
     if name == "thesis":
         return THESIS
     rings = name.removeprefix("rings-")
-    if rings != name and _is_number(rings) and 1 <= int(rings) <= _MOST_RINGS:
+    if rings != name and is_seed(rings) and 1 <= int(rings) <= _MOST_RINGS:
         return make_rings(int(rings))
-    if not _is_number(name):
+    if not is_seed(name):
         return None
     seed = int(name)
     return draw_lockbox(int(np.random.default_rng(seed).integers(*_PARTS)), seed, negated=_NEGATED)
@@ -232,10 +231,6 @@ def find_lockbox(name: str) -> Lockbox | None:
 def has_lockbox(name: str) -> bool:
     """Return whether there is a box with a name."""
     return find_lockbox(name) is not None
-
-
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) <= _LARGEST_SEED and str(int(text)) == text
 
 
 def lockbox_operations(name: str, prefix: str | None = None) -> Iterator[Operation]:

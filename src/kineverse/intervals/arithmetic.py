@@ -117,9 +117,8 @@ def interval_unary(op: int, a: RealInterval) -> RealInterval:
         inside = k is not None and a[1] < (k + 0.5) * math.pi - 1e-12 and a[0] > (k - 0.5) * math.pi + 1e-12
         return _ends(math.tan, a) if inside else REALS
     if op == ca.OP_COSH:
-        return interval_unary(
-            ca.OP_SQRT, interval_add((1.0, 1.0), interval_square(interval_unary(ca.OP_SINH, a)))
-        )
+        square = interval_square(interval_unary(ca.OP_SINH, a))
+        return interval_unary(ca.OP_SQRT, interval_add((1.0, 1.0), square))
     if op == ca.OP_FABS:
         return max(0.0, a[0], -a[1]), max(-a[0], a[1])
     return REALS
@@ -155,20 +154,15 @@ def interval_polynomial(coefficients: tuple[float, ...], a: RealInterval) -> Rea
     """Return an enclosure of the range of a polynomial, constant coefficient first, by Horner's scheme."""
     result = ZERO_INTERVAL
     for coefficient in reversed(coefficients):
-        result = (
-            interval_add(interval_multiply(result, a), (coefficient, coefficient))
-            if result != ZERO_INTERVAL
-            else (coefficient,) * 2
-        )
+        point = coefficient, coefficient
+        result = point if result == ZERO_INTERVAL else interval_add(interval_multiply(result, a), point)
     return result
 
 
 def _pow(x: float, y: float) -> float:
     try:
         return math.pow(x, y)
-    except OverflowError:
-        return math.inf
-    except ValueError:  # 0 to a negative power
+    except (OverflowError, ValueError):  # 0 to a negative power is a ValueError
         return math.inf
 
 

@@ -97,7 +97,10 @@ class Enclosures:
                 continue
             seen.add(term.index)
             if term.op == ca.OP_CONST:
-                self._constants[term.index] = _constant(term)
+                finite = math.isfinite(term.data)
+                self._constants[term.index] = (
+                    taylor_constant(term.data) if finite else ((term.data, term.data),)
+                )
             else:
                 order.append(term)
         return order
@@ -163,9 +166,8 @@ class _Solver:
         there: list[TaylorSeries] = [((float(v), float(v)),) for v in x]
         here: list[TaylorSeries] = [((u, u),) for u in middle]
         *slopes, residual = self._ranges([*self._slopes, *self._equations], there, here, n)
-        slope, by_inputs = np.split(
-            np.array([[_middle(s) for s in column] for column in slopes]).T, [n], axis=1
-        )
+        middles = np.array([[_middle(s) for s in column] for column in slopes]).T
+        slope, by_inputs = middles[:, :n], middles[:, n:]
         if not (np.isfinite(slopes).all() and np.linalg.cond(slope) < _REGULAR):
             return None
         inverse: Array = np.asarray(np.linalg.inv(slope), dtype=np.float64)
@@ -174,10 +176,8 @@ class _Solver:
         straight = _multiply_column(tangent, away)
         radius = [1e-14] * n
         for _ in range(_ATTEMPTS):
-            box = [
-                interval_add(round_outwards(float(v) - r, float(v) + r), along)
-                for v, r, along in zip(x, radius, straight, strict=True)
-            ]
+            around = (round_outwards(float(v) - r, float(v) + r) for v, r in zip(x, radius, strict=True))
+            box = [interval_add(near, along) for near, along in zip(around, straight, strict=True)]
             points: list[TaylorSeries] = [(b,) for b in box]
             wide: list[TaylorSeries] = [(u,) for u in inputs]
             columns = self._ranges(self._slopes, points, wide, n)
@@ -242,10 +242,6 @@ def _multiply_column(matrix: Array, column: list[RealInterval]) -> list[RealInte
             total = interval_add(total, interval_multiply((entry, entry), value))
         result.append(total)
     return result
-
-
-def _constant(term: Term) -> TaylorSeries:
-    return taylor_constant(term.data) if math.isfinite(term.data) else ((term.data, term.data),)
 
 
 _RATIONAL: dict[object, Callable[..., TaylorSeries]] = {
@@ -335,9 +331,8 @@ def enclose_bound(bound: Expression, box: Mapping[Symbol, RealInterval]) -> Real
     count = _PIECES.get(len(symbols), 1)
     result: RealInterval | None = None
     for piece in product(*(_divide(side, count) for side in sides)):
-        (((low, high), *_),) = enclosures.enclose(
-            [root], {s: (x,) for s, x in zip(symbols, piece, strict=True)}
-        )
+        values = {s: (x,) for s, x in zip(symbols, piece, strict=True)}
+        (((low, high), *_),) = enclosures.enclose([root], values)
         here = -math.inf if math.isnan(low) else low, math.inf if math.isnan(high) else high
         result = here if result is None else interval_hull(result, here)
         if result == REALS:

@@ -174,9 +174,8 @@ class TermGraph:
         if isinstance(node, Select):
             return self._step("select", args, deciders=(self.subtract(args[0], self.constant(0.5)),))
         if isinstance(node, Piecewise):
-            ends = (
-                () if node.periodic else tuple(self.subtract(args[0], self.constant(t)) for t in node.knots)
-            )
+            knots = () if node.periodic else node.knots
+            ends = tuple(self.subtract(args[0], self.constant(t)) for t in knots)
             return self._step("piecewise", args, (node.periodic, node.knots, node.pieces), ends)
         op = ca.OP_FMIN if node.options[0] == "min" else ca.OP_FMAX
         result = args[0]

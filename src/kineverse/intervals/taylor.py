@@ -182,11 +182,15 @@ def _with_value(a: TaylorSeries, value: RealInterval) -> TaylorSeries:
 
 
 def _dot(
-    a: TaylorSeries | list[RealInterval], b: TaylorSeries | list[RealInterval], start: int, k: int
+    a: TaylorSeries | list[RealInterval],
+    b: TaylorSeries | list[RealInterval],
+    start: int,
+    k: int,
+    last: bool = True,
 ) -> RealInterval:
-    """Return Σ a_i b_k-i for i from ``start`` to k."""
+    """Return Σ a_i b_k-i for i from ``start`` to k, or to k - 1."""
     total = ZERO_INTERVAL
-    for i in range(start, k + 1):
+    for i in range(start, k + last):
         if a[i] != ZERO_INTERVAL and b[k - i] != ZERO_INTERVAL:
             product = interval_multiply(a[i], b[k - i])
             total = product if total == ZERO_INTERVAL else interval_add(total, product)
@@ -199,9 +203,8 @@ def _weighted(
     """Return Σ i a_i b_k-i for i from 1 to k, or to k - 1."""
     total = ZERO_INTERVAL
     for i in range(1, k + last):
-        total = interval_add(
-            total, interval_multiply((float(i), float(i)), interval_multiply(a[i], b[k - i]))
-        )
+        product = interval_multiply(a[i], b[k - i])
+        total = interval_add(total, interval_multiply((float(i), float(i)), product))
     return total
 
 
@@ -224,17 +227,9 @@ def _root(a: TaylorSeries, value: RealInterval) -> TaylorSeries:
     twice = interval_reciprocal(interval_multiply((2.0, 2.0), value))
     result = [value]
     for k in range(1, len(a)):
-        rest = interval_add(a[k], interval_negate(_inner(result, k)))
+        rest = interval_add(a[k], interval_negate(_dot(result, result, 1, k, last=False)))
         result.append(interval_multiply(rest, twice))
     return tuple(result)
-
-
-def _inner(result: list[RealInterval], k: int) -> RealInterval:
-    """Return Σ c_i c_k-i for i from 1 to k - 1."""
-    total = ZERO_INTERVAL
-    for i in range(1, k):
-        total = interval_add(total, interval_multiply(result[i], result[k - i]))
-    return total
 
 
 def _integrate(value: RealInterval, a: TaylorSeries, divisor: TaylorSeries) -> TaylorSeries:

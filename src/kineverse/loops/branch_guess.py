@@ -211,10 +211,8 @@ class BranchSamples:
         inside = np.ones(len(everywhere), dtype=bool)
         for column, limit in zip(everywhere.T, limits, strict=True):
             inside &= (column >= limit.lower) & (column <= limit.upper)
-        values = np.array(
-            [self._singular_values(q, s) for q, s in zip(everywhere[inside], solutions[inside], strict=True)]
-        )
-        ratios = values[:, -1] / np.maximum(values[:, 0], 1e-30)
+        points = zip(everywhere[inside], solutions[inside], strict=True)
+        ratios = np.array([regularity(equations, s, self.all_inputs(q)) for q, s in points])
         self.condition = float(ratios.min())
         self.worst = everywhere[inside][int(ratios.argmin())]
 
@@ -233,10 +231,8 @@ class BranchSamples:
         reached = continue_solution(self.equations, x, *inputs, first_step)
         if reached.part < 1.0:
             there = start + reached.part * (end - start)
-            at, to = (
-                format_point(self.equations.inputs, there),
-                format_point(self.equations.inputs, end, named=False),
-            )
+            at = format_point(self.equations.inputs, there)
+            to = format_point(self.equations.inputs, end, named=False)
             raise NoSolutionError(
                 f"Loop '{self.name}' does not close between home and {to}: it ends, or is singular, at {at}. "
                 "Narrow the limits, or the loop's within={...}, so that it closes everywhere."
@@ -254,9 +250,8 @@ class BranchSamples:
         while len(left):
             position = int(distance[left].argmin())
             i, left = left[position], np.delete(left, position)
-            solutions[i] = self._continue(
-                solutions[nearest[i]], points[nearest[i]], points[i], first_step=1.0
-            )
+            begin = nearest[i]
+            solutions[i] = self._continue(solutions[begin], points[begin], points[i], first_step=1.0)
             closer = np.abs((points - points[i]) / scale).max(axis=1, initial=0.0)
             better = closer < distance
             nearest[better], distance[better] = i, closer[better]
@@ -282,9 +277,11 @@ class BranchSamples:
             winding[k] = np.where(self._angles, np.round(grown), lengths)
         return winding
 
-    def _singular_values(self, q: Array, x: Array) -> Array:
-        by_x = self.equations(x, self.all_inputs(q))[1]
-        return np.linalg.svd(by_x, compute_uv=False).astype(np.float64)
+
+def regularity(equations: Equations, x: Array, u: Array) -> float:
+    """Return the ratio of the smallest to the largest singular value of ∂r/∂x."""
+    values = np.linalg.svd(equations(x, u)[1], compute_uv=False)
+    return float(values[-1] / max(values[0], 1e-30))
 
 
 def format_point(symbols: Sequence[Symbol], values: Array, named: bool = True) -> str:

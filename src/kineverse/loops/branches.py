@@ -35,12 +35,8 @@ def find_branches(
     smallest = np.inf
     for start in starts:
         x, gap = equations.close(start, u, 60)
-        if (
-            gap <= CLOSURE_TOLERANCE
-            and upright is not None
-            and not np.all(upright(np.concatenate([x, u])) > 0)
-        ):
-            gap = np.pi
+        if gap <= CLOSURE_TOLERANCE and upright is not None:
+            gap = gap if np.all(upright(np.concatenate([x, u])) > 0) else np.pi
         smallest = min(smallest, gap)
         if gap > CLOSURE_TOLERANCE:
             continue
@@ -126,7 +122,9 @@ def continue_solution(
         # Near a singularity the tangent is unreliable, but such short steps stay on the branch.
         if near or (step <= _SHORTEST and gap < CLOSURE_TOLERANCE and wrong < 0.05):
             _, next_by_x, next_by_u = equations(result, u)
-            if step == 1.0 and _change(by_x, next_by_x) > _LITTLE:
+            # Below a norm of 1, nothing between the two is singular.
+            change = least_squares(by_x, next_by_x - by_x) if step == 1.0 else np.zeros(1)
+            if np.linalg.norm(change) > _LITTLE:
                 step = FIRST_STEP
                 continue
             x, done, by_x, by_u = result, done + step, next_by_x, next_by_u
@@ -136,8 +134,3 @@ def continue_solution(
         else:
             return ContinuationResult(x, done)
     return ContinuationResult(x, 1.0)
-
-
-def _change(J: Array, other: Array) -> float:
-    """Return the norm of J⁺(other - J); below 1, nothing between the two is singular."""
-    return float(np.linalg.norm(least_squares(J, other - J)))

@@ -106,9 +106,8 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
         if isinstance(self.dependent, list):
             object.__setattr__(self, "dependent", tuple(self.dependent))
         if isinstance(self.branch, bool) or not isinstance(self.branch, int):
-            raise InvalidValueError(
-                f"The branch of loop '{self.name}' is a number from 0, not {self.branch!r}."
-            )
+            what = f"The branch of loop '{self.name}'"
+            raise InvalidValueError(f"{what} is a number from 0, not {self.branch!r}.")
         if isinstance(self.dependent, str):
             object.__setattr__(self, "dependent", (self.dependent,))
         try:
@@ -129,9 +128,8 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
                 raise InvalidValueError(f"Loop '{self.name}' cannot begin at {k} = {v}.")
         for k, a, b in self.within:
             if not a <= b:
-                raise InvalidValueError(
-                    f"Loop '{self.name}' cannot be used within {a} <= {k} <= {b}: no value lies there."
-                )
+                where = f"within {a} <= {k} <= {b}: no value lies there"
+                raise InvalidValueError(f"Loop '{self.name}' cannot be used {where}.")
 
     def default_tag(self) -> str:
         """Return ``loop`` and the name."""
@@ -139,16 +137,10 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the expressions of the dependent coordinates."""
-        if self.name in model.articulations:
-            raise DuplicateNameError(
-                f"There is an articulation '{self.name}' already; give loop '{self.name}' another name."
-            )
+        _check_name(model, self.name)
         residual = array([row for frame, to in self._ends for row in self._rows(model, frame, to)])
-        signs = [
-            sign
-            for frame, to in self._ends
-            for sign in upright_signs(model.resolve(model.fk(frame, to)), self.mask)
-        ]
+        poses = [model.resolve(model.fk(frame, to)) for frame, to in self._ends]
+        signs = [sign for pose in poses for sign in upright_signs(pose, self.mask)]
         moving = {s for s in residual.symbols if s.has_derivative}
         on_the_way = [s for frame, to in self._ends for s in model.coordinates_between(frame, to)]
         coordinates = list(dict.fromkeys([s for s in on_the_way if s in moving] + sorted(moving, key=str)))
@@ -162,18 +154,11 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
             a, b = limits.get(s, (-math.inf, math.inf))
             home[s] = min(max(self._rest(model, s), a), b)
         home.update({by_name[n]: v for n, v in self._known(self.home, by_name)})
-        closed = solve_loop(
-            self.name,
-            residual,
-            coordinates,
-            home,
-            limits,
-            dependent=None
-            if self.dependent is None
-            else [by_name[n] for (n,) in self._known([(n,) for n in self.dependent], by_name)],
-            branch=self.branch,
-            upright=array(signs) if signs else None,
-        )
+        dependent = None
+        if self.dependent is not None:
+            dependent = [by_name[n] for (n,) in self._known([(n,) for n in self.dependent], by_name)]
+        upright, parts = array(signs) if signs else None, (residual, coordinates, home, limits)
+        closed = solve_loop(self.name, *parts, dependent=dependent, branch=self.branch, upright=upright)
         self._check(model, closed)
         solution = closed.function.apply(closed.function.inputs)
         return Writes(
@@ -216,9 +201,8 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
                     f"along '{axis}', whatever moves."
                 )
         if not kept:
-            raise ModelError(
-                f"Loop '{self.name}' is closed already: nothing of '{frame}' that its mask names moves."
-            )
+            reason = f"nothing of '{frame}' that its mask names moves"
+            raise ModelError(f"Loop '{self.name}' is closed already: {reason}.")
         return kept
 
     def _limits(self, model: ReadRecorder, symbol: Symbol) -> tuple[float, float] | None:
@@ -241,10 +225,15 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
     def _known(self, items: Iterable[_Item], by_name: Mapping[str, Symbol]) -> Iterator[_Item]:
         for item in items:
             if item[0] not in by_name:
-                raise InvalidValueError(
-                    f"Loop '{self.name}' is not about '{item[0]}', only about {', '.join(by_name)}."
-                )
+                known = ", ".join(by_name)
+                raise InvalidValueError(f"Loop '{self.name}' is not about '{item[0]}', only about {known}.")
             yield item
+
+
+def _check_name(model: ReadRecorder, name: str) -> None:
+    if name in model.articulations:
+        told = f"There is an articulation '{name}' already"
+        raise DuplicateNameError(f"{told}; give loop '{name}' another name.")
 
 
 APART = 1e-9  # largest residual of a satisfied constant row [m], [rad]
@@ -295,18 +284,13 @@ class LoopConstraint(Operation, document_kind="LoopConstraint"):
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the constraints."""
-        if self.name in model.articulations:
-            raise DuplicateNameError(
-                f"There is an articulation '{self.name}' already; give loop '{self.name}' another name."
-            )
+        _check_name(model, self.name)
         constraints: dict[str, Constraint] = {}
         ends = ((self.frame, self.to), *self.more)
         for k, (frame, to) in enumerate(ends):
             constraints |= self._between(model, frame, to, f"{self.name}/{k}" if k else self.name)
-        return Writes(
-            constraints=constraints,
-            articulations={self.name: make_constrained_record(ends, self.mask, tuple(constraints))},
-        )
+        record = make_constrained_record(ends, self.mask, tuple(constraints))
+        return Writes(constraints=constraints, articulations={self.name: record})
 
     def _between(self, model: ReadRecorder, frame: str, to: str, name: str) -> dict[str, Constraint]:
         pose = model.fk(frame, to)

@@ -23,9 +23,8 @@ def as_mask(value: Any, name: str) -> tuple[str, ...]:
     """Convert a mask, a sequence or text of distinct names out of :data:`AXES`, to a tuple."""
     mask = tuple(value) if isinstance(value, list | tuple | str) else ()
     if not mask or not all(axis in AXES for axis in mask) or len(set(mask)) < len(mask):
-        raise InvalidValueError(
-            f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {value!r}."
-        )
+        known = ", ".join(AXES)
+        raise InvalidValueError(f"The mask of loop '{name}' has names out of {known}, not {value!r}.")
     return mask
 
 
@@ -34,9 +33,8 @@ def as_ends(value: Any, name: str) -> tuple[tuple[str, str], ...]:
     pairs = tuple(value) if isinstance(value, list | tuple) else (value,)
     for pair in pairs:
         if not isinstance(pair, list | tuple) or [type(end) for end in pair] != [str, str]:
-            raise InvalidValueError(
-                f"Loop '{name}' takes more=((frame, to), ...), pairs of names of frames, not {value!r}."
-            )
+            wanted = "more=((frame, to), ...), pairs of names of frames"
+            raise InvalidValueError(f"Loop '{name}' takes {wanted}, not {value!r}.")
     return tuple((frame, to) for frame, to in pairs)
 
 
@@ -141,10 +139,6 @@ class Equations:
             m = self._evaluate.outputs[0].size
             return np.full((len(x), m), np.inf), np.zeros((len(x), m, len(self.unknowns)))
         return residual, derivative[..., : len(self.unknowns)]
-
-    def gap(self, x: Array, u: Array) -> float:
-        """Return the norm of the residual."""
-        return float(np.linalg.norm(self(x, u)[0]))
 
     def close(self, x: Array, u: Array, steps: int = _NEWTON) -> tuple[Array, float]:
         """Return a solution near x, and the norm of its residual.

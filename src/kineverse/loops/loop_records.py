@@ -51,9 +51,8 @@ def make_constrained_record(
 ) -> Articulation:
     """Return the record of a loop with equality constraints."""
     frame, to = ends[0]
-    return Articulation(
-        CONSTRAINED_LOOP, to, frame, dynamics=(("ends", ends), ("mask", mask), ("constraints", constraints))
-    )
+    facts = ("ends", ends), ("mask", mask), ("constraints", constraints)
+    return Articulation(CONSTRAINED_LOOP, to, frame, dynamics=facts)
 
 
 def find_loops(model: ModelView) -> Iterator[LoopRecord]:

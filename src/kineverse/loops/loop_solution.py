@@ -17,7 +17,7 @@ from kineverse.expressions.implicit import ImplicitFunction
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .branch_guess import BranchGuess, BranchSamples, InputDomain, format_point, list_products
+from .branch_guess import BranchGuess, BranchSamples, InputDomain, format_point, list_products, regularity
 from .branches import continue_solution, find_branches, find_nearest_closed
 from .equations import CLOSURE_TOLERANCE, Equations, WorkBudget, find_periodic
 
@@ -106,7 +106,7 @@ def solve_loop(
     given = np.array([home[s] for s in parameters])
     effort = WorkBudget(name)
     unknown = Equations(residual, coordinates, parameters, effort)
-    if not np.isfinite(unknown.gap(values, given)):
+    if not np.isfinite(unknown(values, given)[0]).all():
         at = format_point(coordinates, values)
         raise NoSolutionError(f"Loop '{name}' is not defined at {at}. Begin elsewhere, with home={{...}}.")
     start, gap = find_nearest_closed(unknown, values, given)
@@ -134,12 +134,10 @@ def solve_loop(
             "Begin where it does, with home={...}."
         )
     if not 0 <= branch < len(result):
-        raise NoSolutionError(
-            f"Loop '{name}' has {len(result)} branches at {where}, numbered from 0, and none is {branch}."
-        )
-    intervals = [
-        _interval(name, s, limits.get(s), bool(turns)) for s, turns in zip(free, goes_round, strict=False)
-    ]
+        told = f"{len(result)} branches at {where}, numbered from 0, and none is {branch}"
+        raise NoSolutionError(f"Loop '{name}' has {told}.")
+    pairs = zip(free, goes_round, strict=False)
+    intervals = [_interval(name, s, limits.get(s), bool(turns)) for s, turns in pairs]
     sampled, seed, steps, rows = _fit_guess(name, equations, intervals, result[branch], u, angles)
     if parameters:
         # The guess is fitted for one value of the parameters only, so others need more steps.
@@ -173,9 +171,8 @@ def _choose_dependent(
     if dependent is not None:
         strange = [str(s) for s in dependent if s not in coordinates]
         if strange:
-            raise InvalidValueError(
-                f"Loop '{name}' is about {', '.join(map(str, coordinates))}, not about {', '.join(strange)}."
-            )
+            known = ", ".join(map(str, coordinates))
+            raise InvalidValueError(f"Loop '{name}' is about {known}, not about {', '.join(strange)}.")
         if len(set(dependent)) != rank:
             raise InvalidValueError(
                 f"Loop '{name}' makes {rank} of {len(coordinates)} coordinates follow the others "
@@ -205,9 +202,8 @@ def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, ang
     if angle and not upper - lower < 2 * np.pi:
         return InputDomain(-np.pi, np.pi, whole=True)
     if not (np.isfinite(lower) and np.isfinite(upper)):
-        raise InvalidValueError(
-            f"Loop '{name}' needs limits of '{symbol}': give the joint limits, or the loop within={{...}}."
-        )
+        hint = "give the joint limits, or the loop within={...}"
+        raise InvalidValueError(f"Loop '{name}' needs limits of '{symbol}': {hint}.")
     return InputDomain(float(lower), float(upper))
 
 
@@ -272,19 +268,13 @@ def _margin_fractions(
             if part < 1.0:
                 # Branches meet at a dead centre; an earlier loop may end without one.
                 stop = there + part * (beyond - there)
-                meet = _regularity(equations, reached.solution, stop) < 0.5 * _regularity(
-                    equations, at_edge, there
+                left, before = (
+                    regularity(equations, *p) for p in ((reached.solution, stop), (at_edge, there))
                 )
-                part *= _BEFORE_MEETING if meet else _BEFORE_ENDING
+                part *= _BEFORE_MEETING if left < 0.5 * before else _BEFORE_ENDING
             parts.append(part)
         reaches.append((parts[0], parts[1]))
     return reaches
-
-
-def _regularity(equations: Equations, x: Array, u: Array) -> float:
-    """Return the ratio of the smallest to the largest singular value of ∂r/∂x."""
-    values = np.linalg.svd(equations(x, u)[1], compute_uv=False)
-    return float(values[-1] / max(values[0], 1e-30))
 
 
 def _choose_guess(name: str, samples: BranchSamples) -> tuple[BranchGuess, int, tuple[int, ...]]:
@@ -326,10 +316,8 @@ def _rows(samples: BranchSamples) -> tuple[int, ...]:
     equations = samples.equations
     n = len(equations.unknowns)
     every = max(1, len(samples.inputs) // 40)
-    matrices = [
-        equations(x, samples.all_inputs(q))[1]
-        for q, x in zip(samples.inputs[::every], samples.solutions[::every], strict=True)
-    ]
+    points = zip(samples.inputs[::every], samples.solutions[::every], strict=True)
+    matrices = [equations(x, samples.all_inputs(q))[1] for q, x in points]
     m = matrices[0].shape[0]
     if m == n:
         return tuple(range(n))

@@ -151,7 +151,7 @@ COLLECTIONS: Mapping[str, ModelCollection] = {
         "kineverse.gallery.kitchens:example_seeds",
         summary="one for each seed from 0 on",
         build="kineverse.gallery.kitchens:kitchen_operations",
-        accept="kineverse.gallery.kitchens:is_seed",
+        accept="kineverse.gallery:is_seed",
         prefix="kitchen",
     ),
     "lockboxes": ModelCollection(

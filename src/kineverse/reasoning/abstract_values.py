@@ -221,9 +221,8 @@ def _unary(term: Term, a: AbstractValue, sign: Signs, live: frozenset[Symbol]) -
     assert isinstance(op, int)
     turn = sign(term.args[0]) if op == ca.OP_FABS else None
     if op == ca.OP_NEG or turn == -1:
-        return AbstractValue(
-            interval_negate(a.range), None if a.polynomial is None else a.polynomial.scale(-1), live
-        )
+        exact = None if a.polynomial is None else a.polynomial.scale(-1)
+        return AbstractValue(interval_negate(a.range), exact, live)
     if op == ca.OP_ASSIGN or turn is not None:
         return a
     low, high = DOMAINS.get(op, REALS)
@@ -261,9 +260,8 @@ def _product(a: AbstractValue, b: AbstractValue, same: bool, live: frozenset[Sym
     exact = None
     if a.polynomial is not None and b.polynomial is not None:
         exact = a.polynomial.multiply(b.polynomial)
-    return AbstractValue(
-        interval_square(a.range) if same else interval_multiply(a.range, b.range), exact, live
-    )
+    span = interval_square(a.range) if same else interval_multiply(a.range, b.range)
+    return AbstractValue(span, exact, live)
 
 
 def _quotient(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozenset[Symbol]) -> AbstractValue:
@@ -327,9 +325,9 @@ def _piecewise(term: Term, x: AbstractValue, values: dict[int, AbstractValue], s
 def _polynomial_of(piece: tuple[float, ...], start: float, x: AbstractValue) -> AbstractValue:
     s = (x.range[0] - start, x.range[1] - start)
     span = interval_polynomial(piece, round_outwards(*s))
-    exact: Polynomial | None = None
     if not any(piece[1:]):
         return from_number(piece[0])
+    exact: Polynomial | None = None
     if x.polynomial is not None:
         distance = x.polynomial - Polynomial.constant(start)
         exact = Polynomial.constant(piece[-1])

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from typing import TypeVar
 
 import casadi as ca
@@ -44,13 +45,9 @@ class Case:
         self._signs = dict(signs or {})
         self._found: dict[int, int | None] = {}
         self._roots = roots
-        places = {
-            **domain.limits,
-            **{axis[0][0]: side for axis, side in self._axes.items() if len(axis) == 1},
-        }
-        self._pinned = {
-            s: Fraction(i.lower) for s, i in places.items() if i.lower == i.upper and not math.isinf(i.lower)
-        }
+        own = {axis[0][0]: side for axis, side in self._axes.items() if len(axis) == 1}
+        places = ((s, i.lower) for s, i in ({**domain.limits, **own}).items() if i.lower == i.upper)
+        self._pinned = {s: Fraction(x) for s, x in places if not math.isinf(x)}
         self._order = reachable_terms(roots) if order is None else order
         self.values: dict[int, AbstractValue] = {}
         for term in self._order:
@@ -240,10 +237,8 @@ class Case:
         side = self.interval(axis)
         if p is not None:
             coefficients = p.coefficients()
-            result = exact.roots(coefficients, side)
-            return self._divide(
-                term, axis, result, _CLOSE_ROOTS, lambda x: exact.evaluate_polynomial(coefficients, x)
-            )
+            at = partial(exact.evaluate_polynomial, coefficients)
+            return self._divide(term, axis, exact.roots(coefficients, side), _CLOSE_ROOTS, at)
         order = reachable_terms((term,))
 
         def ranges(low: float, high: float) -> tuple[RealInterval, RealInterval | None]:

@@ -288,14 +288,11 @@ def make_graph(
         both = []
         for direction, name in ((1, "up"), (-1, "down")):
             about = [(r, m) for r, m in held[symbol] if r.direction == name]
-            both.append(
-                tuple(
-                    None
-                    if symbol in fixed
-                    else _make_step(cells[k], n, direction, whole[k], first[k], about, entered[symbol])
-                    for n in range(len(cells[k]))
-                )
-            )
+            row: list[CellStep | None] = [None] * len(cells[k])
+            if symbol not in fixed:
+                for n in range(len(row)):
+                    row[n] = _make_step(cells[k], n, direction, whole[k], first[k], about, entered[symbol])
+            both.append(tuple(row))
         steps.append((both[0], both[1]))
     return CellGraph(
         tuple(coordinates),
@@ -340,10 +337,9 @@ def _make_step(
 def _needs_cut(cells: Sequence[Interval], limit: Interval, start: float, goal: float) -> bool:
     """Return whether being in the cell of a goal is less than being able to reach it."""
     cell = next(cell for cell in cells if goal in cell)
-    inner_end = (cell.lower_closed and cell.lower != limit.lower) or (
-        cell.upper_closed and cell.upper != limit.upper
-    )
-    return cell.lower < cell.upper and (inner_end or (start in cell and start != goal))
+    inner_low = cell.lower_closed and cell.lower != limit.lower
+    inner_high = cell.upper_closed and cell.upper != limit.upper
+    return cell.lower < cell.upper and (inner_low or inner_high or (start in cell and start != goal))
 
 
 def _may_rest(cells: Sequence[Interval], n: int, sides: Sequence[Interval]) -> bool:
@@ -351,18 +347,17 @@ def _may_rest(cells: Sequence[Interval], n: int, sides: Sequence[Interval]) -> b
     if cells[n].lower < cells[n].upper or not 0 < n < len(cells) - 1:
         return True
     beside = (cells[n - 1], cells[n + 1])
-    return any(not side.covers(cells[n]) and any(map(side.covers, beside)) for side in sides) or any(
-        side.covers(cells[n]) and side.lower == side.upper for side in sides
+    return any(
+        side.lower == side.upper if side.covers(cells[n]) else any(map(side.covers, beside)) for side in sides
     )
 
 
 def _divide(limit: Interval, sides: Sequence[Interval]) -> tuple[Interval, ...]:
     """Return the cells of a range: within each one, every side holds everywhere or nowhere."""
-    cuts = sorted(
-        {float(x) for side in (limit, *sides) for x in (side.lower, side.upper) if abs(x) != float("inf")}
-    )
+    ends = {float(x) for side in (limit, *sides) for x in (side.lower, side.upper)}
+    cuts = sorted(filter(math.isfinite, ends))
     pieces = [Interval(upper=cuts[0])] if cuts else [Interval()]
-    for low, high in pairwise([*cuts, float("inf")]):
+    for low, high in pairwise([*cuts, math.inf]):
         pieces += [Interval(low, low, True, True), Interval(low, high)]
     pieces = [piece for piece in pieces if limit.covers(piece)]
     joined: list[Interval] = []

@@ -35,15 +35,14 @@ def express_bound(case: Case, term: Term, names: Mapping[int, Symbol]) -> Expres
             result[part.index] = _sum_of(value.polynomial)
         elif part.index in names:
             result[part.index] = names[part.index]
-        elif part.op != "implicit" and part.op != ca.OP_CONST:
-            chosen = live_arguments(part, case.values, case.sign)
-            result[part.index] = _step(part, chosen, result)
         elif part.op == ca.OP_CONST:
             result[part.index] = as_expression(part.data)
-        else:
+        elif part.op == "implicit":
             node, element = part.data
-            whole = node.value
-            result[part.index] = whole if not whole.shape else whole.ravel()[element]
+            result[part.index] = node.value.ravel()[element] if node.value.shape else node.value
+        else:
+            chosen = live_arguments(part, case.values, case.sign)
+            result[part.index] = _step(part, chosen, result)
     return result[term.index]
 
 
@@ -207,9 +206,8 @@ def _ramp_reason(case: Case, terms: tuple[Term, ...]) -> str | None:
     """Return the reason for an unknown sign if a smooth step is on its ramp, else None."""
     for term in reachable_terms(terms):
         if term.op == "less" and len(term.deciders) == 2 and case.value(term).range == (0.0, 1.0):
-            return (
-                f"a comparison of contrast {term.data:g} is on its ramp, {2 * SATURATED / term.data:g} wide"
-            )
+            width = 2 * SATURATED / term.data
+            return f"a comparison of contrast {term.data:g} is on its ramp, {width:g} wide"
     return None
 
 
@@ -283,9 +281,8 @@ def find_position_effects(
     elif moves:
         result += _find_effects(query, constraint.expression, lower, upper)
     elif len(constraint.expression.symbols) > 1:
-        result += _joint_limit_effects(
-            query, constraint, terms.term(apply_substitution(constraint.expression, dependent))
-        )
+        whole = terms.term(apply_substitution(constraint.expression, dependent))
+        result += _joint_limit_effects(query, constraint, whole)
     return result
 
 
@@ -302,9 +299,8 @@ def _joint_limit_effects(query: _Query, constraint: Constraint, expression: Term
         if low <= least and most <= high:
             return []
         if most < low or high < least:
-            return [
-                PositionEffect(constraint.expression, "has no value", (IntervalBox({}),), None, None, None)
-            ]
+            everywhere = (IntervalBox({}),)
+            return [PositionEffect(constraint.expression, "has no value", everywhere, None, None, None)]
     p = value.polynomial
     sphere = query.domain.sphere(value.live)
     if p is not None and query.domain.form_range(p) is not None:
@@ -357,9 +353,8 @@ def _join_points(groups: dict[tuple[Hold, Expression, Expression], list[_Leaf]])
     """Move leaves at single values into a group whose bounds are equal there."""
     for (hold, lower, upper), leaves in list(groups.items()):
         for leaf in [] if hold != "stays within" else list(leaves):
-            at = {
-                s: float(i.lower) for s, i in leaf.box.items() if isinstance(s, Symbol) and i.lower == i.upper
-            }
+            points = ((s, i.lower) for s, i in leaf.box.items() if i.lower == i.upper)
+            at = {s: float(x) for s, x in points if isinstance(s, Symbol)}
             for other in groups if at else ():
                 bounds = zip((lower, upper), other[1:], strict=True)
                 if other[0] == hold and other[1:] != (lower, upper) and all(_agree(*b, at) for b in bounds):
@@ -404,9 +399,8 @@ def _leaves(query: _Query, low: Term, high: Term, limit: Interval) -> Iterator[_
     start = Case((*bounds, *compared.values()), query.domain)
     for case, answer in distinguish(start, ask):
         if not isinstance(answer, dict):
-            query.unknown.append(
-                (answer.reason if isinstance(answer, Unanswered) else str(answer), case.box())
-            )
+            reason = answer.reason if isinstance(answer, Unanswered) else str(answer)
+            query.unknown.append((reason, case.box()))
             continue
         lower, upper = (express_bound(case, bound, query.names) for bound in bounds)
         tighter = (answer.get("low above", 1) > 0, answer.get("high below", 1) > 0)

@@ -37,9 +37,8 @@ Box = Mapping[Symbol, RealInterval]
 
 @dataclass(frozen=True)
 class _Row:
-    """Terms of a constraint, and the symbols of each."""
+    """Terms of a constraint, and their symbols."""
 
-    order: int
     lower: Term | float
     value: Term
     upper: Term | float
@@ -86,9 +85,9 @@ class ConstraintRanges:
             return True
         if all(self.excess(name, moving)[1] <= NOTHING for name in names):
             return False
-        sides = {
-            s: self._pieces(s, self._side(box, s), names, start.get(s)) for s in self._symbols_within(names)
-        }
+        symbols = {s for name in names for s in self._row(name).symbols if not s.order}
+        ordered = sorted(symbols, key=lambda s: s.sort_key)
+        sides = {s: self._pieces(s, self._side(box, s), names, start.get(s)) for s in ordered}
         if math.prod(map(len, sides.values())) > _MOST_PIECES:
             return False
         return all(
@@ -98,10 +97,6 @@ class ConstraintRanges:
             )
             for piece in product(*sides.values())
         )
-
-    def _symbols_within(self, names: Iterable[str]) -> list[Symbol]:
-        result = {s for name in names for s in self._row(name).symbols}
-        return sorted((s for s in result if not s.order), key=lambda s: s.sort_key)
 
     def _pieces(
         self, symbol: Symbol, side: RealInterval, names: Iterable[str], start: float | None
@@ -175,7 +170,7 @@ class ConstraintRanges:
             value = self._graph.term(self._follow(row.expression))
             own = (s for s in self._symbols_of(row) if s.value is None)
             symbols = tuple(sorted(own, key=lambda s: s.sort_key))
-            self._known[name] = _Row(row.order, ends[0], value, ends[1], symbols)
+            self._known[name] = _Row(ends[0], value, ends[1], symbols)
         return self._known[name]
 
     def _follow(self, expression: Expression) -> Expression:

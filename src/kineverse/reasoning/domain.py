@@ -19,14 +19,13 @@ from kineverse.intervals.arithmetic import RealInterval
 from kineverse.intervals.graph import Term, TermGraph, reachable_terms
 from kineverse.symbols import Symbol, position
 
-from .boxes import Interval, IntervalBox, wrap_to_turn
+from .boxes import EVERYTHING, Interval, IntervalBox, wrap_to_turn
 from .polynomial import Monomial, Polynomial
 
 UnitSphere = tuple[Symbol, ...]  # coordinates whose squares have the sum 1, such as a unit quaternion
 
 _WHOLE = Interval(-1.0, 1.0, True, True)
 _ROUNDING = 1e-12
-EVERYWHERE = Interval()
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class Domain:
 
     def limits_of(self, symbol: Symbol) -> Interval:
         """Return the interval in which a symbol lies."""
-        limit = self.limits.get(symbol, EVERYWHERE)
+        limit = self.limits.get(symbol, EVERYTHING)
         return limit.intersection(_WHOLE) if symbol in self._on_sphere else limit
 
     def sphere(self, symbols: Iterable[Symbol]) -> UnitSphere | None:
@@ -110,17 +109,15 @@ class PeriodicCoordinates:
 
     def restore_box(self, box: IntervalBox) -> IntervalBox:
         """Return a box in terms of the original coordinates."""
-        return IntervalBox({self._restore_axis(axis): side for axis, side in box.items()})
+        wraps = {inner: wrap_to_turn(s) for inner, s in self._originals.items()}
+        return IntervalBox(
+            {wraps.get(axis, axis) if isinstance(axis, Symbol) else axis: side for axis, side in box.items()}
+        )
 
     def restore_expression(self, expression: Expression) -> Expression:
         """Return an expression in the original coordinates."""
-        return apply_substitution(
-            expression, {s: e for s, e in self._originals.items() if s in expression.symbols}
-        )
-
-    def _restore_axis(self, axis: Expression) -> Expression:
-        original = self._originals.get(axis) if isinstance(axis, Symbol) else None
-        return axis if original is None else wrap_to_turn(original)
+        inside = {s: e for s, e in self._originals.items() if s in expression.symbols}
+        return apply_substitution(expression, inside)
 
 
 def is_periodic(expressions: Sequence[Expression], symbol: Symbol) -> bool:
@@ -135,9 +132,8 @@ def _turn_counts(expression: Expression, moving: Mapping[Symbol, Fraction]) -> l
     result: dict[int, TurnCount] = {}
     for term in reachable_terms(roots):
         args = [result[a.index] for a in term.args]
-        result[term.index] = (
-            moving.get(term.data, UNCHANGED) if term.op == ca.OP_PARAMETER else _turn_count(term, args)
-        )
+        free = term.op == ca.OP_PARAMETER
+        result[term.index] = moving.get(term.data, UNCHANGED) if free else _turn_count(term, args)
     return [result[term.index] for term in roots]
 
 
@@ -159,11 +155,8 @@ def _turn_count(term: Term, args: list[TurnCount]) -> TurnCount:
     if term.op == "piecewise":
         periodic, knots, _ = term.data
         periods = float(known[0]) * math.tau / (knots[-1] - knots[0])
-        return (
-            UNCHANGED
-            if periodic and abs(periods - round(periods)) <= _SAME * max(1.0, abs(periods))
-            else None
-        )
+        whole = abs(periods - round(periods)) <= _SAME * max(1.0, abs(periods))
+        return UNCHANGED if periodic and whole else None
     if term.op == "implicit":
         node, element = term.data
         count: TurnCount = _loop_turn_counts(node.function, tuple(known))[element]
@@ -172,12 +165,11 @@ def _turn_count(term: Term, args: list[TurnCount]) -> TurnCount:
 
 
 def _scale_count(term: Term, known: list[Fraction]) -> TurnCount:
-    for moving, factor in ((0, 1), (1, 0)) if term.op == ca.OP_MUL else ((0, 1),):
+    product = term.op == ca.OP_MUL
+    for moving, factor in ((0, 1), (1, 0)) if product else ((0, 1),):
         number = term.args[factor].data
         if term.args[factor].op == ca.OP_CONST and math.isfinite(number) and number:
-            return (
-                known[moving] * Fraction(number) if term.op == ca.OP_MUL else known[moving] / Fraction(number)
-            )
+            return known[moving] * (Fraction(number) if product else 1 / Fraction(number))
     return None
 
 

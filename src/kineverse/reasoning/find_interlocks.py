@@ -103,20 +103,15 @@ def _find_periodic(
     ends += [apply_substitution(bare.expression, dependent)] if bare.order else []
     free = {s for end in ends for s in end.symbols if s.has_derivative and not s.order} - given.keys()
     unlimited = (s for s in sorted(free, key=str) if domain.limits_of(s).is_everything)
-    return PeriodicCoordinates(
-        s for s in unlimited if (bare.order or s not in inner) and is_periodic(ends, s)
-    )
+    allowed = (s for s in unlimited if bare.order or s not in inner)
+    return PeriodicCoordinates(s for s in allowed if is_periodic(ends, s))
 
 
 def _restore_coordinates(found: ConstraintEffects, periodic: PeriodicCoordinates) -> ConstraintEffects:
     speed = found.speed
     if speed is not None:
-        for region in (
-            speed.blocks_increase,
-            speed.blocks_decrease,
-            speed.forces_decrease,
-            speed.forces_increase,
-        ):
+        blocks = speed.blocks_increase, speed.blocks_decrease
+        for region in (*blocks, speed.forces_decrease, speed.forces_increase):
             region.boxes[:] = map(periodic.restore_box, region.boxes)
             region.reported[:] = map(periodic.restore_box, region.reported)
     positions = [
@@ -128,9 +123,8 @@ def _restore_coordinates(found: ConstraintEffects, periodic: PeriodicCoordinates
         )
         for k in found.positions
     ]
-    return ConstraintEffects(
-        speed, positions, [(reason, periodic.restore_box(box)) for reason, box in found.unknown]
-    )
+    unknown = [(reason, periodic.restore_box(box)) for reason, box in found.unknown]
+    return ConstraintEffects(speed, positions, unknown)
 
 
 def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = None) -> Interlocks:
@@ -216,17 +210,15 @@ def _may_lock(constraint: Constraint) -> bool:
         return True
     if not constraint.order:
         return len(to_plain(constraint.expression).symbols) > 1
-    return not float(constraint.lower) < 0 < float(constraint.upper) or not isinstance(
-        to_plain(constraint.expression), Symbol
-    )
+    around_zero = float(constraint.lower) < 0 < float(constraint.upper)
+    return not (around_zero and isinstance(to_plain(constraint.expression), Symbol))
 
 
 def _given_values(
     constraints: Mapping[str, Constraint], values: Mapping[Symbol | str, float] | None
 ) -> dict[Symbol, float]:
-    symbols = {
-        s for c in constraints.values() for p in (c.lower, c.expression, c.upper) for s in to_plain(p).symbols
-    }
+    parts = (p for c in constraints.values() for p in (c.lower, c.expression, c.upper))
+    symbols = {s for p in parts for s in to_plain(p).symbols}
     given = {s: s.value for s in symbols if s.value is not None}
     if values:
         names = {str(v) for v in values}

@@ -14,10 +14,12 @@ from typing import Literal, TypeAlias
 from .cell_graph import CellGraph, CellStep, Move, MoveRule
 
 Verdict: TypeAlias = Literal["found", "refuted", "undecided"]
+Parents: TypeAlias = dict[
+    int, tuple[int, list[Move]] | None
+]  # by state: the one before, and the moves from it
 Edge: TypeAlias = tuple[int, int, int, CellStep]  # coordinate, bits of a cell and its neighbour, step
 _EXHAUSTED_AT_MOST = 50_000  # largest number of states for which the shortest sequence is searched
 _PRUNED_AT_MOST = 300
-_CLOCK = 64  # expansions between two looks at the clock
 
 
 @dataclass(frozen=True)
@@ -194,28 +196,25 @@ class MoveSearch:
     def search_breadth_first(self) -> MoveSearchResult:
         """Return the shortest sequence of moves; every state is reached at most once."""
         graph, every = self.graph, (1, -1)
-        parents: dict[int, tuple[int, Move] | None] = {graph.start: None}
+        parents: Parents = {graph.start: None}
         waiting, reached = deque([graph.start]), graph.start
         if graph.is_goal(graph.start):
             return MoveSearchResult("found", (), True, 1, reached)
-        for expansions in count():
-            if not waiting:
-                return MoveSearchResult(
-                    "refuted", explored=len(parents), reached=reached, regions=tuple(parents)
-                )
-            if expansions % _CLOCK == 0 and self.is_late():
+        while waiting:
+            if self.is_late():
                 return MoveSearchResult("undecided", explored=len(parents), reached=reached)
             state = waiting.popleft()
             for k in range(len(graph.coordinates)):
                 for move, after in self._moves(state, k, every):
                     if after in parents:
                         continue
-                    parents[after] = state, move
+                    parents[after] = state, [move]
                     reached |= after
                     if graph.is_goal(after):
-                        return MoveSearchResult("found", _trace(parents, after), True, len(parents), reached)
+                        moves = tuple(_trace(parents, after))
+                        return MoveSearchResult("found", moves, True, len(parents), reached)
                     waiting.append(after)
-        raise AssertionError  # pragma: no cover - count() has no end
+        return MoveSearchResult("refuted", explored=len(parents), reached=reached, regions=tuple(parents))
 
     def search_best_first(self) -> MoveSearchResult:
         """Return a sequence of moves without superfluous ones, or prove that there is none.
@@ -225,7 +224,7 @@ class MoveSearch:
         """
         graph = self.graph
         start, first = self.advance(graph.start)
-        parents: dict[int, tuple[int, list[Move]] | None] = {start: None}
+        parents: Parents = {start: None}
         length, _ = self.estimate(start)
         queue, numbers, reached = [(length, 0, start)], count(1), start
         following: dict[int, list[int]] = {}
@@ -234,7 +233,7 @@ class MoveSearch:
                 return MoveSearchResult("undecided", explored=len(parents), reached=reached)
             length, _, state = heapq.heappop(queue)
             if graph.is_goal(state):
-                moves = [*first, *_trace_lists(parents, state)]
+                moves = [*first, *_trace(parents, state)]
                 return MoveSearchResult("found", self.prune(moves), False, len(parents), reached)
             following[state] = []
             for k in range(len(graph.coordinates)):
@@ -292,17 +291,12 @@ class MoveSearch:
             return tuple(kept)
         for n in reversed(range(len(kept))):
             fewer = kept[:n] + kept[n + 1 :]
-            if self._leads_to_goal(fewer):
+            state: int | None = self.graph.start
+            for move in fewer:
+                state = None if state is None else self.graph.apply(state, move)
+            if state is not None and self.graph.is_goal(state):
                 kept = fewer
         return tuple(kept)
-
-    def _leads_to_goal(self, moves: Sequence[Move]) -> bool:
-        state: int | None = self.graph.start
-        for move in moves:
-            if state is None:
-                return False
-            state = self.graph.apply(state, move)
-        return state is not None and self.graph.is_goal(state)
 
 
 def find_circle(graph: CellGraph, reached: int) -> tuple[tuple[MoveRule, ...], bool]:
@@ -349,15 +343,7 @@ def _bits(mask: int) -> Iterator[int]:
         mask ^= low
 
 
-def _trace(parents: dict[int, tuple[int, Move] | None], state: int) -> tuple[Move, ...]:
-    moves = list[Move]()
-    while (link := parents[state]) is not None:
-        state, move = link
-        moves.append(move)
-    return tuple(reversed(moves))
-
-
-def _trace_lists(parents: dict[int, tuple[int, list[Move]] | None], state: int) -> list[Move]:
+def _trace(parents: Parents, state: int) -> list[Move]:
     moves = list[Move]()
     while (link := parents[state]) is not None:
         state, own = link

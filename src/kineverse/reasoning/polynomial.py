@@ -188,33 +188,24 @@ def _sturm(coefficients: list[Fraction]) -> list[list[Fraction]]:
     """Return Sturm's chain of the square-free polynomial with the same roots."""
     chain = [coefficients, [k * c for k, c in enumerate(coefficients) if k]]
     while len(chain[-1]) > 1:
-        rest = _remainder(chain[-2], chain[-1])
+        _, rest = _divide(chain[-2], chain[-1])
         if not rest:
             break
         chain.append([-c for c in rest])
-    return chain if len(chain[-1]) == 1 else _sturm(_quotient(coefficients, chain[-1]))
+    return chain if len(chain[-1]) == 1 else _sturm(_divide(coefficients, chain[-1])[0])
 
 
-def _quotient(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
+def _divide(a: list[Fraction], b: list[Fraction]) -> tuple[list[Fraction], list[Fraction]]:
+    """Return quotient and remainder of two polynomials, the remainder without leading zeros."""
     rest, quotient = list(a), list[Fraction]()
     while len(rest) >= len(b):
         factor = rest.pop() / b[-1]
         quotient.append(factor)
         for k in range(len(b) - 1):
             rest[len(rest) + 1 - len(b) + k] -= factor * b[k]
-    return quotient[::-1]
-
-
-def _remainder(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
-    rest = list(a)
-    while len(rest) >= len(b):
-        factor = rest[-1] / b[-1]
-        for k in range(len(b)):
-            rest[len(rest) - len(b) + k] -= factor * b[k]
+    while rest and not rest[-1]:
         rest.pop()
-        while rest and not rest[-1]:
-            rest.pop()
-    return rest
+    return quotient[::-1], rest
 
 
 def _sign_changes(chain: list[list[Fraction]], x: Fraction) -> int:

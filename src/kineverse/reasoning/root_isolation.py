@@ -145,11 +145,9 @@ def _crossing(ranges: RangeFunction, low: float, high: float) -> list[float] | N
     zero = a if not first and a == low else b if not last and b == high else _middle(a, b)
     near = _CLOSE * max(1.0, abs(zero))
     below, above = _sign_at(ranges, max(low, zero - near)), _sign_at(ranges, min(high, zero + near))
-    if (zero > low and (not below or (first and below != first))) or (
-        zero < high and (not above or (last and above != last))
-    ):
-        return None
-    return [zero]
+    wrong_below = zero > low and (not below or (first and below != first))
+    wrong_above = zero < high and (not above or (last and above != last))
+    return None if wrong_below or wrong_above else [zero]
 
 
 def _sign_at(ranges: RangeFunction, x: float) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -214,7 +213,10 @@ def plan_unlocking(
     end = perf_counter() + budget
     coordinates, rules = relevant_rules(make_rules(model, known), goals)
     given = start_point(model, state)
-    start = {s: _clip(float(given.get(s, 0.0)), limits.get(s, Interval())) for s in coordinates}
+    start = {}
+    for s in coordinates:
+        limit = limits.get(s, Interval())
+        start[s] = min(max(float(given.get(s, 0.0)), float(limit.lower)), float(limit.upper))
 
     def search(some: Sequence[MoveRule]) -> tuple[CellGraph, MoveSearchResult]:
         graph = make_graph(coordinates, some, limits, start, goals, resting)
@@ -285,8 +287,7 @@ def _make_steps(
     states = [graph.start]
     for move in moves:
         after = graph.apply(states[-1], move)
-        if after is None:
-            raise AssertionError("a blocked move")  # pragma: no cover - the search takes free moves only
+        assert after is not None  # the search takes free moves only
         states.append(after)
     following = _next_moves(moves)
     position, steps = dict(start), list[UnlockingStep]()
@@ -294,11 +295,11 @@ def _make_steps(
         symbol, side = graph.coordinates[k], graph.cells[k][cell]
         direction = 1 if cell > graph.cell_of(states[n], k) else -1
         ends = symbol in goals and goals[symbol] in side
-        target = goals[symbol] if ends else _inside(side, direction)
+        bound, room = float(side.lower if direction > 0 else side.upper), float(side.upper - side.lower)
+        target = goals[symbol] if ends else bound + direction * min(_BEYOND, room / 2)
         last = following[n] == len(moves)
         releases = _released(graph, moves, states, n, following[n])
-        bound = side.lower if direction > 0 else side.upper
-        threshold = None if ends and last else float(bound)
+        threshold = None if ends and last else bound
         steps.append(UnlockingStep(symbol, position[symbol], target, threshold, releases))
         position[symbol] = target
     return tuple(steps)
@@ -327,12 +328,6 @@ def _released(
     return tuple(result)
 
 
-def _inside(side: Interval, direction: int) -> float:
-    """Return a position within a cell, a little beyond the end where it is entered."""
-    lower, upper = float(side.lower), float(side.upper)
-    return (lower if direction > 0 else upper) + direction * min(_BEYOND, (upper - lower) / 2)
-
-
 def _check_goal(symbol: Symbol, value: object, limit: Interval) -> float:
     number = finite_number(value)
     if number is None:
@@ -343,11 +338,6 @@ def _check_goal(symbol: Symbol, value: object, limit: Interval) -> float:
             f"[{format_number(float(limit.lower))}, {format_number(float(limit.upper))}]."
         )
     return number
-
-
-def _clip(value: float, limit: Interval) -> float:
-    low = -math.inf if limit.lower == -math.inf else float(limit.lower)
-    return min(max(value, low), float(limit.upper))
 
 
 def _list_words(words: Any) -> str:

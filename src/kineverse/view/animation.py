@@ -12,7 +12,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.planning.trajectories.trajectory import Trajectory
 from kineverse.state import State
 
-from .sliders import choose_slider_range
+from .sliders import choose_slider_range, on_input
 
 PERIOD = 8.0  # time from one limit to the other and back [s]
 FADE_IN = 1.5  # time in which the motion grows from the initial posture [s]
@@ -162,13 +162,8 @@ class TrajectoryPlayback:
                 hint="Time of the trajectory.",
             )
             self._slider.precision = _DIGITS
-        # Values set by this program come back as events without a client.
-        self._running.on_update(
-            lambda event: on_run(event.target.value) if event.client is not None else None
-        )
-        self._slider.on_update(
-            lambda event: on_seek(float(event.target.value)) if event.client is not None else None
-        )
+        on_input(self._running, on_run)
+        on_input(self._slider, lambda value: on_seek(float(value)))
 
     @property
     def time(self) -> float:

@@ -86,15 +86,15 @@ CAMERA_TOLERANCE = 1e-3  # tolerance for equal camera poses, as a fraction of th
 class ClientCameras:
     """Cameras of all browsers that show a page, each fitted to the shape of its window."""
 
-    def __init__(self, server: Any, first: Camera, framing: Callable[[float], Camera]) -> None:
+    def __init__(self, server: Any) -> None:
         self._lock = threading.Lock()
-        self._first, self._framing = first, framing
+        self._first: Camera | None = None
         self._placed: dict[int, Camera] = {}
         server.on_client_connect(self._add_client)
         server.on_client_disconnect(lambda client: self._placed.pop(client.client_id, None))
 
     def set_framing(self, first: Camera, framing: Callable[[float], Camera]) -> None:
-        """Replace the first camera and the framing of later placements."""
+        """Set the first camera, and the framing of later placements for the aspects of windows."""
         with self._lock:
             self._first, self._framing = first, framing
 
@@ -106,7 +106,7 @@ class ClientCameras:
         """Move a camera to the framing of its window, unless a user has moved it."""
         try:
             with self._lock:
-                if not camera.image_height or not camera.image_width:
+                if self._first is None or not camera.image_height or not camera.image_width:
                     return
                 client = camera.client
                 wanted = self._framing(camera.image_width / camera.image_height)

@@ -77,9 +77,7 @@ def fit_camera(
     p = np.asarray(points, dtype=float).reshape(-1, 3)
     if not len(p):
         p = np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 0.5]])
-    away = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+    away = unit_direction(azimuth, elevation)
     axes = Camera(tuple(away), (0.0, 0.0, 0.0)).axes
     seen = p @ axes.T
     vertical = np.tan(field_of_view / 2) * (1.0 - 2.0 * margin)
@@ -95,6 +93,12 @@ def fit_camera(
     ahead = float(np.median(seen[:, 2])) - centre[2]
     target = position + axes[2] * max(ahead, 0.1)
     return Camera(_triple(position), _triple(target), field_of_view=field_of_view)
+
+
+def unit_direction(azimuth: float, elevation: float) -> Floats:
+    """Return the unit vector (3,) at an azimuth around z and an elevation [rad]."""
+    level = np.cos(elevation)
+    return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
 
 
 def _triple(vector: Floats) -> tuple[float, float, float]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import cycle
 from typing import Literal
 
 import numpy as np
@@ -141,18 +142,12 @@ def _build_collision_drawables(frame: str, shape: Shape, color: Rgba, decomposed
     else:
         loaded = load_hulls(shape.geometry) if decomposed else [load_hull(shape.geometry)]
     found = []
-    for number, (surface, problem) in enumerate((one.surface, one.problem) for one in loaded):
-        own = MISSING if problem else _shade_hull(color, number)
-        placed = surface.without_colors().transform(shape.origin.matrix)
-        found.append(Drawable(frame, placed, own, "collision", problem, bool(problem)))
-    return found
-
-
-def _shade_hull(color: Rgba, number: int) -> Rgba:
-    """Return a colour that tells a hull from its neighbours; that of the first is the colour itself."""
     red, green, blue, alpha = color
-    factor = HULL_SHADES[number % len(HULL_SHADES)]
-    return (factor * red, factor * green, factor * blue, alpha)
+    for one, shade in zip(loaded, cycle(HULL_SHADES), strict=False):
+        own = MISSING if one.problem else (shade * red, shade * green, shade * blue, alpha)
+        placed = replace(one.surface, colors=None).transform(shape.origin.matrix)
+        found.append(Drawable(frame, placed, own, "collision", one.problem, bool(one.problem)))
+    return found
 
 
 AXIS_COLORS = ((0.86, 0.16, 0.16, 1.0), (0.13, 0.62, 0.20, 1.0), (0.16, 0.33, 0.88, 1.0))

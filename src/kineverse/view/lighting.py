@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .camera import unit_direction
 from .rasterizer import Projection, rasterize
 from .triangle_mesh import Floats, Integers, Singles, dot_rows
 
@@ -41,9 +42,7 @@ class DirectionalLight:
     @staticmethod
     def from_direction(corners: Floats, azimuth: float, elevation: float) -> DirectionalLight:
         """Return the lamp in a direction [rad] above (T, 3, 3) triangles [m]."""
-        toward = np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
+        toward = unit_direction(azimuth, elevation)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         axes = np.array([right, np.cross(toward, right), -toward])
         points = corners.reshape(-1, 3)

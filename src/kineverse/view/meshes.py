@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,12 @@ from .triangle_mesh import (
 
 logger = logging.getLogger(__name__)
 
+_UNPAINTED = (
+    0.7,
+    0.7,
+    0.72,
+    1.0,
+)  # colour of the pieces of a mesh file that have none, beside others that do
 _PLACES = 3  # number of places named in which a file was looked for
 
 
@@ -93,7 +99,12 @@ def _parse(file: MeshFile) -> TriangleMesh:
     if not pieces:
         raise OSError(f"{file.path} holds no triangles")
     if any(piece.colors is not None for piece in pieces):
-        pieces = [_colored(piece) for piece in pieces]
+        pieces = [
+            replace(piece, colors=np.tile(_UNPAINTED, (len(piece.faces), 1)))
+            if piece.colors is None
+            else piece
+            for piece in pieces
+        ]
     return concatenate_meshes(pieces).scale(unit_length(file.path))
 
 
@@ -104,7 +115,7 @@ def _convert_piece(mesh: Any) -> TriangleMesh:
     except Exception:  # The shape is shown even if its texture cannot be decoded.
         logger.debug("no colours from %s", mesh, exc_info=True)
         colors = None
-    return surface if colors is None else surface.with_colors(colors[kept])
+    return surface if colors is None else replace(surface, colors=colors[kept])
 
 
 def _face_colors(mesh: Any) -> Floats | None:
@@ -112,26 +123,13 @@ def _face_colors(mesh: Any) -> Floats | None:
     visual = mesh.visual
     if visual.kind != "texture":
         return np.asarray(visual.face_colors, dtype=float) / 255.0 if visual.defined else None
-    if visual.uv is not None and _has_texture(visual.material):
+    textures = (getattr(visual.material, name, None) for name in ("image", "baseColorTexture"))
+    if visual.uv is not None and any(texture is not None for texture in textures):
         corners = np.asarray(visual.to_color().vertex_colors, dtype=float)
         if corners.shape == (len(mesh.vertices), 4):
             return np.asarray(corners[mesh.faces].mean(axis=1) / 255.0)
     main = np.asarray(visual.material.main_color, dtype=float) / 255.0
     return np.tile(main, (len(mesh.faces), 1))
-
-
-def _has_texture(material: Any) -> bool:
-    names = ("image", "baseColorTexture")
-    return any(getattr(material, name, None) is not None for name in names)
-
-
-def _colored(
-    piece: TriangleMesh, fallback: tuple[float, float, float, float] = (0.7, 0.7, 0.72, 1.0)
-) -> TriangleMesh:
-    """Return the piece with colours, so that pieces with and without can be joined."""
-    if piece.colors is not None:
-        return piece
-    return piece.with_colors(np.tile(fallback, (len(piece.faces), 1)))
 
 
 def mesh_geometry(geometry: Geometry) -> TriangleMesh:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kineverse.errors import KineverseError
 from kineverse.formats.files import read_file
@@ -75,8 +75,12 @@ def show(
     """
     from .viewer import Viewer  # for start-up time
 
-    notebook = in_notebook()
-    waits = not (notebook or at_prompt()) if block is None else block
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    notebook = getattr(shell, "kernel", None) is not None  # whose front end shows results of cells as HTML
+    # At a prompt, and in a script that ends in one, nothing waits.
+    prompt = hasattr(sys, "ps1") or bool(sys.flags.interactive) or shell is not None
+    waits = not prompt if block is None else block
     page = Viewer(model, state, port=port, host=host, label=label, camera=camera, degrees=degrees)
     try:
         if not notebook:
@@ -112,22 +116,6 @@ def view(
     from .viewer import Viewer  # for start-up time
 
     return Viewer(model, state, port=port, label=label, camera=camera, host=host, degrees=degrees)
-
-
-def in_notebook() -> bool:
-    """Return True in a kernel of IPython, whose front end shows results of cells as HTML."""
-    return getattr(_ipython(), "kernel", None) is not None
-
-
-def at_prompt() -> bool:
-    """Return True in an interactive session, and in a script that ends in one."""
-    return hasattr(sys, "ps1") or bool(sys.flags.interactive) or _ipython() is not None
-
-
-def _ipython() -> Any:
-    """Return the shell of IPython if there is one; if IPython is not imported yet, there is none."""
-    ipython = sys.modules.get("IPython")
-    return ipython.get_ipython() if ipython is not None else None
 
 
 def open_page(address: str) -> None:

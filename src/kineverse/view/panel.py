@@ -11,7 +11,7 @@ from .animation import VelocityDrive
 from .html import Html, HtmlBox, element, format_missing_meshes, format_significant, format_violations
 from .proximity_panel import ProximityPanel
 from .scene import ViewerScene
-from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step
+from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step, on_input
 
 BEYOND = 0.2  # fraction of their range by which sliders are widened on demand, to violate limits
 MOST_UNFOLDED = 100  # with at most so many degrees of freedom all groups are unfolded at first
@@ -67,7 +67,7 @@ class Panel:
         self._locked: dict[str, bool] = {}
         # Events of the page and the motion of the model come from different threads.
         self._changing = threading.RLock()
-        self._in_degrees = degrees
+        self.degrees = degrees  # whether angles are shown in degrees
         self._quaternions, self._drive, self._proximity = quaternions, drive, proximity
         self._limits = {**ranges.limits_at(values), **quaternions.limits}
         self._sliders: dict[str, Any] = {}
@@ -107,11 +107,6 @@ class Panel:
         """True if limits and locks may be violated."""
         return bool(self._beyond.value)
 
-    @property
-    def degrees(self) -> bool:
-        """True if angles are shown in degrees."""
-        return self._in_degrees
-
     def _update(
         self, shown: Mapping[str, float], values: Mapping[str, float], set_by_program: Iterable[str]
     ) -> None:
@@ -142,14 +137,10 @@ class Panel:
             hint=f"Widen all sliders by {BEYOND:.0%}, and ignore locks, to see limits violated.",
         )
         self._beyond.on_update(lambda _: self._widen())
-        degrees = gui.add_checkbox(
-            "degrees", self._in_degrees, hint="Show angles in degrees instead of radians."
-        )
+        degrees = gui.add_checkbox("degrees", self.degrees, hint="Show angles in degrees instead of radians.")
         degrees.on_update(lambda event: self._convert(event.target.value))
         self.playing = gui.add_checkbox("play", False, hint="Move everything through its range.")
-        self.playing.on_update(
-            lambda event: on_play(event.target.value) if event.client is not None else None
-        )
+        on_input(self.playing, on_play)
 
     def _add_sliders(self, values: Mapping[str, float]) -> None:
         groups: dict[str, list[str]] = {}
@@ -161,7 +152,12 @@ class Panel:
             self._folders[group] = folder
             with folder:
                 for name in names:
-                    self._sliders[name] = self._slider(name, values[name])
+                    lower, upper = map(format_significant, self._limits[name])
+                    about = f"limits {lower} to {upper} {self._units.get(name, '')}".rstrip()
+                    range_ = self._range(name, values[name])
+                    self._sliders[name] = self._add_slider(
+                        name, values[name], self._limits, range_, about, self._on_move
+                    )
 
     def _add_speeds(self, on_drive: Callable[[str, float], None]) -> None:
         """Add a slider for each speed, which acts until it is 0 again."""
@@ -170,20 +166,9 @@ class Panel:
             for name in self._drive.speeds:
                 path = name.removesuffix(":velocity")
                 self._units[name] = f"{self._units[path]}/s" if self._units.get(path) else ""
-                low, high = (self._to_shown(name, limit) for limit in limits[name])
                 slowest, fastest = map(format_significant, limits[name])
-                slider = gui.add_slider(
-                    self._label(name, limits[name]),
-                    min=low,
-                    max=high,
-                    step=choose_slider_step((low, high)),
-                    initial_value=0.0,
-                    hint=f"{name}, from {slowest} to {fastest} {self._units[name]}; "
-                    "it goes on until this is 0",
-                )
-                slider.precision = _count_digits(low, high)
-                slider.on_update(lambda event, name=name: self._set(on_drive, name, limits[name], event))
-                self._speeds[name] = slider
+                about = f"from {slowest} to {fastest} {self._units[name]}; it goes on until this is 0"
+                self._speeds[name] = self._add_slider(name, 0.0, limits, limits[name], about, on_drive)
 
             def stop(_: Any) -> None:
                 for name in self._speeds:
@@ -191,21 +176,33 @@ class Panel:
 
             gui.add_button("Stop", hint="Set all speeds to 0.").on_click(stop)
 
-    def _slider(self, name: str, value: float) -> Any:
-        lower, upper = self._limits[name]
-        range_ = self._range(name, value)
+    def _add_slider(
+        self,
+        name: str,
+        value: float,
+        limits: Mapping[str, tuple[float, float]],
+        range_: tuple[float, float],
+        about: str,
+        call: Callable[[str, float], None],
+    ) -> Any:
         low, high = (self._to_shown(name, end) for end in range_)
-        unit = self._units.get(name, "")
         slider = self._gui.add_slider(
-            self._label(name, self._limits[name]),
+            self._label(name, limits[name]),
             min=low,
             max=high,
             step=choose_slider_step((low, high)),
             initial_value=self._to_shown(name, value),
-            hint=f"{name}, limits {format_significant(lower)} to {format_significant(upper)} {unit}".rstrip(),
+            hint=f"{name}, {about}",
         )
         slider.precision = _count_digits(low, high)
-        slider.on_update(lambda event: self._set(self._on_move, name, self._limits[name], event))
+
+        def move(shown: float) -> None:
+            value = float(shown) / self._factor(name)
+            # A limit that is converted between units and back changes by rounding, and would be violated.
+            near = [limit for limit in limits[name] if abs(value - limit) < 1e-12]
+            call(name, near[0] if near else value)
+
+        on_input(slider, move)
         return slider
 
     def _label(self, name: str, limits: tuple[float, float], locked: bool = False) -> str:
@@ -232,17 +229,6 @@ class Panel:
 
     def _value(self, name: str) -> float:
         return float(self._sliders[name].value) / self._factor(name)
-
-    def _set(
-        self, call: Callable[[str, float], None], name: str, limits: tuple[float, float], event: Any
-    ) -> None:
-        # Values set by this program come back as events without a client.
-        if event.client is None:
-            return
-        value = float(event.target.value) / self._factor(name)
-        # A limit that is converted between units and back changes by rounding, and would be violated.
-        near = [limit for limit in limits if abs(value - limit) < 1e-12]
-        call(name, near[0] if near else value)
 
     def _lock(self, values: Mapping[str, float]) -> None:
         """Mark the coordinates that are locked at these values, and disable their sliders."""
@@ -276,7 +262,7 @@ class Panel:
 
     def _convert(self, degrees: bool) -> None:
         with self._changing:
-            self._in_degrees = degrees
+            self.degrees = degrees
             for name, slider in self._sliders.items():
                 self._fit(name, self._shown[name])
                 slider.value = self._to_shown(name, self._shown[name])

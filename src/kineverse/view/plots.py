@@ -120,7 +120,8 @@ def draw_fit(canvas: Canvas, fit: Fit, relative: Array, title: str) -> None:
     draw_axial_view(parts["along"], projection)
     draw_side_view(parts["side"], projection)
     for part, points in _list_parts(projection):
-        _circle_outliers(parts[part], points[list(fit.outliers)])
+        x, y = points[list(fit.outliers)].T
+        parts[part].scatter(x, y, s=60, facecolors="none", edgecolors=AXIS, zorder=4)
     draw_joint_values(parts["values"], fit)
     draw_residuals(parts["left"], fit)
     canvas.suptitle(title)
@@ -130,7 +131,7 @@ def draw_axial_view(axes: Axes, projection: FitProjection) -> None:
     """Draw observed positions along the axis, with the axis and the uncertainty of its position."""
     if projection.fit.family == "prismatic":
         off = 1e3 * (projection.observed - projection.fitted)[:, :2]
-        _scatter(axes, off, "seen, first to last")
+        _scatter(axes, off)
         axes.plot(0.0, 0.0, "+", color=AXIS, markersize=12, zorder=3)
         axes.set(title="along the axis: off the fitted line", xlabel="[mm]", ylabel="[mm]", aspect="equal")
         return
@@ -140,12 +141,8 @@ def draw_axial_view(axes: Axes, projection: FitProjection) -> None:
         root = np.linalg.cholesky(projection.axis_covariances(np.zeros(1))[0] + 1e-18 * np.eye(2))
         axes.fill(*(SIGMAS * root @ np.array([np.cos(ring), np.sin(ring)])), color=AXIS, alpha=0.25)
         axes.plot(0.0, 0.0, "+", color=AXIS, markersize=12, label=f"axis, ±{SIGMAS:g} σ", zorder=3)
-    axes.set(
-        title="along the axis" if projection.has_axis else "across",
-        xlabel="[m]",
-        ylabel="[m]",
-        aspect="equal",
-    )
+    title = "along the axis" if projection.has_axis else "across"
+    axes.set(title=title, xlabel="[m]", ylabel="[m]", aspect="equal")
     axes.legend(loc="best", fontsize="small")
 
 
@@ -153,7 +150,7 @@ def draw_side_view(axes: Axes, projection: FitProjection) -> None:
     """Draw observed positions from the side, with the axis and the uncertainty of its direction."""
     if projection.fit.family == "prismatic":
         points = projection.observed[:, [2, 0]]
-        _scatter(axes, points, "seen, first to last")
+        _scatter(axes, points)
         axes.plot(projection.path[:, 2], projection.path[:, 0], color=MODEL, label="fitted")
         axes.set(title="from the side", xlabel="along the axis [m]", ylabel="across [m]")
         axes.set_aspect("equal", adjustable="datalim")
@@ -161,11 +158,8 @@ def draw_side_view(axes: Axes, projection: FitProjection) -> None:
         return
     _points(axes, projection, 0, 2)
     if projection.has_axis:
-        reach = max(
-            0.1,
-            float(np.ptp(projection.observed[:, 2])),
-            float(np.abs(projection.observed[:, :2]).max()) / 2.0,
-        )
+        along, across = projection.observed[:, 2], projection.observed[:, :2]
+        reach = max(0.1, float(np.ptp(along)), float(np.abs(across).max()) / 2.0)
         heights = np.linspace(-reach, reach, 60)
         spread = SIGMAS * np.sqrt(projection.axis_covariances(heights)[:, 0, 0])
         axes.fill_betweenx(heights, -spread, spread, color=AXIS, alpha=0.25, linewidth=0)
@@ -220,29 +214,18 @@ def _list_parts(projection: FitProjection) -> list[tuple[str, Array]]:
     return [("along", projection.observed[:, [0, 1]]), ("side", projection.observed[:, [0, 2]])]
 
 
-def _circle_outliers(axes: Axes, points: Array) -> None:
-    axes.scatter(points[:, 0], points[:, 1], s=60, facecolors="none", edgecolors=AXIS, zorder=4)
-
-
 def _points(axes: Axes, projection: FitProjection, right: int, up: int) -> None:
-    _scatter(axes, projection.observed[:, [right, up]], "seen, first to last")
+    _scatter(axes, projection.observed[:, [right, up]])
     if projection.fit.joint_values.shape[1] == 1:
         axes.plot(projection.path[:, right], projection.path[:, up], color=MODEL, label="fitted", zorder=1)
     else:
-        axes.scatter(
-            projection.fitted[:, right],
-            projection.fitted[:, up],
-            s=8,
-            marker="x",
-            color=MODEL,
-            label="fitted",
-        )
+        fitted = projection.fitted
+        axes.scatter(fitted[:, right], fitted[:, up], s=8, marker="x", color=MODEL, label="fitted")
 
 
-def _scatter(axes: Axes, points: Array, label: str) -> None:
-    axes.scatter(
-        points[:, 0], points[:, 1], s=8, c=np.arange(len(points)), cmap="viridis", label=label, zorder=2
-    )
+def _scatter(axes: Axes, points: Array) -> None:
+    order, label = np.arange(len(points)), "seen, first to last"
+    axes.scatter(points[:, 0], points[:, 1], s=8, c=order, cmap="viridis", label=label, zorder=2)
 
 
 def _frame(fit: Fit, fitted: Array) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import takewhile
 
 import numpy as np
@@ -36,7 +36,7 @@ class ProximityResult:
     pairs: Sequence[DistanceResult] = ()  # nearest pairs, nearest first, at most MOST_PAIRS of them
     found: int = 0  # number of pairs within the radius
     touching: int = 0  # of those that touch or penetrate
-    ignored: Sequence[tuple[DistanceResult, str]] = field(default=())
+    ignored: Sequence[tuple[DistanceResult, str]] = ()
     checked_pairs: int = 0  # numbers of pairs of bodies that are checked
     unchecked_pairs: int = 0  # that are excluded
 

@@ -33,6 +33,7 @@ from .proximity import (
     format_millimetres,
 )
 from .scene import ViewerScene
+from .sliders import on_input
 
 LINES = 12  # lines of the list; further pairs are counted, not listed
 EXCLUDED_LINES = 5  # excluded bodies and shapes that are named with the reason; further ones are counted
@@ -50,15 +51,13 @@ def format_proximity(found: ProximityResult, problems: Mapping[str, str]) -> Htm
         lines.append(_heading("Near, but not looked at"))
         lines += [_line(pair, None, why) for pair, why in found.ignored[:LINES]]
         lines += _more(len(found.ignored) - LINES)
-    lines += _excluded_lines(problems)
+    if problems:
+        lines.append(_heading("No distances to"))
+        lines += [element("div", f"{name}: {why}") for name, why in list(problems.items())[:EXCLUDED_LINES]]
+        lines += _more(len(problems) - EXCLUDED_LINES)
     pairs = f"{found.checked_pairs} pairs are looked at, {found.unchecked_pairs} are not"
     lines.append(element("div", pairs, style=f"color:{_GREY};margin-top:5px"))
     return wrap_report(*lines)
-
-
-def format_proximity_failure(message: str) -> Html:
-    """Return HTML: the reason why there are no distances."""
-    return wrap_report(element("b", "There are no distances now.", style="color:#c92a2a"), BREAK, message)
 
 
 def wrap_report(*content: str) -> Html:
@@ -96,13 +95,6 @@ def _heading(text: str) -> Html:
 
 def _more(count: int) -> list[Html]:
     return [element("div", f"and {count} more", style=f"color:{_GREY}")] if count > 0 else []
-
-
-def _excluded_lines(problems: Mapping[str, str]) -> list[Html]:
-    if not problems:
-        return []
-    lines = [element("div", f"{name}: {why}") for name, why in list(problems.items())[:EXCLUDED_LINES]]
-    return [_heading("No distances to"), *lines, *_more(len(problems) - EXCLUDED_LINES)]
 
 
 LARGEST_RADIUS = 0.5  # the largest radius on offer [m]
@@ -173,10 +165,6 @@ class ProximityPanel:
         """The result shown last; None if there is no request, or if there are no distances."""
         return self.status.result
 
-    def stop(self) -> None:
-        """Stop the background thread."""
-        self.worker.stop()
-
     def _add_controls(self, gui: Any, request: ProximityRequest) -> None:
         self._folder = gui.add_folder("Collisions", expand_by_default=request.enabled)
         with self._folder:
@@ -208,15 +196,13 @@ class ProximityPanel:
             self._report = HtmlBox(gui, Html())
         self._controls = near, radius, only, ignored, decomposed
         for control in self._controls:
-            control.on_update(self._apply_controls)
+            on_input(control, self._apply_controls)
 
-    def _apply_controls(self, event: Any) -> None:
-        # Values set by this program come back as events without a client.
-        if event.client is not None:
-            request = ProximityRequest(*(control.value for control in self._controls))
-            self._scene.decompose(request.decomposed)
-            self.worker.set_request(request)
-            self._write_report()
+    def _apply_controls(self, _: Any) -> None:
+        request = ProximityRequest(*(control.value for control in self._controls))
+        self._scene.decompose(request.decomposed)
+        self.worker.set_request(request)
+        self._write_report()
 
     def _apply(self, request: ProximityRequest) -> None:
         with self._lock:
@@ -248,9 +234,13 @@ class ProximityPanel:
         """Write the report of the latest status, which is ``new`` if given."""
         with self._lock:
             self.status = status = new or self.status
-            text = Html() if is_installed() else _format_missing_extra()
+            text = Html()
+            if not is_installed():
+                extra, command = element("b", "geometry"), install_command("geometry")
+                text = wrap_report("Distances need the extra ", extra, f": {command}")
             if status.failure:
-                text = format_proximity_failure(status.failure)
+                head = element("b", "There are no distances now.", style="color:#c92a2a")
+                text = wrap_report(head, BREAK, status.failure)
             elif status.result is not None:
                 text = format_proximity(status.result, status.problems or {})
             elif self.worker.request.enabled:
@@ -290,9 +280,3 @@ class ProximityPanel:
         for k, (ends, depth) in enumerate(zip(marks.arrows[:LABELS], marks.depths, strict=False)):
             nodes.append(scene.add_label(f"/near/depth{k}", depth, position=ends[1], font_screen_scale=0.8))
         return {node.name: node for node in nodes}
-
-
-def _format_missing_extra() -> Html:
-    return wrap_report(
-        "Distances need the extra ", element("b", "geometry"), f": {install_command('geometry')}"
-    )

@@ -182,7 +182,8 @@ def _fill(
         near += np.repeat(depth[triangle[part], 0].astype(np.float32), n) * x
         ahead = near > best[pixel]
         if cover is not None:
-            ahead &= _dither(pixel, x, width) < cover[owner]
+            # Bayer's pattern of thresholds: half of a half-opaque face is drawn.
+            ahead &= _PATTERN[(pixel // width) % 4, x % 4] < cover[owner]
         pixel, near, owner = pixel[ahead], near[ahead], owner[ahead]
         np.maximum.at(best, pixel, near)
         wins = near == best[pixel]
@@ -212,11 +213,6 @@ def _extremes(triples: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[
 
 
 _PATTERN = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) / 16.0
-
-
-def _dither(pixel: npt.NDArray[np.int32], x: npt.NDArray[np.int32], width: int) -> Floats:
-    """Return thresholds in [0, 1) of a regular 4×4 pattern (Bayer): half of a half-opaque face is drawn."""
-    return np.asarray(_PATTERN[(pixel // width) % 4, x % 4])
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from .camera import Camera
 from .drawables import Drawable, Kind, choose_axis_length, collect_drawables
 from .poses import FramePoses, to_wxyz
 from .rasterizer import TriangleSoup
-from .triangle_mesh import Floats, Integers, TriangleMesh
+from .triangle_mesh import Floats, TriangleMesh
 
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
@@ -32,7 +32,7 @@ class ViewerScene:
         self, server: Any, model: ModelView, values: Mapping[str, float], camera: Camera | None = None
     ) -> None:
         self._server, self._camera = server, camera
-        self._cameras: ClientCameras | None = None
+        self._cameras = ClientCameras(server)
         # Events of the page and the motion of the model come from different threads.
         self._lock = threading.RLock()
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
@@ -237,33 +237,23 @@ class ViewerScene:
         visuals = [part for part in visuals if part.frame in at]
         surfaces = TriangleSoup.from_drawables(visuals, at)
         self.length = choose_axis_length(surfaces.corners, at)
-        points = (
-            surfaces.corners.reshape(-1, 3)
-            if len(surfaces.corners)
-            else np.array([pose[:3, 3] for pose in at.values()])
-        )
+        if len(surfaces.corners):
+            points = surfaces.corners.reshape(-1, 3)
+            shown = find_extreme_points(points)
+        else:
+            points = np.array([pose[:3, 3] for pose in at.values()])
+            shown = np.concatenate([points, points + 0.2])
         low, high = points.min(axis=0), points.max(axis=0)
         self._floor, self._extent = float(low[2]), float(np.linalg.norm(high - low))
         camera = self._camera
         if camera is None:
             camera = choose_camera(surfaces, weigh_drawables(self._model, visuals), at, ASPECT, FIELD_OF_VIEW)
-            shown = (
-                find_extreme_points(points)
-                if len(surfaces.corners)
-                else np.concatenate([points, points + 0.2])
-            )
-            self._set_framing(camera, partial(reframe, camera, shown))
+            self._cameras.set_framing(camera, partial(reframe, camera, shown))
         start = self._server.initial_camera
         start.position, start.look_at = np.array(camera.position), np.array(camera.target)
         start.fov = camera.field_of_view
         away = np.subtract(camera.position, camera.target)
         lighting.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
-
-    def _set_framing(self, first: Camera, framing: Callable[[float], Camera]) -> None:
-        if self._cameras is None:
-            self._cameras = ClientCameras(self._server, first, framing)
-        else:
-            self._cameras.set_framing(first, framing)
 
 
 def _split_by_color(part: Drawable) -> list[tuple[TriangleMesh, tuple[float, ...]]]:
@@ -277,12 +267,9 @@ def _split_by_color(part: Drawable) -> list[tuple[TriangleMesh, tuple[float, ...
     for k in range(len(tones)):
         chosen = np.flatnonzero(which.reshape(-1) == k)
         mean = surface.colors[chosen].mean(axis=0)
-        pieces.append((_extract_faces(surface, chosen), tuple(float(c) for c in mean)))
+        used, faces = np.unique(surface.faces[chosen], return_inverse=True)
+        piece = TriangleMesh(
+            surface.vertices[used], faces.reshape(-1, 3), surface.normals[used], closed=surface.closed
+        )
+        pieces.append((piece, tuple(float(c) for c in mean)))
     return pieces
-
-
-def _extract_faces(surface: TriangleMesh, chosen: Integers) -> TriangleMesh:
-    used, faces = np.unique(surface.faces[chosen], return_inverse=True)
-    return TriangleMesh(
-        surface.vertices[used], faces.reshape(-1, 3), surface.normals[used], closed=surface.closed
-    )

@@ -8,8 +8,9 @@ some frame by one radian a unit is an angle, one that shifts a frame by one metr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
@@ -119,6 +120,12 @@ PROBE_DISTANCES = (0.0, 1.0, -1.0, 0.1, -0.1)
 """Distances of the probed states from the given values; the later ones are used if earlier ones fail."""
 
 
+def on_input(control: Any, call: Callable[[Any], object]) -> None:
+    """Have a call with the value of a control whenever a browser sets it."""
+    # Values set by this program come back as events without a client.
+    control.on_update(lambda event: call(event.target.value) if event.client is not None else None)
+
+
 def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -> dict[str, str]:
     """Return ``"rad"``, ``"m"`` or ``""`` for each of the named symbols."""
     wanted = list(names)
@@ -133,7 +140,8 @@ def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[s
     def rates(place: Floats, index: int) -> tuple[Floats, Floats]:
         offset = np.zeros(len(inputs))
         offset[index] = DIFFERENCE_STEP
-        return _rates(np.array(function(place - offset)), np.array(function(place + offset)))
+        with np.errstate(invalid="ignore"):  # Frames without a finite pose have no rates.
+            return _rates(np.array(function(place - offset)), np.array(function(place + offset)))
 
     found = dict.fromkeys(wanted, "")
     # A second state excludes coordinates that move by one radian a unit only by chance.
@@ -160,19 +168,11 @@ def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[s
 
 def _rates(before: Floats, after: Floats) -> tuple[Floats, Floats]:
     """Return the (N,) rates of rotation [rad] and translation [m] a unit, from poses two steps apart."""
-    with np.errstate(invalid="ignore"):  # Frames without a finite pose have no rates.
-        return _differences(before, after)
-
-
-def _differences(before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    # The antisymmetric part of R_before' R_after is the sine of the angle between them.
+    # The antisymmetric part of R_before' R_after has the norm √2 |sin| of the angle between them.
     change = np.einsum("nji,njk->nik", before[:, :3, :3], after[:, :3, :3])
-    sine = np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0]], axis=1)
-    turn = np.linalg.norm(
-        sine - np.stack([change[:, 1, 2], change[:, 2, 0], change[:, 0, 1]], axis=1), axis=1
-    )
+    sine = np.linalg.norm(change - np.swapaxes(change, 1, 2), axis=(1, 2)) / np.sqrt(8.0)
     shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
-    return np.asarray(turn / 2.0 / (2.0 * DIFFERENCE_STEP)), np.asarray(shift / (2.0 * DIFFERENCE_STEP))
+    return np.asarray(sine / (2.0 * DIFFERENCE_STEP)), np.asarray(shift / (2.0 * DIFFERENCE_STEP))
 
 
 ANGLES = ("roll", "pitch", "yaw")

@@ -41,21 +41,10 @@ class TriangleMesh:
     def transform(self, a_T_b: npt.ArrayLike) -> TriangleMesh:
         """Return the surface, given in b, in the coordinates of a (a 4×4 rigid transform)."""
         matrix = np.asarray(a_T_b, dtype=float)
-        return TriangleMesh(
-            vertices=self.vertices @ matrix[:3, :3].T + matrix[:3, 3],
-            faces=self.faces,
-            normals=self.normals @ matrix[:3, :3].T,
-            colors=self.colors,
-            closed=self.closed,
+        rotation = matrix[:3, :3].T
+        return replace(
+            self, vertices=self.vertices @ rotation + matrix[:3, 3], normals=self.normals @ rotation
         )
-
-    def with_colors(self, colors: Floats) -> TriangleMesh:
-        """Return the surface with (F, 4) colours of its faces."""
-        return replace(self, colors=colors)
-
-    def without_colors(self) -> TriangleMesh:
-        """Return the surface without colours of its own."""
-        return self if self.colors is None else replace(self, colors=None)
 
     def scale(self, scale: npt.ArrayLike) -> TriangleMesh:
         """Return the surface scaled along x, y, z; a mirrored one keeps its outside outside."""
@@ -63,10 +52,8 @@ class TriangleMesh:
         safe = np.where(factors == 0.0, 1e-12, factors)
         # Normals are covectors: they scale by the inverse.
         normals = normalize_rows(self.normals / safe)
-        faces = self.faces
-        if np.prod(np.sign(safe)) < 0:
-            faces = faces[:, ::-1]
-        return TriangleMesh(self.vertices * factors, faces, normals, self.colors, self.closed)
+        faces = self.faces[:, ::-1] if np.prod(np.sign(safe)) < 0 else self.faces
+        return replace(self, vertices=self.vertices * factors, faces=faces, normals=normals)
 
 
 def normalize_rows(vectors: Floats) -> Floats:

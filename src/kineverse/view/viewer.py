@@ -55,7 +55,8 @@ class Viewer:
     ) -> None:
         if not isinstance(model, ModelView):
             hint = f" Read it first: kv.load({model!r})." if isinstance(model, str | os.PathLike) else ""
-            raise InvalidValueError(f"A page shows a kineverse.Model, not {_describe(model)}.{hint}")
+            given = f"{model!r:.60}" if hint else f"a {type(model).__name__}"
+            raise InvalidValueError(f"A page shows a kineverse.Model, not {given}.{hint}")
         self.model = model
         # The page is built from a snapshot, which is exchanged as a whole after an edit.
         self._shown = _freeze(model)
@@ -251,7 +252,7 @@ class Viewer:
         if self._listener is not None:
             self._listener.close()
         self._worker.join(timeout=5.0)
-        self.collisions.stop()
+        self.collisions.worker.stop()
         web.stop(self._server)
         self._ended.set()
 
@@ -423,10 +424,6 @@ def _find_lone_symbol(constraint: Constraint | None) -> str:
         return ""
     (symbol,) = constraint.expression.symbols
     return str(symbol) if bool(constraint.expression == symbol) else ""
-
-
-def _describe(thing: object) -> str:
-    return f"{thing!r:.60}" if isinstance(thing, str | os.PathLike) else f"a {type(thing).__name__}"
 
 
 def _freeze(model: ModelView) -> ModelView:

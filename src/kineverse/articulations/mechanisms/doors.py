@@ -147,22 +147,16 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
         depth, *front = self.size
         # The walls end behind the ends of the panels, which turn inwards.
         walls = case((depth - _CLEARANCE, front[0], front[1]), self.wall, PALE, (_CLEARANCE / 2, 0.0, 0.0))
+        hinge, turned = (shift(ax, 0, az), rotation_about(Y, q)), rotation_about(Y, lower - q)
+        lean = rotation_about(Y, arctan2(bx + x - dx, bz + z - dz))
         return {
             "base": self.base(*walls),
-            "upper_panel": MechanismPart(
-                "base", (shift(ax, 0, az), rotation_about(Y, q), _on(self.upper_middle)), (leaf,)
-            ),
-            "panel_hinge": MechanismPart(
-                "base", (shift(ax, 0, az), rotation_about(Y, q), _on(self.panel_hinge))
-            ),
-            "lower_panel": MechanismPart(
-                "panel_hinge", (rotation_about(Y, lower - q), _on(self.lower_middle)), (leaf,)
-            ),
-            "arm_end": MechanismPart("panel_hinge", (rotation_about(Y, lower - q), _on(self.arm_end))),
+            "upper_panel": MechanismPart("base", (*hinge, _on(self.upper_middle)), (leaf,)),
+            "panel_hinge": MechanismPart("base", (*hinge, _on(self.panel_hinge))),
+            "lower_panel": MechanismPart("panel_hinge", (turned, _on(self.lower_middle)), (leaf,)),
+            "arm_end": MechanismPart("panel_hinge", (turned, _on(self.arm_end))),
             "handle": MechanismPart("lower_panel", (_on(self.handle),), (grip,)),
-            "arm": MechanismPart(
-                "base", (shift(dx, 0, dz), rotation_about(Y, arctan2(bx + x - dx, bz + z - dz))), (bar,)
-            ),
+            "arm": MechanismPart("base", (shift(dx, 0, dz), lean), (bar,)),
         }
 
     def _arm_end_from(self, bx: Expression, bz: Expression) -> tuple[Expression, Expression]:
@@ -182,9 +176,8 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
             numbers = ()
         if len(numbers) != count:
             raise InvalidValueError(f"{self.describe(field)} has {count} numbers, which {given!r} has not.")
-        return tuple(
-            check_joint_number(n, f"{self.describe(field)}, each of it,", positive=positive) for n in numbers
-        )
+        what = f"{self.describe(field)}, each of it,"
+        return tuple(check_joint_number(n, what, positive=positive) for n in numbers)
 
     def _check_reach(self) -> None:
         """Check that the triangle of B, C and D closes at all angles without becoming flat."""
@@ -193,9 +186,8 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
         across, up = (d - a for a, d in zip(self.top_hinge, self.arm_pivot, strict=True))
         for what, length in (("panel hinge", r), ("arm end", c)):
             if not length:
-                raise InvalidValueError(
-                    f"{self.describe(what)} is at (0, 0), which is no place for another hinge."
-                )
+                where = "is at (0, 0), which is no place for another hinge"
+                raise InvalidValueError(f"{self.describe(what)} {where}.")
         # B is nearest to D, or farthest from it, where the upper panel points along the line from A to D.
         u, v = self.panel_hinge
         straight = math.atan2(-across, -up) - math.atan2(v, u)
@@ -274,13 +266,11 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
     def __post_init__(self) -> None:
         self.check_lengths("length", "width", "thickness", "play", "speed")
         if not isinstance(self.form, str) or self.form not in ("regular", "published"):
-            raise InvalidValueError(
-                f"{self.describe('form')} is 'regular' or 'published', not {self.form!r}."
-            )
+            form = self.describe("form")
+            raise InvalidValueError(f"{form} is 'regular' or 'published', not {self.form!r}.")
         if not self.play < self.length:
-            raise InvalidValueError(
-                f"{self.describe('play')} is less than its length {self.length:g}, and not {self.play:g}."
-            )
+            most = f"less than its length {self.length:g}"
+            raise InvalidValueError(f"{self.describe('play')} is {most}, and not {self.play:g}.")
         super().__post_init__()
         self.check_threshold("catch", self.bolt)
 
@@ -299,10 +289,8 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
 
     def locks(self) -> Mapping[str, BoundedExpression]:
         """Return the lock, c2 of Eq. 13."""
-        raised = self.q("bolt") > self.catch
-        return {
-            "lock": speed_lock(self.q("door"), open_if=raised, engaged_if=self.closed, max_speed=self.speed)
-        }
+        q, raised = self.q("door"), self.q("bolt") > self.catch
+        return {"lock": speed_lock(q, open_if=raised, engaged_if=self.closed, max_speed=self.speed)}
 
     def parts(self) -> Mapping[str, MechanismPart]:
         """Return rails, door and bolt."""
@@ -314,17 +302,12 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
         rails = [box_shape((0.05, 0.05, length), (0.0, y, length / 2), STEEL) for y in (-side, side)]
         rails += [box_shape((length, 0.05, 0.05), (length / 2, y, length), STEEL) for y in (-side, side)]
         leaf = box_shape((self.thickness, self.width, length), (0.0, 0.0, length / 2), WOOD)
-        grip = -self.thickness / 2 - 0.04
+        grip = shift(-self.thickness / 2 - 0.04, 0.0, 0.15 * length)
+        stem = rod_shape((0.0, 0.0, 0.0), (0.04, 0.0, 0.0), 0.01, DARK)
+        lever = box_shape((0.02, 0.2, 0.02), (0, 0, 0), DARK)
         return {
             "base": self.base(*rails),
             "door": MechanismPart("base", (translation_along(Z, height), rotation_about(Y, angle)), (leaf,)),
             "upper_edge": MechanismPart("door", (shift(z=length),)),
-            "bolt": MechanismPart(
-                "door",
-                (shift(grip, 0.0, 0.15 * length), rotation_about(X, self.q("bolt"))),
-                (
-                    rod_shape((0.0, 0.0, 0.0), (0.04, 0.0, 0.0), 0.01, DARK),
-                    box_shape((0.02, 0.2, 0.02), (0, 0, 0), DARK),
-                ),
-            ),
+            "bolt": MechanismPart("door", (grip, rotation_about(X, self.q("bolt"))), (stem, lever)),
         }

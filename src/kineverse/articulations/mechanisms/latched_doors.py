@@ -51,19 +51,14 @@ class HingedDoor(Mechanism):
 
     def leaf(self, color: Rgba = WOOD, *shapes: Shape) -> MechanismPart:
         """Return the moving part of the door."""
-        return MechanismPart(
-            "base",
-            (rotation_about(Z, self.q("door")),),
-            (panel(self.width, self.height, self.thickness, color), *shapes),
-        )
+        board = panel(self.width, self.height, self.thickness, color)
+        return MechanismPart("base", (rotation_about(Z, self.q("door")),), (board, *shapes))
 
     def posts(self) -> tuple[Shape, Shape]:
         """Return the posts on both sides of the door, the first one clear of its corner that turns."""
         size = (self.thickness, 0.06, self.height)
-        first, second = (
-            box_shape(size, (0.0, y, self.height / 2), PALE)
-            for y in (-0.035 - self.thickness, self.width + 0.035)
-        )
+        places = -0.035 - self.thickness, self.width + 0.035
+        first, second = (box_shape(size, (0.0, y, self.height / 2), PALE) for y in places)
         return first, second
 
 
@@ -213,12 +208,11 @@ class Latch(SprungDoor, document_kind="Latch"):
         """Return posts, door and bolt."""
         tongue = box_shape((0.4 * self.thickness, 0.04, 0.03), (0.0, -0.01, 0.0), STEEL)
         place = shift(0.0, self.width, self.height / 2)
+        slide = translation_along((0.0, -1.0, 0.0), self.q("bolt"))
         return {
             "base": self.base(*self.posts()),
             "door": self.leaf(),
-            "bolt": MechanismPart(
-                "door", (place, translation_along((0.0, -1.0, 0.0), self.q("bolt"))), (tongue,)
-            ),
+            "bolt": MechanismPart("door", (place, slide), (tongue,)),
         }
 
 
@@ -263,18 +257,13 @@ class Microwave(SprungDoor, document_kind="Microwave"):
         w, h, t, depth = self.width, self.height, self.thickness, self.depth
         controls = 0.3 * w
         behind = (t / 2 + depth / 2, w / 2, h / 2)
-        grip = rod_shape(
-            (-t / 2 - 0.025, 0.92 * w, 0.15 * h), (-t / 2 - 0.025, 0.92 * w, 0.85 * h), 0.008, STEEL
-        )
+        out, across = -t / 2 - 0.025, 0.92 * w
+        grip = rod_shape((out, across, 0.15 * h), (out, across, 0.85 * h), 0.008, STEEL)
+        side = box_shape((depth + t, controls, h), (depth / 2, w + controls / 2, h / 2), DARK)
+        place = shift(-t / 2, w + controls / 2, 0.2 * h), translation_along(X, self.q("button"))
+        knob = box_shape((0.02, 0.6 * controls, 0.12 * h), (0.0, 0.0, 0.0), RED)
         return {
-            "base": self.base(
-                *case((depth, w, h), 0.02, PALE, behind),
-                box_shape((depth + t, controls, h), (depth / 2, w + controls / 2, h / 2), DARK),
-            ),
+            "base": self.base(*case((depth, w, h), 0.02, PALE, behind), side),
             "door": self.leaf(DARK, grip),
-            "button": MechanismPart(
-                "base",
-                (shift(-t / 2, w + controls / 2, 0.2 * h), translation_along(X, self.q("button"))),
-                (box_shape((0.02, 0.6 * controls, 0.12 * h), (0.0, 0.0, 0.0), RED),),
-            ),
+            "button": MechanismPart("base", place, (knob,)),
         }

@@ -71,14 +71,10 @@ class ScissorLift(Mechanism, document_kind="ScissorLift"):
 
     def __post_init__(self) -> None:
         self.check_lengths("arm", "width")
-        if (
-            isinstance(self.stages, bool)
-            or not isinstance(self.stages, int)
-            or not 1 <= self.stages <= MOST_STAGES
-        ):
-            raise InvalidValueError(
-                f"{self.describe('stages')} are a whole number from 1 to {MOST_STAGES}, not {self.stages!r}."
-            )
+        whole = isinstance(self.stages, int) and not isinstance(self.stages, bool)
+        if not whole or not 1 <= self.stages <= MOST_STAGES:
+            wanted = f"a whole number from 1 to {MOST_STAGES}"
+            raise InvalidValueError(f"{self.describe('stages')} are {wanted}, not {self.stages!r}.")
         self.numeric_range("angle", 0.0, math.pi / 2)
         super().__post_init__()
 
@@ -97,13 +93,10 @@ class ScissorLift(Mechanism, document_kind="ScissorLift"):
         for i in range(self.stages):
             middle = (translation_along(X, reach / 2), translation_along(Z, (i + 0.5) * rise))
             for letter, sign, inset, color in (("a", -1, 0.5, BLUE), ("b", 1, 0.4, STEEL)):
-                bars = tuple(
-                    box_shape((length, 0.5 * thick, thick), (0.0, side * inset * width, 0.0), color)
-                    for side in (-1, 1)
-                )
-                parts[f"arm_{i + 1}{letter}"] = MechanismPart(
-                    "base", (*middle, rotation_about(Y, sign * q)), bars
-                )
+                size, off = (length, 0.5 * thick, thick), inset * width
+                bars = box_shape(size, (0.0, -off, 0.0), color), box_shape(size, (0.0, off, 0.0), color)
+                place = *middle, rotation_about(Y, sign * q)
+                parts[f"arm_{i + 1}{letter}"] = MechanismPart("base", place, bars)
         axle = rod_shape((0.0, -width / 2, 0.0), (0.0, width / 2, 0.0), 0.6 * thick, RED)
         parts["slider"] = MechanismPart("base", (translation_along(X, reach),), (axle,))
         top = box_shape(deck, (length / 2, 0.0, 1.5 * thick), YELLOW)
@@ -158,9 +151,8 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
         self.check_lengths("lower_arm", "upper_arm", "offset")
         for field in ("lower", "upper"):
             if max(map(abs, self.numeric_range(field, -math.pi / 2, math.pi / 2))) >= math.pi / 2:
-                raise InvalidValueError(
-                    f"{self.describe(field)} ends before ±π/2, where its parallelogram falls flat."
-                )
+                what = self.describe(field)
+                raise InvalidValueError(f"{what} ends before ±π/2, where its parallelogram falls flat.")
         super().__post_init__()
 
     @property
@@ -177,31 +169,19 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
         upright = (rod_shape((0.0, -side, 0.0), (0.0, -side, first), 0.006, STEEL),)
         level = (rod_shape((0.0, side, 0.0), (second, side, 0.0), 0.006, STEEL),)
         up, out = rotation_about(Y, lean), rotation_about(Y, -rise)
+        plate = rod_shape((0.0, 0.0, -foot), (0.0, 0.0, -foot / 2), 0.1, DARK)
+        block = box_shape((0.02 + off, wide, foot), (off / 2, 0.0, -foot / 4), DARK)
+        across = box_shape((0.02 + off, wide, 0.02), (off / 2, 0.0, 0.0), RED)
+        post = box_shape((0.02, wide, 0.02 + off), (0.0, 0.0, off / 2), RED)
+        shade = rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, -0.05), 0.05, PALE)
         return {
-            "base": self.base(
-                rod_shape((0.0, 0.0, -foot), (0.0, 0.0, -foot / 2), 0.1, DARK),
-                box_shape((0.02 + off, wide, foot), (off / 2, 0.0, -foot / 4), DARK),
-            ),
+            "base": self.base(plate, block),
             "lower_arm": MechanismPart("base", (up,), upright),
             "lower_bar": MechanismPart("base", (shift(off), up), upright),
-            "elbow": MechanismPart(
-                "lower_arm",
-                (shift(z=first), rotation_about(Y, -lean)),
-                (
-                    box_shape((0.02 + off, wide, 0.02), (off / 2, 0.0, 0.0), RED),
-                    box_shape((0.02, wide, 0.02 + off), (0.0, 0.0, off / 2), RED),
-                ),
-            ),
+            "elbow": MechanismPart("lower_arm", (shift(z=first), rotation_about(Y, -lean)), (across, post)),
             "upper_arm": MechanismPart("elbow", (out,), level),
             "upper_bar": MechanismPart("elbow", (shift(z=off), out), level),
-            "head": MechanismPart(
-                "upper_arm",
-                (shift(second), rotation_about(Y, rise)),
-                (
-                    box_shape((0.02, wide, 0.02 + off), (0.0, 0.0, off / 2), RED),
-                    rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, -0.05), 0.05, PALE),
-                ),
-            ),
+            "head": MechanismPart("upper_arm", (shift(second), rotation_about(Y, rise)), (post, shade)),
             "light": MechanismPart("head", (shift(z=-0.05), HALF_TURN)),
         }
 
@@ -265,33 +245,18 @@ class PistonAndRod(Mechanism, document_kind="PistonAndRod"):
         lean = arcsin(r / length * sin(q))
         thick, half = 0.16 * r, self.bore / 2
         top = r + length + half
-        sides = [
-            box_shape(
-                (0.08 * half, self.bore, 2 * r + 2 * half), (x * 1.08 * half, 0.0, top - r - half), PALE
-            )
-            for x in (-1, 1)
-        ]
+        size, middle = (0.08 * half, self.bore, 2 * r + 2 * half), top - r - half
+        sides = [box_shape(size, (x * 1.08 * half, 0.0, middle), PALE) for x in (-1, 1)]
         back = 0.5 * self.bore
+        web = box_shape((3 * thick, thick, r), (0.0, 2 * thick, r / 2), BLUE)
+        pin = rod_shape((0.0, -2 * thick, r), (0.0, 2 * thick, r), thick, DARK)
+        bar = box_shape((1.5 * thick, thick, length), (0.0, 0.0, length / 2), STEEL)
+        head = rod_shape((0, 0, -0.3 * half), (0, 0, half), half, RED)
         return {
             "base": self.base(*sides, rod_shape((0.0, back, 0.0), (0.0, 4 * thick, 0.0), 1.5 * thick, DARK)),
-            "crank": MechanismPart(
-                "base",
-                (rotation_about(Y, q),),
-                (
-                    box_shape((3 * thick, thick, r), (0.0, 2 * thick, r / 2), BLUE),
-                    rod_shape((0.0, -2 * thick, r), (0.0, 2 * thick, r), thick, DARK),
-                ),
-            ),
-            "rod": MechanismPart(
-                "crank",
-                (shift(z=r), rotation_about(Y, -lean - q)),
-                (box_shape((1.5 * thick, thick, length), (0.0, 0.0, length / 2), STEEL),),
-            ),
-            "piston": MechanismPart(
-                "base",
-                (translation_along(Z, height),),
-                (rod_shape((0, 0, -0.3 * half), (0, 0, half), half, RED),),
-            ),
+            "crank": MechanismPart("base", (rotation_about(Y, q),), (web, pin)),
+            "rod": MechanismPart("crank", (shift(z=r), rotation_about(Y, -lean - q)), (bar,)),
+            "piston": MechanismPart("base", (translation_along(Z, height),), (head,)),
         }
 
 
@@ -359,24 +324,14 @@ class PedalBin(Mechanism, document_kind="PedalBin"):
         lid = arcsin(lift / self.lever)
         hinge, pivot, floor = r, r - self.lever - self.arm, 0.04
         toe = min(-r - 0.04, pivot - 0.03) - pivot
+        lever = box_shape((self.arm - toe, 0.02, 0.008), ((self.arm + toe) / 2, 0.0, 0.0), STEEL)
+        tread = box_shape((0.05, 0.07, 0.01), (toe, 0.0, 0.004), DARK)
+        bar = rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, self.height - floor / 2), 0.004, STEEL)
+        cover = rod_shape((-r, 0.0, 0.0), (-r, 0.0, 0.015), 1.03 * r, STEEL)
+        at_pivot, at_rod = shift(pivot, 0.0, floor / 2), shift(hinge - self.lever, 0.0, floor / 2)
         return {
             "base": self.base(rod_shape((0.0, 0.0, floor), (0.0, 0.0, self.height), r, PALE)),
-            "pedal": MechanismPart(
-                "base",
-                (shift(pivot, 0.0, floor / 2), rotation_about(Y, -p)),
-                (
-                    box_shape((self.arm - toe, 0.02, 0.008), ((self.arm + toe) / 2, 0.0, 0.0), STEEL),
-                    box_shape((0.05, 0.07, 0.01), (toe, 0.0, 0.004), DARK),
-                ),
-            ),
-            "rod": MechanismPart(
-                "base",
-                (shift(hinge - self.lever, 0.0, floor / 2), translation_along(Z, lift)),
-                (rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, self.height - floor / 2), 0.004, STEEL),),
-            ),
-            "lid": MechanismPart(
-                "base",
-                (shift(hinge, 0.0, self.height), rotation_about(Y, lid)),
-                (rod_shape((-r, 0.0, 0.0), (-r, 0.0, 0.015), 1.03 * r, STEEL),),
-            ),
+            "pedal": MechanismPart("base", (at_pivot, rotation_about(Y, -p)), (lever, tread)),
+            "rod": MechanismPart("base", (at_rod, translation_along(Z, lift)), (bar,)),
+            "lid": MechanismPart("base", (shift(hinge, 0.0, self.height), rotation_about(Y, lid)), (cover,)),
         }

@@ -74,21 +74,14 @@ class ScrewAndNut(Mechanism, document_kind="ScrewAndNut"):
         q, r, end = self.q(), self.radius, 2.5 * self.radius
         start = self.travel if self.pitch > 0 else 0.0
         bearing = (4 * r, 4 * r, r)
+        shaft = rod_shape((0.0, 0.0, -end), (0.0, 0.0, self.travel + end), r, STEEL)
+        mark = box_shape((3 * r, 0.5 * r, 0.5 * r), (0.0, 0.0, self.travel + 1.6 * end), STEEL)
+        block = box_shape((4 * r, 4 * r, 2 * r), (0, 0, 0), YELLOW)
+        slide = translation_along(Z, start - self.pitch / math.tau * q)
         return {
             "base": self.base(*(box_shape(bearing, (0.0, 0.0, z), DARK) for z in (-end, self.travel + end))),
-            "screw": MechanismPart(
-                "base",
-                (rotation_about(Z, q),),
-                (
-                    rod_shape((0.0, 0.0, -end), (0.0, 0.0, self.travel + end), r, STEEL),
-                    box_shape((3 * r, 0.5 * r, 0.5 * r), (0.0, 0.0, self.travel + 1.6 * end), STEEL),
-                ),
-            ),
-            "nut": MechanismPart(
-                "base",
-                (translation_along(Z, start - self.pitch / math.tau * q),),
-                (box_shape((4 * r, 4 * r, 2 * r), (0, 0, 0), YELLOW),),
-            ),
+            "screw": MechanismPart("base", (rotation_about(Z, q),), (shaft, mark)),
+            "nut": MechanismPart("base", (slide,), (block,)),
         }
 
 
@@ -140,9 +133,8 @@ class Ratchet(Mechanism, document_kind="Ratchet"):
     def __post_init__(self) -> None:
         self.check_lengths("radius", "thickness", "speed")
         if isinstance(self.teeth, bool) or not isinstance(self.teeth, int) or self.teeth < 3:
-            raise InvalidValueError(
-                f"{self.describe('teeth')} are a whole number from 3, not {self.teeth!r}."
-            )
+            what = self.describe("teeth")
+            raise InvalidValueError(f"{what} are a whole number from 3, not {self.teeth!r}.")
         super().__post_init__()
         self.check_threshold("release", self.lift)
 
@@ -164,24 +156,16 @@ class Ratchet(Mechanism, document_kind="Ratchet"):
         """Return stand, wheel and pawl."""
         half, r = self.thickness / 2, self.radius
         angles = np.linspace(0.0, math.tau, self.teeth, endpoint=False).tolist()
-        teeth = [
-            rod_shape(
-                (r * math.sin(a), -half, r * math.cos(a)),
-                (r * math.sin(a), half, r * math.cos(a)),
-                0.06 * r,
-                DARK,
-            )
-            for a in angles
-        ]
+        tips = [(r * math.sin(a), r * math.cos(a)) for a in angles]
+        teeth = [rod_shape((x, -half, z), (x, half, z), 0.06 * r, DARK) for x, z in tips]
         disc = rod_shape((0.0, -half, 0.0), (0.0, half, 0.0), r, STEEL)
         stand = box_shape((0.4 * r, self.thickness, 2.2 * r), (0.0, 2 * self.thickness, -0.7 * r), DARK)
         nose = rod_shape((0.0, 0.0, 0.0), (-0.7 * r, 0.0, -0.25 * r), 0.08 * r, RED)
+        pivot = shift(0.8 * r, 0.0, 1.25 * r)
         return {
             "base": self.base(stand),
             "wheel": MechanismPart("base", (rotation_about(Y, self.q("wheel")),), (disc, *teeth)),
-            "pawl": MechanismPart(
-                "base", (shift(0.8 * r, 0.0, 1.25 * r), rotation_about(Y, self.q("pawl"))), (nose,)
-            ),
+            "pawl": MechanismPart("base", (pivot, rotation_about(Y, self.q("pawl"))), (nose,)),
         }
 
 
@@ -248,18 +232,13 @@ class Faucet(Mechanism, document_kind="Faucet"):
         """Return the tap, its lever and its outlet."""
         spout = 0.6 * self.height
         mouth = (-self.reach, 0.0, 0.75 * self.height)
+        column = rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, self.height), 0.024, STEEL)
+        pipe = rod_shape((0.0, 0.0, spout), mouth, 0.012, STEEL)
+        head = rod_shape((0.0, 0.0, -0.005), (0.0, 0.0, 0.03), 0.022, STEEL)
+        stick = rod_shape((0.0, 0.0, 0.022), (-0.12, 0.0, 0.035), 0.007, STEEL)
+        moves = rotation_about(Z, self.q("turn")), rotation_about(Y, self.q("lift"))
         return {
-            "base": self.base(
-                rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, self.height), 0.024, STEEL),
-                rod_shape((0.0, 0.0, spout), mouth, 0.012, STEEL),
-            ),
+            "base": self.base(column, pipe),
             "outlet": MechanismPart("base", (shift(*mouth),)),
-            "lever": MechanismPart(
-                "base",
-                (shift(z=self.height), rotation_about(Z, self.q("turn")), rotation_about(Y, self.q("lift"))),
-                (
-                    rod_shape((0.0, 0.0, -0.005), (0.0, 0.0, 0.03), 0.022, STEEL),
-                    rod_shape((0.0, 0.0, 0.022), (-0.12, 0.0, 0.035), 0.007, STEEL),
-                ),
-            ),
+            "lever": MechanismPart("base", (shift(z=self.height), *moves), (head, stick)),
         }

@@ -148,26 +148,16 @@ class Mechanism(PlacedOperation):
             constraints.update(limits.constraints(path, position(path)))
         constraints.update({self.path(name): lock for name, lock in self.locks().items()})
         coordinates = tuple(map(position, self.limits))
+        home, speeds = (0.0,) * len(coordinates), tuple(q.derivative() for q in coordinates)
+        facts = self.kind, self.parent, self.child, coordinates, home, speeds, self.dynamics()
+        above = {n: self.path(part.below) if part.below else self.parent for n, part in parts.items()}
         return Writes(
-            frames={self.path(n): (self._below(part), part.place) for n, part in parts.items()},
+            frames={self.path(n): (above[n], part.place) for n, part in parts.items()},
             bodies={self.path(n): solid_body(part.shapes) for n, part in parts.items() if part.shapes},
             constraints=constraints,
-            articulations={
-                self.name: Articulation(
-                    self.kind,
-                    self.parent,
-                    self.child,
-                    coordinates,
-                    (0.0,) * len(coordinates),
-                    tuple(q.derivative() for q in coordinates),
-                    self.dynamics(),
-                )
-            },
+            articulations={self.name: Articulation(*facts)},
             data={self.path(n): value for n, value in self.data().items()},
         )
-
-    def _below(self, part: MechanismPart) -> str:
-        return self.path(part.below) if part.below else self.parent
 
     def base(self, *shapes: Shape) -> MechanismPart:
         """Return the base, which is fixed in the parent."""
@@ -200,9 +190,8 @@ class Mechanism(PlacedOperation):
         ends = []
         for name, end in (("lower", limits.lower), ("upper", limits.upper)):
             if end is None or (isinstance(end, Expression) and end.symbols):
-                raise InvalidValueError(
-                    f"{self.describe(field)} has a number as its {name} end, not {end!r}."
-                )
+                what = self.describe(field)
+                raise InvalidValueError(f"{what} has a number as its {name} end, not {end!r}.")
             ends.append(check_joint_number(end, f"{self.describe(field)}, its {name} end,"))
         lower, upper = ends
         if not least <= lower < upper <= most:

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from kineverse.errors import UnknownNameError
+from kineverse.gallery import LONGEST_SEED, is_seed
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
@@ -25,10 +26,9 @@ from .layout import draw_layout
 from .room import add_countertop, add_room
 from .units import add_base_unit, add_tall_unit, add_wall_unit
 
-__all__ = ["example_seeds", "generate_kitchen", "is_seed", "kitchen_operations"]
+__all__ = ["example_seeds", "generate_kitchen", "kitchen_operations"]
 
 _EXAMPLES = 10
-_LONGEST = 18
 
 
 def generate_kitchen(seed: int, prefix: str | None = "kitchen") -> Model:
@@ -58,11 +58,6 @@ def example_seeds() -> tuple[str, ...]:
     return tuple(map(str, range(_EXAMPLES)))
 
 
-def is_seed(name: str) -> bool:
-    """Return whether a name is a seed: decimal digits without leading zeros."""
-    return name.isascii() and name.isdecimal() and len(name) <= _LONGEST and str(int(name)) == name
-
-
 def kitchen_operations(name: str, prefix: str | None = None) -> Iterator[Operation]:
     """Yield the operations of a kitchen.
 
@@ -76,7 +71,7 @@ def kitchen_operations(name: str, prefix: str | None = None) -> Iterator[Operati
     if not is_seed(name):
         raise UnknownNameError(
             f"There is no kitchen {name!r}: a kitchen is named by its seed, a whole number from 0 on with at "
-            f"most {_LONGEST} digits, such as 'kitchens/17'."
+            f"most {LONGEST_SEED} digits, such as 'kitchens/17'."
         )
     rng = np.random.default_rng(int(name))
     kitchen = KitchenBuilder(prefix, draw_style(rng))

@@ -175,10 +175,8 @@ class KitchenBuilder:
     ) -> None:
         """Add a joint, whose child frame has its name and carries the body of solids."""
         full = self.full_name(name)
-        self.operations.append(
-            kind(name=full, parent=self.full_name(parent), child=full, origin=origin, **fields)
-        )
-        self.operations.append(SetBody(full, furniture_body(solids)))
+        joint = kind(name=full, parent=self.full_name(parent), child=full, origin=origin, **fields)
+        self.operations += [joint, SetBody(full, furniture_body(solids))]
 
     def mechanism(
         self, kind: type[Mechanism], name: str, parent: str, origin: Pose, density: float, **fields: Any

@@ -72,25 +72,14 @@ def drawer(
     side = (area.y[1] - area.y[0]) / 2 - WALL - _RUNNER
     back = -(depth - WALL - 0.01)
     low = -half + 0.02
-    solids = [
-        slab(FRONT, (y[0], y[1]), (-half, half), material or builder.style.front),
-        *open_box(
-            (back, FRONT[0]), (-side, side), (low, min(half - 0.035, low + rim)), 0.012, BIRCH, opening="+z"
-        ),
-    ]
+    solids = [slab(FRONT, (y[0], y[1]), (-half, half), material or builder.style.front)]
+    inner = (low, min(half - 0.035, low + rim))
+    solids += open_box((back, FRONT[0]), (-side, side), inner, 0.012, BIRCH, opening="+z")
     mass = compute_inertia(solids).mass
-    builder.joint(
-        Prismatic,
-        name,
-        unit,
-        shift(0.0, 0.0, middle),
-        solids,
-        axis=(1.0, 0.0, 0.0),
-        lower=0.0,
-        upper=min(builder.style.travel, round(-back - _BEHIND, 3)),
-        velocity=1.0,
-        dynamics=(("effort", 100.0), ("damping", round(1.5 * mass, 2)), ("friction", round(0.4 * mass, 2))),
-    )
+    upper = min(builder.style.travel, round(-back - _BEHIND, 3))
+    dynamics = (("effort", 100.0), ("damping", round(1.5 * mass, 2)), ("friction", round(0.4 * mass, 2)))
+    fields = {"axis": (1.0, 0.0, 0.0), "lower": 0.0, "upper": upper, "velocity": 1.0, "dynamics": dynamics}
+    builder.joint(Prismatic, name, unit, shift(0.0, 0.0, middle), solids, **fields)
     if handle_height is None:
         handle_height = 0.0 if half < 0.1 else half - 0.07
     add_handle(builder, name, (FRONT[1], (y[0] + y[1]) / 2, handle_height), y[1] - y[0])
@@ -161,17 +150,8 @@ def flap(
     if hinge == "bottom":
         dynamics = [("spring_stiffness", round(weight / (math.pi / 2), 3)), ("spring_reference", 0.0)]
     friction = round((0.25 if hinge == "bottom" else 1.1) * weight, 3)
-    _hinge(
-        builder,
-        name,
-        unit,
-        (FRONT[1], middle, hinge_z),
-        (0.0, sign, 0.0),
-        upper,
-        solids,
-        friction=friction,
-        more=tuple(dynamics),
-    )
+    at, axis, more = (FRONT[1], middle, hinge_z), (0.0, sign, 0.0), tuple(dynamics)
+    _hinge(builder, name, unit, at, axis, upper, solids, friction=friction, more=more)
     add_handle(builder, name, (0.0, 0.0, sign * (height - 0.045)), y[1] - y[0])
 
 
@@ -183,18 +163,16 @@ def add_handle(
     length = bar_length(builder, room)
     t, reach, end = style.thickness, style.clearance + style.thickness / 2, length / 2
     post = end - 0.02
-    solids = []
     if style.round_bar:
-        solids.append(cylinder_between((reach, -end, 0.0), (reach, end, 0.0), t / 2, style.bar))
+        solids = [cylinder_between((reach, -end, 0.0), (reach, end, 0.0), t / 2, style.bar)]
         solids += [
             cylinder_between((0.0, p, 0.0), (reach, p, 0.0), 0.4 * t, style.bar) for p in (-post, post)
         ]
     else:
         across = (-t / 2, t / 2)
-        solids.append(slab((style.clearance, style.clearance + t), (-end, end), across, style.bar))
-        solids += [
-            slab((0.0, style.clearance), (p - t / 2, p + t / 2), across, style.bar) for p in (-post, post)
-        ]
+        solids = [slab((style.clearance, style.clearance + t), (-end, end), across, style.bar)]
+        mount = (0.0, style.clearance)
+        solids += [slab(mount, (p - t / 2, p + t / 2), across, style.bar) for p in (-post, post)]
     a, b, c, d, e, f, g, h, i = _UPRIGHT if upright else _LEVEL
     x, y, z = (round(v, 6) for v in at)
     builder.fixed(f"{part}_handle", part, Pose((a, b, c, x, d, e, f, y, g, h, i, z)), solids)
@@ -220,18 +198,8 @@ def _hinge(
     x, y, z = (round(v, 6) for v in at)
     mass = compute_inertia(solids).mass
     dynamics = (("effort", 60.0), ("damping", round(0.08 * mass, 3)), ("friction", friction), *more)
-    builder.joint(
-        Revolute,
-        name,
-        unit,
-        shift(x, y, z),
-        solids,
-        axis=axis,
-        lower=0.0,
-        upper=upper,
-        velocity=1.0,
-        dynamics=dynamics,
-    )
+    fields = {"axis": axis, "lower": 0.0, "upper": upper, "velocity": 1.0, "dynamics": dynamics}
+    builder.joint(Revolute, name, unit, shift(x, y, z), solids, **fields)
 
 
 def _moved(solid: MaterialShape, by: Vector3) -> MaterialShape:

@@ -106,7 +106,10 @@ def draw_layout(rng: np.random.Generator) -> KitchenLayout:
     opposites: tuple[Opposite, ...] = ("row", "island", "wall")
     opposite = opposites[_draw_index(rng, (0.35, 0.35, 0.3))]
     tall, base, wall = _draw_kinds(rng, objects)
-    second = _take_second_row(rng, base) if opposite != "wall" else []
+    second: list[str] = []
+    if opposite != "wall":  # a third to two thirds of the units below the countertop
+        count = max(1, round(len(base) * float(rng.uniform(0.33, 0.67))))
+        base, second = base[:-count], base[-count:]
     names = _Names()
     rows = [_row(rng, tall, base, wall, names)]
     if second:
@@ -160,14 +163,6 @@ def _draw_kinds(rng: np.random.Generator, objects: int) -> tuple[list[str], list
         base.append(drawn)
         left -= find_kind(drawn).objects
     return tall, [base[k] for k in rng.permutation(len(base))], wall
-
-
-def _take_second_row(rng: np.random.Generator, base: list[str]) -> list[str]:
-    """Take a third to two thirds of the units below the countertop away, and return them."""
-    count = max(1, round(len(base) * float(rng.uniform(0.33, 0.67))))
-    taken = base[-count:]
-    del base[-count:]
-    return taken
 
 
 def _row(

@@ -12,7 +12,7 @@ from kineverse.articulations.mechanisms import FoldingDoor
 from kineverse.articulations.mechanisms.mechanism import shift
 from kineverse.model.body import Pose
 
-from .builder import BOARD, ENAMEL, FOAM, GLASS, STEEL, KitchenBuilder, Span, open_box, slab
+from .builder import BOARD, ENAMEL, FOAM, GLASS, STEEL, KitchenBuilder, Material, Span, open_box, slab
 from .fronts import FRONT, GAP, WALL, Area, door, drawer, flap
 from .layout import Unit
 
@@ -56,6 +56,15 @@ class UnitBuilder:
         """Return the left and the right half of the face between two heights [m]."""
         return Area((self.y[0], 0.0), (low, high)), Area((0.0, self.y[1]), (low, high))
 
+    def front(self, part: str, low: float, high: float) -> tuple[KitchenBuilder, str, str, Area]:
+        """Return what a front between two heights [m] is built from: kitchen, name, unit and area."""
+        return self.kitchen, self.name(part), self.unit.name, self.area(low, high)
+
+    def panel(self, part: str, low: float, high: float, material: Material) -> None:
+        """Add a panel in the plane of the fronts that does not open."""
+        y, z = self.area(low, high).front
+        self.kitchen.fixed(self.name(part), self.unit.name, shift(), [slab(FRONT, y, z, material)])
+
     def hand(self) -> Hand:
         """Return the side of a door's hinges."""
         return "left" if self.rng.random() < 0.5 else "right"
@@ -84,7 +93,7 @@ class UnitBuilder:
         pairs = list(zip(heights[1:], heights, strict=False))
         for k, (low, high) in enumerate(pairs):
             number = "" if only else f"_{first + k}"
-            drawer(self.kitchen, self.name(f"{name}{number}"), self.unit.name, self.area(low, high), DEPTH)
+            drawer(*self.front(f"{name}{number}", low, high), DEPTH)
 
     def doors(self, low: float, high: float, end: Literal["low", "high"], upper: float = _OPEN) -> None:
         """Add a pair of doors."""
@@ -98,15 +107,7 @@ class UnitBuilder:
     ) -> None:
         """Add a door as wide as the unit."""
         bar = (end, self.rng.random() < 0.75)
-        door(
-            self.kitchen,
-            self.name(part),
-            self.unit.name,
-            self.area(low, high),
-            self.hand(),
-            bar=bar,
-            upper=upper,
-        )
+        door(*self.front(part, low, high), self.hand(), bar=bar, upper=upper)
 
     def tall_door(self, low: float, high: float, part: str, *, cold: bool = False, hand: Hand) -> None:
         """Add a door of a tall unit, insulated if it is cold inside, with an upright handle."""
@@ -115,34 +116,16 @@ class UnitBuilder:
             half = self.unit.width / 2 - 0.035
             inside = [slab((-0.045, FRONT[0]), (-half, half), (low + 0.03, high - 0.03), FOAM)]
         room = self.kitchen.style.length / 2 + 0.08
-        height = min(max(_HANDLE_HEIGHT, low + room), high - room)
-        style = self.kitchen.style
-        door(
-            self.kitchen,
-            self.name(part),
-            self.unit.name,
-            self.area(low, high),
-            hand,
-            bar=round(height, 3),
-            material=style.tall_front,
-            inside=inside,
-        )
+        height = round(min(max(_HANDLE_HEIGHT, low + room), high - room), 3)
+        material = self.kitchen.style.tall_front
+        door(*self.front(part, low, high), hand, bar=height, material=material, inside=inside)
 
     def oven(self, low: float, high: float) -> None:
         """Add the panel and the flap of an oven."""
-        half = self.unit.width / 2
-        flap(
-            self.kitchen,
-            self.name("door"),
-            self.unit.name,
-            self.area(low, high - 0.12),
-            "bottom",
-            material=GLASS,
-            inside=[slab((-0.03, FRONT[0]), (-half + 0.04, half - 0.04), (low + 0.03, high - 0.15), ENAMEL)],
-        )
-        y, z = self.area(high - 0.12, high).front
-        panel = [slab(FRONT, y, z, STEEL)]
-        self.kitchen.fixed(self.name("panel"), self.unit.name, shift(), panel)
+        half = self.unit.width / 2 - 0.04
+        inside = [slab((-0.03, FRONT[0]), (-half, half), (low + 0.03, high - 0.15), ENAMEL)]
+        flap(*self.front("door", low, high - 0.12), "bottom", material=GLASS, inside=inside)
+        self.panel("panel", high - 0.12, high, STEEL)
 
     def wide(self) -> float:
         """Return the largest angle of a door between flush neighbours [rad]."""
@@ -173,9 +156,8 @@ def add_wall_unit(kitchen: KitchenBuilder, rng: np.random.Generator, unit: Unit,
     if unit.kind == "wall_folding":
         middle = round((low + high) / 2, 4)
         # The cupboard of the mechanism opens towards its -x.
-        pose = Pose(
-            (-1.0, 0.0, 0.0, -BACK + _FOLDING_SIZE[0] / 2, 0.0, -1.0, 0.0, unit.y, 0.0, 0.0, 1.0, middle)
-        )
+        behind = -BACK + _FOLDING_SIZE[0] / 2
+        pose = Pose((-1.0, 0.0, 0.0, behind, 0.0, -1.0, 0.0, unit.y, 0.0, 0.0, 1.0, middle))
         kitchen.mechanism(FoldingDoor, f"{unit.name}_door", row, pose, 600.0, size=_FOLDING_SIZE)
         return
     half = (low + high) / 2
@@ -186,10 +168,10 @@ def add_wall_unit(kitchen: KitchenBuilder, rng: np.random.Generator, unit: Unit,
         u.doors(low, high, "low")
     elif unit.kind == "wall_flap":
         # The upper half stays open, as a shelf.
-        flap(kitchen, u.name("flap"), unit.name, u.area(low, half), "top", upper=_OPEN)
+        flap(*u.front("flap", low, half), "top", upper=_OPEN)
     else:
-        flap(kitchen, u.name("upper_flap"), unit.name, u.area(half, high), "top", upper=_OPEN)
-        flap(kitchen, u.name("lower_flap"), unit.name, u.area(low, half), "top", upper=_OPEN)
+        flap(*u.front("upper_flap", half, high), "top", upper=_OPEN)
+        flap(*u.front("lower_flap", low, half), "top", upper=_OPEN)
 
 
 # -- units below the countertop ------------------------------------------------------------------------------
@@ -230,7 +212,7 @@ def _drawers(parts: Sequence[float]) -> UnitKind:
 
 def _pull_out(u: UnitBuilder, row: str, low: float, high: float) -> None:
     u.carcass(row)
-    drawer(u.kitchen, u.name("pull_out"), u.unit.name, u.area(low, high), DEPTH)
+    drawer(*u.front("pull_out", low, high), DEPTH)
 
 
 def _sink_door(u: UnitBuilder, row: str, low: float, high: float) -> None:
@@ -245,9 +227,8 @@ def _sink_doors(u: UnitBuilder, row: str, low: float, high: float) -> None:
 
 def _sink_pull_out(u: UnitBuilder, row: str, low: float, high: float) -> None:
     u.carcass(row, top=False)
-    drawer(u.kitchen, u.name("pull_out"), u.unit.name, u.area(low, high - 0.16), DEPTH)
-    y, z = u.area(high - 0.16, high).front
-    u.kitchen.fixed(u.name("panel"), u.unit.name, shift(), [slab(FRONT, y, z, u.kitchen.style.front)])
+    drawer(*u.front("pull_out", low, high - 0.16), DEPTH)
+    u.panel("panel", high - 0.16, high, u.kitchen.style.front)
 
 
 def _dishwasher(u: UnitBuilder, row: str, low: float, high: float) -> None:
@@ -255,16 +236,13 @@ def _dishwasher(u: UnitBuilder, row: str, low: float, high: float) -> None:
     half = u.unit.width / 2 - 0.04
     material = u.kitchen.style.front if u.rng.random() < 0.5 else STEEL
     inside = [slab((-0.03, FRONT[0]), (-half, half), (low + 0.03, high - 0.04), STEEL)]
-    flap(
-        u.kitchen, u.name("door"), u.unit.name, u.area(low, high), "bottom", material=material, inside=inside
-    )
+    flap(*u.front("door", low, high), "bottom", material=material, inside=inside)
 
 
 def _oven(u: UnitBuilder, row: str, low: float, high: float) -> None:
     u.carcass(row)
-    y, z = u.area(low, high - 0.6).front
     u.oven(high - 0.6, high)
-    u.kitchen.fixed(u.name("plinth_panel"), u.unit.name, shift(), [slab(FRONT, y, z, u.kitchen.style.front)])
+    u.panel("plinth_panel", low, high - 0.6, u.kitchen.style.front)
 
 
 def _open_shelf(u: UnitBuilder, row: str, low: float, high: float) -> None:
@@ -296,17 +274,11 @@ def _fridge_top(u: UnitBuilder, row: str, low: float, high: float) -> None:
     top = min(round(high - float(u.rng.choice((0.32, 0.4, 0.5))), 3), _HIGHEST_HANDLE - 0.06)
     u.carcass(row, shelves=(0.6, 0.95, top - WALL / 2))
     u.tall_door(low, top, "door", cold=True, hand=u.hand())
+    material = u.kitchen.style.tall_front
     if u.rng.random() < 0.5:
-        flap(
-            u.kitchen, u.name("top_flap"), u.unit.name, u.area(top, high), "top", upper=_OPEN,
-            material=u.kitchen.style.tall_front,
-        )  # fmt: skip
+        flap(*u.front("top_flap", top, high), "top", upper=_OPEN, material=material)
     else:
-        style, name = u.kitchen.style, u.name("top_door")
-        door(
-            u.kitchen, name, u.unit.name, u.area(top, high), u.hand(), bar=("low", False),
-            material=style.tall_front,
-        )  # fmt: skip
+        door(*u.front("top_door", top, high), u.hand(), bar=("low", False), material=material)
 
 
 def _oven_column(u: UnitBuilder, row: str, low: float, high: float) -> None:
