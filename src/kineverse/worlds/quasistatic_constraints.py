@@ -87,7 +87,7 @@ class ObjectLimits:
         self,
         model: ModelView,
         speeds: Sequence[Symbol],
-        is_robot: Callable[[str], bool],
+        robot: Robot,
         leave_out: Collection[str] = (),
     ) -> None:
         # Those of the robot alone have no entries in the columns, and are no rows.
@@ -105,7 +105,7 @@ class ObjectLimits:
         ]
         skipped = [(n, "accelerations are not limited") for n, c in kept.items() if c.order > 1]
         skipped += [pair for each in rows for pair in each.skipped if pair[1] not in _HARMLESS]
-        others = {n for n, c in kept.items() if not all(is_robot(s.path) for s in c.symbols)}
+        others = {n for n, c in kept.items() if not all(robot.moves(s) for s in c.symbols)}
         self.skipped = tuple(pair for pair in skipped if pair[0] in others)
         place = {s: k for k, s in enumerate(model.symbols)}
         self._positions, self._rates = (

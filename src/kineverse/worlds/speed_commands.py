@@ -12,8 +12,6 @@ import numpy.typing as npt
 from kineverse._checks import finite_number
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
-from kineverse.model.frame import is_of_robot
-from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
@@ -25,12 +23,14 @@ class _Command(NamedTuple):
     speeds: Array
     start: float
     end: float
+    silent: float  # time from which the fingers stop, too
 
 
 class SpeedCommands:
     """Speeds (n,) that were commanded to a robot, each with the time in which it acts [s].
 
-    After its end everything stops but the fingers, which keep their last speed.
+    After its end everything stops but the fingers. These keep their last speed until no command has come for
+    the time-out: a hand whose controller is gone must not go on closing.
     """
 
     def __init__(
@@ -48,8 +48,7 @@ class SpeedCommands:
     def reset(self) -> None:
         """Forget all commands."""
         self.refused = 0
-        self._last: Array = np.zeros(len(self._fingers))
-        self._active = _Command(self._last, 0.0, 0.0)
+        self._last = self._active = _Command(np.zeros(len(self._fingers)), 0.0, 0.0, 0.0)
         self._coming: deque[_Command] = deque()
 
     def take(self, speeds: StateLike, duration: float, stamp: float | None, now: float) -> float:
@@ -58,30 +57,35 @@ class SpeedCommands:
         taken = None if stamp is None else finite_number(stamp)
         if stamp is not None and taken is None:
             raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
-        vector = parse_speeds(speeds, self._columns, self._stop(self._last))
+        vector = parse_speeds(speeds, self._columns, self._at_rest(self._last, now))
+        silent = max(end, now + self._timeout)
         if taken is not None and now - self._timeout <= taken + ROUNDING <= now + 2 * ROUNDING:
-            until = min(end, taken + self._timeout)
+            silent = taken + self._timeout
+            until = min(end, silent)
         elif taken is not None:
             self.refused += 1
             self._report(f"speeds with the stamp {taken:g} s are refused")
-            vector = self._stop(self._last)
-        self._last = vector
-        self._coming.append(_Command(vector, now + self._delay, until + self._delay))
+            vector, until, silent = self._last.speeds, now, self._last.silent
+        self._last = _Command(vector, now, until, silent)
+        shift = self._delay
+        self._coming.append(_Command(vector, now + shift, until + shift, silent + shift))
         return end
 
     def acting(self, time: float) -> Array:
         """Return the speeds that act at a time [s], which is not before that of the last call."""
         while self._coming and self._coming[0].start <= time + ROUNDING:
             self._active = self._coming.popleft()
-        return self._active.speeds if time < self._active.end - ROUNDING else self._stop(self._active.speeds)
+        active = self._active
+        return active.speeds if time < active.end - ROUNDING else self._at_rest(active, time)
 
     def next_change(self, time: float) -> float:
         """Return the time after another one at which other speeds may act [s]; infinite if none is known."""
-        changes = (self._active.end, *(command.start for command in self._coming))
+        changes = self._active.end, self._active.silent, *(command.start for command in self._coming)
         return min((t for t in changes if t > time + ROUNDING), default=np.inf)
 
-    def _stop(self, speeds: Array) -> Array:
-        return np.where(self._fingers, speeds, 0.0)
+    def _at_rest(self, command: _Command, time: float) -> Array:
+        """Return the speeds (n,) at a time [s] from the end of a command on."""
+        return np.where(self._fingers & (time < command.silent - ROUNDING), command.speeds, 0.0)
 
 
 def parse_speeds(speeds: StateLike, columns: SpeedColumns, vector: Array) -> Array:
@@ -120,13 +124,3 @@ def check_settings(positive: Mapping[str, Any], others: Mapping[str, Any]) -> No
             kind = "positive number" if name in positive else "number from 0 on"
             raise InvalidValueError(f"'{name}' of a world is a {kind}, not {value!r}.")
 
-
-def find_robot_coordinates(model: ModelView, robot: str) -> list[Symbol]:
-    """Return the degrees of freedom of a robot, or raise UnknownNameError if it has none."""
-    result = [s for s in model.degrees_of_freedom if is_of_robot(s.path, robot)]
-    if not result:
-        prefixes = sorted({s.path.partition("/")[0] for s in model.degrees_of_freedom})
-        raise UnknownNameError(
-            f"No coordinate of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
-        )
-    return result
