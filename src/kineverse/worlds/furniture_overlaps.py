@@ -74,7 +74,12 @@ class FurnitureOverlaps:
         self._query = self.watch(self._objects)
         # Scenes without rules of their own find the same.
         plain = len(scene.rules) == len(Scene(scene.model).rules)
-        key = ("furniture overlaps", None if robot is None else robot.name, *scene.bodies, len(scene.collision_world.objects))
+        key = (
+            "furniture overlaps",
+            None if robot is None else robot.name,
+            *scene.bodies,
+            len(scene.collision_world.objects),
+        )
         self._by_default, self._always = (
             cached_for_version(scene.model, key, self._sample) if plain else self._sample()
         )

@@ -51,6 +51,7 @@ from .quasistatic_constraints import (
     pair_keys,
     project_twists,
 )
+from .robot import Robot
 
 SKIN = 1e-6  # gap to which objects are pushed [m]: below, normals of nearest points are not determined
 _REACH = 0.005  # distance beyond the robot's motion up to which gaps are rows [m]

@@ -25,6 +25,7 @@ from kineverse.model.velocity_constraints.velocity_rows import Recovery, Velocit
 from kineverse.symbols import Symbol
 
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps
+from .robot import Robot
 
 JAM = 0.5  # cosine of the angle between a normal and the motion that it causes, below which a contact jams
 _PARALLEL = 1e-3  # least eigenvalue of directions of motion that are not parallel

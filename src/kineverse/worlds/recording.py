@@ -33,7 +33,8 @@ from kineverse.state import State
 from kineverse.symbols import Symbol, parse_symbol_name
 
 from .recorder import TOPICS, import_mcap
-from .world import Contact, Observation
+from .robot_interface import Observation
+from .simulated_world import Contact
 
 MAX_CHUNK = 1 << 28  # largest chunk [byte], uncompressed
 MAX_TOTAL = 1 << 30  # largest content of a file [byte], uncompressed
@@ -230,14 +231,15 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunRecording:
-    """Run in a world.
+    """Run of a robot.
 
     Attributes
     ----------
     path
         File that it was read from.
     states, beliefs, commands
-        True state, believed state, and commanded speeds over time.
+        True state, believed state, and commanded speeds over time. There are no true states of a robot of
+        which nobody knows the truth.
     belief_poses
         World poses (4, 4) by frame that the believed values alone do not give.
     contacts
@@ -271,13 +273,18 @@ class RunRecording:
     complete: bool = True
 
     @property
+    def motion(self) -> ValuesOverTime:
+        """The true states; without any, the believed ones."""
+        return self.states if len(self.states) else self.beliefs
+
+    @property
     def times(self) -> Array:
-        """Times (T,) of the true states [s]."""
-        return self.states.times
+        """Times (T,) of the states [s]."""
+        return self.motion.times
 
     @property
     def duration(self) -> float:
-        """Time of the last true state [s]."""
+        """Time of the last state [s]."""
         return float(self.times[-1]) if len(self.times) else 0.0
 
     def __repr__(self) -> str:

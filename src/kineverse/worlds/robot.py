@@ -107,7 +107,7 @@ class Robot:
 
     @classmethod
     def of_mechanism(cls, model: ModelView) -> Robot:
-        """Return a model without a robot as one: its coordinates are driven, and none of its frames is a robot's."""
+        """Return a model without a robot as one that has no frames, and whose coordinates are all driven."""
         return cached_for_version(model, ("robot", None), lambda: cls(model, "", ()))
 
     def __repr__(self) -> str:

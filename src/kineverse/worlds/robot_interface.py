@@ -67,7 +67,8 @@ class RobotInterface(Protocol):
         """Let the robot move with speeds for a duration, and return when it is over.
 
         Speeds of anything else are not read. A missing speed is zero, but that of fingers keeps the last
-        value: a stop keeps the force of the gripper. Fingers that touch keep pressing until they are opened.
+        value: a stop keeps the force of the gripper. Fingers that hold something press it until they are
+        opened. Others stop where they are once no command has come for the time-out.
 
         Parameters
         ----------

@@ -57,12 +57,15 @@ class SpeedCommands:
         taken = None if stamp is None else finite_number(stamp)
         if stamp is not None and taken is None:
             raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
-        vector = parse_speeds(speeds, self._columns, self._at_rest(self._last, now))
-        silent = max(end, now + self._timeout)
-        if taken is not None and now - self._timeout <= taken + ROUNDING <= now + 2 * ROUNDING:
-            silent = taken + self._timeout
-            until = min(end, silent)
-        elif taken is not None:
+        vector = parse_speeds(
+            speeds, self._columns, self._stop(self._last, now <= self._last.silent + ROUNDING)
+        )
+        silent = now + self._timeout
+        if taken is None:
+            silent = max(silent, end)
+        elif now - self._timeout <= taken + ROUNDING <= now + 2 * ROUNDING:
+            until = min(end, taken + self._timeout)
+        else:
             self.refused += 1
             self._report(f"speeds with the stamp {taken:g} s are refused")
             vector, until, silent = self._last.speeds, now, self._last.silent
@@ -76,16 +79,18 @@ class SpeedCommands:
         while self._coming and self._coming[0].start <= time + ROUNDING:
             self._active = self._coming.popleft()
         active = self._active
-        return active.speeds if time < active.end - ROUNDING else self._at_rest(active, time)
+        if time < active.end - ROUNDING:
+            return active.speeds
+        return self._stop(active, time < active.silent - ROUNDING)
 
     def next_change(self, time: float) -> float:
         """Return the time after another one at which other speeds may act [s]; infinite if none is known."""
         changes = self._active.end, self._active.silent, *(command.start for command in self._coming)
         return min((t for t in changes if t > time + ROUNDING), default=np.inf)
 
-    def _at_rest(self, command: _Command, time: float) -> Array:
-        """Return the speeds (n,) at a time [s] from the end of a command on."""
-        return np.where(self._fingers & (time < command.silent - ROUNDING), command.speeds, 0.0)
+    def _stop(self, command: _Command, keeps_fingers: bool) -> Array:
+        """Return the speeds (n,) from the end of a command on."""
+        return np.where(self._fingers & keeps_fingers, command.speeds, 0.0)
 
 
 def parse_speeds(speeds: StateLike, columns: SpeedColumns, vector: Array) -> Array:
@@ -123,4 +128,3 @@ def check_settings(positive: Mapping[str, Any], others: Mapping[str, Any]) -> No
         if number is None or number < 0 or (name in positive and not number):
             kind = "positive number" if name in positive else "number from 0 on"
             raise InvalidValueError(f"'{name}' of a world is a {kind}, not {value!r}.")
-
