@@ -33,7 +33,7 @@ class Belief(Protocol):
 
 
 class EncoderBelief:
-    """Belief that reads encoders alone: of a mechanism that is driven, or a robot that nothing has to be seen by.
+    """Belief that reads encoders alone: of a driven mechanism, or a robot that has nothing to see.
 
     All other coordinates keep their default values, and their deviations are infinite.
     """

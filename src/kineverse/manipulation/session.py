@@ -1,4 +1,4 @@
-"""Session of a robot with skills: speeds go to its interface, readings come back and become the believed state."""
+"""Session of a robot: speeds go to its interface, readings come back and become the believed state."""
 
 from __future__ import annotations
 

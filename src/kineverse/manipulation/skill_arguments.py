@@ -7,23 +7,22 @@ from typing import Any
 
 from kineverse._checks import as_tolerance, finite_number
 from kineverse.errors import InvalidValueError
-from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import World
+from kineverse.worlds import Robot
 
 TOLERANCE = 0.02  # distance from a limit at which an object is open or shut, in a long range [m], [rad]
 _FIXED = 1e-9  # range of a coordinate up to which it counts as fixed [m], [rad]
 _LEAST_TOLERANCE, _SHARE = 1e-3, 0.02  # least tolerance between limits [m], [rad], and share of the distance
 
 
-def find_object_coordinate(world: World, what: Symbol | str) -> Symbol:
+def find_object_coordinate(robot: Robot, what: Symbol | str) -> Symbol:
     """Return the coordinate of an object by symbol or name."""
     if not isinstance(what, (str, Symbol)):
         raise InvalidValueError(f"what= is the coordinate of an object, by symbol or name, not {what!r:.60}.")
-    coordinate = world.model.symbol(str(what))
-    if is_of_robot(coordinate.path, world.robot):
+    coordinate = robot.model.symbol(str(what))
+    if robot.moves(coordinate):
         raise InvalidValueError(f"'{coordinate}' is a coordinate of the robot; name one of an object.")
     return coordinate
 

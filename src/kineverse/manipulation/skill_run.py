@@ -12,6 +12,9 @@ from kineverse.symbols import Symbol
 from .outcome import Outcome, SkillError
 from .session import Session
 
+_RAMP = 0.5  # time from rest to the usual speed [s]
+_PATIENCE = 4.0  # longest time for which a reference waits [s]
+
 
 class SkillRun:
     """Run of a skill: what all skills do in the same way.
@@ -42,7 +45,7 @@ class SkillRun:
 
     @property
     def value(self) -> float:
-        """Believed value of the object's coordinate [m], [rad]; the believed opening of one without a model."""
+        """Believed value of the object's coordinate [m], [rad]; NaN without one."""
         return float("nan") if self.coordinate is None else float(self.session.state[self.coordinate])
 
     @property
@@ -82,7 +85,8 @@ class SkillRun:
         except (InfeasibleError, NotFiniteError) as error:
             reason, kind = f"The controller has no command: {error}", "other"
         finally:  # also if the user interrupts it
-            session.stop()
+            if session.commands:
+                session.stop()
             session.phase, session.reference, session.vectors, session.contact = "", None, {}, None
         return self.finish(reason, kind)
 
@@ -96,3 +100,36 @@ class SkillRun:
             not failure, self.value, reason, session.interface.name,
             session.time - self.begin, session.steps - self.first, measures,
         )  # fmt: skip
+
+
+class Pace:
+    """Pace of a reference along a path, which waits for a robot that is late by a distance [m], [rad].
+
+    It begins at rest, unless the reference does so itself (``speed=1``), and again after a pause in which the
+    robot has stopped: nothing catches up.
+    """
+
+    def __init__(self, session: Session, late: float, *, speed: float = 0.0) -> None:
+        self._session, self._late, self._speed = session, late, speed
+        self._last = self._moved = session.time
+
+    def advance(self, distance: float) -> float:
+        """Return the time by which the reference goes on after a step [s], or raise SkillError.
+
+        The distance is that of the robot from the reference [m], [rad].
+        """
+        session = self._session
+        passed, self._last = session.time - self._last, session.time
+        if passed > session.interface.timeout:
+            self._speed, self._moved, passed = 0.0, session.time, session.dt
+        share = min(1.0, max(0.0, 1.5 - distance / self._late))
+        self._speed = share * min(1.0, self._speed + passed / _RAMP)
+        if share > 0.0:
+            self._moved = session.time
+        elif session.time - self._moved > _PATIENCE:
+            raise SkillError(
+                "other",
+                f"The robot does not follow its path: for {_PATIENCE:g} s it has been {distance:.3g} (m or "
+                f"rad) from it in '{session.phase}'.",
+            )
+        return self._speed * passed

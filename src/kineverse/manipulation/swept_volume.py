@@ -21,12 +21,12 @@ from kineverse.geometry import Rule, Scene
 from kineverse.geometry.distance_queries import PreparedQuery
 from kineverse.geometry.objects import Exclusion
 from kineverse.lie import Array
-from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot
 from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 from .outcome import SkillError
@@ -75,7 +75,7 @@ class BlockedError(SkillError):
     """End of a skill before something in the way of an object."""
 
     def __init__(self, obstacle: Obstacle) -> None:
-        super().__init__("collision", str(obstacle))
+        super().__init__("collision", str(obstacle), obstacle.measures)
         self.obstacle = obstacle
 
 
@@ -85,7 +85,7 @@ def find_obstacle(
     state: State,
     target: float,
     *,
-    robot: str = "",
+    robot: Robot | None = None,
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
     start: State | None = None,
@@ -101,7 +101,7 @@ def find_obstacle(
     def make() -> _Sweep:
         return _Sweep(model, robot, *own)
 
-    sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot), make)
+    sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot and robot.name), make)
     sweep.start = start
     result = sweep.find(coordinate, state, target, least)
     return None if result is None else sweep.find_aside(result, state)
@@ -111,10 +111,11 @@ class _Sweep:
     """Scene in which objects are swept."""
 
     def __init__(
-        self, model: ModelView, robot: str, rules: tuple[Rule, ...], leave_out: tuple[Exclusion, ...]
+        self, model: ModelView, robot: Robot | None, rules: tuple[Rule, ...], leave_out: tuple[Exclusion, ...]
     ) -> None:
         self._model, self._robot = model, robot
-        self._scene = Scene(model, rules=rules, leave_out=leave_out)
+        plain = not rules and not leave_out
+        self._scene = Scene.of(model) if plain else Scene(model, rules=rules, leave_out=leave_out)
         self._overlaps = FurnitureOverlaps(self._scene, robot)
         self._queries: dict[tuple[Symbol, bytes], tuple[PreparedQuery, FrameDependence]] = {}
         self.start: State | None = None
@@ -149,7 +150,7 @@ class _Sweep:
     def find_aside(self, found: Obstacle, state: State) -> Obstacle:
         """Return an obstacle with the coordinate that moves it, and where it leaves the path free."""
         model = self._model
-        free = [s for s in model.degrees_of_freedom if not (self._robot and is_of_robot(s.path, self._robot))]
+        free = [s for s in model.degrees_of_freedom if self._robot is None or not self._robot.moves(s)]
         moving = [
             s
             for s in free

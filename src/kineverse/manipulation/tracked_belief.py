@@ -116,8 +116,8 @@ class TrackedBelief:
     """Belief that reads observations and commands, and never the truth.
 
     Coordinates that were never seen have their default value, and half the width of their limits as
-    deviation. If the time goes back, as by a reset of a simulated world, all starts again: objects are believed
-    where they were, with that same deviation until they are seen.
+    deviation. If the time goes back, as by a reset of a simulated world, all starts again: objects are
+    believed where they were, with that same deviation until they are seen.
 
     Parameters
     ----------
@@ -153,8 +153,8 @@ class TrackedBelief:
         self.camera, marked = sensors.find_frames(robot)
         if sensors.camera is None and robot.camera is None:
             remarks.append(
-                f"No frame of '{robot.name}' is named like a camera, so markers are seen from '{self.camera}'; "
-                "camera= names another one."
+                f"No frame of '{robot.name}' is named like a camera, so markers are seen from "
+                f"'{self.camera}'; camera= names another one."
             )
         coordinates = {*model.degrees_of_freedom}
         moving = {name: coordinates.intersection(model.fk(name).symbols) for name in marked}
