@@ -257,6 +257,25 @@ def test_stale_commands_are_refused() -> None:
         assert (world.state["pr2/base/x"] > 1e-4) == (not refused)
 
 
+def test_fingers_stop_once_no_command_has_come_for_the_time_out_but_hold_what_they_press() -> None:
+    world, hand = world_with_bar(grip=40.0), gripper("fetch")
+    close, finger = closing("fetch"), hand.joints[0]
+    world.apply(close, 0.1, stamp=0.0)  # nothing follows: it acts for the time-out of 40 ms
+    after = world.state[finger]
+    assert 0.5 * 0.05 * 0.04 < abs(after - hand.opened[finger]) < 1.5 * 0.05 * 0.04
+    for _ in range(10):
+        world.apply(close, 0.05, stamp=world.time - 1.0)
+        world.apply({}, 0.05)
+    assert world.refused == 10
+    assert world.state[finger] == pytest.approx(after, abs=1e-4)
+    assert world.held is None
+    world.apply(close, 1.2)
+    assert world.held == "thing/bar"
+    for _ in range(5):
+        world.apply(close, 0.1, stamp=world.time - 1.0)
+    assert finger_forces(world) == pytest.approx([40.0, 40.0], rel=0.02)
+
+
 def test_delay_postpones_commands() -> None:
     model = kv.load("fetch")
     world = MujocoWorld(model, "fetch", gripper("fetch"), delay=0.05, sensors=Sensors(rate=100.0))
