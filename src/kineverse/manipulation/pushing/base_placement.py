@@ -18,8 +18,7 @@ from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
 from kineverse.errors import KineverseError
 from kineverse.lie import Array
-from kineverse.manipulation.base_sampling import BaseSampler, find_planar_base
-from kineverse.model.frame import is_of_robot
+from kineverse.manipulation.base_sampling import BaseSampler
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -180,12 +179,12 @@ class _Sampler:
         tip, axis = tool.locate_tip(model), tool.point_axis(model)
         self._point = Target("push/start/point", np.zeros(3))
         self._facing = Target("push/start/facing", np.array([1.0, 0.0, 0.0]))
-        still = [s for s in model.degrees_of_freedom if not is_of_robot(s.path, pushing.robot)]
+        still = [s for s in model.degrees_of_freedom if not pushing.robot.moves(s)]
         exact: list[Task] = [Hold(tip, self._point.expression, name="tip")]
         if axis.gradient():
             exact.append(Goal(axis, self._facing.expression, name="facing", weight=0.1))
         nearby = Goal(tip, self._point.expression, name="tip")
-        self.base = find_planar_base(model, model.symbols_of(tool.frame))
+        self.base = pushing.robot.planar_base
         # A pusher that cannot face the contact may still reach it with another part than its tip.
         goals: tuple[tuple[list[Task], float], ...] = (
             (exact, 2 * math.sin(_TILT / 2)), ([nearby], _NEARBY)
@@ -207,7 +206,7 @@ class _Sampler:
                 for (tasks, tolerance), last in zip(goals, clear, strict=True)
             ]
         self._tried = 0
-        robot_bodies = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
+        robot_bodies = [b for b in pushing.scene.bodies if pushing.robot.owns(b)]
         others = [b for b in pushing.scene.bodies if b not in robot_bodies]
         self._bases = BaseSampler(pushing.scene, self.base, robot_bodies, others, _MARGIN)
         self._points = pushing.surface.at(state)
