@@ -37,8 +37,8 @@ _SETTLED, _MOST_SETTLING = 5e-4, 3.0
 """Error of the hand's pose at the end of a straight path [m], [rad], and the longest time until it is met
 [s]."""
 _LATE, _LINE_LATE = 0.1, 0.02
-"""Distances from a reference at which that stands still [m], [rad]: of an arm and a held object, and of a hand
-beside a handle, which must not cut corners."""
+"""Distances from a reference at which that stands still [m], [rad]: of an arm and a held object, and of a
+hand beside a handle, which must not cut corners."""
 _RESTING_AT_END = 0.2  # time for which a reference stands at the end of a trajectory [s]
 _AT_HANDLE = 0.02  # distance of a hand that may hold a handle, less than after any retreat [m]
 _REFERENCES = 24  # number of poses that pages show of a path
