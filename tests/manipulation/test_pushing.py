@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import cache
 
 import numpy as np
@@ -30,7 +29,7 @@ from kineverse.manipulation.pushing.vectors import move_point
 from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.tracked_belief import TrackedBelief
-from kineverse.worlds import KinematicWorld, MujocoWorld, Observation, Robot, RunMetrics, Sensors, TrueBelief
+from kineverse.worlds import KinematicWorld, MujocoWorld, Robot, RunMetrics, Sensors, TrueBelief
 from robot_interface_proxy import InterfaceOnly
 
 PUSHER = "robot/finger"
