@@ -73,7 +73,7 @@ class FurnitureOverlaps:
         self.counting = np.ones((len(scene.bodies),) * 2, dtype=bool)
         self._query = self.watch(self._objects)
         # Scenes without rules of their own find the same.
-        plain = len(scene.rules) == len(Scene(scene.model).rules)
+        plain = len(scene.rules) == len(Scene.of(scene.model).rules)
         key = (
             "furniture overlaps",
             None if robot is None else robot.name,

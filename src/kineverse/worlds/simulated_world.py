@@ -1,4 +1,4 @@
-"""What only a simulation has: the true state, resets, contacts, and what a hand really holds."""
+"""Simulated worlds: true state, resets, contacts, and the body in the hand, which no real robot tells."""
 
 from __future__ import annotations
 
