@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 
 import numpy as np
@@ -29,7 +30,7 @@ from kineverse.manipulation.pushing.vectors import move_point
 from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.tracked_belief import TrackedBelief
-from kineverse.worlds import KinematicWorld, MujocoWorld, Robot, RunMetrics, Sensors, TrueBelief
+from kineverse.worlds import KinematicWorld, MujocoWorld, Observation, Robot, RunMetrics, Sensors, TrueBelief
 from robot_interface_proxy import InterfaceOnly
 
 PUSHER = "robot/finger"
@@ -79,6 +80,55 @@ def begin(
 
     belief = TrueBelief(world) if sensors is None else TrackedBelief(world.model, "robot", sensors)
     return Session(InterfaceOnly(world), belief=belief, on_step=look)
+
+
+class FaultyReadings:
+    """Interface of a world whose readings are wrong for a time, from when a coordinate has moved by 2 cm or 0.02 rad.
+
+    Attributes
+    ----------
+    moving
+        Time after the begin of the fault at which the robot still moved [s].
+    """
+
+    def __init__(self, world: KinematicWorld, watched: str, fault: str, seconds: float) -> None:
+        self._world, self._watched, self._fault, self._seconds = world, watched, fault, seconds
+        self.name, self.model, self.robot = world.name, world.model, world.robot
+        self.remarks, self.timeout = world.remarks, world.timeout
+        self._first, self._begin, self._last = world.state[watched], math.inf, world.observe()
+        self.moving = 0.0
+
+    @property
+    def time(self) -> float:
+        return self._world.time
+
+    def apply(self, speeds: kv.StateLike, duration: float, *, stamp: float | None = None) -> None:
+        before = self._world.state
+        self._world.apply(speeds, duration, stamp=stamp)
+        after = self._world.state
+        if math.isinf(self._begin) and abs(after[self._watched] - self._first) > 0.02:
+            self._begin = self.time
+        elif self.is_faulty and any(abs(after[s] - before[s]) > 1e-6 for s in self.robot.coordinates):
+            self.moving = self.time - self._begin
+
+    @property
+    def is_faulty(self) -> bool:
+        return 0.0 <= self.time - self._begin < self._seconds
+
+    def observe(self) -> Observation:
+        reading = self._world.observe()
+        if not self.is_faulty:
+            self._last = reading
+        elif self._fault == "not a number":
+            return replace(reading, joints=dict.fromkeys(reading.joints, math.nan))
+        return self._last
+
+
+READING_FAULTS = (
+    ("missing", 0.3, ""), ("missing", 1.0, ""), ("missing", math.inf, "was observed last at"),
+    ("not a number", 0.3, ""), ("not a number", math.inf, "are no finite numbers"),
+)  # fmt: skip
+"""Faults, how long they last [s], and what the outcome says of those that do not end."""
 
 
 class Locked(KinematicWorld):
@@ -228,6 +278,26 @@ def test_push_on_estimates_feels_for_the_object() -> None:
     assert abs(world.state["door"]) < 0.02
     assert abs(outcome.value - world.state["door"]) < 0.01
     assert outcome.measures["losses"] <= 1
+
+
+@pytest.mark.parametrize(("fault", "seconds", "says"), READING_FAULTS)
+def test_push_waits_for_readings_and_says_which_have_ended(fault: str, seconds: float, says: str) -> None:
+    world = KinematicWorld(room(), "robot", sensors=SENSORS)
+    world.reset(opened(drawer=0.2) | {"robot/base/y": -1.0, "robot/base/x": 0.5})
+    faulty, fastest = FaultyReadings(world, "drawer", fault, seconds), [0.0]
+
+    def look(session: Session) -> None:
+        fastest.append(max(map(abs, session.commands.values()), default=0.0))
+
+    session = Session(
+        InterfaceOnly(faulty), belief=TrackedBelief(room(), "robot", SENSORS), on_step=look, patience=3.0
+    )
+    outcome = push(session, "drawer", bodies=PUSHER)
+    assert (bool(outcome), says in outcome.reason) == (not says, True), outcome.reason
+    assert (abs(world.state["drawer"]) < 0.02) == (not says)
+    assert not any(session.commands.values())
+    assert faulty.moving <= 0.1
+    assert max(fastest) < 0.5
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_pushing import READING_FAULTS, FaultyReadings
 
 import kineverse as kv
 from kineverse.control import Goal, same_pose
@@ -160,8 +161,8 @@ def make_world(model, seed=1):
     return world
 
 
-def run(model, world, part=None, **options):
-    session = Session(InterfaceOnly(world), on_step=options.pop("on_step", None))
+def run(model, world, part=None, on_step=None, **options):
+    session = Session(InterfaceOnly(world), on_step=on_step, patience=3.0)
     return open_unknown(session, HANDLE, model=model, part=part, sensors=SENSORS, **options)
 
 
@@ -217,6 +218,26 @@ def test_looks_at_a_part_that_slips_through_the_hand_are_those_of_its_joint(trut
         see((k + 10) / 30, 1.0)  # the stamp is that of the last look
     np.testing.assert_allclose([look.pose for look in belief.looks], [door({DOOR: q}) for q in angles])
     assert belief.slip(place, floating.point) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("fault", "seconds", "says"),
+    [pytest.param(*fault, marks=pytest.mark.long) for fault in READING_FAULTS[:-1]] + [READING_FAULTS[-1]],
+)
+def test_pull_waits_for_readings_and_says_which_have_ended(truth, fault, seconds, says):
+    world, fastest = make_world(truth), [0.0]
+    faulty = FaultyReadings(world, DOOR, fault, seconds)
+
+    def look(session):
+        if session.phase == "pull":
+            fastest.append(max(map(abs, session.commands.values()), default=0.0))
+
+    model = forget_joint(truth, DOOR, truth.default_state())
+    outcome = run(model, faulty, part=DOOR, turn=np.radians(15), on_step=look)
+    assert (bool(outcome), says in outcome.reason) == (not says, True), outcome.reason
+    assert (world.state[DOOR] > np.radians(12)) == (not says)
+    assert faulty.moving <= 0.1
+    assert max(fastest) < 1.0
 
 
 @pytest.mark.parametrize(

@@ -209,6 +209,8 @@ class UnknownOpeningRun(SkillRun):
         with self.session.believing(self.belief):
             self._look()
             self._prepare(self.unknown)
+            if self.motion.is_at_handle:
+                self._retract(None)
             if self.belief.monitor is None:
                 self.belief.monitor = watch_joint(self.model, self.belief)
             failure: SkillError | None = None
@@ -245,18 +247,19 @@ class UnknownOpeningRun(SkillRun):
             found.append((share, placement))
             return share > _ENOUGH and self._plan(placement)
 
-        why = ""
+        failure: SkillError | None = None
         for k in range(_SEARCHES if twists else 1):
             result = self._search(_REACH, accept, self.seed + k)
             if result:
                 return result
-            why = why or result.why
+            failure = failure or self._explain(result)
             if not found:
-                raise SkillError(result.failure, why)
+                raise failure
         for _, placement in sorted(found, key=lambda pair: -pair[0]):
             if self._plan(placement):
                 return placement
-        raise SkillError("collision", f"{why}{self.approach.barrier}")
+        assert failure is not None
+        raise failure
 
     def _place_further(self) -> BasePlacement:
         learned = self.learning.learned
@@ -270,8 +273,14 @@ class UnknownOpeningRun(SkillRun):
         rest = self.wanted[kind] - self.pulling.opening[kind]
         result = self._search(_FURTHER * scale * rest, self._plan, self.seed)
         if not result:
-            raise SkillError(result.failure, f"{result.why}{self.approach.barrier}")
+            raise self._explain(result)
         return result
+
+    def _explain(self, result: BasePlacement) -> SkillError:
+        """Return why there is no placement from which the robot could pull."""
+        standing = self.opener.approaches.explain_standing(self.session.state)
+        why = f" {standing}" if standing else self.approach.barrier
+        return SkillError("reach" if standing else result.failure, f"{result.why}{why}")
 
     def _pull(self, placement: BasePlacement) -> str:
         """Take the handle, pull, let go, and return how far the part is open."""
@@ -298,17 +307,20 @@ class UnknownOpeningRun(SkillRun):
         return reason
 
     def _let_go(self, grasp: Grasp) -> None:
-        """Open the fingers, take the hand back, and look at the part, if there is time and anything is read.
+        """Let go of the part, if there is time and anything is read."""
+        session = self.session
+        self.belief.release()
+        if self.left >= 0.0 and not session.broken and session.time - (session.state.stamp or 0.0) <= STALE:
+            self._retract(grasp)
+
+    def _retract(self, grasp: Grasp | None) -> None:
+        """Open the fingers, take the hand back, and look at the part.
 
         Where the part is after an unknown motion, the retreat of the placement has not been checked.
         """
-        session = self.session
-        self.belief.release()
-        if self.left < 0.0 or session.broken or session.time - (session.state.stamp or 0.0) > STALE:
-            return
-        session.phase = "release"
+        self.session.phase = "release"
         self.motion.move_fingers(self.gripper.opened)
-        session.phase = "retract"
+        self.session.phase = "retract"
         self.motion.back_off(grasp)
         self.stand(LOOKING)
 
@@ -334,8 +346,9 @@ class UnknownOpeningRun(SkillRun):
             model, handle = self.unknown.model, self.unknown.handle
             grasps = sample_grasps(model, self.gripper, handle, _GRASPS, seed, state=session.state)
             return self.opener.search.find(
-                session.state, grasps, distance, accept=accept, samples=self.samples, seed=seed
-            )
+                session.state, grasps, distance, accept=accept, samples=self.samples, seed=seed,
+                stays=bool(self.opener.approaches.explain_standing(session.state)),
+            )  # fmt: skip
 
     def _plan(self, placement: BasePlacement) -> bool:
         self.approach = self.opener.approaches.plan_to(self.session.state, placement, self.seed)
