@@ -15,7 +15,7 @@ from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Robot, Session, TrackedBelief, open_object
 from kineverse.manipulation.opening.arm_paths import CartesianPaths, PathCheck, find_least_time
 from kineverse.manipulation.opening.base_placement import PlacementSampler
-from kineverse.manipulation.opening.hand_motion import HandMotion
+from kineverse.manipulation.opening.hand_motion import SLIPPED, HandMotion
 from kineverse.manipulation.skill_arguments import choose_tolerance
 from kineverse.worlds import KinematicWorld, MujocoWorld, RunMetrics, Sensors, TrueBelief
 from robot_interface_proxy import InterfaceOnly
@@ -151,15 +151,19 @@ def test_loss_of_a_drawer_that_moves_too_hard_is_noticed_and_said(model):
     pytest.importorskip("mujoco")
     world = MujocoWorld(model, "hsr", door_friction={DRAWER: 150.0})  # and friction holds 100 N
     world.reset(start(model))
-    last_held, losses, phases = 0.0, [], [""]
+    in_hand = model.fk(find_handle(model, DRAWER).frame, relative_to="hsr/hand_palm_link")[:3, 3]
+    losses, phases, places = [], [""], []
 
     def watch(session):
-        nonlocal last_held
+        """Note how long the handle was further off than it slips before the arm stands."""
         if phases[-1] == "move" != session.phase:
             arm = [v for s, v in session.commands.items() if "hand_motor" not in str(s)]
-            losses.append((world.time - session.dt - last_held, max(map(abs, arm), default=0.0)))
+            gone = (t for t, place in places if np.linalg.norm(place - places[0][1]) > SLIPPED)
+            losses.append((world.time - session.dt - next(gone, world.time), max(map(abs, arm), default=0.0)))
+            places.clear()
         phases.append(session.phase)
-        last_held = world.time if world.held else last_held
+        if session.phase == "move":
+            places.append((world.time, in_hand(world.state)))
 
     outcome = open_object(connect(world, on_step=watch), DRAWER)
     assert not outcome

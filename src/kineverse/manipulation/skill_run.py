@@ -106,24 +106,24 @@ class Pace:
     """Pace of a reference along a path, which waits for a robot that is late by a distance [m], [rad].
 
     It begins at rest, unless the reference does so itself (``speed=1``), and again after a pause in which the
-    robot has stopped: nothing catches up.
+    robot has stopped: nothing catches up. ``speed`` is the present share of the usual speed.
     """
 
     def __init__(self, session: Session, late: float, *, speed: float = 0.0) -> None:
-        self._session, self._late, self._speed = session, late, speed
+        self._session, self._late, self.speed = session, late, speed
         self._last = self._moved = session.time
 
     def advance(self, distance: float) -> float:
         """Return the time by which the reference goes on after a step [s], or raise SkillError.
 
-        The distance is that of the robot from the reference [m], [rad].
+        The distance is that of the robot from the reference before the step [m], [rad].
         """
         session = self._session
         passed, self._last = session.time - self._last, session.time
         if passed > session.interface.timeout:
-            self._speed, self._moved, passed = 0.0, session.time, session.dt
+            self.speed, self._moved, passed = 0.0, session.time, session.dt
         share = min(1.0, max(0.0, 1.5 - distance / self._late))
-        self._speed = share * min(1.0, self._speed + passed / _RAMP)
+        self.speed = share * min(1.0, self.speed + passed / _RAMP)
         if share > 0.0:
             self._moved = session.time
         elif session.time - self._moved > _PATIENCE:
@@ -132,4 +132,4 @@ class Pace:
                 f"The robot does not follow its path: for {_PATIENCE:g} s it has been {distance:.3g} (m or "
                 f"rad) from it in '{session.phase}'.",
             )
-        return self._speed * passed
+        return self.speed * passed

@@ -148,10 +148,10 @@ class HandMotion:
         while time < trajectory.duration + _RESTING_AT_END:
             self.refer_to(time / max(trajectory.duration, session.dt))
             with session.timed("approach"):
-                follower.set(controller, time)
+                follower.set(controller, time, pace=pace.speed)
                 command = controller.step(self.state)
-            self.run.act(command.speeds, command)
             away = session.state.vector(trajectory.symbols) - trajectory.positions_at(time)
+            self.run.act(command.speeds, command)
             time += pace.advance(float(np.abs(away).max(initial=0.0)))
         session.reference = None
 
@@ -186,12 +186,12 @@ class HandMotion:
             with session.timed("line"):
                 state = self.state
                 controller.set(wanted, bar(state.vector(bar.inputs)) @ pose)
-                controller.set(rate, speed if share < 1.0 else 0.0 * speed)
+                controller.set(rate, (pace.speed if share < 1.0 else 0.0) * speed)
                 if posture is not None and follow is not None and rows is not None:
                     # A base that lags would lead the arm along a path that was not checked.
                     row, next_row = row_at(rows, share), row_at(rows, later)
                     controller.set(posture, row)
-                    controller.set(follow, (next_row - row) / session.dt)
+                    controller.set(follow, pace.speed * (next_row - row) / session.dt)
                 command = controller.step(state)
             error = command.residuals["hand"]
             if share == 1.0 and error < settled:
@@ -448,11 +448,11 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             controller.set(posture, reference)
             controller.set(wanted, np.array([value]))
             command = controller.step(state)
+            # The reference waits for the slowest joint.
+            arm = np.abs(reference - state.vector(moving)).max(initial=0.0)
+            late = max(float(arm), abs(value - state[coordinate]))
         motion.refer_to(share)
         motion.run.act(command.speeds, command)
-        # The reference waits for the slowest joint.
-        arm = np.abs(reference - session.state.vector(moving)).max(initial=0.0)
-        late = max(float(arm), abs(value - session.state[coordinate]))
         share = min(1.0, share + pace.advance(late) * _SPEED / length)
         slip.check(slip.measure(session.state), coordinate)
         done = abs(session.state[coordinate] - values[0])

@@ -320,10 +320,14 @@ class PushRun(SkillRun):
         session.phase, symbols = "approach", trajectory.symbols
         time, pace = 0.0, Pace(session, _LATE, speed=1.0)
         while time < trajectory.duration + _SETTLING:
-            now, later = trajectory.positions_at(time), trajectory.positions_at(time + session.dt)
-            rates = (later - now) / session.dt + _FOLLOWING * (now - session.state.vector(symbols))
+            now = trajectory.positions_at(time)
+            later, away = (
+                trajectory.positions_at(time + pace.speed * session.dt),
+                now - session.state.vector(symbols),
+            )
+            rates = (later - now) / session.dt + _FOLLOWING * away
             self.act({s.derivative(): v for s, v in zip(symbols, rates.tolist(), strict=True)})
-            time += pace.advance(float(np.abs(now - session.state.vector(symbols)).max()))
+            time += pace.advance(float(np.abs(away).max()))
 
     def _retreat(self) -> None:
         self._pushing.retreating = True
