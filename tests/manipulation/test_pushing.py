@@ -280,6 +280,17 @@ def test_push_on_estimates_feels_for_the_object() -> None:
     assert outcome.measures["losses"] <= 1
 
 
+def test_push_begins_at_the_present_of_a_robot_whose_time_runs_on() -> None:
+    world = KinematicWorld(room(), "robot")
+    world.reset(opened(drawer=0.1) | {"robot/base/y": -1.0, "robot/base/x": 0.4})
+    session = begin(world)
+    world.apply({"robot/base/x:velocity": 0.1}, 0.1)
+    world.apply({}, 60.0)
+    outcome = push(session, "drawer", bodies=PUSHER, seconds=20.0)
+    assert outcome, outcome.reason
+    assert outcome.seconds < 20.0
+
+
 @pytest.mark.parametrize(("fault", "seconds", "says"), READING_FAULTS)
 def test_push_waits_for_readings_and_says_which_have_ended(fault: str, seconds: float, says: str) -> None:
     world = KinematicWorld(room(), "robot", sensors=SENSORS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 from kineverse.control import Command
@@ -37,6 +38,8 @@ class SkillRun:
     """
 
     def __init__(self, session: Session, coordinate: Symbol | None, seconds: float) -> None:
+        with suppress(SkillError):  # which the skill says
+            session.refresh()  # a robot's time runs on between two skills
         self.session, self.coordinate = session, coordinate
         self.model, self.robot = session.model, session.robot
         self.first, self.begin = session.steps, session.time
