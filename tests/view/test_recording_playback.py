@@ -106,6 +106,18 @@ def test_a_recording_is_played_on_the_page(scene):
             page.play(Trajectory((kv.position("cupboard/dor"),), [0], [[0]], [[0]]))
 
 
+def test_a_run_without_a_known_truth_shows_the_belief(tmp_path):
+    model, path = cupboard(), tmp_path / "run.mcap"
+    with Recorder(path, model) as recorder:
+        for time in (0.5, 1.0):
+            step = SimpleNamespace(time=time, state=state(model, cupboard__door=time), commands={}, phase="")
+            recorder(step)
+    scene = RecordedScene(read_run_recording(path))
+    assert scene.trajectory.duration == 1.0
+    assert scene.values_at(1.0)["cupboard/door"] == 1.0
+    assert scene.at(1.0).ghosts == {}
+
+
 def test_a_run_is_shown_while_it_happens(scene):
     pytest.importorskip("viser", reason="the page needs the extra 'view'")
     from kineverse.view.run_overlay import LiveRun
