@@ -118,7 +118,7 @@ def _execute(
     with ExitStack() as stack:
         if arguments.record is not None:
             about = {"model": arguments.model, "world": world.name}
-            recorder = stack.enter_context(Recorder(arguments.record, world, about))
+            recorder = stack.enter_context(Recorder(arguments.record, model, about, world=world))
             watchers.append(recorder)
 
         def look(session: Session) -> None:

@@ -19,6 +19,9 @@ from .opening.grasped_opening import open_object
 from .outcome import Outcome
 from .session import Session
 
+_SHORT_WAY, _SHORT_TURN = 0.03, math.radians(6.0)
+"""Distance [m] and angle [rad] by which a part may be less open than the skill believes."""
+
 
 @dataclass(frozen=True, slots=True)
 class JudgedOutcome(Outcome):
@@ -38,20 +41,34 @@ class JudgedOutcome(Outcome):
 def judge_outcome(outcome: Outcome, metrics: RunMetrics) -> JudgedOutcome:
     """Return the outcome of a skill as the metrics of its run have it.
 
+    The object has to be where it was wanted; a part whose motion is measured, as far open as the skill says.
+
     Parameters
     ----------
     outcome
         What the skill believes; its measures ``target`` and ``tolerance`` say where the object was wanted.
     metrics
-        Metrics of the run, with the coordinate of the object. Their measures are added.
+        Metrics of the run, with the coordinate of the object. Their measures are added, and the ``way`` and
+        the ``turn`` of a part replace what the skill believes of them.
     """
-    value, overlap, done, reason = metrics.value, metrics.overlap, outcome.done, outcome.reason
+    value, overlap, objections = metrics.value, metrics.overlap, list[str]()
     measures = {**metrics.measures, **outcome.measures}
     target, tolerance = measures.get("target", math.nan), measures.get("tolerance", math.nan)
-    if done and abs(value - target) > tolerance:
-        done, reason = False, f"{reason} The world says {value:.4g}, not {target:.4g} ± {tolerance:.2g}."
+    if abs(value - target) > tolerance:
+        objections.append(f"The world says {value:.4g}, not {target:.4g} ± {tolerance:.2g}.")
+    if not math.isnan(metrics.way):
+        way, turn = measures.get("way", 0.0), measures.get("turn", 0.0)
+        measures |= {"way": metrics.way, "turn": metrics.turn}
+        if metrics.way < way - _SHORT_WAY or metrics.turn < turn - _SHORT_TURN:
+            opened = f"{100 * metrics.way:.0f} cm and {math.degrees(metrics.turn):.0f}°"
+            objections.append(f"The world says that it is open by {opened}.")
+    if not outcome:
+        objections = []  # the skill has said why
     if overlap is not None:
-        done, reason = False, f"{reason} {overlap}"
+        objections.append(str(overlap))
+    done, reason = outcome.done and not objections, outcome.reason
+    if objections:
+        reason = " ".join([f"{reason.removesuffix('.')}.", *objections])
     if not done:
         measures.setdefault("failure", "other" if overlap is None else "collision")
     return JudgedOutcome(

@@ -130,9 +130,9 @@ def push(
     Returns
     -------
     Outcome
-        With ``measures``: ``losses``, ``blocked``, ``contacts``, ``jammed``, ``planned``, ``tolerance``, and
-        ``failure``: ``"collision"``, ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to
-        which the path is free, if something is in the way.
+        With ``measures``: ``losses``, ``blocked``, ``contacts``, ``jammed``, ``planned``, ``target``,
+        ``tolerance``, and ``failure``: ``"collision"``, ``"time"`` or ``"other"``, if it was not done;
+        ``free``, the value up to which the path is free, if something is in the way.
 
     Raises
     ------
@@ -206,7 +206,7 @@ class PushRun(SkillRun):
         session, model, coordinate, target = self.session, self.model, self.coordinate, self._target
         self._look()
         self._tolerance = tolerance = choose_tolerance(model, coordinate, session.state, target, tolerance)
-        self.measures["tolerance"] = tolerance
+        self.measures |= {"target": target, "tolerance": tolerance}
         if pushing is None:
             if abs(self.value - target) <= tolerance / 2:
                 return f"'{coordinate}' is there from the start"
