@@ -291,6 +291,32 @@ def test_push_begins_at_the_present_of_a_robot_whose_time_runs_on() -> None:
     assert outcome.seconds < 20.0
 
 
+class LateSteps(FaultyReadings):
+    """Interface whose steps last up to 30 ms longer than they should, each in its own way."""
+
+    random = np.random.default_rng(0)
+
+    def apply(self, speeds: kv.StateLike, duration: float, *, stamp: float | None = None) -> None:
+        super().apply(speeds, duration, stamp=stamp)
+        self._world.apply(speeds, self.random.uniform(0.001, 0.03))
+
+
+def test_push_counts_the_time_that_steps_really_last() -> None:
+    world = KinematicWorld(room(), "robot", sensors=SENSORS)
+    world.reset(opened(door=0.3) | {"robot/base/y": 1.0})
+    metrics = RunMetrics(world, room().symbol("door"))
+    session = Session(
+        InterfaceOnly(LateSteps(world, "door", "", 0.0)),
+        belief=TrackedBelief(room(), "robot", SENSORS),
+        on_step=metrics,
+    )
+    outcome = push(session, "door", bodies=PUSHER)
+    assert outcome, outcome.reason
+    assert abs(world.state["door"]) < 0.02
+    assert metrics.measures["contact_losses"] <= 1
+    assert metrics.overlap is None
+
+
 @pytest.mark.parametrize(("fault", "seconds", "says"), READING_FAULTS)
 def test_push_waits_for_readings_and_says_which_have_ended(fault: str, seconds: float, says: str) -> None:
     world = KinematicWorld(room(), "robot", sensors=SENSORS)
