@@ -116,6 +116,34 @@ def test_drawer_closes_again(opened, session, world):
     assert closed.measures["placements"] == 0  # the way of the opening, backwards
 
 
+@pytest.mark.parametrize("is_known", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_a_hand_that_was_left_at_a_handle_lets_go_first(model, is_known):
+    """The skill dies while it pulls, and another one knows nothing of that."""
+    world = KinematicWorld(model, "hsr", sensors=Sensors.parse("3mm+3mm/m,0.5deg,30Hz"))
+    world.reset(start(model))
+
+    def break_off(session):
+        if world.state[DRAWER] > 0.1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        open_object(connect(world, on_step=break_off), DRAWER)
+    assert world.held
+    phases, metrics = [], measure(world)
+
+    def look(session):
+        metrics(session)
+        phases.append(session.phase)
+
+    again = Session(InterfaceOnly(world), belief=TrueBelief(world) if is_known else None, on_step=look)
+    outcome = open_object(again, DRAWER)
+    assert outcome, outcome.reason
+    assert world.state[DRAWER] == pytest.approx(0.22, abs=0.02)
+    first = [phase for phase in dict.fromkeys(phases) if phase != "look"]
+    assert first[:3] == ["release", "retract", "approach"]
+    assert metrics.measures["penetration"] < 5e-4
+
+
 def test_ways_lead_back_for_their_own_coordinate_only(opened, session, world):
     """A stage that carries the drawer is not taken for it, though the handle is the same."""
     grasp = session.made[-1].grasp

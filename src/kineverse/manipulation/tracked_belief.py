@@ -109,7 +109,7 @@ In the latter all of the tracker's process noise counts."""
 _STILL = 1e-3  # largest speed of a part that rests [m/s], [rad/s]
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
 """Error of the motion of joints relative to the commanded one, and independent of it [rad/√s], [m/√s]."""
-_HORIZON = 0.04  # longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays
+_HORIZON = 0.02  # longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays
 
 
 class TrackedBelief:
