@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import perf_counter, thread_time
@@ -279,7 +280,7 @@ class Session:
         """
         resolved = self._resolve(speeds)
         before, self.command = self.time, command
-        self._advance(resolved)
+        self._advance(resolved, stamp=self.state.stamp if resolved else None)
         if self._find_problem(before):
             self.await_readings(before)
 
@@ -297,16 +298,21 @@ class Session:
             if waited > self._patience:
                 raise SkillError("other", f"{problem} The robot has waited for {waited:.3g} s.")
             earlier = self.time
-            self._advance({})
+            self._advance(self._fingers_at_rest, stamp=None)
             if self.time <= earlier:
                 time.sleep(self.dt)  # an interface that does not wait by itself
+
+    @cached_property
+    def _fingers_at_rest(self) -> Speeds:
+        """Speeds of fingers that close on nothing any more, and keep the force on what they hold."""
+        return {s.derivative(): 0.0 for gripper in self.robot.grippers for s in gripper.joints}
 
     def stop(self) -> None:
         """Command zero speeds for one step; nothing if the robot does not answer."""
         self.command = None
         if not self.broken:
             with suppress(SkillError):
-                self._advance({})
+                self._advance({}, stamp=None)
 
     def _find_problem(self, before: float) -> str:
         """Return why the robot must not move by the present state; empty if it may."""
@@ -342,9 +348,9 @@ class Session:
             resolved[speed] = number
         return resolved
 
-    def _advance(self, speeds: Speeds) -> None:
+    def _advance(self, speeds: Speeds, stamp: float | None) -> None:
+        """Command speeds for one step, with the time of their state: None for a stop, which is never too old."""
         self.commands = {s: v for s, v in speeds.items() if self.robot.moves(s)}
-        stamp = self.state.stamp if self.commands else None  # a stop is never too old
 
         def step() -> tuple[Observation, float]:
             self.interface.apply(self.commands, self.dt, stamp=stamp)
@@ -408,7 +414,7 @@ class Session:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What users should know of the readings, such as poses of frames that the model does not have."""
+        """Remarks on the readings, such as on poses of frames that the model does not have."""
         if not self._unknown:
             return ()
         return (f"Poses are observed of frames that the model does not have: {_list(self._unknown)}.",)
