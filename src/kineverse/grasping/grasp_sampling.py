@@ -199,13 +199,13 @@ class _Surroundings:
     ) -> None:
         robot = _frames_of_robot(model, gripper)
         scene = Scene(model, decomposed=decomposed) if decomposed else Scene.of(model)
-        others = {f for f in scene.bodies if f not in robot}
+        around = {f for f in scene.bodies if f not in robot}
         scene.update(state)
         frame_T_world = lie.inverse(scene.pose(handle.frame))
         middle = (scene.pose(handle.frame) @ handle.pose)[:3, 3]
         near: dict[str, list[int]] = {}
         pieces: list[Part] = []
-        for part in find_parts(scene, middle, _NEAR, bodies=others):
+        for part in find_parts(scene, middle, _NEAR, bodies=around):
             near.setdefault(part.body, []).append(part.number)
             if (part.body, part.number) == (handle.frame, handle.shape):
                 pieces.append(part)

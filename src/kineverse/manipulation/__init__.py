@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .pushing import push as push
     from .robot_placement import PlacedRobot as PlacedRobot, place_robot as place_robot
     from .session import Session as Session
+    from .skill_run import SkillRun as SkillRun
     from .tracked_belief import TrackedBelief as TrackedBelief
     from .trials import (
         JudgedOutcome as JudgedOutcome,
