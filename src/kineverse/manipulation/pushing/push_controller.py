@@ -198,10 +198,6 @@ class Pushing:
         self._contact: PushPair | None = None
         self._stamp: float | None = None  # time of the last step [s]
 
-    def done(self, state: State, tolerance: float = 0.02) -> bool:
-        """Return True if the coordinate is within a tolerance of the target."""
-        return abs(state[self.coordinate] - self.target) < tolerance
-
     def first_contact(self, state: State) -> str:
         """Return which body of the robot penetrates something at a state; empty if none does."""
         self.scene.update(state)

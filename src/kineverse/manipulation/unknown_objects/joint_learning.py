@@ -84,12 +84,6 @@ class JointLearning:
         self.learned = LearnedJoint(fit, self.learned.distance, self.learned.turn, self.learned.time)
         return True
 
-    def explain(self) -> str:
-        """Return the present result in words."""
-        if self.poses < 2:
-            return "it was not seen"
-        return str(self._identifier.result)
-
 
 _DISTANCE, _LEAST_POSITION, _LEAST_ORIENTATION = 1.0, 1e-3, 2e-3
 """Distance of the camera, and least standard deviations, for the test of a believed joint [m], [rad]."""

@@ -60,21 +60,15 @@ def is_near(a: Array, b: Array) -> bool:
     return bool(np.linalg.norm(error[:3]) <= _NEAR and np.linalg.norm(error[3:]) <= _TURNED)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PartLook:
-    """Look at the part that is no outlier."""
-
-    pose: Array  # pose (4, 4) of the part relative to what it moves in
-    covariance: Array  # covariance (6, 6) of its errors
-    time: float  # time [s]
-
-
 class PartBelief:
     """Belief in which the robot is read by its encoders, and a part of unknown motion is seen.
 
     Before a hand holds the part, it stands where the mean of all looks is. In a hand it is where the hand is,
     times the mean of the last looks at the part in the hand. So the estimate does not lag behind the motion,
     and looks that are far from it are outliers.
+
+    ``looks`` has the others since the part was held: poses (4, 4) relative to what it moves in, and the
+    covariances (6, 6) of their errors.
     """
 
     def __init__(
@@ -100,7 +94,7 @@ class PartBelief:
         self._before = self._world_T_parent @ unknown.origin
         self.held: PoseMean | None = None
         self.still = PoseMean(_STATIC_LOOKS)
-        self.looks: list[PartLook] = []
+        self.looks: list[tuple[Array, Array]] = []
         self.path: JointPath | None = None
         self._references = {name: PoseMean(_STATIC_LOOKS) for name in ancestors}
         self._beside: str | None = None
@@ -220,7 +214,7 @@ class PartBelief:
         elif self.held.add(inverse(frame) @ pose):
             relative = inverse(self.reference_pose)
             turn = np.kron(np.eye(2), relative[:3, :3])
-            self.looks.append(PartLook(relative @ pose, turn @ covariance @ turn.T, seen.stamp))
+            self.looks.append((relative @ pose, turn @ covariance @ turn.T))
 
     def _covariance(self, world_T_marker: Array, world_T_part: Array) -> Array:
         """Return the covariance (6, 6) of an observed pose of the part in the world."""

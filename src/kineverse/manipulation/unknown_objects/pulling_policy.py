@@ -291,7 +291,7 @@ class PartPulling:
         best, idle = self.opening[0], 0.0  # time without progress, but for that in which the robot waits [s]
         while True:
             for look in belief.looks:
-                learning.add(look.pose, look.covariance)
+                learning.add(*look)
             belief.looks.clear()
             distance, turn = self.opening
             now = self.session.time
