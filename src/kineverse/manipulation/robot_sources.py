@@ -68,7 +68,7 @@ class RobotSource:
         values = {f"{self.prefix}/{joint}": value for joint, value in self.start.items()}
         return model.default_state().updated({k: v for k, v in values.items() if k in known})
 
-    def count_freedom(self, model: Model) -> int:
+    def count_freedom(self, model: ModelView) -> int:
         """Return the number of degrees of freedom of the robot in a model, its base included."""
         return sum(str(s).startswith(f"{self.prefix}/") for s in model.degrees_of_freedom)
 

@@ -69,8 +69,8 @@ def judge_outcome(outcome: Outcome, metrics: RunMetrics) -> JudgedOutcome:
     done, reason = outcome.done and not objections, outcome.reason
     if objections:
         reason = " ".join([f"{reason.removesuffix('.')}.", *objections])
-    if not done:
-        measures.setdefault("failure", "other" if overlap is None else "collision")
+    if outcome and not done:
+        measures["failure"] = "other" if overlap is None else "collision"
     return JudgedOutcome(
         done, outcome.value if math.isnan(value) else value, reason, outcome.world, outcome.seconds,
         outcome.steps, measures, outcome.done,
