@@ -25,7 +25,7 @@ from kineverse.manipulation.pushing.contact_selection import PushSurface, find_p
 from kineverse.manipulation.pushing.guarded_contact import PushPress
 from kineverse.manipulation.pushing.push_controller import Pushing
 from kineverse.manipulation.pushing.push_program import ContactRates, PushNumbers, PushPair
-from kineverse.manipulation.pushing.push_skill import plan_push_approach, push
+from kineverse.manipulation.pushing.push_skill import PushRun, plan_push_approach, push
 from kineverse.manipulation.pushing.vectors import move_point
 from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.session import Session
@@ -526,6 +526,28 @@ def test_approach_is_planned_to_a_contact_point() -> None:
     assert path.found, path.why
     tip = model.fk(PUSHER)(path.at(1.0)) @ [*pushing.tool.tip, 1]
     assert np.linalg.norm(tip[:3] - pushing.surface.at(start).points[point]) == pytest.approx(0.03, abs=1e-4)
+
+
+def test_approach_that_is_followed_waits_for_a_robot_that_has_stopped() -> None:
+    model, start, sensors = room(), opened(drawer=0.4), Sensors.parse("1mm,0.1deg,30Hz")
+    pushing = Pushing(model, "robot", "drawer", PUSHER, start, target=0.0)
+    path, _ = plan_push_approach(pushing, start)
+
+    def follow(stop: float) -> float:
+        """Return the largest speed on the path with a stop [s]."""
+        world, speeds = KinematicWorld(model, "robot", sensors=sensors), [0.0]
+        world.reset(start)
+        session = Session(
+            InterfaceOnly(FaultyReadings(world, "robot/base/x", "missing", stop)),
+            belief=TrackedBelief(model, "robot", sensors),
+            on_step=lambda session: speeds.extend(map(abs, session.commands.values())),
+        )
+        PushRun(session, pushing.coordinate, 30.0, 0.0, True)._follow(path)
+        goal = np.array([path.at(1.0)[s] for s in path.symbols])
+        np.testing.assert_allclose(world.state.vector(path.symbols), goal, atol=5e-3)
+        return max(speeds)
+
+    assert follow(1.0) < 1.2 * follow(0.0)
 
 
 def test_locked_object_is_told_and_not_penetrated() -> None:
