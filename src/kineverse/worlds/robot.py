@@ -10,6 +10,7 @@ import numpy as np
 
 from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.expressions import Expression
 from kineverse.formats.srdf.description import Srdf
 from kineverse.grasping.gripper_detection import Gripper, find_gripper, find_grippers
 from kineverse.lie import rotation_z, transform
@@ -30,7 +31,7 @@ class MobileBase:
     Attributes
     ----------
     coordinates
-        Its coordinates.
+        Its coordinates on which the place of the robot depends.
     parent, child
         Its frames: that in which it moves, and that of the robot.
     is_planar
@@ -142,8 +143,11 @@ class Robot:
         for record in self.model.articulations.values():
             outside = record.parent == WORLD or not self.owns(record.parent)
             if record.coordinates and outside and self.owns(record.child):
-                planar = _is_planar(self.model, record.parent, record.child, record.coordinates)
-                return MobileBase(record.coordinates, record.parent, record.child, planar)
+                pose = self.model.fk(record.child, relative_to=record.parent)
+                placing = tuple(
+                    s for s in record.coordinates if s in pose.symbols
+                )  # not the steering of a car
+                return MobileBase(placing, record.parent, record.child, _is_planar(pose, placing))
         return None
 
     @property
@@ -211,9 +215,8 @@ def _make(model: ModelView, name: str, srdf: Srdf | None) -> Robot:
     return robot
 
 
-def _is_planar(model: ModelView, parent: str, child: str, coordinates: tuple[Symbol, ...]) -> bool:
+def _is_planar(pose: Expression, coordinates: tuple[Symbol, ...]) -> bool:
     """Return whether a pose is translation(x, y, 0) · rotation_z(θ) of three coordinates, after an offset."""
-    pose = model.fk(child, relative_to=parent)
     if len(coordinates) != 3 or not set(pose.symbols) <= set(coordinates):
         return False
     x, y, angle = values = np.array([0.3, -0.7, 1.1])

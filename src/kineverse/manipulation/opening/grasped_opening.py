@@ -371,6 +371,8 @@ class OpeningRun(SkillRun):
     def _push(self, failure: SkillError, attempt: int) -> None:
         """Push the object on where no grasp leads, or raise SkillError after the last attempt."""
         session, value, before, begun = self.session, self.value, self.rest, False
+        if self.opener.approaches.explain_standing(session.state):
+            raise failure  # starts of pushes are elsewhere
         try:
             pushing, seconds = self._find_push(self._seed + attempt)
             self._bring_base()
