@@ -31,6 +31,7 @@ from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.tracked_belief import TrackedBelief
 from kineverse.worlds import KinematicWorld, MujocoWorld, Observation, Robot, RunMetrics, Sensors, TrueBelief
+from kineverse_studies.experiments.table1_push import SHIPPED_KITCHEN, make_push_setup
 from robot_interface_proxy import InterfaceOnly
 
 PUSHER = "robot/finger"
@@ -369,8 +370,6 @@ def test_push_with_physics_is_gentle(sensors: Sensors | None) -> None:
 @pytest.mark.parametrize("robot", ["fetch", "hsr", "pr2"])
 def test_heavy_robot_presses_a_drawer_that_sticks_with_some_120_newtons(robot: str) -> None:
     pytest.importorskip("mujoco")
-    from kineverse_studies.experiments.table1_push import SHIPPED_KITCHEN, make_push_setup
-
     setup = make_push_setup(SHIPPED[robot], SHIPPED_KITCHEN, "sink left upper drawer")
     hand = Robot.of(setup.model, robot).gripper().bodies
     pushing = Pushing(setup.model, robot, setup.what, hand, setup.start, target=0.0)
