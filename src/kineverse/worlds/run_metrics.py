@@ -46,6 +46,7 @@ from .simulated_world import SimulatedWorld
 CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
 
 _STILL = 5e-3
+_ROUNDING = 1e-9  # depth that is nothing but rounding [m]
 _TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap [m]
 
 
@@ -516,7 +517,7 @@ class _BodyMetrics:
         known = self._overlaps.get((found.a, found.b))
         if known is not None and (known.depth > OVERLAP or found.depth <= OVERLAP):
             self._overlaps[found.a, found.b] = known._replace(depth=max(found.depth, known.depth))
-        elif found.depth > 0.0:
+        elif found.depth > _ROUNDING:
             self._overlaps[found.a, found.b] = found
 
 

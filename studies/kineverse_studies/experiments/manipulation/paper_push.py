@@ -30,7 +30,7 @@ _FAR, _ANY, _TOLERANCE = 20.0, 1e3, 0.02
 
 class PaperPush:
     def __init__(self, model: ModelView, what: Symbol, link: str, handle: str, dt: float) -> None:
-        self.contact = PlannedContact((link,), (handle,), False)
+        self.contact = PlannedContact((link,), (), False)  # nothing but a handle may be penetrated
         self._scene, self._link, self._frames = Scene(model), link, (model.fk(link), model.fk(handle))
         self._nearest = self._scene.watch(link, handle, _FAR)
         self._numbers = Target("push/contact", np.zeros((3, 3)))
