@@ -224,6 +224,34 @@ def test_what_is_claimed_and_not_true_is_not_done(run, asked):
     assert answer["measures"]["failure"] == "other"
 
 
+def test_a_base_that_does_not_drive_is_put_to_the_handle(run, asked, monkeypatch):
+    def stand(session, world, handle, target, **options):
+        assert handle.frame == "shelf_drawers/upper_drawer_handle"
+        world.reset(world.state.updated({"hsr/base/x": -0.25, "hsr/base/y": 0.5}))
+        session.refresh()
+        return True
+
+    monkeypatch.setattr("kineverse.manipulation.stand_at_handle", stand)
+    status, out, err = run("open", "shelf_drawers", *HSR, "--json")
+    assert (status, asked[0].session.state["hsr/base/x"]) == (0, -0.25)
+    assert "does not drive to the handle by itself; it is put to -0.25, 0.50" in err
+    assert json.loads(out)["measures"]["distance"] == 0.0
+
+
+def test_a_part_with_an_unknown_joint_is_as_far_open_as_the_world_says(run, monkeypatch):
+    def open_unknown(session, handle, **options):
+        session.stop()
+        measures = {"way": 0.2, "turn": 0.0}
+        return Outcome(True, 0.2, "open by 20 cm", session.interface.name, 0.02, 1, measures)
+
+    monkeypatch.setattr("kineverse.manipulation.open_unknown", open_unknown)
+    status, out, _ = run("open", "shelf_drawers", *HSR, "--unknown", "--json")
+    answer = json.loads(out)
+    assert (status, answer["claimed"], answer["done"], answer["value"]) == (1, True, False, 0.0)
+    assert answer["reason"] == "open by 20 cm. The world says that it is open by 0 cm and 0°."
+    assert (answer["measures"]["way"], answer["target"]) == (0.0, None)
+
+
 def test_other_coordinates_are_set_at_the_start(run, asked):
     lower = HSR[3].replace("upper", "lower")
     status, *_ = run(

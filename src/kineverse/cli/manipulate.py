@@ -23,12 +23,9 @@ from kineverse.worlds import KinematicWorld, Sensors, TrueBelief
 from .arguments import add_model_options, add_set_option, needs_mujoco, print_notes, require
 from .manipulate_skills import (
     ManipulationScene,
-    grasp_object,
+    SkillTrial,
     is_shut,
     make_scene,
-    open_as_unknown,
-    push_object,
-    skip_skill,
 )
 from .output import format_table, join_lines, name_options, show_activity
 from .pages import (
@@ -291,16 +288,19 @@ def _act(
             for watch in watchers:
                 watch(step)
 
+        trial = SkillTrial(arguments, scene, world, belief, look)
         there = abs(scene.start[scene.coordinate] - scene.target) <= scene.tolerance
         if scene.fixed and (not there or (skill == "open" and arguments.to is None)):
-            outcome = skip_skill(scene, world, False, scene.fixed)
+            outcome = trial.skip(False, scene.fixed)
         elif there:
-            outcome = skip_skill(scene, world, True, f"'{scene.coordinate}' is there from the start")
+            outcome = trial.skip(True, f"'{scene.coordinate}' is there from the start")
         elif not arguments.unknown and (obstacle := _find_obstacle(scene)) is not None:
-            outcome = skip_skill(scene, world, False, str(obstacle), obstacle.measures)
+            outcome = trial.skip(False, str(obstacle), obstacle.measures)
         else:
-            act = push_object if skill == "push" else open_as_unknown if arguments.unknown else grasp_object
-            outcome = act(arguments, scene, world, belief, look)
+            act = (
+                trial.push if skill == "push" else trial.open_as_unknown if arguments.unknown else trial.grasp
+            )
+            outcome = act()
             out_of_reach = outcome.measures.get("failure") == "reach"
             if not outcome and out_of_reach and scene.robot.base is None:
                 advice = "The robot stands still without a mobile base: --base omni gives it one."

@@ -203,67 +203,6 @@ _SHORT = 0.1  # share of a wanted opening that may be missing at the stop of a p
 _BETWEEN_LINES = 1.0  # least time between two lines on the progress of a search [s]
 
 
-def grasp_object(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    world: SimulatedWorld,
-    belief: Belief,
-    look: Callable[[RecordedStep], None],
-) -> JudgedOutcome:
-    """Open or close the object by its handle."""
-    found = _find_gripper_and_handle(arguments, scene)
-    if isinstance(found, str):
-        return skip_skill(scene, world, False, found)
-    gripper, handle = found
-
-    from kineverse.manipulation.opening.grasped_opening import open_object  # for start-up time
-
-    metrics = RunMetrics(world, scene.coordinate, gripper=gripper, handle=handle.frame)
-    session = _open_session(world, belief, metrics, look)
-    _stand_at_handle(arguments, scene, session, world, metrics, gripper, handle)
-    outcome = open_object(
-        session,
-        scene.coordinate,
-        target=scene.target,
-        hand=gripper,
-        handle=handle,
-        seconds=arguments.seconds,
-        seed=arguments.seed,
-    )
-    return judge_outcome(outcome, metrics)
-
-
-def _open_session(
-    world: SimulatedWorld, belief: Belief, metrics: RunMetrics, look: Callable[[RecordedStep], None]
-) -> Session:
-    """Return a session of the robot in a world, whose steps are measured and looked at."""
-
-    def watch(session: Session) -> None:
-        metrics(session)
-        look(session)
-
-    return Session(world, belief=belief, on_step=watch, on_search=_SearchLines())
-
-
-def _stand_at_handle(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    session: Session,
-    world: SimulatedWorld,
-    metrics: RunMetrics,
-    gripper: Gripper,
-    handle: Handle,
-) -> None:
-    """Put a robot whose base does not drive by itself in front of the handle, and say so."""
-    from kineverse.manipulation import stand_at_handle  # for start-up time
-
-    put = stand_at_handle(session, world, handle, scene.target, gripper=gripper, seed=arguments.seed)
-    if put and scene.robot.base is not None:
-        metrics.reset()
-        where = ", ".join(f"{world.state[s]:.2f}" for s in scene.robot.base.coordinates[:2])
-        print_line(f"start: the base does not drive to the handle by itself, so the robot is put to {where}")
-
-
 class _SearchLines:
     """Lines on standard error on the progress of a search, at most one in some seconds."""
 
@@ -276,39 +215,80 @@ class _SearchLines:
             print_line(f"searching: {text}")
 
 
-def open_as_unknown(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    world: SimulatedWorld,
-    belief: Belief,
-    look: Callable[[RecordedStep], None],
-) -> JudgedOutcome:
-    """Open the object as if its joint was unknown."""
-    found = _find_gripper_and_handle(arguments, scene)
-    if isinstance(found, str):
-        return skip_skill(scene, world, False, found)
-    gripper, handle = found
+class SkillTrial:
+    """Trial of a skill in a world: it is measured in the true states, and its outcome is judged by them."""
 
-    from kineverse.manipulation import open_unknown  # for start-up time
-    from kineverse.manipulation.unknown_objects import forget_joint  # for start-up time
-    from kineverse.manipulation.unknown_objects.unknown_opening import (  # for start-up time
-        OPEN_TURN,
-        OPEN_WAY,
-    )
-    from kineverse.worlds import Sensors  # for start-up time
+    def __init__(
+        self,
+        arguments: argparse.Namespace,
+        scene: ManipulationScene,
+        world: SimulatedWorld,
+        belief: Belief,
+        look: Callable[[RecordedStep], None],
+    ) -> None:
+        self._arguments, self._scene, self._world = arguments, scene, world
+        self._belief, self._look = belief, look
 
-    model, coordinate, start = scene.model, scene.coordinate, scene.start
-    part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
-    if part is None:
-        raise InvalidValueError(f"--unknown: no joint moves '{coordinate}', so no part belongs to it.")
-    far = None if arguments.to is None else abs(scene.target - start[coordinate])
-    middle = (model.fk(handle.frame, part)(start) @ handle.pose)[:3, 3]
-    metrics = RunMetrics(world, coordinate, gripper=gripper, handle=handle.frame, part=part, point=middle)
-    session = _open_session(world, belief, metrics, look)
-    _stand_at_handle(arguments, scene, session, world, metrics, gripper, handle)
-    outcome = judge_outcome(
-        open_unknown(
-            session,
+    def skip(
+        self, done: bool, reason: str, measures: Mapping[str, Any] = MappingProxyType({})
+    ) -> JudgedOutcome:
+        """Return the outcome of what was not begun."""
+        value, name = self._world.state[self._scene.coordinate], self._world.name
+        return JudgedOutcome(done, value, join_lines(reason), name, 0.0, 0, measures, done)
+
+    def grasp(self) -> JudgedOutcome:
+        """Open or close the object by its handle."""
+        found = self._find_gripper_and_handle()
+        if isinstance(found, str):
+            return self.skip(False, found)
+        gripper, handle = found
+
+        from kineverse.manipulation.opening.grasped_opening import open_object  # for start-up time
+
+        coordinate, target = self._scene.coordinate, self._scene.target
+        metrics = RunMetrics(self._world, coordinate, gripper=gripper, handle=handle.frame)
+        outcome = open_object(
+            self._open_session_at_handle(metrics, gripper, handle),
+            coordinate,
+            target=target,
+            hand=gripper,
+            handle=handle,
+            seconds=self._arguments.seconds,
+            seed=self._arguments.seed,
+        )
+        return judge_outcome(outcome, metrics)
+
+    def open_as_unknown(self) -> JudgedOutcome:
+        """Open the object as if its joint was unknown."""
+        found = self._find_gripper_and_handle()
+        if isinstance(found, str):
+            return self.skip(False, found)
+        gripper, handle = found
+
+        from kineverse.manipulation import open_unknown  # for start-up time
+        from kineverse.manipulation.unknown_objects import forget_joint  # for start-up time
+        from kineverse.manipulation.unknown_objects.unknown_opening import (  # for start-up time
+            OPEN_TURN,
+            OPEN_WAY,
+        )
+        from kineverse.worlds import Sensors  # for start-up time
+
+        arguments, model, coordinate = self._arguments, self._scene.model, self._scene.coordinate
+        start = self._scene.start
+        part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
+        if part is None:
+            raise InvalidValueError(f"--unknown: no joint moves '{coordinate}', so no part belongs to it.")
+        far = None if arguments.to is None else abs(self._scene.target - start[coordinate])
+        metrics = RunMetrics(
+            self._world,
+            coordinate,
+            gripper=gripper,
+            handle=handle.frame,
+            part=part,
+            point=(model.fk(handle.frame, part)(start) @ handle.pose)[:3, 3],
+        )
+        outcome = open_unknown(
+            self._open_session_at_handle(metrics, gripper, handle),
             handle.frame,
             model=forget_joint(model, part, start),
             part=part,
@@ -318,92 +298,95 @@ def open_as_unknown(
             seed=arguments.seed,
             way=OPEN_WAY if far is None else far,
             turn=OPEN_TURN if far is None else far,
-        ),
-        metrics,
-    )
-    there = abs(outcome.value - start[coordinate])
-    if outcome and far is not None and there < (1.0 - _SHORT) * far:
-        reason = f"{outcome.reason} That is {there:.3g}, and not {far:.3g}, from where it began."
-        measures = {**outcome.measures, "failure": "other"}
-        outcome = replace(outcome, done=False, reason=reason, measures=measures)
-    return outcome
-
-
-def push_object(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    world: SimulatedWorld,
-    belief: Belief,
-    look: Callable[[RecordedStep], None],
-) -> JudgedOutcome:
-    """Push the object, from where the robot stands or from a place that is searched."""
-    from kineverse.manipulation.pushing.base_placement import find_push_start, roll_out  # for start-up time
-    from kineverse.manipulation.pushing.push_controller import Pushing  # for start-up time
-    from kineverse.manipulation.pushing.push_skill import push  # for start-up time
-
-    if not scene.pusher:
-        return skip_skill(scene, world, False, scene.why)
-    with show_activity("building the controller"):
-        pushing = Pushing(
-            scene.model, scene.robot, scene.coordinate, scene.pusher, scene.start, target=scene.target
         )
-    placed, nowhere = 0, None
-    if not scene.stays:
-        steps = round(arguments.seconds / 0.02)
-        problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
-        if problem:
-            with show_activity("searching for a place of the robot"):
-                found = find_push_start(
-                    pushing,
-                    scene.start,
-                    seconds=_PLACEMENT,
-                    steps=steps,
-                    seed=arguments.seed,
-                    report=_SearchLines(),
-                )
-            placed, why = found.samples, f"Another place of the robot: {found.why}"
-            print(f"not from where the robot stands: {problem}. {why}", file=sys.stderr)
-            if found.state is not None:
-                world.reset(found.state)
-            else:
-                nowhere = found
+        judged = judge_outcome(outcome, metrics)
+        there = abs(judged.value - start[coordinate])
+        if judged and far is not None and there < (1.0 - _SHORT) * far:
+            reason = f"{judged.reason} That is {there:.3g}, and not {far:.3g}, from where it began."
+            return replace(
+                judged, done=False, reason=reason, measures={**judged.measures, "failure": "other"}
+            )
+        return judged
 
-    metrics = RunMetrics(world, scene.coordinate)
-    session = _open_session(world, belief, metrics, look)
-    skill_outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
-    outcome = judge_outcome(skill_outcome, metrics)
-    if not outcome and nowhere is not None:
-        measures = {**outcome.measures, "failure": nowhere.failure}
-        reason = f"{outcome.reason} Another place of the robot: {nowhere.why}"
-        outcome = replace(outcome, reason=reason, measures=measures)
-    return replace(outcome, measures={**outcome.measures, "placed": placed})
+    def push(self) -> JudgedOutcome:
+        """Push the object, from where the robot stands or from a place that is searched."""
+        from kineverse.manipulation.pushing.base_placement import (  # for start-up time
+            find_push_start,
+            roll_out,
+        )
+        from kineverse.manipulation.pushing.push_controller import Pushing  # for start-up time
+        from kineverse.manipulation.pushing.push_skill import push  # for start-up time
 
+        arguments, scene, world = self._arguments, self._scene, self._world
+        if not scene.pusher:
+            return self.skip(False, scene.why)
+        with show_activity("building the controller"):
+            pushing = Pushing(
+                scene.model, scene.robot, scene.coordinate, scene.pusher, scene.start, target=scene.target
+            )
+        placed, nowhere = 0, None
+        if not scene.stays:
+            steps = round(arguments.seconds / 0.02)
+            problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
+            if problem:
+                with show_activity("searching for a place of the robot"):
+                    found = find_push_start(
+                        pushing,
+                        scene.start,
+                        seconds=_PLACEMENT,
+                        steps=steps,
+                        seed=arguments.seed,
+                        report=_SearchLines(),
+                    )
+                placed, why = found.samples, f"Another place of the robot: {found.why}"
+                print(f"not from where the robot stands: {problem}. {why}", file=sys.stderr)
+                if found.state is not None:
+                    world.reset(found.state)
+                else:
+                    nowhere = found
 
-def _find_gripper_and_handle(
-    arguments: argparse.Namespace, scene: ManipulationScene
-) -> tuple[Gripper, Handle] | str:
-    """Return the gripper, and the handle that is named or the best one, which is printed; or why not."""
-    if scene.gripper is None:
-        return scene.why
-    try:
-        handle = find_handle(scene.model, scene.coordinate, arguments.handle)
-    except UnknownNameError as error:
-        if arguments.handle is not None:
-            raise
-        if not Scene.of(scene.model).bodies_moved_by([scene.coordinate]):
-            return str(error)  # nothing to push at either
-        return f"{error} Without one it can be pushed: kineverse push ... --to VALUE."
-    print(handle, file=sys.stderr)
-    return scene.gripper, handle
+        metrics = RunMetrics(world, scene.coordinate)
+        session = self._open_session(metrics)
+        outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
+        judged = judge_outcome(outcome, metrics)
+        measures = {**judged.measures, "placed": placed}
+        if judged or nowhere is None:
+            return replace(judged, measures=measures)
+        reason = f"{judged.reason} Another place of the robot: {nowhere.why}"
+        return replace(judged, reason=reason, measures={**measures, "failure": nowhere.failure})
 
+    def _open_session(self, metrics: RunMetrics) -> Session:
+        def look(session: Session) -> None:
+            metrics(session)
+            self._look(session)
 
-def skip_skill(
-    scene: ManipulationScene,
-    world: SimulatedWorld,
-    done: bool,
-    reason: str,
-    measures: Mapping[str, Any] = MappingProxyType({}),
-) -> JudgedOutcome:
-    """Return the outcome of what was not begun."""
-    value = world.state[scene.coordinate]
-    return JudgedOutcome(done, value, join_lines(reason), world.name, 0.0, 0, measures, done)
+        return Session(self._world, belief=self._belief, on_step=look, on_search=_SearchLines())
+
+    def _open_session_at_handle(self, metrics: RunMetrics, gripper: Gripper, handle: Handle) -> Session:
+        """Return a session of a robot that has been put to the handle if its base does not drive there."""
+        from kineverse.manipulation import stand_at_handle  # for start-up time
+
+        session, world = self._open_session(metrics), self._world
+        target, base = self._scene.target, self._scene.robot.base
+        put = stand_at_handle(session, world, handle, target, gripper=gripper, seed=self._arguments.seed)
+        if put and base is not None:
+            metrics.reset()
+            where = ", ".join(f"{world.state[s]:.2f}" for s in base.coordinates[:2])
+            print_line(f"start: the base does not drive to the handle by itself; it is put to {where}")
+        return session
+
+    def _find_gripper_and_handle(self) -> tuple[Gripper, Handle] | str:
+        """Return the gripper, and the handle that is named or the best one, which is printed; or why not."""
+        scene, named = self._scene, self._arguments.handle
+        if scene.gripper is None:
+            return scene.why
+        try:
+            handle = find_handle(scene.model, scene.coordinate, named)
+        except UnknownNameError as error:
+            if named is not None:
+                raise
+            if not Scene.of(scene.model).bodies_moved_by([scene.coordinate]):
+                return str(error)  # nothing to push at either
+            return f"{error} Without one it can be pushed: kineverse push ... --to VALUE."
+        print(handle, file=sys.stderr)
+        return scene.gripper, handle
