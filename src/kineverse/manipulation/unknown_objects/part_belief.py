@@ -163,9 +163,10 @@ class PartBelief:
         self.held, self.path, self.still = None, None, PoseMean(_STATIC_LOOKS)
 
     def update(self, observation: Observation, time: float, commands: State | None = None) -> State:
-        """Return the state of the model of the part by the latest readings; their stamp is its own.
+        """Return the state of the model of the part by the latest readings.
 
-        Poses with the stamp of the last ones are the same again.
+        Readings that are as old as the sensors' delay say are of the present. Poses with the stamp of the
+        last ones are the same again.
         """
         joints = {s: v for s, v in observation.joints.items() if s in self._symbols}
         self._state = self._state.updated(joints)
@@ -177,7 +178,8 @@ class PartBelief:
             self.path.project(inverse(self.reference_pose) @ self._world_T_hand @ self.held.pose)
         part = self.unknown.values(inverse(self._world_T_parent) @ self.pose)
         self._state = self._state.updated(part)
-        return State(self._state, stamp=observation.stamp, source="looks")
+        stamp = min(time, observation.stamp + self.sensors.delay)
+        return State(self._state, stamp=stamp, source="looks")
 
     def deviation(self, coordinate: Symbol) -> float:
         """Return 0: only coordinates of the robot are used, and its encoders are exact enough."""
