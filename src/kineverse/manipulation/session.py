@@ -349,7 +349,7 @@ class Session:
         return resolved
 
     def _advance(self, speeds: Speeds, stamp: float | None) -> None:
-        """Command speeds for one step, with the time of their state; a stop has None, and is never too old."""
+        """Command speeds for one step, with the time of their state; a stop has None and is never too old."""
         self.commands = {s: v for s, v in speeds.items() if self.robot.moves(s)}
 
         def step() -> tuple[Observation, float]:
