@@ -16,7 +16,7 @@ from kineverse.manipulation import PlacementSearch, Robot, Session, TrackedBelie
 from kineverse.manipulation.opening.arm_paths import CartesianPaths, PathCheck, find_least_time
 from kineverse.manipulation.opening.base_placement import PlacementSampler
 from kineverse.manipulation.opening.hand_motion import SLIPPED, HandMotion
-from kineverse.manipulation.skill_arguments import choose_tolerance
+from kineverse.manipulation.skill_run import choose_tolerance
 from kineverse.worlds import KinematicWorld, MujocoWorld, RunMetrics, Sensors, TrueBelief
 from robot_interface_proxy import InterfaceOnly
 

@@ -16,8 +16,11 @@ from kineverse.manipulation.skill_run import SkillRun
 from kineverse.manipulation.unknown_objects import forget_joint
 from kineverse.manipulation.unknown_objects.joint_learning import JointLearning
 from kineverse.manipulation.unknown_objects.part_belief import PartBelief, PoseMean, measure_way
-from kineverse.manipulation.unknown_objects.pulling_policy import ArmEndError, PartPulling
-from kineverse.manipulation.unknown_objects.unknown_opening import guess_hinges
+from kineverse.manipulation.unknown_objects.unknown_opening import (
+    ArmEndError,
+    UnknownOpeningRun,
+    guess_hinges,
+)
 from kineverse.manipulation.unknown_objects.unmodelled_joint import JointPath, free_part, write_joint
 from kineverse.worlds import KinematicWorld, Observation, Robot, RunMetrics, Sensors
 from robot_interface_proxy import InterfaceOnly
@@ -245,21 +248,21 @@ def test_pull_waits_for_readings_and_says_which_have_ended(truth, fault, seconds
 )
 def test_end_of_an_arm_is_not_the_stop_of_a_part(monkeypatch, why, kind, error):
     motion = SimpleNamespace(close=lambda grasp: True, follow_line=lambda a, b: None)
-    pulling = PartPulling.__new__(PartPulling)
-    pulling.session = SimpleNamespace(time=0.0)
+    pulling = UnknownOpeningRun.__new__(UnknownOpeningRun)
+    pulling.session, pulling.motion = SimpleNamespace(time=0.0), motion
     pulling.learning = SimpleNamespace(poses=1, learned=object())
     pulling.belief = SimpleNamespace(pose=np.eye(4), hand_pose=np.eye(4))
-    pulling.frame_T_handle, pulling.part, pulling.begin, pulling._reached = np.eye(4), DOOR, 0.0, 0.0
-    pulling._measures = {"grasps": 0}
-    monkeypatch.setattr(PartPulling, "opening", (0.3, 0.8))
-    monkeypatch.setattr(PartPulling, "_pull_once", lambda self: (why, kind))
-    monkeypatch.setattr(PartPulling, "_let_go", lambda self: None)
+    pulling.frame_T_handle, pulling.unknown = np.eye(4), SimpleNamespace(frame=DOOR)
+    pulling._first_pull, pulling._reached, pulling.measures = 0.0, 0.0, {"grasps": 0}
+    monkeypatch.setattr(UnknownOpeningRun, "opening", (0.3, 0.8))
+    monkeypatch.setattr(UnknownOpeningRun, "_pull_once", lambda self: (why, kind))
+    monkeypatch.setattr(UnknownOpeningRun, "_open_fingers", lambda self: None)
     grasp = SimpleNamespace(pose=np.eye(4))
     if error is None:
-        assert "this is its stop" in pulling.perform(motion, grasp)
+        assert "this is its stop" in pulling._pull_open(grasp)
         return
     with pytest.raises(error, match="was pulled") as caught:
-        pulling.perform(motion, grasp)
+        pulling._pull_open(grasp)
     assert caught.value.kind == "reach"
 
 

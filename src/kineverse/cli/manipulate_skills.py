@@ -17,7 +17,7 @@ from kineverse.geometry.exclusions import remove_unusable_shapes
 from kineverse.grasping import Gripper, Handle, find_handle
 from kineverse.manipulation import JudgedOutcome, PlacedRobot, Robot, Session, judge_outcome, place_robot
 from kineverse.manipulation.articulated_objects import find_shut_value
-from kineverse.manipulation.skill_arguments import choose_tolerance, explain_fixed
+from kineverse.manipulation.skill_run import choose_tolerance, explain_fixed
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from kineverse._checks import finite_number
+from kineverse._checks import as_positive, finite_number
 from kineverse.control import Command
 from kineverse.errors import InvalidValueError, ShapeError, SimulationError, UnknownNameError, suggest
 from kineverse.expressions import Expression
@@ -152,9 +152,8 @@ class Session:
         patience: float = 10.0,
     ) -> None:
         for name, value in (("dt", dt), ("timeout", timeout), ("patience", patience)):
-            number = finite_number(value)
-            if not (name == "timeout" and value is None) and (number is None or number <= 0.0):
-                raise InvalidValueError(f"{name}= is a positive time in s, such as 0.02, not {value!r}.")
+            if value is not None or name != "timeout":
+                as_positive(value, f"{name}=", "time in s, such as 0.02")
         if dt > interface.timeout + 1e-9:
             raise InvalidValueError(
                 f"dt={dt:g} s is longer than the time-out of the robot, {interface.timeout:g} s: it would "
@@ -198,10 +197,15 @@ class Session:
         ------
         ShapeError
             For an expression that is no number.
+        UnknownNameError
+            For a coordinate that the belief does not have.
         """
         if isinstance(what, str):
             what = self.model.symbol(what)
         if isinstance(what, Symbol):
+            if what not in self.state:
+                known = suggest(str(what), map(str, self.state), "coordinate")
+                raise UnknownNameError(f"The belief says nothing about '{what}'. {known}")
             return self.belief.deviation(what)
         if what.shape != ():
             raise ShapeError(f"Only a scalar has a deviation, not an expression of shape {what.shape}.")

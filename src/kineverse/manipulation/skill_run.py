@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
+from kineverse._checks import as_tolerance, finite_number
 from kineverse.control import Command
-from kineverse.errors import InfeasibleError, NotFiniteError
+from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot
 
 from .outcome import Outcome, SkillError
 from .session import Session
+from .swept_volume import BlockedError, find_obstacle
 
 _RAMP = 0.5  # time from rest to the usual speed [s]
 _PATIENCE = 4.0  # longest time for which a reference waits [s]
@@ -49,7 +55,7 @@ class SkillRun:
     @property
     def value(self) -> float:
         """Believed value of the object's coordinate [m], [rad]; NaN without one."""
-        return float("nan") if self.coordinate is None else float(self.session.state[self.coordinate])
+        return math.nan if self.coordinate is None else float(self.session.state[self.coordinate])
 
     @property
     def left(self) -> float:
@@ -60,6 +66,16 @@ class SkillRun:
         """Raise SkillError if the time is up."""
         if self.left < 0.0:
             raise SkillError("time", f"The time is up in '{self.session.phase}'.")
+
+    def check_way(self, target: float) -> None:
+        """Raise BlockedError if something is in the way of the object to a value [m], [rad]."""
+        session, coordinate = self.session, self.coordinate
+        assert coordinate is not None
+        obstacle = find_obstacle(
+            self.model, coordinate, session.state, target, robot=self.robot, start=session.start
+        )
+        if obstacle is not None:
+            raise BlockedError(obstacle)
 
     def act(self, speeds: Mapping[Symbol, float], command: Command | None = None) -> None:
         """Command speeds for one step, those of a controller's command if given, while there is time."""
@@ -136,3 +152,81 @@ class Pace:
                 f"rad) from it in '{session.phase}'.",
             )
         return self.speed * passed
+
+
+_AT_LIMIT = 0.02  # distance from a limit at which an object is open or shut, in a long range [m], [rad]
+_FIXED = 1e-9  # range of a coordinate up to which it counts as fixed [m], [rad]
+_LEAST_TOLERANCE, _SHARE = 1e-3, 0.02  # least tolerance between limits [m], [rad], and share of the distance
+
+
+def find_object_coordinate(robot: Robot, what: Symbol | str) -> Symbol:
+    """Return the coordinate of an object by symbol or name."""
+    if not isinstance(what, (str, Symbol)):
+        raise InvalidValueError(f"what= is the coordinate of an object, by symbol or name, not {what!r:.60}.")
+    coordinate = robot.model.symbol(str(what))
+    if robot.moves(coordinate):
+        raise InvalidValueError(f"'{coordinate}' is a coordinate of the robot; name one of an object.")
+    return coordinate
+
+
+def check_target(target: Any, tolerance: Any) -> tuple[float | None, float | None]:
+    """Return a wanted value and its tolerance [m], [rad], None for their defaults."""
+    number = None if target is None else finite_number(target)
+    if target is not None and number is None:
+        raise InvalidValueError(f"target= is a finite number [m], [rad], not {target!r:.60}.")
+    return number, None if tolerance is None else as_tolerance(tolerance, "tolerance=")
+
+
+def explain_fixed(model: ModelView, coordinate: Symbol, state: State) -> str:
+    """Return why a coordinate cannot move from where it is in a state; empty if its limits let it.
+
+    A lock is a limit of the coordinate or of its speed that depends on other coordinates, so these are named.
+    """
+    for symbol in (coordinate, coordinate.derivative()):
+        lower, upper = (float(v) for v in model.limits(symbol, state))
+        if upper - lower > _FIXED:
+            continue
+        limits = [c for c in model.constraints_for(symbol, exact=True).values() if c.expression == symbol]
+        keys = sorted({str(s) for c in limits for s in c.symbols if s not in (symbol, coordinate)})
+        at = ", ".join(f"'{key}' is {state[key]:.3g}" for key in keys if key in state)
+        if at:
+            return (
+                f"'{coordinate}' is locked at {state[coordinate]:.3g} while {at}. "
+                "'kineverse unlock' says what has to move before it."
+            )
+        if symbol.order:
+            return f"'{coordinate}' cannot move: the limits of its speed are {lower:.3g} and {upper:.3g}."
+        return f"'{coordinate}' cannot move: its lower and its upper limit are {upper:.3g}."
+    return ""
+
+
+def choose_tolerance(
+    model: ModelView, coordinate: Symbol, state: State, target: float, given: float | None = None
+) -> float:
+    """Return the distance from a target up to which an object is there [m], [rad].
+
+    By default that is 2 % of the distance, between 1 and 20 mm (mrad). At a limit, where an object is open or
+    shut, it is 20 mm. It is never more than a tenth of the coordinate's range.
+    """
+    lower, upper = (float(v) for v in model.limits(coordinate, state))
+    if given is not None:
+        tolerance = given
+    elif min(abs(target - lower), abs(target - upper)) <= _FIXED:
+        tolerance = _AT_LIMIT
+    else:
+        distance = abs(target - float(state[coordinate]))
+        tolerance = min(max(_LEAST_TOLERANCE, _SHARE * distance), _AT_LIMIT)
+    return min(tolerance, max(0.0, 0.1 * (upper - lower))) if math.isfinite(upper - lower) else tolerance
+
+
+def choose_target(model: ModelView, coordinate: Symbol, state: State, target: float | None) -> float:
+    """Return a wanted value within limits, by default the limit that is the farthest away."""
+    lower, upper = (float(v) for v in model.limits(coordinate, state))
+    here = state[coordinate]
+    if target is None:
+        target = upper if abs(upper - here) >= abs(lower - here) else lower
+        if not math.isfinite(target):
+            raise InvalidValueError(f"'{coordinate}' has no limit to move to; name a target.")
+    if not lower - 1e-9 <= target <= upper + 1e-9:
+        raise InvalidValueError(f"'{coordinate}' moves from {lower:g} to {upper:g}, not to {target!r}.")
+    return float(target)

@@ -9,7 +9,7 @@ move relative to: fixed furniture, furniture that other coordinates move, and wh
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import NoSolutionError
-from kineverse.geometry import Rule, Scene
+from kineverse.geometry import Scene
 from kineverse.geometry.distance_queries import PreparedQuery
-from kineverse.geometry.objects import Exclusion
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
@@ -86,8 +85,6 @@ def find_obstacle(
     target: float,
     *,
     robot: Robot | None = None,
-    rules: Iterable[Rule] = (),
-    leave_out: Iterable[Exclusion] = (),
     start: State | None = None,
     least: float = OVERLAP,
 ) -> Obstacle | None:
@@ -96,12 +93,8 @@ def find_obstacle(
     What overlaps at the begin counts as far as it gets deeper than :class:`.FurnitureOverlaps` allows. The
     robot counts nowhere: it moves.
     """
-    own = tuple(rules), tuple(leave_out)
-
-    def make() -> _Sweep:
-        return _Sweep(model, robot, *own)
-
-    sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot and robot.name), make)
+    key = "swept motion", robot and robot.name
+    sweep = cached_for_version(model, key, lambda: _Sweep(model, robot))
     sweep.start = start
     result = sweep.find(coordinate, state, target, least)
     return None if result is None else sweep.find_aside(result, state)
@@ -110,12 +103,8 @@ def find_obstacle(
 class _Sweep:
     """Scene in which objects are swept."""
 
-    def __init__(
-        self, model: ModelView, robot: Robot | None, rules: tuple[Rule, ...], leave_out: tuple[Exclusion, ...]
-    ) -> None:
-        self._model, self._robot = model, robot
-        plain = not rules and not leave_out
-        self._scene = Scene.of(model) if plain else Scene(model, rules=rules, leave_out=leave_out)
+    def __init__(self, model: ModelView, robot: Robot | None) -> None:
+        self._model, self._robot, self._scene = model, robot, Scene.of(model)
         self._overlaps = FurnitureOverlaps(self._scene, robot)
         self._queries: dict[tuple[Symbol, bytes], tuple[PreparedQuery, FrameDependence]] = {}
         self.start: State | None = None
@@ -184,9 +173,8 @@ class _Sweep:
             if first is None:
                 return
             k += first
-            # What rests on something touches for long.
             inputs = self._scene.collision_world.values
-            while True:
+            while True:  # what rests on something touches for long
                 yield k
                 k += 1
                 if k == len(values):

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from kineverse.compilation import compile
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError
 from kineverse.estimation import ObservedPose, Outliers, Tracker, pose_covariance
 from kineverse.estimation.noise import CHI_SQUARED_6
 from kineverse.lie import Array, inverse, pose_difference, rotation_z, transform
@@ -442,7 +442,4 @@ class TrackedBelief:
             return math.sqrt(float(self._spread[self._encoded.index(coordinate)]))
         if self._base is not None and coordinate in self._base.coordinates:
             return float(self._filter.deviations[self._base.coordinates.index(coordinate)])
-        if coordinate not in self._place:
-            known = suggest(str(coordinate), map(str, self._symbols), "coordinate")
-            raise UnknownNameError(f"The belief says nothing about '{coordinate}'. {known}")
         return 0.0 if coordinate in self._exact else math.inf

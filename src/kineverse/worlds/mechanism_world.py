@@ -12,6 +12,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from kineverse._checks import as_positive
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
@@ -20,7 +21,7 @@ from kineverse.symbols import Symbol
 from .robot import Robot
 from .robot_interface import Observation
 from .simulated_world import Contact
-from .speed_commands import check_duration, parse_speeds
+from .speed_commands import parse_speeds
 
 _ALLOWED = 1e-7  # violation of a constraint that counts as none, in its unit
 _NO_VALUE = 1e9
@@ -85,7 +86,7 @@ class MechanismWorld:
 
         The stamp is not read.
         """
-        length = check_duration(duration)
+        length = as_positive(duration, "A duration", "number of seconds")
         v = parse_speeds(speeds, self._place, np.zeros(len(self._columns)))
         after = self._advance(self._q, v, length)
         if after is None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import finite_number
+from kineverse._checks import as_positive, finite_number
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
 from kineverse.state import State, StateLike
@@ -53,7 +53,7 @@ class SpeedCommands:
 
     def take(self, speeds: StateLike, duration: float, stamp: float | None, now: float) -> float:
         """Take speeds for a duration [s], and return its end; those with a stale stamp stop the robot."""
-        until = end = now + check_duration(duration)
+        until = end = now + as_positive(duration, "A duration", "number of seconds")
         taken = None if stamp is None else finite_number(stamp)
         if stamp is not None and taken is None:
             raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
@@ -111,14 +111,6 @@ def parse_speeds(speeds: StateLike, columns: SpeedColumns, vector: Array) -> Arr
                 raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
             vector[column] = number
     return vector
-
-
-def check_duration(duration: float) -> float:
-    """Return the duration of a step [s], or raise InvalidValueError if it is no positive number."""
-    length = finite_number(duration)
-    if length is None or length <= 0:
-        raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
-    return length
 
 
 def check_settings(positive: Mapping[str, Any], others: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from kineverse._checks import as_count, as_tolerance
+from kineverse._checks import as_count, as_positive
 from kineverse.errors import InvalidValueError
 from kineverse.grasping import Gripper, Handle, find_handle
 from kineverse.manipulation.outcome import Outcome, SkillError
@@ -15,16 +15,14 @@ from kineverse.manipulation.pushing.base_placement import find_push_start
 from kineverse.manipulation.pushing.push_controller import Pushing
 from kineverse.manipulation.pushing.push_skill import push
 from kineverse.manipulation.session import Session
-from kineverse.manipulation.skill_arguments import (
-    check_positive,
+from kineverse.manipulation.skill_run import (
+    SkillRun,
     check_target,
     choose_target,
     choose_tolerance,
     explain_fixed,
     find_object_coordinate,
 )
-from kineverse.manipulation.skill_run import SkillRun
-from kineverse.manipulation.swept_volume import BlockedError, find_obstacle
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -102,10 +100,8 @@ def open_object(
         placement.
     """
     coordinate = find_object_coordinate(session.robot, what)
-    seconds, target = check_positive("seconds", seconds), check_target(target)
+    seconds, (target, tolerance) = as_positive(seconds, "seconds="), check_target(target, tolerance)
     placements, seed = as_count("placements", placements, 1), as_count("seed", seed, 0)
-    if tolerance is not None:
-        tolerance = as_tolerance(tolerance, "tolerance=")
     if not isinstance(handle, Handle):
         handle = find_handle(session.model, coordinate, handle)
     gripper = hand if isinstance(hand, Gripper) else session.robot.gripper(hand)
@@ -132,14 +128,13 @@ class OpeningRun(SkillRun):
     ) -> None:
         super().__init__(session, handle.coordinate, seconds)
         self.opener, self.handle, self.gripper = opener, handle, opener.gripper
-        self.motion = HandMotion(self, opener, handle)
-        self.target = math.nan if target is None else target
-        self.tolerance = math.nan if tolerance is None else tolerance
+        self.motion = HandMotion(self, opener, handle, seed)
+        self._wanted = target, tolerance
+        self.target = self.tolerance = math.nan
         self._samples, self._seed = placements, seed
         self.pushed_from: float | None = None
         self.slips: list[str] = []
         self._last_rest = math.inf
-        self._approach = Approach()
         self.measures |= {"placements": 0, "grasps": 0}
         held = self.gripper.hand, handle.frame, handle.coordinate
         self._reversible = [
@@ -162,7 +157,8 @@ class OpeningRun(SkillRun):
         """Move the object to the target, and return that it is there, or raise SkillError."""
         self.motion.look()
         self._choose_target()
-        self._let_go()
+        if self.motion.is_at_handle:
+            self.motion.let_go()
         self._check_start()
         self._check_height()
         failure = self._move_grasped()
@@ -186,27 +182,14 @@ class OpeningRun(SkillRun):
     def _choose_target(self) -> None:
         """Choose target and tolerance, or raise SkillError if the object cannot go there."""
         model, coordinate, state = self.model, self.coordinate, self.session.state
-        given = None if math.isnan(self.target) else self.target
+        target, tolerance = self._wanted
         fixed = explain_fixed(model, coordinate, state)
-        if fixed and given != self.value:
+        if fixed and target != self.value:
             raise SkillError("other", fixed)
-        self.target = choose_target(model, coordinate, state, given)
-        tolerance = None if math.isnan(self.tolerance) else self.tolerance
+        self.target = choose_target(model, coordinate, state, target)
         self.tolerance = choose_tolerance(model, coordinate, state, self.target, tolerance)
         self.measures |= {"target": self.target, "tolerance": self.tolerance}
-        obstacle = find_obstacle(
-            model, coordinate, state, self.target, robot=self.robot, start=self.session.start
-        )
-        if obstacle is not None:
-            raise BlockedError(obstacle)
-
-    def _let_go(self) -> None:
-        """Open a hand that is at the handle, and take it back."""
-        if self.motion.is_at_handle:
-            self.session.phase = "release"
-            self.motion.move_fingers(self.gripper.opened)
-            self.session.phase = "retract"
-            self.motion.back_off()
+        self.check_way(self.target)
 
     def _check_start(self) -> None:
         """Raise SkillError if the robot touches something before anything is done."""
@@ -251,10 +234,8 @@ class OpeningRun(SkillRun):
         """Take the handle, move the object as far as a placement leads, and let go."""
         assert placement.grasp is not None
         self.measures["grasps"] += 1
-        self._bring_base()
-        self.session.phase = "approach"
-        assert self._approach.trajectory is not None
-        self.motion.approach(placement, self._approach.trajectory)
+        self.motion.drive()
+        self.motion.approach(placement)
         before, stall = self.rest, None
         try:
             if self.motion.close(placement.grasp):
@@ -288,10 +269,6 @@ class OpeningRun(SkillRun):
                 "is locked or jammed, or moves too hard for the force of the fingers.",
             )
 
-    def _bring_base(self) -> None:
-        if self._approach.places is not None:
-            self.motion.drive(self._approach)
-
     def _place(self) -> BasePlacement:
         """Return a placement that leads as far as possible, and plan the path to the handle."""
         back = self._retrace(whole=True)
@@ -301,9 +278,7 @@ class OpeningRun(SkillRun):
             result = self._search(self._samples)
             if result:
                 return result
-            standing = self.opener.approaches.explain_standing(self.session.state)
-            why = f" {standing}" if standing else self._approach.barrier
-            failure = SkillError("reach" if standing else result.failure, f"{result.why}{why}")
+            failure = self.motion.explain(result)
         except SkillError as error:  # no grasp has room
             failure = error
         back = self._retrace(whole=False)
@@ -324,11 +299,11 @@ class OpeningRun(SkillRun):
                     or abs(end - here) < _LEAST_PROGRESS * self.rest
                 ):
                     continue
-                result = self.opener.search.retrace(session.state, earlier, end, self._plan)
+                result = self.opener.search.retrace(session.state, earlier, end, self.motion.plan)
                 if result is not None:
                     self._reversible.remove(earlier)
                     return result
-        self._approach = Approach()
+        self.motion.planned = Approach()
         return None
 
     def _search(self, samples: int) -> BasePlacement:
@@ -353,7 +328,7 @@ class OpeningRun(SkillRun):
                 session.state,
                 grasps,
                 self.target,
-                accept=self._plan,
+                accept=self.motion.plan,
                 stays=bool(opener.approaches.explain_standing(session.state)),
                 samples=samples,
                 seed=self._seed + self.measures["grasps"],
@@ -361,10 +336,6 @@ class OpeningRun(SkillRun):
             )
         self.measures["placements"] += result.samples
         return result
-
-    def _plan(self, placement: BasePlacement) -> bool:
-        self._approach = self.opener.approaches.plan_to(self.session.state, placement, self._seed)
-        return bool(self._approach)
 
     # -- pushes --------------------------------------------------------------------------------------------
 
@@ -375,10 +346,8 @@ class OpeningRun(SkillRun):
             raise failure  # starts of pushes are elsewhere
         try:
             pushing, seconds = self._find_push(self._seed + attempt)
-            self._bring_base()
-            session.phase = "approach"
-            assert self._approach.trajectory is not None
-            self.motion.follow(self._approach.trajectory)
+            self.motion.drive()
+            self.motion.follow_planned()
             begun = True
             outcome = push(
                 session,
@@ -437,7 +406,9 @@ class OpeningRun(SkillRun):
 
     def _plan_push(self, start: State) -> str:
         """Plan the path to the start of a push, and return why there is none."""
-        self._approach = self.opener.approaches.plan(self.session.state, start, seconds=_PLANNING)
-        if self._approach.trajectory is None:
+        self.motion.planned = planned = self.opener.approaches.plan(
+            self.session.state, start, seconds=_PLANNING
+        )
+        if planned.trajectory is None:
             return "no path to the start"
-        return "far away" if self._approach.trajectory.duration > self.left - _PUSHING else ""
+        return "far away" if planned.trajectory.duration > self.left - _PUSHING else ""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -58,10 +57,11 @@ Targets = TypeVar("Targets")
 
 
 class HandMotion:
-    """Motions of the hand of a robot at a handle."""
+    """Motions of the hand of a robot at a handle, and the path to it that was planned last."""
 
-    def __init__(self, run: SkillRun, opener: Opener, handle: Handle) -> None:
-        self.run, self.session, self.handle = run, run.session, handle
+    def __init__(self, run: SkillRun, opener: Opener, handle: Handle, seed: int = 0) -> None:
+        self.run, self.session, self.handle, self.seed = run, run.session, handle, seed
+        self.planned = Approach()
         self.gripper, self.search, self.approaches = opener.gripper, opener.search, opener.approaches
         self.controllers, self.model = opener.controllers, opener.search.model
         self.turns: Array = np.zeros(len(self.search.moving))
@@ -113,24 +113,43 @@ class HandMotion:
         moved = {s: v for s, v in inside.items() if v != state[s]}
         return state.updated(moved) if moved else state
 
-    def approach(self, placement: BasePlacement, trajectory: Trajectory) -> None:
-        """Bring the hand along a trajectory before the handle, and then straight to the grasp."""
+    def plan(self, placement: BasePlacement) -> bool:
+        """Plan the path to a placement, and return whether there is one."""
+        self.planned = self.approaches.plan_to(self.session.state, placement, self.seed)
+        return bool(self.planned)
+
+    def explain(self, result: BasePlacement) -> SkillError:
+        """Return why no placement was found."""
+        standing = self.approaches.explain_standing(self.session.state)
+        why = f" {standing}" if standing else self.planned.barrier
+        return SkillError("reach" if standing else result.failure, f"{result.why}{why}")
+
+    def drive(self) -> bool:
+        """Drive a base on wheels as planned, with a compact arm where needed; return False if it stays."""
+        drive, places = self.approaches.drive, self.planned.places
+        if places is None:
+            return False
+        assert drive is not None
+        self.session.phase = "drive"
+        if self.planned.tuck is not None:
+            self.follow(self.planned.tuck)
+        self.session.reference = None
+        drive.follow(self.run, places)
+        return True
+
+    def follow_planned(self) -> None:
+        """Follow the planned path, from where the base has driven to."""
+        self.session.phase = "approach"
+        assert self.planned.trajectory is not None
+        self.follow(self.planned.trajectory)
+
+    def approach(self, placement: BasePlacement) -> None:
+        """Bring the hand along the planned path before the handle, and then straight to the grasp."""
         assert placement.grasp is not None
-        self.follow(trajectory)
+        self.follow_planned()
         self.move_fingers(self.gripper.opened)
         self.count_turns(placement.line[0])
         self.follow_line(placement.grasp.approach, placement.grasp.pose, self.rows(placement.line))
-
-    def drive(self, approach: Approach) -> None:
-        """Drive a base on wheels to its place, with a compact arm where that is needed."""
-        drive = self.approaches.drive
-        assert drive is not None
-        assert approach.places is not None
-        self.session.phase = "drive"
-        if approach.tuck is not None:
-            self.follow(approach.tuck)
-        self.session.reference = None
-        drive.follow(self.run, approach.places)
 
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory, whose time waits where the robot is late."""
@@ -249,7 +268,7 @@ class HandMotion:
         self.session.phase = "retract"
         if abs(state[self.handle.coordinate] - placement.values[-1]) > _ARRIVED:
             # The retreat of the placement was checked for an object that has arrived.
-            self.back_off(grasp)
+            self._back_off(grasp)
             return
         end = dict(zip(placement.coordinates, placement.retreat[-1].tolist(), strict=True))
         gone = state.updated({**end, self.handle.coordinate: float(placement.values[-1])})
@@ -257,12 +276,19 @@ class HandMotion:
         away[:3, 3] += (inverse(self._bar(gone)) @ self._hand(gone))[:3, 3] - grasp.pose[:3, 3]
         self.follow_line(pose, away, self.rows(placement.retreat))
 
-    def back_off(self, grasp: Grasp | None = None) -> None:
+    def let_go(self, grasp: Grasp | None = None) -> None:
+        """Open the fingers, and take the hand straight away from the handle."""
+        self.session.phase = "release"
+        self.move_fingers(self.gripper.opened)
+        self.session.phase = "retract"
+        self._back_off(grasp)
+
+    def _back_off(self, grasp: Grasp | None) -> None:
         """Take the hand straight away from the handle, as far as it touches nothing."""
         world_T_bar, world_T_hand = self._bar(self.session.state), self._hand(self.session.state)
-        retreat = find_retreat(self, grasp, world_T_bar, world_T_hand)
+        end, arms = find_retreat(self, grasp, world_T_bar, world_T_hand)
         bar_T_world = inverse(world_T_bar)
-        self.follow_line(bar_T_world @ world_T_hand, bar_T_world @ retreat.end, retreat.arms)
+        self.follow_line(bar_T_world @ world_T_hand, bar_T_world @ end, arms)
 
     @property
     def is_at_handle(self) -> bool:
@@ -474,21 +500,14 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
 _STEPS = 12  # number of arms along a retreat
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandRetreat:
-    """Straight path of a hand from a handle."""
-
-    end: Array  # last pose world_T_hand (4, 4)
-    arms: Array | None  # configurations (L, n) of the arm along it; None if the arm does not reach the end
-
-
 def find_retreat(
     motion: HandMotion, grasp: Grasp | None, world_T_handle: Array, world_T_hand: Array
-) -> HandRetreat:
-    """Return the retreat that touches nothing, or the one that goes the farthest before it does.
+) -> tuple[Array, Array | None]:
+    """Return the straight path from a handle that touches nothing, or goes the farthest before it does.
 
-    It is the reversed approach of the grasp, or deviates from it along the bar. The approach of a grasp that
-    nobody knows is taken to be straight ahead of the hand.
+    That is the last pose world_T_hand (4, 4), and the configurations (L, n) of the arm on the way; None if it
+    does not reach the end. The path is the reversed approach of the grasp, or deviates from it along the bar.
+    The approach of a grasp that nobody knows is taken to be straight ahead of the hand.
     """
     search, state = motion.search, motion.state
     if grasp is None:
@@ -500,7 +519,8 @@ def find_retreat(
     arm, base = state.vector(search.moving), state.vector(search.standing)
     count, ends = len(lines), lines[:, -1]
     paths, reached = search.paths.follow(np.tile(arm, (count, 1)), np.tile(base, (count, 1)), lines)
-    best, farthest = HandRetreat(ends[0], None), 0
+    best: tuple[Array, Array | None] = (ends[0], None)
+    farthest = 0
     for end, path, number in zip(ends, paths, reached.tolist(), strict=True):
         if number < 2:
             continue
@@ -508,5 +528,5 @@ def find_retreat(
         hit = search.contacts.first(state, search.moving, rows, motion.handle.frame, opened=False)
         free = number if hit is None else hit
         if free > farthest:
-            best, farthest = HandRetreat(end, path if number == _STEPS else None), free
+            best, farthest = (end, path if number == _STEPS else None), free
     return best

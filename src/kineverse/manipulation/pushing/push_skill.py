@@ -8,20 +8,20 @@ from functools import partial
 
 import numpy as np
 
-from kineverse._checks import as_tolerance
+from kineverse._checks import as_positive
 from kineverse.control import Goal
 from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
-from kineverse.manipulation.skill_arguments import (
-    check_positive,
+from kineverse.manipulation.skill_run import (
+    Pace,
+    SkillRun,
     check_target,
     choose_tolerance,
     explain_fixed,
     find_object_coordinate,
 )
-from kineverse.manipulation.skill_run import Pace, SkillRun
-from kineverse.manipulation.swept_volume import BlockedError, find_obstacle
+from kineverse.manipulation.swept_volume import BlockedError
 from kineverse.planning import Path, Planner
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -139,9 +139,8 @@ def push(
     UnknownNameError, InvalidValueError
         For a coordinate of the robot, and as :class:`.Pushing`.
     """
-    coordinate, wanted = find_object_coordinate(session.robot, what), check_target(target)
-    seconds = check_positive("seconds", seconds)
-    tolerance = None if tolerance is None else as_tolerance(tolerance, "tolerance=")
+    coordinate, seconds = find_object_coordinate(session.robot, what), as_positive(seconds, "seconds=")
+    wanted, tolerance = check_target(target, tolerance)
     if pushing is not None:
         wanted = pushing.target
     elif wanted is None:
@@ -212,11 +211,7 @@ class PushRun(SkillRun):
                 return f"'{coordinate}' is there from the start"
             if why := explain_fixed(model, coordinate, session.state):
                 raise SkillError("other", why)
-            obstacle = find_obstacle(
-                model, coordinate, session.state, target, robot=self.robot, start=session.start
-            )
-            if obstacle is not None:
-                raise BlockedError(obstacle)
+            self.check_way(target)
             with session.search(f"points of '{coordinate}' at which it can be pushed"):
                 own = self.robot.gripper().bodies if bodies is None else bodies
                 pushing = Pushing(

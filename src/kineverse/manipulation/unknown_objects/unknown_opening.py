@@ -9,27 +9,28 @@ from dataclasses import replace
 
 import numpy as np
 
-from kineverse._checks import as_count
+from kineverse._checks import as_count, as_positive
+from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.grasping import Grasp, Gripper, sample_grasps
 from kineverse.grasping.finger_branches import path_to_root
 from kineverse.grasping.graspable_features import find_parts
-from kineverse.lie import Array, adjoint, exp_se3
+from kineverse.lie import Array, adjoint, exp_se3, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.approach_planner import Approach, Opener
-from kineverse.manipulation.opening.hand_motion import HandMotion
+from kineverse.manipulation.opening.hand_motion import PULLED_OUT, HandMotion
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import STALE, Session
-from kineverse.manipulation.skill_arguments import check_positive
 from kineverse.manipulation.skill_run import SkillRun
+from kineverse.manipulation.swept_volume import BlockedError
 from kineverse.manipulation.tracked_belief import TrackedBelief
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import Robot, Sensors
 
 from .joint_learning import JointLearning, revise_joint, watch_joint
-from .part_belief import PartBelief
-from .pulling_policy import LEAST_OPENING, LOOKING, ArmEndError, PartPulling, point_speed
+from .part_belief import PartBelief, measure_way
+from .pulling_policy import LearnedPull, StraightPull, learn_model, point_speed
 from .unmodelled_joint import JointPath, UnknownPart, find_joint, free_part
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)  # opening that is wanted by default [m], [rad]
@@ -42,6 +43,20 @@ _FURTHER = 1.1  # share of the rest of an opening that a further placement shoul
 _LEAST_RADIUS = 0.15  # distance of a bar from an edge of its part from which on a hinge may be there [m]
 _STEP = 0.05  # distance of the handle between two poses of an arm [m]
 _CLOSED_WAY, _CLOSED_TURN = 0.03, math.radians(6.0)  # motion back after which a part is not open [m], [rad]
+_LEAST_OPENING = 0.08, math.radians(10.0)  # from which a part at its own stop is open [m], [rad]
+_LOOKING, _HELD_LOOKING = 0.6, 1.0  # times of looks at a part that stands, and with the hand closed [s]
+_MOST_GRASPS = 3
+_DIRECTIONS = (
+    (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0),
+)  # fmt: skip
+"""Directions in which a part is pulled one after the other until it follows, in the axes of its handle: along
+its outward normal, to both sides across the bar, and to both ends along it."""
+_REFIT = 0.5  # time between two controllers for a learned joint [s]
+_FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
+"""Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
+_LED = 0.06  # distance of the handle before which the hand does not rely on a joint that was learned [m]
+_ENDING = 0.5  # time without progress where the arm is expected to end [s]
+_AHEAD, _AHEAD_STEPS = 0.03, 4  # distance that an arm must be able to go on [m], and number of poses
 
 
 def open_unknown(
@@ -113,7 +128,7 @@ def open_unknown(
         that is not positive.
     """
     for name, value in (("way", way), ("turn", turn), ("seconds", seconds)):
-        check_positive(name, value)
+        as_positive(value, f"{name}=")
     for name in (handle, *(n for n in (part, beside) if n is not None)):
         if name not in model.frames:
             raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
@@ -150,6 +165,10 @@ def open_unknown(
     return run.finish_learning(run.perform(run.open))
 
 
+class ArmEndError(SkillError):
+    """End of the arm's reach, or an obstacle, before the part is open."""
+
+
 class UnknownOpeningRun(SkillRun):
     """Run of an opening of a part with an unknown joint."""
 
@@ -168,25 +187,36 @@ class UnknownOpeningRun(SkillRun):
     ) -> None:
         super().__init__(session, None, seconds)
         self.model, self.gripper, self.belief, self.unknown = model, gripper, belief, belief.unknown
+        self.point, self.frame_T_handle = belief.unknown.point, belief.unknown.frame_T_handle
         self.wanted, self.samples, self.seed = wanted, samples, seed
         self.learning = JointLearning()
-        self.pulling = PartPulling(self, belief, self.learning, model, wanted)
         self.opener: Opener
         self.motion: HandMotion
-        self.approach = Approach()
+        self.start: Array | None = None  # pose (4, 4) of the part when it was grasped first
+        self._first_pull = self._reached = self.begin  # times of the first pull, and of the last progress [s]
+        self._direction, *self._others = _DIRECTIONS
+        self.measures["grasps"] = 0
 
     @property
     def value(self) -> float:
         """Believed opening: the angle [rad] of a part that turns, else the distance of the handle [m]."""
-        way, turn = self.pulling.opening
+        way, turn = self.opening
         learned = self.learning.learned
-        turns = turn > 0.5 * LEAST_OPENING[1] if learned is None else bool(learned.fit.motion.kinds[0])
+        turns = turn > 0.5 * _LEAST_OPENING[1] if learned is None else bool(learned.fit.motion.kinds[0])
         return turn if turns else way
+
+    @property
+    def opening(self) -> tuple[float, float]:
+        """Believed distance of the handle [m] and angle of the part [rad] since the first grasp."""
+        if self.start is None:
+            return 0.0, 0.0
+        return measure_way(self.start, self.belief.relative_pose, self.point)
 
     def finish_learning(self, outcome: Outcome) -> Outcome:
         """Write what was learned into the model, also if the part is not open, and add it to the outcome."""
-        way, turn = self.pulling.opening
-        measures = {**outcome.measures, **self.pulling.measures, "way": way, "turn": turn}
+        way, turn = self.opening
+        pulled = self.session.time - self._first_pull
+        measures = {**outcome.measures, "pull_seconds": pulled, "way": way, "turn": turn}
         if (learned := self.learning.learned) is None:
             return replace(outcome, measures=measures)
         verdict, words = revise_joint(self.model, self.belief, learned)
@@ -210,7 +240,7 @@ class UnknownOpeningRun(SkillRun):
             self._look()
             self._prepare(self.unknown)
             if self.motion.is_at_handle:
-                self._retract(None)
+                self._retract()
             if self.belief.monitor is None:
                 self.belief.monitor = watch_joint(self.model, self.belief)
             failure: SkillError | None = None
@@ -231,7 +261,7 @@ class UnknownOpeningRun(SkillRun):
         with session.search():
             robot = Robot.of(unknown.model, self.robot)
             self.opener = Opener(robot, self.gripper, session.state)
-        self.motion = HandMotion(self, self.opener, unknown.handle)
+        self.motion = HandMotion(self, self.opener, unknown.handle, self.seed)
         self.unknown = unknown
 
     def _place_first(self) -> BasePlacement:
@@ -245,18 +275,18 @@ class UnknownOpeningRun(SkillRun):
                 unknown, self.opener.search, placement, session.state, twists, _REACH, self.wanted[1]
             )
             found.append((share, placement))
-            return share > _ENOUGH and self._plan(placement)
+            return share > _ENOUGH and self.motion.plan(placement)
 
         failure: SkillError | None = None
         for k in range(_SEARCHES if twists else 1):
             result = self._search(_REACH, accept, self.seed + k)
             if result:
                 return result
-            failure = failure or self._explain(result)
+            failure = failure or self.motion.explain(result)
             if not found:
                 raise failure
         for _, placement in sorted(found, key=lambda pair: -pair[0]):
-            if self._plan(placement):
+            if self.motion.plan(placement):
                 return placement
         assert failure is not None
         raise failure
@@ -264,43 +294,34 @@ class UnknownOpeningRun(SkillRun):
     def _place_further(self) -> BasePlacement:
         learned = self.learning.learned
         assert learned is not None
-        assert self.pulling.start is not None
-        path = JointPath.of_fit(learned.fit, self.pulling.start)
+        assert self.start is not None
+        path = JointPath.of_fit(learned.fit, self.start)
         path.project(self.belief.relative_pose)
         self._prepare(self.unknown.pulled_along(path.twist()))
         kind = learned.fit.motion.kinds[0]
-        scale = point_speed(path.twist(), self.unknown.point)
-        rest = self.wanted[kind] - self.pulling.opening[kind]
-        result = self._search(_FURTHER * scale * rest, self._plan, self.seed)
+        scale = point_speed(path.twist(), self.point)
+        rest = self.wanted[kind] - self.opening[kind]
+        result = self._search(_FURTHER * scale * rest, self.motion.plan, self.seed)
         if not result:
-            raise self._explain(result)
+            raise self.motion.explain(result)
         return result
-
-    def _explain(self, result: BasePlacement) -> SkillError:
-        """Return why there is no placement from which the robot could pull."""
-        standing = self.opener.approaches.explain_standing(self.session.state)
-        why = f" {standing}" if standing else self.approach.barrier
-        return SkillError("reach" if standing else result.failure, f"{result.why}{why}")
 
     def _pull(self, placement: BasePlacement) -> str:
         """Take the handle, pull, let go, and return how far the part is open."""
-        grasp, approach = placement.grasp, self.approach
+        grasp = placement.grasp
         assert grasp is not None
-        assert approach.trajectory is not None
-        if approach.places is not None:
-            self.motion.drive(approach)
+        if self.motion.drive():
             self._look()
-        self.session.phase = "approach"
-        self.motion.approach(placement, approach.trajectory)
+        self.motion.approach(placement)
         try:
-            reason = self.pulling.perform(self.motion, grasp)
+            reason = self._pull_open(grasp)
         except KineverseError:
             with suppress(SkillError):  # the first one says more
                 self._let_go(grasp)
             raise
-        way, turn = self.pulling.opening
+        way, turn = self.opening
         self._let_go(grasp)
-        after = self.pulling.opening
+        after = self.opening
         if after[0] < way - _CLOSED_WAY or after[1] < turn - _CLOSED_TURN:
             words = f"by {100 * after[0]:.0f} cm and {math.degrees(after[1]):.0f}°"
             raise SkillError("other", f"{reason} It did not stay there: it is open {words}.")
@@ -313,22 +334,19 @@ class UnknownOpeningRun(SkillRun):
         if self.left >= 0.0 and not session.broken and session.time - (session.state.stamp or 0.0) <= STALE:
             self._retract(grasp)
 
-    def _retract(self, grasp: Grasp | None) -> None:
+    def _retract(self, grasp: Grasp | None = None) -> None:
         """Open the fingers, take the hand back, and look at the part.
 
         Where the part is after an unknown motion, the retreat of the placement has not been checked.
         """
-        self.session.phase = "release"
-        self.motion.move_fingers(self.gripper.opened)
-        self.session.phase = "retract"
-        self.motion.back_off(grasp)
-        self.stand(LOOKING)
+        self.motion.let_go(grasp)
+        self.stand(_LOOKING)
 
     def _look(self) -> None:
         """Stand until the part is seen, or raise SkillError if it is not."""
         self.session.phase = "look"
         begin = self.session.time
-        self.stand(LOOKING)
+        self.stand(_LOOKING)
         while not self.belief.is_seen:
             if self.session.time - begin > _MOST_LOOKING:
                 raise SkillError(
@@ -340,7 +358,7 @@ class UnknownOpeningRun(SkillRun):
 
     def _search(self, distance: float, accept: Callable[[BasePlacement], bool], seed: int) -> BasePlacement:
         """Search a placement from which the handle can be pulled by a distance [m], or as far as possible."""
-        session, self.approach = self.session, Approach()
+        session, self.motion.planned = self.session, Approach()
         session.phase = "place"
         with session.search(f"places of the robot from which '{self.unknown.frame}' can be pulled"):
             model, handle = self.unknown.model, self.unknown.handle
@@ -350,9 +368,148 @@ class UnknownOpeningRun(SkillRun):
                 stays=bool(self.opener.approaches.explain_standing(session.state)),
             )  # fmt: skip
 
-    def _plan(self, placement: BasePlacement) -> bool:
-        self.approach = self.opener.approaches.plan_to(self.session.state, placement, self.seed)
-        return bool(self.approach)
+    # -- pulls ---------------------------------------------------------------------------------------------
+
+    def _pull_open(self, grasp: Grasp) -> str:
+        """Pull until the part is open or at its own stop, and return how far that is.
+
+        A handle that slips is grasped again.
+        """
+        distance = self.opening[0] if self.learning.poses else -math.inf
+        for _ in range(_MOST_GRASPS):
+            self.measures["grasps"] += 1
+            barrier = ""
+            if not self.motion.close(grasp):
+                why = "The fingers closed next to the handle."
+            else:
+                if not self.learning.poses:
+                    self._first_pull = self.session.time
+                why, barrier = self._pull_once()
+            if not why:
+                return self._describe_opening("is open")
+            self._open_fingers()
+            last, distance = distance, self.opening[0]
+            if barrier and distance >= _FOLLOWS:
+                kind = ArmEndError if self.learning.learned is not None else SkillError
+                raise kind(barrier, f"{self._describe_opening('was pulled')} {why}")
+            if distance - last < _FOLLOWS:
+                break
+            self.measures["opened_seconds"] = self._reached - self._first_pull
+            pose = inverse(self.belief.pose @ self.frame_T_handle) @ self.belief.hand_pose
+            self.motion.follow_line(pose, grasp.pose)
+        opened, _ = self.opening
+        if opened < _FOLLOWS:
+            raise SkillError(
+                "other",
+                f"'{self.unknown.frame}' does not follow the hand, pulled outwards, to both sides, and to "
+                f"both ends of its handle: it moved by {1e3 * opened:.0f} mm. {why} It may be fixed, locked, "
+                "or need more force than the grip holds.",
+            )
+        words = f"{self._describe_opening('goes no further')} {why}"
+        if opened >= _LEAST_OPENING[0] or self.opening[1] >= _LEAST_OPENING[1]:
+            self.measures["opened_seconds"] = self._reached - self._first_pull
+            return f"{words} The arm could go on, so this is its stop."
+        raise SkillError("other", words)
+
+    def _open_fingers(self) -> None:
+        self.session.phase = "let go"
+        self.belief.release()
+        self.motion.move_fingers(self.gripper.opened)
+        self.stand(_LOOKING)
+
+    def _pull_once(self) -> tuple[str, str]:
+        """Pull until the part is open.
+
+        Return why it is not, empty if it is, and the kind of failure if the part could go on.
+        """
+        session, belief, motion, learning = self.session, self.belief, self.motion, self.learning
+        session.phase = "pull"
+        belief.hold()
+        self.stand(_HELD_LOOKING)
+        part_T_hand = inverse(belief.pose) @ belief.hand_pose
+        bar_T_hand = inverse(self.frame_T_handle) @ part_T_hand
+        if self.start is None or not learning.poses:
+            self.start = belief.relative_pose
+        belief.begin_motion()
+        pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand, self._direction)
+        fitted, best = -math.inf, self.opening[0]
+        idle = 0.0  # time without progress, but for that in which the robot waits [s]
+        while True:
+            for look in belief.looks:
+                learning.add(*look)
+            belief.looks.clear()
+            distance, turn = self.opening
+            now = self.session.time
+            with session.timed("learn"):
+                learning.update(distance, turn, now - self._first_pull)
+                learned = learning.learned
+                if learned is not None and now - fitted >= _REFIT and distance >= _LED:
+                    fit, fitted = learned.fit, now
+                    pull = LearnedPull(
+                        motion, belief, learn_model(self.model, belief, fit), bar_T_hand, self.start,
+                        self.wanted[fit.motion.kinds[0]],
+                    )  # fmt: skip
+                elif learning.likely is not None and isinstance(pull, StraightPull):
+                    pull.likely = JointPath.of_fit(learning.likely, self.start)
+            if isinstance(pull, LearnedPull) and pull.obstacle is not None and pull.is_blocked:
+                self._open_fingers()
+                raise BlockedError(pull.obstacle)
+            with session.timed("open"):
+                command = pull.step(distance)
+            self.act(command.speeds, command)
+            distance, turn = self.opening
+            if self._is_open(distance, turn):
+                self.measures["opened_seconds"] = now - self._first_pull
+                return "", ""
+            if belief.slip(part_T_hand, self.point) > PULLED_OUT:
+                session.stop()
+                ends = isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand)
+                why = "The handle slipped in the hand"
+                return (f"{why} where the arm ends.", "reach") if ends else (f"{why}.", "")
+            idle += session.dt
+            if distance > best + _STALLED:
+                best, idle = distance, 0.0
+                self._reached = now
+            elif idle > (_ENDING if isinstance(pull, LearnedPull) and pull.ends else _PATIENCE):
+                if isinstance(pull, StraightPull) and distance < _FOLLOWS and self._others:
+                    # It may slide to a side.
+                    self._direction, idle = self._others.pop(0), 0.0
+                    pull = StraightPull(motion, belief, bar_T_hand, self._direction)
+                    continue
+                return self._explain_stall(pull, command, part_T_hand)
+
+    def _explain_stall(
+        self, pull: StraightPull | LearnedPull, command: Command, part_T_hand: Array
+    ) -> tuple[str, str]:
+        """Return what is in the way, and its kind if that is not the part itself."""
+        words = f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
+        if any(name.startswith("contact of") for name in command.active[:3]):
+            return words, "collision"
+        limits = [c for name, c in self.model.constraints.items() if name in command.active and not c.order]
+        limited = any(map(self.robot.moves, [s for c in limits for s in c.expression.symbols]))
+        if limited or (isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand)):
+            return f"The arm ends there. {words}", "reach"
+        return words, ""
+
+    def _can_go_on(self, pull: LearnedPull, part_T_hand: Array) -> bool:
+        """Return whether the arm reaches the next poses of the handle along a learned joint."""
+        path, search, state = pull.path, self.motion.search, self.session.state
+        step = path.direction * _AHEAD / point_speed(path.twist(), self.point) / _AHEAD_STEPS
+        values = path.value + step * np.arange(_AHEAD_STEPS + 1)
+        hands = [self.belief.reference_pose @ path.pose(v) @ part_T_hand for v in values.tolist()]
+        arm, base = state.vector(search.moving)[None], state.vector(search.standing)[None]
+        _, reached = search.paths.follow(arm, base, np.array(hands)[None])
+        return int(reached[0]) == len(hands)
+
+    def _is_open(self, distance: float, turn: float) -> bool:
+        learned = self.learning.learned
+        if learned is not None and learned.fit.motion.kinds[0]:
+            return turn >= self.wanted[1]
+        return distance >= self.wanted[0] or turn >= self.wanted[1]
+
+    def _describe_opening(self, verb: str) -> str:
+        distance, turn = self.opening
+        return f"'{self.unknown.frame}' {verb}, by {100 * distance:.0f} cm and {math.degrees(turn):.0f}°."
 
 
 def guess_hinges(unknown: UnknownPart, search: PlacementSearch, state: State) -> list[Array]:

@@ -7,9 +7,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from kineverse._checks import finite_number
+from kineverse._checks import as_positive
 from kineverse.control import Controller, Goal
-from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import Session
@@ -50,11 +49,9 @@ class PartMover:
     def __init__(
         self, model: ModelView, session: Session, *, patience: float = 1.0, speed: float = 0.4
     ) -> None:
-        for what, number in (("patience", patience), ("speed", speed)):
-            if not (finite_number(number) or 0.0) > 0:
-                raise InvalidValueError(f"The {what} of a moved part is a positive number, not {number!r}.")
         self.model, self.session = model, session
-        self._patience, self._speed = float(patience), float(speed)
+        self._patience = as_positive(patience, "The patience of a moved part")
+        self._speed = as_positive(speed, "The speed of a moved part")
         self._target = parameter(_TARGET, 0.0)
         self._controllers: dict[Symbol, Controller] = {}
 

@@ -28,7 +28,7 @@ from kineverse.manipulation import (
 from kineverse.manipulation.pushing.base_placement import find_push_start
 from kineverse.manipulation.pushing.push_controller import Pushing
 from kineverse.manipulation.robot_sources import SHIPPED, RobotSource, find_robot
-from kineverse.manipulation.skill_arguments import find_object_coordinate
+from kineverse.manipulation.skill_run import find_object_coordinate
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
