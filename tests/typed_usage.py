@@ -111,7 +111,15 @@ motion = kv.planning.time_parameterize([[0.0, 0.0], [1.0, 2.0]], 1.0, [2.0, 3.0]
 assert_type(motion.at(0.5), kv.State)
 assert_type(motion.positions_at([0.0, 0.5]), Numbers)
 gripper: kv.grasping.Gripper
-world: kv.worlds.World
+world: kv.worlds.SimulatedWorld = kv.worlds.MechanismWorld(model)
+robot: kv.worlds.RobotInterface = world
+
+
+def simulations(model: kv.Model) -> list[kv.worlds.SimulatedWorld]:
+    """Return worlds that need extras; nobody calls it here."""
+    return [kv.worlds.KinematicWorld(model, "robot"), kv.worlds.MujocoWorld(model, "robot")]
+
+
 outcome: kv.manipulation.Outcome
 shower = kv.show
 version: str = kv.__version__

@@ -24,11 +24,10 @@ from pathlib import Path
 import coal
 import numpy as np
 
-from kineverse.grasping import find_gripper
 from kineverse.manipulation import Outcome, Session, open_object
-from kineverse.manipulation.pushing import Pushing
+from kineverse.manipulation.pushing.push_controller import Pushing
 from kineverse.manipulation.robot_sources import SHIPPED
-from kineverse.worlds import KinematicWorld
+from kineverse.worlds import KinematicWorld, RunMetrics, TrueBelief
 from kineverse_studies.experiments.manipulation.skills import try_push
 
 ROBOTS = ("hsr", "pr2", "fetch")
@@ -355,13 +354,16 @@ def run_robot(robot: str, cupboard: Cupboard, folder: Path) -> Run:
     def look(session: Session) -> None:
         read()
 
+    def open_session() -> Session:
+        return Session(world, belief=TrueBelief(world), on_step=look)
+
     read()
     if cupboard.skill == "push":
-        bodies = find_gripper(model, robot).bodies
-        pushing = Pushing(model, what, bodies, state, target=cupboard.target, robot=robot)
-        outcome, _, _ = try_push(pushing, world, state, lambda: Session(world, on_step=look))
+        bodies = world.robot.gripper().bodies
+        pushing = Pushing(model, world.robot, what, bodies, state, target=cupboard.target)
+        outcome, _, _ = try_push(pushing, world, state, RunMetrics(world, what), open_session)
     else:
-        outcome = open_object(Session(world, on_step=look), what, target=cupboard.target)
+        outcome = open_object(open_session(), what, target=cupboard.target)
     read()
     return Run(outcome, _find_wrong(cupboard, outcome, states), time.process_time() - begin)
 

@@ -51,6 +51,14 @@ def as_tolerance(given: float, subject: str = "A tolerance") -> float:
     return tolerance
 
 
+def as_positive(given: Any, subject: str, kind: str = "finite number") -> float:
+    """Return a positive finite number as a float; messages begin with the subject and name the kind."""
+    number = finite_number(given)
+    if number is None or number <= 0:
+        raise InvalidValueError(f"{subject} is a positive {kind}, not {given!r:.60}.")
+    return number
+
+
 def as_count(name: str, given: int, least: int) -> int:
     """Return a keyword argument as an integer."""
     count = None if isinstance(given, bool) or not hasattr(given, "__index__") else index(given)

@@ -2,11 +2,14 @@
 
 import json
 import urllib.request
+from dataclasses import replace
+from functools import partial
 
 import pytest
 
 from kineverse.errors import InvalidValueError
 from kineverse.manipulation.outcome import Outcome
+from kineverse.manipulation.robot_sources import SHIPPED, find_robot
 
 pytest.importorskip("coal")
 pytest.importorskip("daqp")
@@ -25,20 +28,24 @@ def asked(monkeypatch, fails):
     """Stand in for the skill: it puts the object where it is wanted. Returns what it was asked for."""
     calls = []
     monkeypatch.setattr("kineverse.cli.demo.KITCHEN", "shelf_drawers")  # a small kitchen
+    away = replace(SHIPPED["hsr"], start={"base/x": -1.0})  # it would stand in the drawers
+    monkeypatch.setattr("kineverse.cli.demo.find_robot", partial(find_robot, robots={"hsr": away}))
 
     def open_object(session, coordinate, *, target, hand, **options):
         calls.append((str(coordinate), target))
         if len(calls) in fails:
             raise fails[len(calls)]
         session.phase = "move"
-        session.restart(session.world.state.updated({coordinate: target}))
+        world = session.interface
+        world.reset(world.state.updated({coordinate: target}))
+        session.refresh()
         for _ in range(2):
             session.stop()
-        assert hand == "hsr/hand_palm_link"
-        value = float(session.world.state[coordinate])
-        return Outcome(True, value, "as wanted", "kinematic", 0.04, 2, {"grasp_error": 1e-3})
+        assert hand.hand == "hsr/hand_palm_link"
+        measures = {"grasp_error": 1e-3, "target": target, "tolerance": 0.02}
+        return Outcome(True, target, "as wanted", "kinematic", 0.04, 2, measures)
 
-    monkeypatch.setattr("kineverse.manipulation.open_close.open_object", open_object)
+    monkeypatch.setattr("kineverse.manipulation.trials.open_object", open_object)
     return calls
 
 

@@ -51,7 +51,10 @@ def files(tmp_path, monkeypatch):
 
 @pytest.fixture
 def asked(monkeypatch):
-    """Stand in for the skill: it holds still for two steps. Returns what it was asked for."""
+    """Stand in for the skill: it holds still for two steps. Returns what it was asked for.
+
+    With the seed 1 it says that the object is at the target.
+    """
     calls = []
 
     def open_object(session, what, *, target=None, **options):
@@ -59,8 +62,11 @@ def asked(monkeypatch):
         session.phase = "grasp"
         session.stop()
         session.stop()
-        done = not options["handle"]
-        return Outcome(done, 0.3, "it is over", session.world.name, 0.04, 2, {"grasp": float("nan")})
+        measures = {"grasp": float("nan")}
+        if options["seed"] == 1:
+            measures |= {"target": target, "tolerance": 0.02}
+        done = options["seconds"] != 7.0
+        return Outcome(done, 0.3, "it is over", session.interface.name, 0.04, 2, measures)
 
     monkeypatch.setitem(
         sys.modules,
@@ -184,27 +190,66 @@ def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
     answer = json.loads(out)
     assert status == 0
     assert {"done", "value", "reason", "world", "seconds"} <= answer.keys()
-    assert answer["measures"] == {"grasp": None}
+    assert answer["measures"]["grasp"] is None
+    assert {"limit_violation", "penetration", "grasp_error", "contact_losses"} <= answer["measures"].keys()
     assert "gripper of hsr/hand_palm_link" in err
     assert "handle shelf_drawers/" in err
     assert err.count("grasp") == 1
     assert "touch, so the robot begins at" in err  # it would stand in the drawers
     assert asked[0].target == kv.load("shelf_drawers").limits(asked[0].what)[1]
-    assert asked[0].options == {"hand": "hsr/hand_palm_link", "handle": None, "seconds": 5.0, "seed": 0}
+    options, found = asked[0].options, (asked[0].options["hand"].hand, asked[0].options["handle"].frame)
+    assert (options["seconds"], options["seed"]) == (5.0, 0)
+    assert found == ("hsr/hand_palm_link", "shelf_drawers/upper_drawer_handle")
 
     picture = tmp_path / "end.png"
     words = ["close", "shelf_drawers", "--robot", "hsr@-1,0.5,90deg", *HSR[2:]]
     handle = next(line.split()[1].strip(":") for line in err.splitlines() if line.startswith("handle"))
-    status, out, _ = run(*words, "--handle", handle, "--picture", picture)
+    status, out, _ = run(*words, "--handle", handle, "--picture", picture, "--seconds", 7)
     assert status == 1
-    assert out.startswith("shelf_drawers/upper_drawer: not done, at 0.3 m. it is over\n")
+    assert out.startswith("shelf_drawers/upper_drawer: not done, at 0.22 m. it is over\n")
     assert "steps" in out
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    state, drawer = asked[1].session.world.state, asked[1].what
+    state, drawer = asked[1].session.state, asked[1].what
     model = kv.load("shelf_drawers")
     assert asked[1].target == model.limits(drawer)[0]
     assert state[drawer] == min(0.4, model.limits(drawer)[1])
     assert [state[f"hsr/base/{c}"] for c in ("x", "y", "angle")] == pytest.approx([-1, 0.5, 1.5708], abs=1e-4)
+
+
+def test_what_is_claimed_and_not_true_is_not_done(run, asked):
+    status, out, _ = run("open", "shelf_drawers", *HSR, "--json", "--seed", 1)
+    answer = json.loads(out)
+    assert (status, answer["claimed"], answer["done"], answer["value"]) == (1, True, False, 0.0)
+    assert answer["reason"] == "it is over. The world says 0, not 0.22 ± 0.02."
+    assert answer["measures"]["failure"] == "other"
+
+
+def test_a_base_that_does_not_drive_is_put_to_the_handle(run, asked, monkeypatch):
+    def stand(session, world, handle, target, **options):
+        assert handle.frame == "shelf_drawers/upper_drawer_handle"
+        world.reset(world.state.updated({"hsr/base/x": -0.25, "hsr/base/y": 0.5}))
+        session.refresh()
+        return True
+
+    monkeypatch.setattr("kineverse.manipulation.stand_at_handle", stand)
+    status, out, err = run("open", "shelf_drawers", *HSR, "--json")
+    assert (status, asked[0].session.state["hsr/base/x"]) == (0, -0.25)
+    assert "does not drive to the handle by itself; it is put to -0.25, 0.50" in err
+    assert json.loads(out)["measures"]["distance"] == 0.0
+
+
+def test_a_part_with_an_unknown_joint_is_as_far_open_as_the_world_says(run, monkeypatch):
+    def open_unknown(session, handle, **options):
+        session.stop()
+        measures = {"way": 0.2, "turn": 0.0}
+        return Outcome(True, 0.2, "open by 20 cm", session.interface.name, 0.02, 1, measures)
+
+    monkeypatch.setattr("kineverse.manipulation.open_unknown", open_unknown)
+    status, out, _ = run("open", "shelf_drawers", *HSR, "--unknown", "--json")
+    answer = json.loads(out)
+    assert (status, answer["claimed"], answer["done"], answer["value"]) == (1, True, False, 0.0)
+    assert answer["reason"] == "open by 20 cm. The world says that it is open by 0 cm and 0°."
+    assert (answer["measures"]["way"], answer["target"]) == (0.0, None)
 
 
 def test_other_coordinates_are_set_at_the_start(run, asked):
@@ -212,7 +257,7 @@ def test_other_coordinates_are_set_at_the_start(run, asked):
     status, *_ = run(
         "open", "shelf_drawers", *HSR, "--set", f"{lower}=10cm", "--set", "hsr/arm_lift_joint=0.2"
     )
-    state = asked[0].session.world.state
+    state = asked[0].session.state
     assert status == 0
     assert (state[HSR[3]], state[lower], state["hsr/arm_lift_joint"]) == (0.0, 0.1, 0.2)
 

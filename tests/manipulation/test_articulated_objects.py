@@ -9,7 +9,7 @@ from kineverse.manipulation.articulated_objects import (
     find_shut_value,
     select_objects,
 )
-from kineverse.manipulation.skill_arguments import choose_tolerance
+from kineverse.manipulation.skill_run import choose_tolerance
 from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Box, Shape
 

@@ -11,11 +11,12 @@ import pytest
 import kineverse as kv
 from cupboards import box
 from kineverse.geometry import Scene
-from kineverse.manipulation import Session, open_object, push
+from kineverse.manipulation import Robot, Session, open_object, push
 from kineverse.manipulation.swept_volume import find_obstacle
 from kineverse.model.model import Model
 from kineverse.state import State
-from kineverse.worlds import KinematicWorld
+from kineverse.worlds import KinematicWorld, TrueBelief
+from robot_interface_proxy import InterfaceOnly
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import random_cupboards
@@ -151,14 +152,15 @@ def test_skills_say_what_is_in_the_way_and_move_nothing() -> None:
         edit.attach("shelf/shelf", parent="world", transform=kv.translation(1, 0, 0.7))
         edit.add_frame("bar", "world", np.eye(4), body=box(0.02, 1.0, 0.02, at=(0.75, 0, 0.9)))
     drawer = "shelf/upper_drawer"
-    scene_free = find_obstacle(model, model.symbol(drawer), model.default_state(), 0.2, robot="hsr")
+    robot = Robot.of(model, "hsr")
+    scene_free = find_obstacle(model, model.symbol(drawer), model.default_state(), 0.2, robot=robot)
     if scene_free is None:
         pytest.skip("the bar is beside the drawer")
     world = KinematicWorld(model, "hsr")
     world.reset(model.default_state().updated({"hsr/base/x": -1.5}))
-    for outcome in (open_object(Session(world), drawer), push(Session(world), drawer, target=0.2)):
+    session = Session(InterfaceOnly(world), belief=TrueBelief(world))
+    for outcome in (open_object(session, drawer), push(session, drawer, target=0.2)):
         assert not outcome.done
-        assert not outcome.claimed
         assert outcome.steps == 0
         assert "'bar'" in outcome.reason
         assert outcome.measures["failure"] == "collision"

@@ -2,23 +2,28 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_pushing import READING_FAULTS, FaultyReadings
 
 import kineverse as kv
 from kineverse.control import Goal, same_pose
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.estimation import identify, pose_covariance
-from kineverse.grasping import find_gripper
 from kineverse.lie import inverse, pose_difference, quaternion, retract, rotation_z, transform, translation
 from kineverse.manipulation import Session, open_unknown
 from kineverse.manipulation.opening import PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
+from kineverse.manipulation.skill_run import SkillRun
 from kineverse.manipulation.unknown_objects import forget_joint
-from kineverse.manipulation.unknown_objects.joint_hypotheses import guess_hinges
 from kineverse.manipulation.unknown_objects.joint_learning import JointLearning
 from kineverse.manipulation.unknown_objects.part_belief import PartBelief, PoseMean, measure_way
-from kineverse.manipulation.unknown_objects.pulling_policy import ArmEndError, PartPulling
+from kineverse.manipulation.unknown_objects.unknown_opening import (
+    ArmEndError,
+    UnknownOpeningRun,
+    guess_hinges,
+)
 from kineverse.manipulation.unknown_objects.unmodelled_joint import JointPath, free_part, write_joint
-from kineverse.worlds import KinematicWorld, Observation, Sensors
+from kineverse.worlds import KinematicWorld, Observation, Robot, RunMetrics, Sensors
+from robot_interface_proxy import InterfaceOnly
 
 DOOR, HANDLE = "shelf_door/door", "shelf_door/door_handle"
 NOISE = np.array([0.0045] * 3 + [0.0087] * 3)
@@ -39,7 +44,8 @@ def floating(truth):
 
 @pytest.fixture(scope="module")
 def search(truth, floating):
-    return PlacementSearch(floating.model, find_gripper(truth, "hsr"), floating.model.default_state())
+    robot = Robot.of(floating.model, "hsr")
+    return PlacementSearch(floating.model, robot, robot.gripper(), floating.model.default_state())
 
 
 def believe_that_it_slides(model):
@@ -149,20 +155,32 @@ def test_learned_joint_replaces_the_attachment_without_limits(truth):
     assert abs(path.value - path.start) == pytest.approx(1.5, abs=0.02)
 
 
-def run(model, world_model, part=None, seed=1, **options):
-    sensors = Sensors.parse("3mm+3mm/m,0.5deg,30Hz,outliers=0.05")
-    world = KinematicWorld(world_model, "hsr", sensors=sensors, seed=seed)
-    world.reset(world_model.default_state().updated({"hsr/base/x": -0.5}))
-    return open_unknown(Session(world), HANDLE, model=model, part=part, sensors=sensors, **options)
+SENSORS = Sensors.parse("3mm+3mm/m,0.5deg,30Hz,outliers=0.05")
+
+
+def make_world(model, seed=1):
+    world = KinematicWorld(model, "hsr", sensors=SENSORS, seed=seed)
+    world.reset(model.default_state().updated({"hsr/base/x": -0.5}))
+    return world
+
+
+def run(model, world, part=None, on_step=None, **options):
+    session = Session(InterfaceOnly(world), on_step=on_step, patience=3.0)
+    return open_unknown(session, HANDLE, model=model, part=part, sensors=SENSORS, **options)
 
 
 @pytest.mark.long
 def test_door_that_was_believed_to_slide_is_relearned_and_opened(truth):
     model = truth.copy()
     believe_that_it_slides(model)
-    outcome = run(model, truth, turn=np.radians(15))
+    world = make_world(truth)
+    gripper = Robot.of(truth, "hsr").gripper()
+    metrics = RunMetrics(world, truth.symbol(DOOR), gripper=gripper, handle=HANDLE, part=DOOR)
+    outcome = run(model, world, turn=np.radians(15), on_step=metrics)
     assert outcome, outcome.reason
-    assert outcome.value == pytest.approx(np.radians(15), abs=0.05)
+    assert world.state[DOOR] == pytest.approx(np.radians(15), abs=0.05)
+    assert outcome.value == pytest.approx(metrics.turn, abs=0.02)
+    assert metrics.overlap is None
     assert outcome.measures["believed"] == "refuted"
     assert outcome.measures["decided_turn"] < np.radians(10)
     assert outcome.measures["opened_seconds"] < 15
@@ -173,8 +191,11 @@ def test_door_that_nothing_moves_is_said_not_to_follow(truth):
     model, locked = forget_joint(truth, DOOR, truth.default_state()), truth.copy()
     with locked.edit() as edit:
         edit.constrain("lock", 0, kv.position(DOOR).derivative(), 0)
-    outcome = run(model, locked, part=DOOR)
+    world = make_world(locked)
+    outcome = run(model, world, part=DOOR)
     assert not outcome
+    assert abs(outcome.value) < 0.02
+    assert world.state[DOOR] == 0.0
     assert "does not follow the hand" in outcome.reason
     assert outcome.measures["failure"] == "other"
     assert model.articulations[DOOR].kind == "fixed"
@@ -183,20 +204,43 @@ def test_door_that_nothing_moves_is_said_not_to_follow(truth):
 def test_looks_at_a_part_that_slips_through_the_hand_are_those_of_its_joint(truth, floating):
     """The hand stands still while the part moves by 4 cm: all that is learned is of the markers."""
     state, door = truth.default_state(), truth.fk(DOOR)
-    world = SimpleNamespace(robot="hsr", angle=0.0, time=0.0)
-    world.observe = lambda: Observation(world.time, state, {DOOR: door({DOOR: world.angle})})
-    belief = PartBelief(floating, world, state, "hsr/hand_palm_link", [DOOR], [], Sensors())
-    for world.time in np.arange(10) / 30:
-        belief.update(world)
+    robot = Robot.of(floating.model, "hsr")
+    belief = PartBelief(floating, robot, state, robot.gripper().hand, [DOOR], [], Sensors())
+
+    def see(time, angle):
+        belief.update(Observation(time, state, {DOOR: door({DOOR: angle})}), time)
+
+    for time in np.arange(10) / 30:
+        see(time, 0.0)
     assert belief.is_seen
     belief.hold()
     belief.begin_motion()
     place, angles = inverse(belief.pose) @ belief.hand_pose, np.linspace(0.0, 0.04 / 0.38, 60)
-    for world.angle in angles:
-        world.time += 1 / 30
-        belief.update(world)
-    np.testing.assert_allclose([look.pose for look in belief.looks], [door({DOOR: q}) for q in angles])
+    for k, angle in enumerate(angles):
+        see((k + 10) / 30, angle)
+        see((k + 10) / 30, 1.0)  # the stamp is that of the last look
+    np.testing.assert_allclose([pose for pose, _ in belief.looks], [door({DOOR: q}) for q in angles])
     assert belief.slip(place, floating.point) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("fault", "seconds", "says"),
+    [pytest.param(*fault, marks=pytest.mark.long) for fault in READING_FAULTS[:-1]] + [READING_FAULTS[-1]],
+)
+def test_pull_waits_for_readings_and_says_which_have_ended(truth, fault, seconds, says):
+    world, fastest = make_world(truth), [0.0]
+    faulty = FaultyReadings(world, DOOR, fault, seconds)
+
+    def look(session):
+        if session.phase == "pull":
+            fastest.append(max(map(abs, session.commands.values()), default=0.0))
+
+    model = forget_joint(truth, DOOR, truth.default_state())
+    outcome = run(model, faulty, part=DOOR, turn=np.radians(15), on_step=look)
+    assert (bool(outcome), says in outcome.reason) == (not says, True), outcome.reason
+    assert (world.state[DOOR] > np.radians(12)) == (not says)
+    assert faulty.moving <= 0.1
+    assert max(fastest) < 1.0
 
 
 @pytest.mark.parametrize(
@@ -204,40 +248,39 @@ def test_looks_at_a_part_that_slips_through_the_hand_are_those_of_its_joint(trut
 )
 def test_end_of_an_arm_is_not_the_stop_of_a_part(monkeypatch, why, kind, error):
     motion = SimpleNamespace(close=lambda grasp: True, follow_line=lambda a, b: None)
-    pulling = PartPulling.__new__(PartPulling)
-    pulling.session = SimpleNamespace(world=SimpleNamespace(time=0.0))
+    pulling = UnknownOpeningRun.__new__(UnknownOpeningRun)
+    pulling.session, pulling.motion = SimpleNamespace(time=0.0), motion
     pulling.learning = SimpleNamespace(poses=1, learned=object())
     pulling.belief = SimpleNamespace(pose=np.eye(4), hand_pose=np.eye(4))
-    pulling.frame_T_handle, pulling.part, pulling.begin, pulling._reached = np.eye(4), DOOR, 0.0, 0.0
-    pulling._measures = {"grasps": 0}
-    monkeypatch.setattr(PartPulling, "opening", (0.3, 0.8))
-    monkeypatch.setattr(PartPulling, "_pull_once", lambda self: (why, kind))
-    monkeypatch.setattr(PartPulling, "_let_go", lambda self: None)
+    pulling.frame_T_handle, pulling.unknown = np.eye(4), SimpleNamespace(frame=DOOR)
+    pulling._first_pull, pulling._reached, pulling.measures = 0.0, 0.0, {"grasps": 0}
+    monkeypatch.setattr(UnknownOpeningRun, "opening", (0.3, 0.8))
+    monkeypatch.setattr(UnknownOpeningRun, "_pull_once", lambda self: (why, kind))
+    monkeypatch.setattr(UnknownOpeningRun, "_open_fingers", lambda self: None)
     grasp = SimpleNamespace(pose=np.eye(4))
     if error is None:
-        assert "this is its stop" in pulling.perform(motion, grasp)
+        assert "this is its stop" in pulling._pull_open(grasp)
         return
     with pytest.raises(error, match="was pulled") as caught:
-        pulling.perform(motion, grasp)
+        pulling._pull_open(grasp)
     assert caught.value.kind == "reach"
 
 
 def test_robot_alone_moves_on_lines_relative_to_a_part_that_floats(truth, floating, search):
-    session = Session(KinematicWorld(truth, "hsr"))
+    session = Session(InterfaceOnly(KinematicWorld(truth, "hsr")))
     unknown, gripper = floating, search.contacts.gripper
     opener = SimpleNamespace(gripper=gripper, search=search, approaches=None, controllers={})
-    motion = HandMotion(session, opener, unknown.handle, None, 1.0)
+    motion = HandMotion(SkillRun(session, None, 1.0), opener, unknown.handle)
     goal = Goal(same_pose(unknown.model.fk(HANDLE), unknown.model.fk(gripper.hand)), name="hand")
     assert {s.path.partition("/")[0] for s in motion.controller([goal]).speeds} == {"hsr"}
 
 
 def test_wrong_arguments_name_the_mistake(truth):
-    model = truth
+    model, session = truth, Session(InterfaceOnly(KinematicWorld(truth, "hsr")))
     with pytest.raises(InvalidValueError, match="none can be forgotten"):
         forget_joint(model, "shelf_door/body", model.default_state())
     with pytest.raises(UnknownNameError, match="door_handle"):
-        open_unknown(Session(KinematicWorld(model, "hsr")), "shelf_door/handle", model=model)
-    session = Session(KinematicWorld(model, "hsr"))
+        open_unknown(session, "shelf_door/handle", model=model)
     with pytest.raises(InvalidValueError, match="is a frame of the robot 'hsr', not a handle"):
         open_unknown(session, "hsr/hand_palm_link", model=model)
     with pytest.raises(UnknownNameError, match="no hand closes around it"):

@@ -106,6 +106,18 @@ def test_a_recording_is_played_on_the_page(scene):
             page.play(Trajectory((kv.position("cupboard/dor"),), [0], [[0]], [[0]]))
 
 
+def test_a_run_without_a_known_truth_shows_the_belief(tmp_path):
+    model, path = cupboard(), tmp_path / "run.mcap"
+    with Recorder(path, model) as recorder:
+        for time in (0.5, 1.0):
+            step = SimpleNamespace(time=time, state=state(model, cupboard__door=time), commands={}, phase="")
+            recorder(step)
+    scene = RecordedScene(read_run_recording(path))
+    assert scene.trajectory.duration == 1.0
+    assert scene.values_at(1.0)["cupboard/door"] == 1.0
+    assert scene.at(1.0).ghosts == {}
+
+
 def test_a_run_is_shown_while_it_happens(scene):
     pytest.importorskip("viser", reason="the page needs the extra 'view'")
     from kineverse.view.run_overlay import LiveRun
@@ -113,13 +125,13 @@ def test_a_run_is_shown_while_it_happens(scene):
     model = scene.recording.model
     touch = Contact("robot/neck", "cupboard/panel", X, X, 0.0, np.nan)
     with view(model, port=0) as page:
-        live = LiveRun(page, speed=0.0)
+        world = SimpleNamespace(contacts=lambda: [touch] * 6)
+        live = LiveRun(page, world, speed=0.0)
         for time in (0.0, 1.0):
-            truth = state(model, cupboard__door=time)
-            world = SimpleNamespace(time=time, state=truth, contacts=lambda: [touch] * 6)
-            believed = truth.updated({"cupboard/door": 0.5})
+            world.state = state(model, cupboard__door=time)
+            believed = world.state.updated({"cupboard/door": 0.5})
             live._drawn = -1.0
-            live(SimpleNamespace(world=world, state=believed, phase="push", vectors={"p": (X, UP)}))
+            live(SimpleNamespace(time=time, state=believed, phase="push", vectors={"p": (X, UP)}))
         assert page.settled()
         assert page.values["cupboard/door"] == 1.0
         (ghost,) = live._layer._ghosts.values()
@@ -130,6 +142,12 @@ def test_a_run_is_shown_while_it_happens(scene):
             assert line in live._layer._text.content
         assert len(live._layer._arrows) == 2
         live.remove()
+        unseen = LiveRun(page, speed=0.0)  # nobody knows the truth
+        unseen(SimpleNamespace(time=2.0, state=believed, phase="", vectors={}))
+        assert page.settled()
+        assert page.values["cupboard/door"] == 0.5
+        assert not unseen._layer._ghosts
+        assert "contact" not in unseen._layer._text.content
 
 
 def test_commands_draw_a_recording_and_a_trajectory(run, tmp_path, capsys):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pusher import gripper, pusher, solid
+from scripted_world import Step
 
 import kineverse as kv
 from kineverse.geometry import Rule, Scene
 from kineverse.manipulation.swept_volume import find_obstacle
 from kineverse.model.body import Box, Cylinder
-from kineverse.worlds import Judge, KinematicWorld
+from kineverse.worlds import KinematicWorld, Robot, RunMetrics
 from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 
@@ -29,6 +30,11 @@ def cupboard(lower: float | None = 0.0, upper: float | None = 1.5, hinge: float 
     return model
 
 
+def furniture(model: kv.Model, *rules: Rule) -> FurnitureOverlaps:
+    robot = Robot.of(model, "robot") if "robot/base" in model.frames else None
+    return FurnitureOverlaps(Scene(model, rules=rules), robot)
+
+
 def excess(overlaps: FurnitureOverlaps, **values: float) -> float:
     """Return the largest excess at a state [m]."""
     overlaps.scene.update(overlaps.scene.model.default_state() | values)
@@ -36,11 +42,11 @@ def excess(overlaps: FurnitureOverlaps, **values: float) -> float:
 
 
 def test_a_door_may_not_turn_into_its_own_box():
-    overlaps = FurnitureOverlaps(Scene(cupboard(None)), "robot")
+    overlaps = furniture(cupboard(None))
     assert excess(overlaps, door=1.0) == excess(overlaps, door=0.0) == 0.0
     assert excess(overlaps, door=-0.5) > 0.1
     # Nor where it overlaps the box at its hinge wherever it is.
-    overlaps = FurnitureOverlaps(Scene(cupboard(None, hinge=0.003)), "robot")
+    overlaps = furniture(cupboard(None, hinge=0.003))
     assert excess(overlaps, door=0.0) == 0.0
     assert excess(overlaps, door=-0.5) > 0.1
 
@@ -49,7 +55,7 @@ def test_bodies_that_overlap_in_all_of_their_range_are_made_so():
     model = cupboard(0.0, 1.0)
     with model.edit() as edit:
         edit.add_frame("knob", "panel", np.eye(4), solid(Box((0.05, 0.05, 0.05)), (0.0, 0.005, 0)))
-    overlaps, values = FurnitureOverlaps(Scene(model), "robot"), np.linspace(0.0, 1.0, 7)
+    overlaps, values = furniture(model), np.linspace(0.0, 1.0, 7)
     depths = [-distance(model, "box", "knob", q) for q in values]
     assert max(depths) > depths[0] + 0.001
     assert all(excess(overlaps, door=q) == 0.0 for q in values)
@@ -77,7 +83,7 @@ def chest(lower: float | None, upper: float | None, *, carried: bool = True) -> 
 
 
 def begin(model: kv.Model, **values: float) -> FurnitureOverlaps:
-    overlaps = FurnitureOverlaps(Scene(model), "robot")
+    overlaps = furniture(model)
     overlaps.scene.update(model.default_state() | values)
     overlaps.begin()
     return overlaps
@@ -124,7 +130,7 @@ def test_what_is_made_to_overlap_does_not_count_and_a_rod_may_turn_in_its_sleeve
 
 
 def test_pairs_that_a_rule_excepts_do_not_overlap():
-    overlaps = FurnitureOverlaps(Scene(cupboard(None), rules=[Rule("box", "panel")]), "robot")
+    overlaps = furniture(cupboard(None), Rule("box", "panel"))
     assert excess(overlaps, door=-0.5) == 0.0
 
 
@@ -226,22 +232,23 @@ def test_furniture_pushes_other_furniture_as_far_as_that_can_move():
 
 
 def test_a_pushed_drawer_goes_back_into_a_solid_box_only_if_it_is_partly_in_it():
-    """The world holds what the check before a motion allows, and the judge sees what the world does."""
+    """The world holds what the check before a motion allows, and the metrics see what the world does."""
     for start, end in ((0.3, 0.0), (0.44, 0.41)):
         model = chest(0.0, 0.45)
         with model.edit() as edit:
             base = np.eye(4)
             edit.add_frame("robot/ball", "robot/base", base, solid(Box((0.02, 0.02, 0.02)), (0, 0, -9)))
         state = model.default_state() | {"robot/x": 0.24 + start, "drawer": start}
-        world, judge = KinematicWorld(model, "robot"), Judge(model, "robot")
+        world = KinematicWorld(model, "robot")
         world.reset(state)
-        judge.update(world.state)
+        metrics, push = RunMetrics(world), {kv.velocity("robot/x"): -0.5}
         for _ in range(40):
-            world.apply({"robot/x:velocity": -0.5}, 0.02, stamp=world.time)
-            judge.update(world.state)
+            world.apply(push, 0.02, stamp=world.time)
+            metrics(Step(push, world.state))
         assert world.state["drawer"] == pytest.approx(end, abs=2 * OVERLAP)
-        assert (find_obstacle(model, model.symbol("drawer"), state, 0.0, robot="robot") is None) == (end == 0)
-        overlap = judge.overlap
+        obstacle = find_obstacle(model, model.symbol("drawer"), state, 0.0, robot=world.robot)
+        assert (obstacle is None) == (end == 0)
+        overlap = metrics.overlap
         assert overlap is None or "robot/ball" in (overlap.a, overlap.b)
 
 
@@ -252,3 +259,11 @@ def test_a_ball_that_pushes_near_the_hinge_does_not_throw_the_door_through_a_boa
     states = run(world, 0.5, x=0.5)
     assert states[-1]["room/door"] > 0.1
     assert deepest(model, states, "room/panel", "room/board") < OVERLAP
+
+
+def test_without_a_robot_all_bodies_are_furniture():
+    model = cupboard(None)
+    for robot in (None, Robot.of_mechanism(model)):
+        overlaps = FurnitureOverlaps(Scene(model), robot)
+        overlaps.scene.update(model.default_state() | {"door": -0.5})
+        assert [{one.a, one.b} for one in overlaps.find()] == [{"box", "panel"}]

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from pusher import BALL, angle_of_door, gripper, pusher, solid
+from scripted_world import Step
 
 import kineverse as kv
 from kineverse.errors import InvalidValueError, UnknownNameError
@@ -14,7 +15,7 @@ from kineverse.formats import load
 from kineverse.grasping import Gripper
 from kineverse.model.body import Sphere
 from kineverse.model.model import Model
-from kineverse.worlds import Judge, KinematicWorld, Sensors
+from kineverse.worlds import KinematicWorld, RunMetrics, Sensors
 
 OBJECTS = ("door", "drawer", "bolt", "puck", "first", "second", "left", "right")
 
@@ -302,6 +303,31 @@ def test_fingers_keep_their_speed_until_their_limit(world):
     assert world.state["robot/finger"] == pytest.approx(0.006, abs=1e-15)
 
 
+def test_fingers_stop_once_no_command_has_come_for_the_time_out(model, hand):
+    world, close = KinematicWorld(model, "robot", hand, timeout=0.1), {"robot/finger:velocity": -0.02}
+    start(world, x=0.0)
+    world.apply(close, 0.02, stamp=world.time)
+    world.apply({}, 0.02, stamp=world.time)  # a stop, after which the fingers have a speed
+    for _ in range(10):
+        world.apply(close, 0.02, stamp=-1.0)  # refused, as if none had come
+    assert world.state["robot/finger"] == pytest.approx(0.05 - 0.02 * 0.12)
+    world.apply({}, 0.5)  # nobody remembers the speed
+    assert world.state["robot/finger"] == pytest.approx(0.05 - 0.02 * 0.12)
+    start(world, x=0.0)
+    world.apply(close, 1.0, stamp=0.0)  # silence
+    assert world.state["robot/finger"] == pytest.approx(0.05 - 0.02 * 0.1)
+    # What is held stays so, and fingers that are opened still let go.
+    start(world, x=0.88, y=0.7)
+    for _ in range(150):
+        world.apply(close, 0.02, stamp=world.time)
+    assert world.held == "room/door_handle"
+    world.apply({}, 1.0, stamp=world.time - 1.0)
+    world.apply({}, 1.0)
+    assert world.held == "room/door_handle"
+    world.apply({"robot/finger:velocity": 0.02}, 0.02, stamp=world.time)
+    assert world.held is None
+
+
 def test_bad_input_is_refused_and_changes_nothing(world, model):
     start(world, x=0.2)
     before = world.state
@@ -318,7 +344,7 @@ def test_bad_input_is_refused_and_changes_nothing(world, model):
         world.apply({"robot/xx:velocity": 0.1}, 0.02)
     assert world.state is before
     assert world.time == 0.0
-    with pytest.raises(UnknownNameError, match="'room'"):
+    with pytest.raises(UnknownNameError, match=r"no robot 'rooom'.*'room'"):
         KinematicWorld(model, "rooom")
     with pytest.raises(UnknownNameError, match="room/door/range"):
         KinematicWorld(model, "robot", leave_out=["room/door/ranges"])
@@ -352,22 +378,22 @@ def test_fetch_drives_by_its_wheels_and_closes_a_door():
     begin = model.default_state().updated(
         {"kitchen/fridge_door": 0.6, "fetch/base/x": -0.72, "fetch/base/y": -1.4}
     )
-    judge = Judge(model, "fetch")
     world.reset(begin)
-    judge.update(world.state)
-    wheels = {"fetch/l_wheel_joint:velocity": 5.0, "fetch/r_wheel_joint:velocity": 4.9}
+    metrics = RunMetrics(world)
+    speeds = {"fetch/l_wheel_joint:velocity": 5.0, "fetch/r_wheel_joint:velocity": 4.9}
+    wheels = {v: speeds[str(v)] for v in model.speeds if str(v) in speeds}
     for _ in range(80):
         world.apply(wheels, 0.02, stamp=world.time)
-        judge.update(world.state, wheels)
+        metrics(Step(wheels, world.state))
     alone = model.integrate(begin, wheels, 1.6)
     for name in ("x", "y", "angle"):
         assert world.state[f"fetch/base/{name}"] == pytest.approx(alone[f"fetch/base/{name}"], abs=1e-9)
     moved = {str(s) for s, v in world.state.items() if v != begin[s] and str(s).startswith("kitchen")}
     assert moved == {"kitchen/fridge_door"}
     assert 0.1 < world.state["kitchen/fridge_door"] < 0.55
-    assert judge.measures["penetration"] < 1e-6
-    assert judge.measures["limit_violation"] < 1e-9
-    assert judge.measures["distance"] == pytest.approx(4.95 * 0.06 * 1.6, rel=1e-3)
+    assert metrics.measures["penetration"] < 1e-6
+    assert metrics.measures["limit_violation"] < 1e-9
+    assert metrics.measures["distance"] == pytest.approx(4.95 * 0.06 * 1.6, rel=1e-3)
 
 
 @pytest.mark.parametrize("scene", ["ball", "folding_door", "four_bar", "ratchet"])
@@ -379,7 +405,8 @@ def test_mechanisms_of_all_kinds_keep_their_limits(scene):
     with model.edit() as edit:
         edit.add_frame("robot/ball", "world", kv.translation(x, y, z), solid(Sphere(BALL)))
         edit.include(f"articulations/{scene}", prefix="thing")
-    world, judge = KinematicWorld(model, "robot"), Judge(model, "robot")
+    world = KinematicWorld(model, "robot")
+    metrics = RunMetrics(world)
     rng, moved = np.random.default_rng(0), 0
     objects = [s for s in model.symbols if s.path.startswith("thing")]
     ranges = {s: np.array(model.limits(s)) for s in objects}
@@ -390,15 +417,14 @@ def test_mechanisms_of_all_kinds_keep_their_limits(scene):
         middle, way = model.fk(body)(home)[:3, 3], rng.normal(size=3)
         way *= 0.25 / np.linalg.norm(way)
         world.reset(home.updated(dict(zip((x, y, z), middle - way, strict=True))))
-        judge.reset()
-        judge.update(world.state)
+        metrics.reset()
         speeds = dict(zip((x.derivative(), y.derivative(), z.derivative()), way, strict=True))
         for _ in range(60):
             before, near = world.state.vector(objects), bool(world.contacts())
             world.apply(speeds, 0.02)
-            judge.update(world.state, speeds)
+            metrics(Step(speeds, world.state))
             still = np.allclose(world.state.vector(objects), before, atol=1e-12)
             assert still or near or world.contacts()
             moved += not still
-        assert judge.measures["limit_violation"] < 1e-7
+        assert metrics.measures["limit_violation"] < 1e-7
     assert moved

@@ -15,7 +15,7 @@ from kineverse.manipulation import SkillError
 from kineverse.manipulation.session import Session
 from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Box, Inertia, Pose, Shape
-from kineverse.worlds import MujocoWorld
+from kineverse.worlds import MujocoWorld, TrueBelief
 
 pytest.importorskip("mujoco")
 
@@ -148,21 +148,22 @@ def test_a_door_without_limits_does_not_turn_through_its_frame():
 
 def test_speeds_and_forces_beyond_reason_end_a_run():
     world = MujocoWorld(room(), "robot")
-    session = Session(world)
-    session.act({"robot/x:velocity": 0.1})
     for speed in (1e3, 1e30, math.nan):
-        session.restart(world.model.default_state())
+        world.reset(world.model.default_state())
+        session = Session(world, belief=TrueBelief(world))
+        session.act({"robot/x:velocity": 0.1})
         before = world.state["room/door"]
         world._data.joint("room/door").qvel[:] = speed
         with pytest.raises(SkillError, match="not to be trusted"):
             session.act({"robot/x:velocity": 0.1})
-        assert "not to be trusted" in session.untrusted
+        assert "not to be trusted" in session.broken
         assert world.state["room/door"] == before
         # It does not go on before a reset.
         with pytest.raises(SimulationError, match="not to be trusted"):
             world.apply({}, 0.02)
-    session.restart(world.model.default_state())
+    world.reset(world.model.default_state())
+    session = Session(world, belief=TrueBelief(world))
     session.act({"robot/x:velocity": 0.1})
-    assert not session.untrusted
+    assert not session.broken
     assert world._bounds.force > 10 * EFFORT
     assert world._bounds.find_problem(world._data, 1e9).startswith("a force is 1e+09 N")

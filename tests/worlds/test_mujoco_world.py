@@ -17,7 +17,7 @@ from kineverse.grasping import Gripper, find_gripper
 from kineverse.lie import Array
 from kineverse.model import Body, Box, Inertia, Shape
 from kineverse.model.basic_operations import SetBody
-from kineverse.worlds import MujocoWorld, Sensors, World
+from kineverse.worlds import MujocoWorld, Sensors, SimulatedWorld
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -83,7 +83,7 @@ def joint_speeds(world: MujocoWorld) -> Array:
     """Return how fast the robot's coordinates move, from two states."""
     before = world.state
     world.apply({}, 0.002)
-    names = [s for s in before if s.path.startswith(f"{world.robot}/")]
+    names = [s for s in before if world.robot.moves(s)]
     return (world.state.vector(names) - before.vector(names)) / 0.002
 
 
@@ -93,7 +93,7 @@ def test_gravity_moves_neither_robot_nor_doors(robot: str) -> None:
     ajar = {OVEN: 0.4, DISHWASHER: 0.9}
     world.reset(world.model.default_state() | ajar)
     before = world.state
-    checked: World = world
+    checked: SimulatedWorld = world
     checked.apply({}, 1.5)
     after = checked.state
     moved = {str(s): abs(after[s] - before[s]) for s in before if abs(after[s] - before[s]) > 1e-5}
@@ -255,6 +255,25 @@ def test_stale_commands_are_refused() -> None:
         world.apply(speeds, 0.02, stamp=world.time - age)
         assert world.refused == refused
         assert (world.state["pr2/base/x"] > 1e-4) == (not refused)
+
+
+def test_fingers_stop_once_no_command_has_come_for_the_time_out_but_hold_what_they_press() -> None:
+    world, hand = world_with_bar(grip=40.0), gripper("fetch")
+    close, finger = closing("fetch"), hand.joints[0]
+    world.apply(close, 0.1, stamp=0.0)  # nothing follows: it acts for the time-out of 40 ms
+    after = world.state[finger]
+    assert 0.5 * 0.05 * 0.04 < abs(after - hand.opened[finger]) < 1.5 * 0.05 * 0.04
+    for _ in range(10):
+        world.apply(close, 0.05, stamp=world.time - 1.0)
+        world.apply({}, 0.05)
+    assert world.refused == 10
+    assert world.state[finger] == pytest.approx(after, abs=1e-4)
+    assert world.held is None
+    world.apply(close, 1.2)
+    assert world.held == "thing/bar"
+    for _ in range(5):
+        world.apply(close, 0.1, stamp=world.time - 1.0)
+    assert finger_forces(world) == pytest.approx([40.0, 40.0], rel=0.02)
 
 
 def test_delay_postpones_commands() -> None:
@@ -438,7 +457,7 @@ def test_wrong_arguments_are_refused() -> None:
     ):
         with pytest.raises((InvalidValueError, UnknownNameError), match=words):
             MujocoWorld(model, "fetch", hand, **options)
-    with pytest.raises(UnknownNameError, match=r"below 'fetsch'.*Did you mean 'fetch'"):
+    with pytest.raises(UnknownNameError, match=r"no robot 'fetsch'.*Did you mean 'fetch'"):
         MujocoWorld(model, "fetsch", hand)
     world = world_with_bar()
     with pytest.raises(UnknownNameError, match=r"no free speed 'fetch/torso_lift'.*torso_lift_joint"):

@@ -14,7 +14,7 @@ import numpy as np
 
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
-from kineverse.manipulation import OpenCloseRunner, TrackedBelief, find_articulated_objects
+from kineverse.manipulation import OpenCloseRunner, Robot, TrackedBelief, find_articulated_objects
 from kineverse.manipulation.articulated_objects import select_objects
 from kineverse.manipulation.robot_sources import find_robot
 
@@ -26,9 +26,11 @@ from .pages import add_page_options, check_picture_path, handle_interrupts, page
 if TYPE_CHECKING:
     from kineverse.manipulation import OpenCloseReport, Outcome, Session
     from kineverse.manipulation.articulated_objects import ArticulatedObject
+    from kineverse.manipulation.belief import Belief
     from kineverse.view.run_overlay import LiveRun
     from kineverse.view.skill_stills import SkillStills
     from kineverse.view.viewer import Viewer
+    from kineverse.worlds import SimulatedWorld
 
 HELP = """\
 A robot that ships opens and closes the doors and drawers of the kitchen that ships, one after another, live
@@ -149,8 +151,9 @@ class RobotDemo:
         with show_activity(f"reading the {KITCHEN} and the {self._robot.name}"):
             self.model = self._robot.load()
             self.model.include(KITCHEN)
+            self.robot = Robot.of(self.model, self._robot.prefix)
             self.gripper = self._robot.gripper(self.model)
-            found = find_articulated_objects(self.model, self._robot.prefix)
+            found = find_articulated_objects(self.model, self.robot)
         self.objects = _choose_objects(found, arguments.what, arguments.headless)
         self.reports: list[OpenCloseReport] = []
         self._progress = ProgressLine(len(self.objects))
@@ -170,15 +173,17 @@ class RobotDemo:
 
     def act(self, page: Viewer | None) -> None:
         """Open and close all objects, on a page if there is one, with a line for each."""
-        from kineverse.worlds import KinematicWorld, MujocoWorld  # for start-up time
+        from kineverse.worlds import KinematicWorld, MujocoWorld, TrueBelief  # for start-up time
 
-        self._show_on(page)
         with show_activity("preparing the world"):
             make_world = MujocoWorld if self._arguments.world == "mujoco" else KinematicWorld
-            prefix, sensors = self._robot.prefix, self._sensors
-            # First, so that its code is compiled while the world is made.
-            belief = None if sensors is None else TrackedBelief(self.model, prefix, sensors)
-            world = make_world(self.model, prefix, self.gripper, sensors=sensors, seed=self._seed)
+            sensors, tracked = self._sensors, None
+            if sensors is not None:  # first, so that its code is compiled while the world is made
+                tracked = TrackedBelief(self.model, self.robot, sensors)
+            world: SimulatedWorld = make_world(
+                self.model, self.robot, self.gripper, sensors=sensors, seed=self._seed
+            )
+            belief: Belief = TrueBelief(world) if tracked is None else tracked
             start = self._robot.start_state(self.model)
             runner = OpenCloseRunner(
                 world,
@@ -188,7 +193,8 @@ class RobotDemo:
                 hand=self.gripper.hand,
                 seed=self._seed,
             )
-        self._runner = runner
+        self._runner, self._world = runner, world
+        self._show_on(page)
         if page is not None and self._speed:
             self._say("The robot begins when a browser shows this page.")
             _wait_for_browser(page)
@@ -232,11 +238,11 @@ class RobotDemo:
         if page is None:
             from kineverse.view.skill_stills import SkillStills  # for start-up time
 
-            self._stills = SkillStills(self.model, self._robot.prefix)
+            self._stills = SkillStills(self.robot, self._world)
         else:
             from kineverse.view.run_overlay import LiveRun  # for start-up time
 
-            self._live = LiveRun(page, self._speed, self.gripper.hand)
+            self._live = LiveRun(page, self._world, speed=self._speed, hand=self.gripper.hand)
 
     def _say(self, text: str) -> None:
         if self._live is not None:
@@ -256,9 +262,10 @@ class RobotDemo:
         runner = self._runner
         one = runner.current
         assert one is not None
-        self._progress.update(session, one, runner.opening)
+        value = float(self._world.state[one.coordinate])
+        self._progress.update(session.phase, one, value, runner.opening)
         if self._live is not None:
-            self._live.captions = (self._title(one), describe_belief(session, one))
+            self._live.captions = (self._title(one), describe_belief(session, one, value))
             self._live(session)
         if self._stills is not None:
             self._stills.watch(session, runner.opening)
@@ -310,14 +317,13 @@ class ProgressLine:
         """Begin the next object."""
         self._number += 1
 
-    def update(self, session: Session, one: ArticulatedObject, opening: bool) -> None:
+    def update(self, phase: str, one: ArticulatedObject, value: float, opening: bool) -> None:
         """Show the phase and the value of an object, at most ten times a second."""
         now = time.monotonic()
         if self._terminal and now - self._shown >= _REFRESH:
             self._shown = now
-            value = format_reading(one, session.world.state[one.coordinate])
             skill = "open" if opening else "close"
-            text = f"{self._place} {one.coordinate}: {skill}, {session.phase}, {value}"
+            text = f"{self._place} {one.coordinate}: {skill}, {phase}, {format_reading(one, value)}"
             print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 
     def finish(self, report: OpenCloseReport) -> None:
@@ -349,7 +355,7 @@ def describe_report(report: OpenCloseReport) -> str:
 def format_row(report: OpenCloseReport) -> list[str]:
     """Return the cells of an object."""
     one, scale = report.object, 1e3 if report.object.kind == "drawer" else math.degrees(1.0)
-    unit = "mm" if one.kind == "drawer" else "°"
+    unit = " mm" if one.kind == "drawer" else "°"
     steps = 1e3 * np.array(report.steps) if report.steps else np.array([math.nan])
     remark = ("pushed in part" if report.pushed else "") if report else join_lines(report.reason)
     return [
@@ -359,7 +365,7 @@ def format_row(report: OpenCloseReport) -> list[str]:
         _format_outcome(one, report.closed),
         f"{report.seconds:.1f} s",
         "-" if math.isnan(report.grasp_error) else f"{1e3 * report.grasp_error:.2f} mm",
-        f"{scale * report.estimate_error:.1f} {unit}".replace(" °", "°"),
+        "-" if math.isnan(error := report.estimate_error) else f"{scale * error:.1f}{unit}",
         f"{np.median(steps):.2f} ms",
         f"{np.quantile(steps, 0.99):.2f} ms",
         shorten_text(remark, _LONGEST_REASON),
@@ -372,12 +378,12 @@ def format_page_row(report: OpenCloseReport) -> list[str]:
     return [name.rpartition("/")[2], opened, closed, seconds]
 
 
-def describe_belief(session: Session, one: ArticulatedObject) -> str:
+def describe_belief(session: Session, one: ArticulatedObject, value: float) -> str:
     """Return a line on the true and the believed value of an object."""
     drawer, symbol = one.kind == "drawer", one.coordinate
     scale, unit = (1e3, "mm") if drawer else (math.degrees(1.0), "°")
     space = " " if drawer else ""
-    true, believed = scale * session.world.state[symbol], scale * session.state[symbol]
+    true, believed = scale * value, scale * session.state[symbol]
     if not (deviation := scale * session.deviation(symbol)):
         return f"at {true:.1f}{space}{unit}"
     return f"at {true:.1f}, believed at {believed:.1f} ± {deviation:.1f}{space}{unit}"
@@ -396,7 +402,7 @@ def report_as_data(report: OpenCloseReport) -> dict[str, Any]:
         "pushed": report.pushed,
         "seconds": report.seconds,
         "grasp_error": None if math.isnan(report.grasp_error) else report.grasp_error,
-        "estimate_error": report.estimate_error,
+        "estimate_error": None if math.isnan(report.estimate_error) else report.estimate_error,
         "steps": len(steps),
         "step_median": float(np.median(steps)) if len(steps) else None,
         "step_p99": float(np.quantile(steps, 0.99)) if len(steps) else None,

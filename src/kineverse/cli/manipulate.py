@@ -17,20 +17,15 @@ import numpy as np
 
 from kineverse.errors import InvalidValueError, MissingDependencyError
 from kineverse.expressions.printing import format_number
-from kineverse.manipulation.belief import EstimateError
 from kineverse.manipulation.swept_volume import find_obstacle
-from kineverse.worlds import KinematicWorld, Sensors
-from kineverse.worlds.sensor_sampler import find_robot_base
+from kineverse.worlds import KinematicWorld, Sensors, TrueBelief
 
 from .arguments import add_model_options, add_set_option, needs_mujoco, print_notes, require
 from .manipulate_skills import (
     ManipulationScene,
-    grasp_object,
+    SkillTrial,
     is_shut,
     make_scene,
-    open_as_unknown,
-    push_object,
-    skip_skill,
 )
 from .output import format_table, join_lines, name_options, show_activity
 from .pages import (
@@ -44,10 +39,10 @@ from .pages import (
 )
 
 if TYPE_CHECKING:
+    from kineverse.manipulation import JudgedOutcome
     from kineverse.manipulation.belief import Belief
-    from kineverse.manipulation.outcome import Outcome
     from kineverse.manipulation.swept_volume import Obstacle
-    from kineverse.worlds import World
+    from kineverse.worlds import SimulatedWorld
     from kineverse.worlds.recorder import RecordedStep
 
 DONE, NOT_DONE = 0, 1
@@ -239,8 +234,8 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
         check_recording_name(arguments.record)
 
 
-def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:
-    world: World
+def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> SimulatedWorld:
+    world: SimulatedWorld
     sensors = None if arguments.noise is None else Sensors.parse(arguments.noise)
     if arguments.world == "mujoco":
         from kineverse.worlds import MujocoWorld  # for start-up time
@@ -259,15 +254,14 @@ def _act(
     arguments: argparse.Namespace,
     skill: str,
     scene: ManipulationScene,
-    world: World,
+    world: SimulatedWorld,
     watchers: list[Callable[[RecordedStep], object]],
     record: str | None,
-) -> Outcome:
-    belief: Belief | None = None
-    error = EstimateError(scene.coordinate)
+) -> JudgedOutcome:
+    belief: Belief = TrueBelief(world)
     with ExitStack() as stack:
-        watchers = [_PhaseLines(scene), *watchers]
-        if arguments.noise is not None and not arguments.unknown:
+        watchers = [_PhaseLines(scene, world), *watchers]
+        if arguments.noise is not None:
             from kineverse.manipulation import TrackedBelief  # for start-up time
 
             tracked = TrackedBelief(scene.model, scene.robot, Sensors.parse(arguments.noise))
@@ -275,36 +269,42 @@ def _act(
             if tracked.sensors.position > 0.0 and tracked.sensors.orientation == 0.0:
                 print_notes(["orientations are seen exactly; 0.5deg in --noise gives them noise, too"])
             belief = tracked
-            watchers.append(error)
         recorder = None
         if record is not None:
-            about = {"skill": skill, "robot": scene.robot, "what": str(scene.coordinate), "world": world.name}
+            about = {
+                "skill": skill,
+                "robot": scene.robot.name,
+                "what": str(scene.coordinate),
+                "world": world.name,
+            }
             if arguments.noise is not None:
                 about["noise"] = arguments.noise
             from kineverse.worlds import Recorder  # for start-up time
 
-            recorder = stack.enter_context(Recorder(record, scene.model, about))
+            recorder = stack.enter_context(Recorder(record, scene.model, about, world=world))
             watchers.append(recorder)
 
         def look(step: RecordedStep) -> None:
             for watch in watchers:
                 watch(step)
 
+        trial = SkillTrial(arguments, scene, world, belief, look)
         there = abs(scene.start[scene.coordinate] - scene.target) <= scene.tolerance
         if scene.fixed and (not there or (skill == "open" and arguments.to is None)):
-            outcome = skip_skill(scene, world, False, scene.fixed)
+            outcome = trial.skip(False, scene.fixed)
         elif there:
-            outcome = skip_skill(scene, world, True, f"'{scene.coordinate}' is there from the start")
+            outcome = trial.skip(True, f"'{scene.coordinate}' is there from the start")
         elif not arguments.unknown and (obstacle := _find_obstacle(scene)) is not None:
-            outcome = skip_skill(scene, world, False, str(obstacle), obstacle.measures)
+            outcome = trial.skip(False, str(obstacle), obstacle.measures)
         else:
-            act = push_object if skill == "push" else open_as_unknown if arguments.unknown else grasp_object
-            outcome = act(arguments, scene, world, belief, look)
+            act = (
+                trial.push if skill == "push" else trial.open_as_unknown if arguments.unknown else trial.grasp
+            )
+            outcome = act()
             out_of_reach = outcome.measures.get("failure") == "reach"
-            if not outcome and out_of_reach and not find_robot_base(scene.model, scene.robot).coordinates:
+            if not outcome and out_of_reach and scene.robot.base is None:
                 advice = "The robot stands still without a mobile base: --base omni gives it one."
                 outcome = replace(outcome, reason=f"{outcome.reason} {advice}")
-            outcome = replace(outcome, measures={**outcome.measures, **error.measures})
         if recorder is not None:
             recorder.write_outcome(outcome)
     return outcome
@@ -319,9 +319,9 @@ def _view(
     arguments: argparse.Namespace,
     skill: str,
     scene: ManipulationScene,
-    world: World,
+    world: SimulatedWorld,
     stack: ExitStack,
-) -> Outcome | None:
+) -> JudgedOutcome | None:
     """Run the skill on a page, then play it there until Ctrl-C; return None if it was interrupted before."""
     from kineverse.view.page import read_title  # for start-up time
     from kineverse.view.run_overlay import LiveRun, play_recording  # for start-up time
@@ -337,7 +337,7 @@ def _view(
             print(f"kineverse: note: the run is not played again. {error}", file=sys.stderr)
         else:
             record = str(Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run.mcap")
-    label = f"{read_title(arguments.model)}, {scene.robot}"
+    label = f"{read_title(arguments.model)}, {scene.robot.name}"
     outcome = None
     with (
         handle_interrupts(),
@@ -346,7 +346,7 @@ def _view(
         print_mesh_problems(page.problems)
         with redirect_stdout(sys.stderr if arguments.json else sys.stdout):
             print_address(page, browser=not arguments.no_browser)
-        live = LiveRun(page)
+        live = LiveRun(page, world)
         outcome = _act(arguments, skill, scene, world, [live], record)
         live.remove()
         _report_outcome(arguments, skill, scene, world, outcome)
@@ -360,18 +360,22 @@ def _view(
 class _PhaseLines:
     """Lines on standard error, one for each phase that begins."""
 
-    def __init__(self, scene: ManipulationScene) -> None:
-        self._scene, self._phase = scene, ""
+    def __init__(self, scene: ManipulationScene, world: SimulatedWorld) -> None:
+        self._scene, self._world, self._phase = scene, world, ""
 
     def __call__(self, session: RecordedStep) -> None:
         if session.phase != self._phase:
             self._phase, scene = session.phase, self._scene
-            value = f"{session.world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()
-            print(f"{session.world.time:7.2f} s  {self._phase:<12}  {value}", file=sys.stderr, flush=True)
+            value = f"{self._world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()
+            print(f"{session.time:7.2f} s  {self._phase:<12}  {value}", file=sys.stderr, flush=True)
 
 
 def _report_outcome(
-    arguments: argparse.Namespace, skill: str, scene: ManipulationScene, world: World, outcome: Outcome
+    arguments: argparse.Namespace,
+    skill: str,
+    scene: ManipulationScene,
+    world: SimulatedWorld,
+    outcome: JudgedOutcome,
 ) -> None:
     """Print the result of a skill, and write a picture if wanted."""
     if arguments.picture is not None:
@@ -390,7 +394,7 @@ def _report_outcome(
             "seconds": outcome.seconds,
             "steps": outcome.steps,
             "skill": skill,
-            "robot": scene.robot,
+            "robot": scene.robot.name,
             "what": str(scene.coordinate),
             "start": scene.start[scene.coordinate],
             "target": None if arguments.unknown and arguments.to is None else scene.target,
@@ -446,7 +450,8 @@ def _plain(value: Any) -> Any:
 
 
 _MEASURE_UNITS = {
-    **dict.fromkeys(("penetration", "grasp_error", "distance", "hand_distance", "way", "decided_way"), "m"),
+    **dict.fromkeys(("penetration", "grasp_error", "distance", "hand_distance", "pressed"), "m"),
+    **dict.fromkeys(("way", "decided_way"), "m"),
     **dict.fromkeys(("grasp_rotation", "turn", "decided_turn"), "rad"),
     **dict.fromkeys(("opened_seconds", "pull_seconds", "decided_seconds"), "s"),
     "jitter": "rad/s, m/s",
@@ -455,7 +460,8 @@ _MEASURE_UNITS = {
 }
 """Units of figures; others are numbers, or have the unit of what they are about."""
 
-_OF_OBJECT = ("penetration_from", "tolerance")  # figures in the unit of the object's coordinate
+_OF_OBJECT = ("penetration_from", "target", "tolerance", "estimate_mean", "estimate_largest")
+"""Figures in the unit of the object's coordinate."""
 
 
 def _format_measure(value: Any, unit: str) -> str:

@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING, Any
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.geometry import Scene
 from kineverse.geometry.exclusions import remove_unusable_shapes
-from kineverse.grasping import Gripper, Handle, find_gripper, find_handle
-from kineverse.manipulation import Outcome, PlacedRobot, Session, place_robot
+from kineverse.grasping import Gripper, Handle, find_handle
+from kineverse.manipulation import JudgedOutcome, PlacedRobot, Robot, Session, judge_outcome, place_robot
 from kineverse.manipulation.articulated_objects import find_shut_value
-from kineverse.manipulation.skill_arguments import choose_tolerance, explain_fixed
+from kineverse.manipulation.skill_run import choose_tolerance, explain_fixed
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.view.sliders import infer_units
+from kineverse.worlds import RunMetrics, SimulatedWorld
 
 from .arguments import check_unit, load_model, parse_assignments, parse_value, print_notes
 from .output import join_lines, print_line, show_activity
@@ -29,7 +30,6 @@ from .plan_arguments import parse_robot
 
 if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief
-    from kineverse.worlds import World
     from kineverse.worlds.recorder import RecordedStep
 
 OPENING = 0.4  # distance from shut at which closing and pushing begin [m], [rad]
@@ -47,7 +47,7 @@ class ManipulationScene:
     """Robot and furniture before a skill."""
 
     model: Model  # model of both
-    robot: str  # prefix of the robot
+    robot: Robot
     coordinate: Symbol  # coordinate of the object
     unit: str  # its unit, rad, m, or nothing
     start: State  # state of everything
@@ -65,7 +65,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
     source, place = parse_robot(arguments.robot)
     model = load_model(arguments, arguments.model)
-    robot = place_robot(
+    placed = place_robot(
         model,
         source,
         place,
@@ -74,15 +74,15 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         strict=arguments.strict,
         loops=arguments.loops,
     )
-    named = robot.name
     lost = remove_unusable_shapes(model)
     more = [f"and {len(lost) - _MOST_NOTES} more"] if len(lost) > _MOST_NOTES else []
     print_notes([f"without this shape: {line}" for line in lost[:_MOST_NOTES]] + more)
 
-    coordinate = _find_coordinate(model, arguments.what, named)
+    robot = Robot.of(model, placed.name)
+    coordinate = _find_coordinate(model, arguments.what, robot)
     default = model.default_state()
     values = {str(s): default[s] for s in model.symbols if s in default}
-    others = _parse_other_positions(arguments.assignments, model, coordinate, robot.place)
+    others = _parse_other_positions(arguments.assignments, model, coordinate, placed.place)
     default = default.updated(others)
     unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
     for option, text in (("--from", arguments.start), ("--to", arguments.to)):
@@ -99,13 +99,13 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     _check_limits(model, "--from", coordinate, begin)
     if not fixed:  # that it is fixed is the result
         _check_limits(model, "--to", coordinate, end)
-    state = robot.start_state(model).updated(others).updated({coordinate: begin})
+    state = placed.start_state(model).updated(others).updated({coordinate: begin})
     if skill != "push":  # pushes search a place for the whole push
-        state = _find_free_start(model, robot, state)
-    gripper, why, pusher = _find_pusher(model, named, arguments.hand, skill)
+        state = _find_free_start(model, placed, state)
+    gripper, why, pusher = _find_pusher(robot, arguments.hand, skill)
     return ManipulationScene(
         model,
-        named,
+        robot,
         coordinate,
         unit,
         state,
@@ -165,33 +165,32 @@ def _find_free_start(model: Model, robot: PlacedRobot, state: State) -> State:
     return free
 
 
-def _find_coordinate(model: Model, name: str, robot: str) -> Symbol:
-    objects = [str(s) for s in model.degrees_of_freedom if not str(s).startswith(f"{robot}/")]
-    if name.startswith(f"{robot}/"):
-        raise InvalidValueError(
-            f"--what {name} is a coordinate of the robot; name one of an object. "
-            f"{suggest(name, objects, 'coordinate')}"
-        )
-    if name not in objects:
+def _find_coordinate(model: Model, name: str, robot: Robot) -> Symbol:
+    known = {str(s): s for s in model.degrees_of_freedom}
+    objects = [other for other, s in known.items() if not robot.moves(s)]
+    if name not in known:
         raise UnknownNameError(
             f"--what {name}: the model has no such coordinate that is free to move. "
             f"{suggest(name, objects, 'coordinate')}"
         )
-    return model.symbol(name)
+    if name not in objects:
+        raise InvalidValueError(
+            f"--what {name} is a coordinate of the robot; name one of an object. "
+            f"{suggest(name, objects, 'coordinate')}"
+        )
+    return known[name]
 
 
-def _find_pusher(
-    model: Model, robot: str, hand: str | None, skill: str
-) -> tuple[Gripper | None, str, tuple[str, ...]]:
+def _find_pusher(robot: Robot, hand: str | None, skill: str) -> tuple[Gripper | None, str, tuple[str, ...]]:
     """Return the gripper, or why there is none, and the bodies that push."""
     if hand is not None and skill == "push":
-        model.fk(hand)  # raises for an unknown frame: any body can push
+        robot.model.fk(hand)  # raises for an unknown frame: any body can push
     try:
-        gripper = find_gripper(model, robot, hand)
+        gripper = robot.gripper(hand)
     except UnknownNameError as error:
         if hand is None:
             return None, f"{error} {_NEXT_STEP[skill == 'push']}", ()
-        if skill == "push" and hand in model.bodies and hand.startswith(f"{robot}/"):
+        if skill == "push" and hand in robot.bodies:
             print_line(f"pusher: {hand}")
             return None, "", (hand,)
         raise
@@ -202,33 +201,6 @@ def _find_pusher(
 _PLACEMENT = 60.0  # largest time of the search for a place of the base [s]
 _SHORT = 0.1  # share of a wanted opening that may be missing at the stop of a part whose joint is learned
 _BETWEEN_LINES = 1.0  # least time between two lines on the progress of a search [s]
-
-
-def grasp_object(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    world: World,
-    belief: Belief | None,
-    look: Callable[[RecordedStep], None],
-) -> Outcome:
-    """Open or close the object by its handle."""
-    found = _find_gripper_and_handle(arguments, scene)
-    if isinstance(found, str):
-        return skip_skill(scene, world, False, found)
-    gripper, _ = found
-
-    from kineverse.manipulation.opening.grasped_opening import open_object  # for start-up time
-
-    outcome: Outcome = open_object(
-        Session(world, belief=belief, on_step=look, on_search=_SearchLines()),
-        scene.coordinate,
-        target=scene.target,
-        hand=gripper.hand,
-        handle=arguments.handle,
-        seconds=arguments.seconds,
-        seed=arguments.seed,
-    )
-    return outcome
 
 
 class _SearchLines:
@@ -243,130 +215,178 @@ class _SearchLines:
             print_line(f"searching: {text}")
 
 
-def open_as_unknown(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    world: World,
-    belief: Belief | None,
-    look: Callable[[RecordedStep], None],
-) -> Outcome:
-    """Open the object as if its joint was unknown."""
-    found = _find_gripper_and_handle(arguments, scene)
-    if isinstance(found, str):
-        return skip_skill(scene, world, False, found)
-    gripper, handle = found
+class SkillTrial:
+    """Trial of a skill in a world: it is measured in the true states, and its outcome is judged by them."""
 
-    from kineverse.manipulation import open_unknown  # for start-up time
-    from kineverse.manipulation.unknown_objects import forget_joint  # for start-up time
-    from kineverse.manipulation.unknown_objects.unknown_opening import (  # for start-up time
-        OPEN_TURN,
-        OPEN_WAY,
-    )
-    from kineverse.worlds import Sensors  # for start-up time
+    def __init__(
+        self,
+        arguments: argparse.Namespace,
+        scene: ManipulationScene,
+        world: SimulatedWorld,
+        belief: Belief,
+        look: Callable[[RecordedStep], None],
+    ) -> None:
+        self._arguments, self._scene, self._world = arguments, scene, world
+        self._belief, self._look = belief, look
 
-    model, coordinate, start = scene.model, scene.coordinate, scene.start
-    part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
-    if part is None:
-        raise InvalidValueError(f"--unknown: no joint moves '{coordinate}', so no part belongs to it.")
-    far = None if arguments.to is None else abs(scene.target - start[coordinate])
-    outcome: Outcome = open_unknown(
-        Session(world, on_step=look),
-        handle.frame,
-        model=forget_joint(model, part, start),
-        part=part,
-        sensors=None if arguments.noise is None else Sensors.parse(arguments.noise),
-        hand=gripper.hand,
-        seconds=arguments.seconds,
-        seed=arguments.seed,
-        way=OPEN_WAY if far is None else far,
-        turn=OPEN_TURN if far is None else far,
-    )
-    there = abs(world.state[coordinate] - scene.start[coordinate])
-    if outcome and far is not None and there < (1.0 - _SHORT) * far:
-        reason = f"{outcome.reason} That is {there:.3g}, and not {far:.3g}, from where it began."
-        measures = {**outcome.measures, "failure": "other"}
-        outcome = replace(outcome, done=False, reason=reason, measures=measures)
-    return outcome
+    def skip(
+        self, done: bool, reason: str, measures: Mapping[str, Any] = MappingProxyType({})
+    ) -> JudgedOutcome:
+        """Return the outcome of what was not begun."""
+        value, name = self._world.state[self._scene.coordinate], self._world.name
+        return JudgedOutcome(done, value, join_lines(reason), name, 0.0, 0, measures, done)
 
+    def grasp(self) -> JudgedOutcome:
+        """Open or close the object by its handle."""
+        found = self._find_gripper_and_handle()
+        if isinstance(found, str):
+            return self.skip(False, found)
+        gripper, handle = found
 
-def push_object(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    world: World,
-    belief: Belief | None,
-    look: Callable[[RecordedStep], None],
-) -> Outcome:
-    """Push the object, from where the robot stands or from a place that is searched."""
-    from kineverse.manipulation.pushing.base_placement import find_push_start, roll_out  # for start-up time
-    from kineverse.manipulation.pushing.push_controller import Pushing  # for start-up time
-    from kineverse.manipulation.pushing.push_skill import push  # for start-up time
+        from kineverse.manipulation.opening.grasped_opening import open_object  # for start-up time
 
-    if not scene.pusher:
-        return skip_skill(scene, world, False, scene.why)
-    with show_activity("building the controller"):
-        pushing = Pushing(
-            scene.model,
-            scene.coordinate,
-            scene.pusher,
-            scene.start,
-            target=scene.target,
-            robot=scene.robot,
+        coordinate, target = self._scene.coordinate, self._scene.target
+        metrics = RunMetrics(self._world, coordinate, gripper=gripper, handle=handle.frame)
+        outcome = open_object(
+            self._open_session_at_handle(metrics, gripper, handle),
+            coordinate,
+            target=target,
+            hand=gripper,
+            handle=handle,
+            seconds=self._arguments.seconds,
+            seed=self._arguments.seed,
         )
-    placed, nowhere = 0, None
-    if not scene.stays:
-        steps = round(arguments.seconds / 0.02)
-        problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
-        if problem:
-            with show_activity("searching for a place of the robot"):
-                found = find_push_start(
-                    pushing,
-                    scene.start,
-                    seconds=_PLACEMENT,
-                    steps=steps,
-                    seed=arguments.seed,
-                    report=_SearchLines(),
-                )
-            placed, why = found.samples, f"Another place of the robot: {found.why}"
-            print(f"not from where the robot stands: {problem}. {why}", file=sys.stderr)
-            if found.state is not None:
-                world.reset(found.state)
-            else:
-                nowhere = found
+        return judge_outcome(outcome, metrics)
 
-    session = Session(world, belief=belief, on_step=look)
-    outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
-    if not outcome and nowhere is not None:
-        measures = {**outcome.measures, "failure": nowhere.failure}
-        reason = f"{outcome.reason} Another place of the robot: {nowhere.why}"
-        outcome = replace(outcome, reason=reason, measures=measures)
-    return replace(outcome, measures={**outcome.measures, "placed": placed})
+    def open_as_unknown(self) -> JudgedOutcome:
+        """Open the object as if its joint was unknown."""
+        found = self._find_gripper_and_handle()
+        if isinstance(found, str):
+            return self.skip(False, found)
+        gripper, handle = found
 
+        from kineverse.manipulation import open_unknown  # for start-up time
+        from kineverse.manipulation.unknown_objects import forget_joint  # for start-up time
+        from kineverse.manipulation.unknown_objects.unknown_opening import (  # for start-up time
+            OPEN_TURN,
+            OPEN_WAY,
+        )
+        from kineverse.worlds import Sensors  # for start-up time
 
-def _find_gripper_and_handle(
-    arguments: argparse.Namespace, scene: ManipulationScene
-) -> tuple[Gripper, Handle] | str:
-    """Return the gripper, and the handle that is named or the best one, which is printed; or why not."""
-    if scene.gripper is None:
-        return scene.why
-    try:
-        handle = find_handle(scene.model, scene.coordinate, arguments.handle)
-    except UnknownNameError as error:
-        if arguments.handle is not None:
-            raise
-        if not Scene(scene.model).bodies_moved_by([scene.coordinate]):
-            return str(error)  # nothing to push at either
-        return f"{error} Without one it can be pushed: kineverse push ... --to VALUE."
-    print(handle, file=sys.stderr)
-    return scene.gripper, handle
+        arguments, model, coordinate = self._arguments, self._scene.model, self._scene.coordinate
+        start = self._scene.start
+        part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
+        if part is None:
+            raise InvalidValueError(f"--unknown: no joint moves '{coordinate}', so no part belongs to it.")
+        far = None if arguments.to is None else abs(self._scene.target - start[coordinate])
+        metrics = RunMetrics(
+            self._world,
+            coordinate,
+            gripper=gripper,
+            handle=handle.frame,
+            part=part,
+            point=(model.fk(handle.frame, part)(start) @ handle.pose)[:3, 3],
+        )
+        outcome = open_unknown(
+            self._open_session_at_handle(metrics, gripper, handle),
+            handle.frame,
+            model=forget_joint(model, part, start),
+            part=part,
+            sensors=None if arguments.noise is None else Sensors.parse(arguments.noise),
+            hand=gripper,
+            seconds=arguments.seconds,
+            seed=arguments.seed,
+            way=OPEN_WAY if far is None else far,
+            turn=OPEN_TURN if far is None else far,
+        )
+        judged = judge_outcome(outcome, metrics)
+        there = abs(judged.value - start[coordinate])
+        if judged and far is not None and there < (1.0 - _SHORT) * far:
+            reason = f"{judged.reason} That is {there:.3g}, and not {far:.3g}, from where it began."
+            return replace(
+                judged, done=False, reason=reason, measures={**judged.measures, "failure": "other"}
+            )
+        return judged
 
+    def push(self) -> JudgedOutcome:
+        """Push the object, from where the robot stands or from a place that is searched."""
+        from kineverse.manipulation.pushing.base_placement import (  # for start-up time
+            find_push_start,
+            roll_out,
+        )
+        from kineverse.manipulation.pushing.push_controller import Pushing  # for start-up time
+        from kineverse.manipulation.pushing.push_skill import push  # for start-up time
 
-def skip_skill(
-    scene: ManipulationScene,
-    world: World,
-    done: bool,
-    reason: str,
-    measures: Mapping[str, Any] = MappingProxyType({}),
-) -> Outcome:
-    """Return the outcome of what was not begun."""
-    value = world.state[scene.coordinate]
-    return Outcome(done, value, join_lines(reason), world.name, 0.0, 0, measures)
+        arguments, scene, world = self._arguments, self._scene, self._world
+        if not scene.pusher:
+            return self.skip(False, scene.why)
+        with show_activity("building the controller"):
+            pushing = Pushing(
+                scene.model, scene.robot, scene.coordinate, scene.pusher, scene.start, target=scene.target
+            )
+        placed, nowhere = 0, None
+        if not scene.stays:
+            steps = round(arguments.seconds / 0.02)
+            problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
+            if problem:
+                with show_activity("searching for a place of the robot"):
+                    found = find_push_start(
+                        pushing,
+                        scene.start,
+                        seconds=_PLACEMENT,
+                        steps=steps,
+                        seed=arguments.seed,
+                        report=_SearchLines(),
+                    )
+                placed, why = found.samples, f"Another place of the robot: {found.why}"
+                print(f"not from where the robot stands: {problem}. {why}", file=sys.stderr)
+                if found.state is not None:
+                    world.reset(found.state)
+                else:
+                    nowhere = found
+
+        metrics = RunMetrics(world, scene.coordinate)
+        session = self._open_session(metrics)
+        outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
+        judged = judge_outcome(outcome, metrics)
+        measures = {**judged.measures, "placed": placed}
+        if judged or nowhere is None:
+            return replace(judged, measures=measures)
+        reason = f"{judged.reason} Another place of the robot: {nowhere.why}"
+        return replace(judged, reason=reason, measures={**measures, "failure": nowhere.failure})
+
+    def _open_session(self, metrics: RunMetrics) -> Session:
+        def look(session: Session) -> None:
+            metrics(session)
+            self._look(session)
+
+        return Session(self._world, belief=self._belief, on_step=look, on_search=_SearchLines())
+
+    def _open_session_at_handle(self, metrics: RunMetrics, gripper: Gripper, handle: Handle) -> Session:
+        """Return a session of a robot that has been put to the handle if its base does not drive there."""
+        from kineverse.manipulation import stand_at_handle  # for start-up time
+
+        session, world = self._open_session(metrics), self._world
+        target, base = self._scene.target, self._scene.robot.base
+        put = stand_at_handle(session, world, handle, target, gripper=gripper, seed=self._arguments.seed)
+        if put and base is not None:
+            metrics.reset()
+            where = ", ".join(f"{world.state[s]:.2f}" for s in base.coordinates[:2])
+            print_line(f"start: the base does not drive to the handle by itself; it is put to {where}")
+        return session
+
+    def _find_gripper_and_handle(self) -> tuple[Gripper, Handle] | str:
+        """Return the gripper, and the handle that is named or the best one, which is printed; or why not."""
+        scene, named = self._scene, self._arguments.handle
+        if scene.gripper is None:
+            return scene.why
+        try:
+            handle = find_handle(scene.model, scene.coordinate, named)
+        except UnknownNameError as error:
+            if named is not None:
+                raise
+            if not Scene.of(scene.model).bodies_moved_by([scene.coordinate]):
+                return str(error)  # nothing to push at either
+            return f"{error} Without one it can be pushed: kineverse push ... --to VALUE."
+        print(handle, file=sys.stderr)
+        return scene.gripper, handle

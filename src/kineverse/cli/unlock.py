@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +15,7 @@ from kineverse.reasoning import plan_unlocking
 from .arguments import add_model_options, load_model, match_coordinates, parse_assignments
 
 if TYPE_CHECKING:
-    from kineverse.manipulation import UnlockingExecution
     from kineverse.model.model import Model
-    from kineverse.reasoning import UnlockingPlan
 
 HELP = """\
 The interlocks of the model are derived from its constraints. Each step is printed with its reason. If the
@@ -38,6 +36,8 @@ examples:
 FOUND, REFUTED, UNDECIDED = 0, 1, 3
 STATUS = {"found": FOUND, "refuted": REFUTED, "undecided": UNDECIDED}
 """Exit statuses; 2 is that of a request that cannot be fulfilled."""
+_DT = 0.05  # time of a step [s]
+_VIOLATED = 1e-6  # excess of a constraint from which on it is violated, in its unit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     plan = plan_unlocking(model, goal, start, fixed=still, budget=arguments.budget)
     if arguments.execute:
         return _execute(arguments, model, goal, start, still)
-    _print(arguments, plan)
+    print(json.dumps(plan.as_data(), allow_nan=False) if arguments.json else plan)
     return STATUS[plan.verdict]
 
 
@@ -108,24 +108,45 @@ def _execute(
     still: Sequence[str],
 ) -> int:
     """Execute the plan in a world, print what moved, and record it if wanted."""
-    from kineverse.manipulation import execute_unlocking  # for start-up time
-    from kineverse.worlds import MechanismWorld, Recorder  # for start-up time
+    from kineverse.manipulation import Session, execute_unlocking  # for start-up time
+    from kineverse.worlds import MechanismWorld, Recorder, RunMetrics  # for start-up time
 
     world = MechanismWorld(model, match_coordinates(model, arguments.jam, "--jam"))
     world.reset(start)
+    metrics = RunMetrics(world)
+    watchers: list[Callable[[Session], object]] = [metrics]
     with ExitStack() as stack:
-        recorder = None
         if arguments.record is not None:
             about = {"model": arguments.model, "world": world.name}
-            recorder = stack.enter_context(Recorder(arguments.record, model, about))
-        done = execute_unlocking(world, goal, fixed=still, budget=arguments.budget, on_step=recorder)
-        if recorder is not None:
-            recorder.write_outcome(done.as_data())
-    _print(arguments, done)
-    if done.constraint:
-        raise KineverseError(f"The motion violated '{done.constraint}', by {done.violation:.3g}.")
-    return FOUND if done else STATUS[done.plan.verdict] or REFUTED
+            recorder = stack.enter_context(Recorder(arguments.record, model, about, world=world))
+            watchers.append(recorder)
 
+        def look(session: Session) -> None:
+            for watch in watchers:
+                watch(session)
 
-def _print(arguments: argparse.Namespace, answer: UnlockingPlan | UnlockingExecution) -> None:
-    print(json.dumps(answer.as_data(), allow_nan=False) if arguments.json else answer)
+        session = Session(world, dt=_DT, on_step=look)
+        execution = execute_unlocking(session, goal, fixed=still, budget=arguments.budget)
+        overlap, violation = metrics.overlap, metrics.violation
+        done = execution.done and overlap is None
+        constraint = metrics.limit if violation > _VIOLATED else ""
+        answer = execution.as_data() | {
+            "claimed": execution.done,
+            "done": done,
+            "reason": str(overlap or execution.reason),
+            "violation": violation,
+            "constraint": constraint,
+            "overlap": 0.0 if overlap is None else overlap.depth,
+            "overlapping": ["", ""] if overlap is None else [overlap.a, overlap.b],
+        }
+        if arguments.record is not None:
+            recorder.write_outcome(answer)
+    if arguments.json:
+        print(json.dumps(answer, allow_nan=False))
+    else:
+        print(execution)
+        if overlap is not None:
+            print(overlap)
+    if constraint:
+        raise KineverseError(f"The motion violated '{constraint}', by {violation:.3g}.")
+    return FOUND if done else STATUS[execution.plan.verdict] or REFUTED

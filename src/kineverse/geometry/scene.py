@@ -14,6 +14,7 @@ from kineverse.errors import InvalidValueError, NoSolutionError
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.model.sampling import StateSamples
+from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
@@ -83,6 +84,14 @@ class Scene:
         self._lock = self._world.lock
         self._parameters: dict[tuple[str, str], DistanceParameters] = {}
         self._queries: dict[tuple[Any, ...], PreparedQuery] = {}
+
+    @classmethod
+    def of(cls, model: ModelView) -> Scene:
+        """Return the scene of a version of a model that all share who need no rules of their own.
+
+        Others place it elsewhere: update it before each query, and use it in one thread.
+        """
+        return cached_for_version(model, "scene", lambda: cls(model))
 
     @property
     def collision_world(self) -> CollisionWorld:

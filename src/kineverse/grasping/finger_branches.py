@@ -34,17 +34,12 @@ class Palm(Struct, frozen=True):
     refused: tuple[str, ...]  # why each other branch on it is no finger
 
 
-def robot_frames(model: ModelView, robot: str) -> tuple[str, ...]:
-    """Return the frames of a robot in the order of the model: those below its prefix, or all."""
-    return tuple(name for name in model.frames if is_of_robot(name, robot))
-
-
 def find_palms(model: ModelView, robot: str, srdf: Srdf | None = None) -> list[tuple[int, Palm]]:
     """Return the rigid links of a robot with two or more moving branches.
 
     With each comes the index of the first end effector of a semantic description whose links it carries.
     """
-    parents = {name: model.frames[name].parent for name in robot_frames(model, robot)}
+    parents = {name: frame.parent for name, frame in model.frames.items() if is_of_robot(name, robot)}
     moving = {f: model.speeds_of(f, parent) for f, parent in parents.items()}
     link: dict[str, str] = {}
     for frame in _parents_first(parents):

@@ -25,7 +25,7 @@ from .gripper_detection import Gripper
 from .hand_model import HandModel, bodies_with_shapes
 from .handles import Handle
 
-_RETREAT = 0.1  # distance of the pose from which the hand approaches [m]
+RETREAT = 0.1  # distance of the pose from which the hand approaches [m]
 _SLACK = 4e-3  # gap of the pads minus the thickness of the bar, before the fingers touch [m]
 _MARGIN = 1e-3  # least distance of the hand from the object before the fingers touch [m]
 _MOST_TILT, _MOST_TILT_OF_KNOB = math.radians(100), math.radians(20)
@@ -187,7 +187,7 @@ def _candidates(
 def _place_hand(gripper: Gripper, frame_T_grasp: Array, gap: float) -> tuple[Array, Array]:
     """Return frame_T_hand of a hand with a gap of its pads at a grasp pose, and before it approaches."""
     grasp_T_hand = lie.inverse(gripper.grasp_pose_at(gap))
-    back = lie.translation(np.array([-_RETREAT, 0.0, 0.0]))
+    back = lie.translation(np.array([-RETREAT, 0.0, 0.0]))
     return frame_T_grasp @ grasp_T_hand, frame_T_grasp @ back @ grasp_T_hand
 
 
@@ -198,13 +198,14 @@ class _Surroundings:
         self, model: ModelView, gripper: Gripper, handle: Handle, decomposed: tuple[str, ...], state: State
     ) -> None:
         robot = _frames_of_robot(model, gripper)
-        scene = Scene(model, leave_out=[f for f in model.bodies if f in robot], decomposed=decomposed)
+        scene = Scene(model, decomposed=decomposed) if decomposed else Scene.of(model)
+        around = {f for f in scene.bodies if f not in robot}
         scene.update(state)
         frame_T_world = lie.inverse(scene.pose(handle.frame))
         middle = (scene.pose(handle.frame) @ handle.pose)[:3, 3]
         near: dict[str, list[int]] = {}
         pieces: list[Part] = []
-        for part in find_parts(scene, middle, _NEAR):
+        for part in find_parts(scene, middle, _NEAR, bodies=around):
             near.setdefault(part.body, []).append(part.number)
             if (part.body, part.number) == (handle.frame, handle.shape):
                 pieces.append(part)

@@ -65,10 +65,18 @@ class Part:
         return find_widest_gap(self.placed, other.placed, np.zeros((0, 3)))[0] <= _TOUCH
 
 
-def find_parts(scene: Scene, near: Array | None = None, radius: float = math.inf) -> list[Part]:
-    """Return the convex parts of the bodies of a scene, as they are placed."""
+def find_parts(
+    scene: Scene,
+    near: Array | None = None,
+    radius: float = math.inf,
+    *,
+    bodies: Collection[str] | None = None,
+) -> list[Part]:
+    """Return the convex parts of the bodies of a scene, or of some of them, as they are placed."""
     parts = []
     for item in scene.collision_world.objects:
+        if bodies is not None and item.body not in bodies:
+            continue
         solid = item.make_solid()
         pose = scene.pose(item.body) @ item.shape.origin.matrix
         middle = pose[:3, :3] @ solid.centre + pose[:3, 3]

@@ -131,17 +131,21 @@ def _search_anew(
     if not moved:
         return (), "It moves no frame."
     tops = {path_to_root(model, name)[-1] for name in moved}
-    others = [f for f in model.bodies if path_to_root(model, f)[-1] not in tops]
-    scene = Scene(model, leave_out=others, decomposed=decomposed)
-    if not any(f in scene.bodies for f in moved):
+    if decomposed:
+        others = [f for f in model.bodies if path_to_root(model, f)[-1] not in tops]
+        scene = Scene(model, leave_out=others, decomposed=decomposed)
+    else:
+        scene = Scene.of(model)
+    bodies = {f for f in scene.bodies if path_to_root(model, f)[-1] in tops}
+    if bodies.isdisjoint(moved):
         return (), f"It moves {_listed(moved)}, without shapes."
     state, opening, is_known = _open_a_little(model, symbol)
     scene.update(state)
-    parts = find_parts(scene)
-    poses = {name: scene.pose(name) for name in moved if name in scene.bodies}
+    parts = find_parts(scene, bodies=bodies)
+    poses = {name: scene.pose(name) for name in moved if name in bodies}
     scene.update(opening)
     shifts = {name: scene.pose(name) for name in poses}
-    links = {name: _link(model, name) for name in scene.bodies}
+    links = {name: _link(model, name) for name in bodies}
     own = [links[f] for f in poses if motion.moving_ancestors(f)[-1] == links[f]]
     further = [links[f] for f in poses if links[f] not in own]  # such as the lever on a door
     still = [part for part in parts if part.body not in poses and not model.speeds_of(part.body)]
@@ -160,7 +164,7 @@ def _search_anew(
             handle = _make_handle(model, symbol, bar, before, body, around)
             rated.append((link not in own, along < _WITHIN, -round(distance, 4), handle.thickness, handle))
     rated.sort(key=lambda row: row[:4])
-    why = f"It moves {_listed([f for f in moved if f in scene.bodies])}: no slim shape of these stands out, "
+    why = f"It moves {_listed([f for f in moved if f in bodies])}: no slim shape of these stands out, "
     why += "with free space in front of it."
     return tuple(row[4] for row in rated), why
 

@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
+    from kineverse.worlds import Robot as Robot
+
     from .articulated_objects import (
         ArticulatedObject as ArticulatedObject,
         find_articulated_objects as find_articulated_objects,
     )
-    from .belief import Belief as Belief, TrueBelief as TrueBelief
-    from .open_close import OpenCloseReport as OpenCloseReport, OpenCloseRunner as OpenCloseRunner
+    from .belief import Belief as Belief
     from .opening import (
         BasePlacement as BasePlacement,
         PlacementSearch as PlacementSearch,
@@ -20,7 +21,15 @@ if TYPE_CHECKING:
     from .pushing import push as push
     from .robot_placement import PlacedRobot as PlacedRobot, place_robot as place_robot
     from .session import Session as Session
+    from .skill_run import SkillRun as SkillRun
     from .tracked_belief import TrackedBelief as TrackedBelief
+    from .trials import (
+        JudgedOutcome as JudgedOutcome,
+        OpenCloseReport as OpenCloseReport,
+        OpenCloseRunner as OpenCloseRunner,
+        judge_outcome as judge_outcome,
+        stand_at_handle as stand_at_handle,
+    )
     from .unknown_objects import open_unknown as open_unknown
     from .unlocking import (
         LockExploration as LockExploration,

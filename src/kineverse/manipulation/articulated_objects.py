@@ -13,10 +13,10 @@ from kineverse.errors import UnknownNameError, suggest
 from kineverse.geometry.objects import collision_shapes, matches_pattern
 from kineverse.geometry.shapes import solid_from_geometry
 from kineverse.lie import Array, inverse, rotation_angle
-from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import moved_frames
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot
 
 MotionKind: TypeAlias = Literal["door", "flap", "drawer", "knob", "linkage"]
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
@@ -49,25 +49,25 @@ class ArticulatedObject:
     opened: float
 
 
-def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[ArticulatedObject, ...]:
+def find_articulated_objects(
+    model: ModelView, robot: Robot | str | None = None
+) -> tuple[ArticulatedObject, ...]:
     """Return the objects that coordinates with two limits move, in the order of the model.
 
     Parameters
     ----------
     robot
-        Prefix of a robot, which is not an object; none if empty.
+        A robot, or the prefix of its names, which is not an object.
 
     Raises
     ------
     MissingDependencyError
         Without the extra ``geometry``.
     UnknownNameError
-        If nothing of the model is below the prefix.
+        If nothing of the model that moves is below the prefix.
     """
-    if not any(is_of_robot(name, robot) for name in model.frames):
-        prefixes = {name.partition("/")[0] for name in model.frames}
-        raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
-    free = [s for s in model.degrees_of_freedom if not (robot and is_of_robot(s.path, robot))]
+    known = None if robot is None else Robot.of(model, robot)
+    free = [s for s in model.degrees_of_freedom if known is None or not known.moves(s)]
     defaults = model.default_state()
     result = []
     for coordinate, frames in moved_frames(model, free).items():

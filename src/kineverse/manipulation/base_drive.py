@@ -23,7 +23,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .session import Session, Speeds
+from .skill_run import SkillRun
 
 _SPEED, _TURN = 0.3, 0.8  # largest speeds of a drive [m/s], [rad/s]
 _ACCELERATION = 0.5  # acceleration and deceleration [m/s²], [rad/s²]
@@ -102,27 +102,28 @@ class BaseDrive:
 
         return DriveSearch(start, place, is_free, speed, turn)
 
-    def follow(self, session: Session, places: Array, act: Callable[[Speeds], object]) -> None:
+    def follow(self, run: SkillRun, places: Array) -> None:
         """Drive along places (K, 3), between which the base either turns or rolls straight on."""
         for start, end in pairwise(places):
             away = end[:2] - start[:2]
             length = float(np.hypot(*away))
-            self._roll(session, start, end, length, act)
+            self._roll(run, start, end, length)
 
-    def _roll(
-        self, session: Session, start: Array, end: Array, length: float, act: Callable[[Speeds], object]
-    ) -> None:
+    def _roll(self, run: SkillRun, start: Array, end: Array, length: float) -> None:
         """Turn to the angle of a place, or roll straight on to it."""
         along = (end[:2] - start[:2]) / length if length > _EXACT else np.zeros(2)
         heading = np.array([math.cos(end[2]), math.sin(end[2])])
         direction = 1.0 if along @ heading >= 0.0 else -1.0
-        speed, rest = 0.0, math.inf
+        session, speed, rest, last = run.session, 0.0, math.inf, run.session.time
         most = self._most[0 if length > _EXACT else 1]
         while True:
             x, y, angle = (session.state[s] for s in self.base)
             offset = np.array([x, y]) - end[:2]
             turned = _wrap(end[2] - angle)
             before, rest = rest, float(-along @ offset) if length > _EXACT else abs(turned)
+            if session.time - last > session.interface.timeout:  # by now it has stopped by itself
+                speed, before = 0.0, math.inf
+            last = session.time
             # Near the end noise may keep the error above its tolerance: no progress ends the leg as well.
             if rest < (_ARRIVED if length > _EXACT else _TURNED) or (speed < 0.02 and rest > before):
                 return
@@ -137,7 +138,7 @@ class BaseDrive:
             else:
                 rate, rolling = math.copysign(speed, turned), 0.0
             vector = rolling * self._straight + rate * self._turn
-            act(dict(zip(self._speeds, vector.tolist(), strict=True)))
+            run.act(dict(zip(self._speeds, vector.tolist(), strict=True)))
 
 
 class DriveSearch:

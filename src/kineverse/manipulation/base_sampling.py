@@ -1,17 +1,15 @@
-"""Sampling of mobile bases: random places in front of a point to reach, and collision-free start states."""
+"""Sampling of mobile bases: random places in front of a point to reach."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.geometry import Rule, Scene
+from kineverse.geometry import Scene
 from kineverse.lie import Array
-from kineverse.model.frame import is_of_robot
-from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -71,38 +69,3 @@ class BaseSampler:
         turn = random.uniform(-_TURN, _TURN, count)
         at = points + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return np.column_stack([at, angle + math.pi + turn])
-
-
-def find_planar_base(model: ModelView, symbols: Sequence[Symbol]) -> tuple[Symbol, ...]:
-    """Return the coordinates x, y and angle of a mobile base among some; empty without one."""
-    for joint in model.articulations.values():
-        names = tuple(s.path.rpartition("/")[2] for s in joint.coordinates)
-        if names == ("x", "y", "angle") and {*joint.coordinates} <= {*symbols}:
-            return tuple(joint.coordinates)
-    return ()
-
-
-def find_free_state(
-    model: ModelView, robot: str, states: Iterable[State], margin: float = 0.0, rules: Iterable[Rule] = ()
-) -> tuple[State | None, str]:
-    """Return the first of some states in which a robot touches nothing, and its contact in the first."""
-    scene = Scene(model)
-    robot_bodies = [body for body in scene.bodies if is_of_robot(body, robot)]
-    others = [body for body in scene.bodies if not is_of_robot(body, robot)]
-    near = (
-        scene.watch(robot_bodies, others, radius=max(margin, 0.0), rules=rules)
-        if robot_bodies and others
-        else None
-    )
-    contact = None
-    for state in states:
-        if near is None:
-            return state, ""
-        scene.update(state)
-        pair = next(iter(near()), None)
-        touches = pair is not None and pair.distance < margin
-        if contact is None:
-            contact = f"{pair.a} and {pair.b}" if touches and pair is not None else ""
-        if not touches:
-            return state, contact
-    return None, contact or ""

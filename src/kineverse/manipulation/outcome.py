@@ -1,4 +1,4 @@
-"""Results of skills."""
+"""Results of skills: what a skill believes, and how it fails."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from kineverse.errors import KineverseError
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of a skill, true if it was done.
+    """Result of a skill as the skill believes it, true if it was done.
 
     Attributes
     ----------
     done
-        Whether the object is where it was wanted, in the world's truth, and nothing went through anything on
-        the way: no two bodies overlapped by more than 0.5 mm that did not at the start.
+        Whether the object is where it was wanted, by the robot's own readings.
     value
-        Value of the coordinate at the end, in the world's truth [m], [rad].
+        Believed value of the coordinate at the end [m], [rad].
     reason
         Why it is done, or what prevented it.
+    world
+        Name of the robot's interface, such as ``"kinematic"``.
     seconds
-        Time in the world [s].
+        Time that it took, by the robot's clock [s].
     steps
         Number of control steps.
     measures
-        Further figures by name: see the tables of ``kineverse reproduce``.
-    claimed
-        Whether the skill itself says that it is done, by what it knows; ``done`` if not given.
+        Further figures by name; ``failure`` is the kind of what prevented it: ``"collision"``, ``"reach"``,
+        ``"time"`` or ``"other"``.
     """
 
     done: bool
@@ -39,11 +39,6 @@ class Outcome:
     seconds: float
     steps: int
     measures: Mapping[str, Any] = field(default_factory=dict)
-    claimed: bool | None = None
-
-    def __post_init__(self) -> None:
-        if self.claimed is None:
-            object.__setattr__(self, "claimed", self.done)
 
     def __bool__(self) -> bool:
         return self.done
@@ -56,8 +51,10 @@ class SkillError(KineverseError):
     ----------
     kind
         ``"collision"``, ``"reach"``, ``"time"`` or ``"other"``.
+    measures
+        Figures of the failure, which the outcome gets.
     """
 
-    def __init__(self, kind: str, reason: str) -> None:
+    def __init__(self, kind: str, reason: str, measures: Mapping[str, Any] | None = None) -> None:
         super().__init__(reason)
-        self.kind = kind
+        self.kind, self.measures = kind, dict(measures or {})

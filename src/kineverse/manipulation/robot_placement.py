@@ -17,6 +17,7 @@ from kineverse._checks import finite_number
 from kineverse.articulations import OmniBase
 from kineverse.errors import InvalidValueError
 from kineverse.formats import load
+from kineverse.geometry import Rule, Scene
 from kineverse.model.edit import Edit
 from kineverse.model.frame import WORLD, is_of_robot
 from kineverse.model.model import Model
@@ -25,11 +26,10 @@ from kineverse.model.registry import LoopTreatment
 from kineverse.spatial import rotation_z, translation
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot
 
-from .base_sampling import find_free_state
 from .robot_sources import SHIPPED, mount
 
-_BASE = ("x", "y", "angle")
 _DEEPEST = 2e-4  # depth below which bodies only touch at the start [m]
 _RING, _RINGS, _DIRECTIONS = 0.25, 16, 12  # distance of rings of places [m], their number, and places on each
 
@@ -128,7 +128,7 @@ def place_robot(
     source = os.fspath(robot)
     if prefix != "":
         prefix, name = _choose_prefix(model, source, prefix, base, root, strict, loops)
-    frames, joints = {*model.frames}, {*model.articulations}
+    frames = {*model.frames}
     with model.edit() as edit:
         edit.include(source, prefix or None, root=root, strict=strict, loops=loops)
         added = [frame for frame in model.frames if frame not in frames]
@@ -136,18 +136,9 @@ def place_robot(
             name = next((frame.partition("/")[0] for frame in added if "/" in frame), "")
         if base is not None:
             _add_base(edit, name)
-        coordinates = find_base(model, [joint for joint in model.articulations if joint not in joints])
+        coordinates = Robot(model, name, [f for f in model.frames if f not in frames]).planar_base
         place = {} if at is None else _put(edit, coordinates, added, at)
     return PlacedRobot(name, coordinates, place, source)
-
-
-def find_base(model: ModelView, joints: Iterable[str]) -> tuple[Symbol, ...]:
-    """Return the coordinates x, y and angle of a mobile base among articulations; none without one."""
-    for name in joints:
-        coordinates = model.articulations[name].coordinates
-        if tuple(s.path.rpartition("/")[2] for s in coordinates) == _BASE:
-            return tuple(coordinates)
-    return ()
 
 
 def _choose_prefix(
@@ -225,3 +216,33 @@ def _list_places(state: State, base: Sequence[Symbol]) -> Iterator[State]:
     for ring, turn in product(range(1, _RINGS + 1), range(_DIRECTIONS)):
         angle, radius = math.tau * turn / _DIRECTIONS, _RING * ring
         yield state.updated({x: state[x] + radius * math.cos(angle), y: state[y] + radius * math.sin(angle)})
+
+
+def find_free_state(
+    model: ModelView,
+    robot: Robot | str,
+    states: Iterable[State],
+    margin: float = 0.0,
+    rules: Iterable[Rule] = (),
+) -> tuple[State | None, str]:
+    """Return the first of some states in which a robot touches nothing, and its contact in the first."""
+    scene, robot = Scene.of(model), Robot.of(model, robot)
+    robot_bodies = [body for body in scene.bodies if robot.owns(body)]
+    others = [body for body in scene.bodies if not robot.owns(body)]
+    near = (
+        scene.watch(robot_bodies, others, radius=max(margin, 0.0), rules=rules)
+        if robot_bodies and others
+        else None
+    )
+    contact = None
+    for state in states:
+        if near is None:
+            return state, ""
+        scene.update(state)
+        pair = next(iter(near()), None)
+        touches = pair is not None and pair.distance < margin
+        if contact is None:
+            contact = f"{pair.a} and {pair.b}" if touches and pair is not None else ""
+        if not touches:
+            return state, contact
+    return None, contact or ""

@@ -12,12 +12,13 @@ from kineverse.articulations import DifferentialDrive, OmniBase
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.formats import load
 from kineverse.geometry.exclusions import remove_unusable_shapes
-from kineverse.grasping.gripper_detection import Gripper, find_gripper
+from kineverse.grasping.gripper_detection import Gripper
 from kineverse.model.edit import Edit
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
+from kineverse.worlds import Robot
 
 BASE_SPEED, BASE_TURN = 1.0, 0.6
 WHEEL_RADIUS, TRACK, WHEEL_SPEED = 0.06, 0.3748, 17.4
@@ -68,13 +69,13 @@ class RobotSource:
         values = {f"{self.prefix}/{joint}": value for joint, value in self.start.items()}
         return model.default_state().updated({k: v for k, v in values.items() if k in known})
 
-    def count_freedom(self, model: Model) -> int:
+    def count_freedom(self, model: ModelView) -> int:
         """Return the number of degrees of freedom of the robot in a model, its base included."""
-        return sum(str(s).startswith(f"{self.prefix}/") for s in model.degrees_of_freedom)
+        return len(Robot.of(model, self.prefix).coordinates)
 
     def gripper(self, model: Model) -> Gripper:
         """Return the gripper at the robot's hand in a model."""
-        return find_gripper(model, self.prefix, f"{self.prefix}/{self.hand}")
+        return Robot.of(model, self.prefix).gripper(f"{self.prefix}/{self.hand}")
 
 
 def mount(edit: Edit, base: OmniBase | DifferentialDrive, roots: Iterable[str]) -> None:

@@ -1,33 +1,43 @@
-"""A robot that acts in a world: commands go to the world, the belief comes back, both are measured."""
+"""Session of a robot: speeds go to its interface, readings come back and become the believed state."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from threading import Thread
+from dataclasses import dataclass, replace
+from functools import cached_property
+from queue import SimpleQueue
+from threading import Event, Thread
 from time import perf_counter, thread_time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from kineverse._checks import finite_number
+from kineverse._checks import as_positive, finite_number
 from kineverse.control import Command
 from kineverse.errors import InvalidValueError, ShapeError, SimulationError, UnknownNameError, suggest
 from kineverse.expressions import Expression
 from kineverse.lie import Array
-from kineverse.model.frame import is_of_robot
+from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import Observation, World
+from kineverse.worlds import Observation, PlannedContact, Robot, RobotInterface
 
-from .belief import Belief, TrueBelief
+from .belief import Belief, EncoderBelief
 from .outcome import SkillError
 
 if TYPE_CHECKING:
     from .opening.base_placement import BasePlacement
+
+Speeds = Mapping[Symbol, float]
+Result = TypeVar("Result")
+
+STALE = 0.06  # age of the latest readings from which on the robot waits for newer ones [s]
+_MADE = 64  # number of motions that are remembered
+_NAMED = 3  # number of names that a message lists
 
 
 @dataclass(slots=True, eq=False)
@@ -59,14 +69,8 @@ class HandReference:
         return float(np.clip(self.share, 0.0, 1.0)) * (len(self.poses) - 1)
 
 
-Speeds = Mapping[Symbol, float]
-
-STALE = 0.06  # age of the latest readings from which on a skill ends [s]
-_MADE = 64  # number of motions that are remembered
-
-
 class Session:
-    """Steps of a skill in a world.
+    """Steps of skills with a robot.
 
     A skill reads :attr:`state`, computes speeds within :meth:`timed`, and calls :meth:`act`::
 
@@ -75,25 +79,39 @@ class Session:
                 command = controller.step(session.state)
             session.act(command.speeds)
 
+    Readings that are old or wrong do not end a skill: the robot stands still and waits for better ones.
+
     Parameters
     ----------
+    interface
+        The robot: a simulated one, one in another process, or a real one.
     dt
         Time of a step [s].
     belief
-        Source of the state; the truth by default.
+        Source of the state; by default a :class:`.TrackedBelief` with usual noise of cameras and encoders.
     on_step
-        Is called with the session after each step, for recordings, measurements and pictures.
+        Is called with the session after each step, for recordings, metrics and pictures.
     on_search
         Is called with a text on the progress of a search that takes long, while nothing moves.
     timeout
-        Longest wall time of a step of the world [s], for worlds that are elsewhere; None to wait for ever.
+        Longest wall time of a step of the interface [s]; None to wait for ever.
+    patience
+        Longest time to wait for readings of the present [s].
 
     Attributes
     ----------
+    model, robot
+        Model of the robot and its furniture, and the robot in it.
     belief
         Source of the state.
+    state
+        The believed state.
     start
-        The true state at the begin of the session.
+        The believed state at the begin of the session.
+    time
+        Time of the robot after the last step [s].
+    observation
+        The latest readings of the sensors.
     commands
         The speeds of the last step.
     command
@@ -102,6 +120,8 @@ class Session:
         The path of the hand that a controller follows; None if there is none.
     vectors
         Vectors of the controller by name, each with its origin in the world [m], for pages and recordings.
+    contact
+        The bodies that the skill means to bring together; None if there are none.
     phase
         Name of the present phase of the skill, for recordings and messages.
     steps
@@ -110,62 +130,63 @@ class Session:
         Durations of the computations of each step by the name given to :meth:`timed` [s].
     made
         Placements of completed grasped motions, oldest first; reversed, they serve to move the object back.
-    answers
-        Whether the world has answered the last step within the time-out.
-    untrusted
-        Why the world's simulation is not to be trusted any more, until a restart; empty if it is.
-    peak_force
-        Largest force between the robot and another body so far [N]; NaN in a world that does not say it.
+    broken
+        Why the robot's interface can be used no more; empty if it can.
 
     Raises
     ------
     InvalidValueError
-        For a time of a step, or a time-out, that is not positive, and for steps that are longer than the
-        world's own time-out, after which it stops the robot.
+        For a time of a step, a time-out or a patience that is not positive, and for steps that are longer
+        than the interface's own time-out, after which it stops the robot.
     """
 
     def __init__(
         self,
-        world: World,
+        interface: RobotInterface,
         *,
         dt: float = 0.02,
         belief: Belief | None = None,
         on_step: Callable[[Session], object] | None = None,
         on_search: Callable[[str], object] | None = None,
-        timeout: float | None = None,
+        timeout: float | None = 10.0,
+        patience: float = 10.0,
     ) -> None:
-        if not 0.0 < dt < math.inf:
-            raise InvalidValueError(f"dt= is the time of a step in s, such as 0.02, not {dt!r}.")
-        if timeout is not None and not timeout > 0.0:
+        for name, value in (("dt", dt), ("timeout", timeout), ("patience", patience)):
+            if value is not None or name != "timeout":
+                as_positive(value, f"{name}=", "time in s, such as 0.02")
+        if dt > interface.timeout + 1e-9:
             raise InvalidValueError(
-                f"timeout= is a positive time in s, or None to wait for ever, not {timeout!r}."
+                f"dt={dt:g} s is longer than the time-out of the robot, {interface.timeout:g} s: it would "
+                f"stand still for the rest of each step. Make its interface with timeout={dt:g} or more."
             )
-        if dt > world.timeout + 1e-9:
-            raise InvalidValueError(
-                f"dt={dt:g} s is longer than the time-out of the world, {world.timeout:g} s: the robot would "
-                f"stand still for the rest of each step. Make the world with timeout={dt:g} or more."
-            )
-        self.world, self.dt = world, dt
-        self._timeout, self.answers, self.untrusted = timeout, True, ""
-        self.peak_force = math.nan
-        self._speeds: dict[object, Symbol] = {name: s for s in world.model.speeds for name in (s, str(s))}
-        self.belief = belief or TrueBelief()
+        self.interface, self.dt = interface, dt
+        self.model = interface.model
+        self.robot = Robot.of(self.model, interface.robot)
+        self.belief: Belief = belief or _make_belief(self.model, self.robot)
+        self.broken = ""
+        self._patience = patience
+        self._caller = None if timeout is None else _Caller(timeout)
+        self._speeds: dict[object, Symbol] = {name: s for s in self.model.speeds for name in (s, str(s))}
+        self._coordinates = frozenset(self.robot.coordinates)
         self._on_step, self._on_search = on_step, on_search
-        self.state: State = self.belief.update(world)
-        self.start: State = world.state
         self.commands: Speeds = {}
         self.command: Command | None = None
         self.reference: HandReference | None = None
         self.vectors: Mapping[str, tuple[Array, Array]] = {}
-        self.phase, self.steps = "", 0
+        self.contact: PlannedContact | None = None
+        self.phase, self.steps, self.time = "", 0, 0.0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
         self.made: deque[BasePlacement] = deque(maxlen=_MADE)
+        self._problem = ""  # what is wrong with the latest readings
+        self._unknown: dict[str, None] = {}  # observed frames that the model does not have
+        self.state: State = self.model.default_state()
+        self.observation = Observation(-math.inf, {})
+        with suppress(SkillError):  # of what does not answer now, the first skill says it
+            self.refresh()
+        self.start = self.state
 
-    @property
-    def observation(self) -> Observation | None:
-        """The sensor readings from which the state was estimated; None if it is the truth."""
-        return self.belief.observation
+    # -- what is known ---------------------------------------------------------------------------------------
 
     def deviation(self, what: Symbol | str | Expression) -> float:
         """Return the standard deviation of a coordinate, or of an expression of coordinates [m], [rad].
@@ -176,16 +197,38 @@ class Session:
         ------
         ShapeError
             For an expression that is no number.
+        UnknownNameError
+            For a coordinate that the belief does not have.
         """
         if isinstance(what, str):
-            what = self.world.model.symbol(what)
+            what = self.model.symbol(what)
         if isinstance(what, Symbol):
+            if what not in self.state:
+                known = suggest(str(what), map(str, self.state), "coordinate")
+                raise UnknownNameError(f"The belief says nothing about '{what}'. {known}")
             return self.belief.deviation(what)
         if what.shape != ():
             raise ShapeError(f"Only a scalar has a deviation, not an expression of shape {what.shape}.")
         own = {s: self.belief.deviation(s) for s in what.symbols}
         slopes = {s: float(what.partial([s])(self.state)[0]) for s, deviation in own.items() if deviation}
         return math.hypot(*(k * own[s] for s, k in slopes.items() if k))
+
+    def refresh(self) -> None:
+        """Read the sensors without a step, such as after a search, or after a reset of a simulated world."""
+        self.observation, self.time = self._call(self._read)
+        self._update({})
+
+    @contextmanager
+    def believing(self, belief: Belief) -> Iterator[None]:
+        """Use another source of the state for a while."""
+        before, self.belief = self.belief, belief
+        try:
+            self.refresh()
+            yield
+        finally:
+            self.belief = before
+
+    # -- what is computed ------------------------------------------------------------------------------------
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
@@ -195,17 +238,33 @@ class Session:
         self.cpu.setdefault(name, []).append(thread_time() - cpu)
         self.wall.setdefault(name, []).append(perf_counter() - wall)
 
+    @contextmanager
+    def search(self, text: str = "") -> Iterator[None]:
+        """Search or plan something that takes long, while nothing moves; then the sensors are read anew.
+
+        The text tells what is searched.
+        """
+        if text:
+            self.report_search(text)
+        wall = perf_counter()
+        yield
+        if perf_counter() - wall > self.interface.timeout and not self.broken:
+            self.refresh()
+
     def report_search(self, text: str) -> None:
         """Tell the progress of a search, in which nothing moves."""
         if self._on_search is not None:
             self._on_search(text)
+
+    # -- what is done ----------------------------------------------------------------------------------------
 
     def act(
         self, speeds: Mapping[Symbol, float] | Mapping[str, float], command: Command | None = None
     ) -> None:
         """Command speeds for one step, and update the belief. Speeds of objects are not sent.
 
-        The belief gets them all.
+        The belief gets them all. Where readings are old or wrong afterwards, the robot stands still until
+        better ones come.
 
         Parameters
         ----------
@@ -220,21 +279,57 @@ class Session:
         UnknownNameError, InvalidValueError
             For speeds that the model does not have, and those that are not finite. Then nothing has changed.
         SkillError
-            If the world does not answer within the time-out, stands still, is not to be trusted, or has not
-            been observed for more than :data:`STALE`. Worlds refuse commands from then on, and their robots
-            stop.
+            If the robot does not answer within the time-out, its simulation is not to be trusted, or no
+            readings of the present have come within the patience. Robots stop by themselves then.
         """
         resolved = self._resolve(speeds)
-        before, self.command = self.world.time, command
-        self._advance(resolved)
-        now, stamp = self.world.time, self.state.stamp
+        before, self.command = self.time, command
+        self._advance(resolved, stamp=self.state.stamp if resolved else None)
+        if self._find_problem(before):
+            self.await_readings(before)
+
+    def await_readings(self, before: float = -math.inf) -> None:
+        """Stand still until readings are right, and of the present, after a time [s].
+
+        Raises
+        ------
+        SkillError
+            Saying what is wrong, if that takes longer than the patience, by any clock.
+        """
+        begin, wall = self.time, time.monotonic()
+        while problem := self._find_problem(before):
+            waited = max(self.time - begin, time.monotonic() - wall)
+            if waited > self._patience:
+                raise SkillError("other", f"{problem} The robot has waited for {waited:.3g} s.")
+            earlier = self.time
+            self._advance(self._fingers_at_rest, stamp=None)
+            if self.time <= earlier:
+                time.sleep(self.dt)  # an interface that does not wait by itself
+
+    @cached_property
+    def _fingers_at_rest(self) -> Speeds:
+        """Speeds of fingers that close on nothing any more, and keep the force on what they hold."""
+        return {s.derivative(): 0.0 for gripper in self.robot.grippers for s in gripper.joints}
+
+    def stop(self) -> None:
+        """Command zero speeds for one step; nothing if the robot does not answer."""
+        self.command = None
+        if not self.broken:
+            with suppress(SkillError):
+                self._advance({}, stamp=None)
+
+    def _find_problem(self, before: float) -> str:
+        """Return why the robot must not move by the present state; empty if it may."""
+        name, now, stamp = self.interface.name, self.time, self.state.stamp
+        if self._problem:
+            return self._problem
         if now <= before:
-            raise SkillError("other", f"The world '{self.world.name}' stands still at {now:g} s.")
-        if stamp is not None and now - stamp > STALE:
-            raise SkillError(
-                "other",
-                f"The world '{self.world.name}' was observed last at {stamp:.3f} s, {now - stamp:.3f} s ago.",
-            )
+            return f"The robot's time '{name}' stands still at {now:g} s."
+        if stamp is None:
+            return f"The robot '{name}' has not been observed."
+        if now - stamp > STALE:
+            return f"The robot '{name}' was observed last at {stamp:.3f} s, {now - stamp:.3f} s ago."
+        return ""
 
     def _resolve(self, speeds: Mapping[Symbol, float] | Mapping[str, float]) -> Speeds:
         if not isinstance(speeds, Mapping):
@@ -242,10 +337,10 @@ class Session:
         resolved: dict[Symbol, float] = {}
         for key, value in speeds.items():
             speed = self._speeds.get(key)
-            if speed is None and isinstance(key, Symbol) and not is_of_robot(key.path, self.world.robot):
+            if speed is None and isinstance(key, Symbol) and not self.robot.moves(key):
                 speed = key  # of an object that only the skill's own model has
             if speed is None:
-                known = map(str, self.world.model.speeds)
+                known = map(str, self.model.speeds)
                 raise UnknownNameError(
                     f"The model has no free speed '{key}'. {suggest(str(key), known, 'speed')}"
                 )
@@ -257,57 +352,129 @@ class Session:
             resolved[speed] = number
         return resolved
 
-    def _advance(self, speeds: Speeds) -> None:
-        robot = self.world.robot
-        self.commands = {s: v for s, v in speeds.items() if is_of_robot(s.path, robot)}
+    def _advance(self, speeds: Speeds, stamp: float | None) -> None:
+        """Command speeds for one step, with the time of their state; a stop has None and is never too old."""
+        self.commands = {s: v for s, v in speeds.items() if self.robot.moves(s)}
+
+        def step() -> tuple[Observation, float]:
+            self.interface.apply(self.commands, self.dt, stamp=stamp)
+            return self._read()
+
         try:
-            self._wait(lambda: self.world.apply(self.commands, self.dt, stamp=self.state.stamp))
+            self.observation, self.time = self._call(step)
         except SimulationError as error:
-            self.untrusted = str(error)
-            raise SkillError("other", self.untrusted) from error
-        force = getattr(self.world, "peak_force", math.nan)
-        if not force <= self.peak_force:
-            self.peak_force = force
-        self._wait(lambda: self._update(speeds))
+            self.broken = str(error)
+            raise SkillError("other", self.broken) from error
+        self._update(speeds)
         self.steps += 1
         if self._on_step is not None:
             self._on_step(self)
 
-    def _wait(self, call: Callable[[], object]) -> None:
-        """Call a function of the world; raise SkillError if it takes longer than the time-out."""
-        if self._timeout is None:
-            call()
-            return
-        errors: list[Exception] = []
+    def _read(self) -> tuple[Observation, float]:
+        return self.interface.observe(), float(self.interface.time)
+
+    def _call(self, function: Callable[[], Result]) -> Result:
+        """Call a function of the interface, or raise SkillError if it takes longer than the time-out."""
+        if self.broken:
+            raise SkillError("other", self.broken)
+        if self._caller is None:
+            return function()
+        try:
+            return self._caller.call(function)
+        except TimeoutError as error:
+            self.commands = {}
+            self.broken = f"The robot '{self.interface.name}' has not answered for {error} s."
+            raise SkillError("other", self.broken) from None
+
+    def _update(self, speeds: Speeds) -> None:
+        """Update the belief by the latest readings, unless something is wrong with them."""
+        self._problem = self._check_joints()
+        if not self._problem:
+            self._check_poses()
+            self.state = self.belief.update(self.observation, self.time, State(speeds))
+
+    def _check_joints(self) -> str:
+        """Return what is wrong with the latest stamp and encoders; empty if nothing is."""
+        observation = self.observation
+        if finite_number(observation.stamp) is None or not math.isfinite(self.time):
+            return f"The robot's readings have the stamp {observation.stamp!r} at {self.time!r} s."
+        if missing := self._coordinates.difference(observation.joints):
+            return f"The robot's readings lack {_list(map(str, missing))}."
+        bad = [str(s) for s, v in observation.joints.items() if finite_number(v) is None]
+        return f"The robot's readings of {_list(bad)} are no finite numbers." if bad else ""
+
+    def _check_poses(self) -> None:
+        """Leave out observed poses that are no numbers, and those of frames that the model does not have."""
+        poses = self.observation.poses
+        frames = self.model.frames
+        self._unknown |= dict.fromkeys(name for name in poses if name not in frames)
+        good = {
+            name: pose
+            for name, pose in poses.items()
+            if name in frames and np.shape(pose) == (4, 4) and np.isfinite(pose).all()
+        }
+        if len(good) < len(poses):
+            self.observation = replace(self.observation, poses=good)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Remarks on the readings, such as on poses of frames that the model does not have."""
+        if not self._unknown:
+            return ()
+        return (f"Poses are observed of frames that the model does not have: {_list(self._unknown)}.",)
+
+
+def _list(names: Iterator[str] | list[str] | Mapping[str, None]) -> str:
+    known = sorted(names)
+    more = f" and {len(known) - _NAMED} more" if len(known) > _NAMED else ""
+    return ", ".join(f"'{name}'" for name in known[:_NAMED]) + more
+
+
+def _make_belief(model: ModelView, robot: Robot) -> Belief:
+    """Return a belief from sensors that nobody has described, of all that can be observed."""
+    if not any(model.symbols_of(name) for name in robot.markers):
+        return EncoderBelief(model, robot)
+    from .tracked_belief import USUAL, TrackedBelief  # for start-up time: it needs all of estimation
+
+    return TrackedBelief(model, robot, USUAL)
+
+
+class _Caller:
+    """Calls in a thread of its own, so that one that never returns does not hold up the caller."""
+
+    def __init__(self, timeout: float) -> None:
+        self._timeout = timeout
+        self._calls: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        self._thread: Thread | None = None
+
+    def __del__(self) -> None:
+        self._calls.put(None)
+
+    def call(self, function: Callable[[], Result]) -> Result:
+        """Return the result of a function, or raise what it raises; TimeoutError after the time-out [s]."""
+        if self._thread is None:
+            self._thread = Thread(target=_serve, args=(self._calls,), daemon=True, name="robot interface")
+            self._thread.start()
+        results: list[Result] = []
+        errors: list[BaseException] = []
+        done = Event()
 
         def run() -> None:
             try:
-                call()
-            except Exception as error:
+                results.append(function())
+            except BaseException as error:
                 errors.append(error)
+            finally:
+                done.set()
 
-        thread = Thread(target=run, daemon=True)
-        thread.start()
-        thread.join(self._timeout)
-        if thread.is_alive():
-            self.answers, self.commands = False, {}
-            raise SkillError(
-                "other", f"The world '{self.world.name}' has not answered for {self._timeout:g} s."
-            )
+        self._calls.put(run)
+        if not done.wait(self._timeout):
+            raise TimeoutError(f"{self._timeout:g}")
         if errors:
             raise errors[0]
+        return results[0]
 
-    def restart(self, state: State) -> None:
-        """Reset the world to a state, at time 0, and update the belief."""
-        self.world.reset(state)
-        self.untrusted = ""
-        self._update({})
 
-    def _update(self, speeds: Speeds) -> None:
-        self.state = self.belief.update(self.world, State(speeds))
-
-    def stop(self) -> None:
-        """Command zero speeds for one step; nothing if the world does not answer."""
-        if self.answers:
-            with suppress(SkillError):
-                self._advance({})
+def _serve(calls: SimpleQueue[Callable[[], object] | None]) -> None:
+    while (call := calls.get()) is not None:
+        call()

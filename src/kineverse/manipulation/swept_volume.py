@@ -9,7 +9,7 @@ move relative to: fixed furniture, furniture that other coordinates move, and wh
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -17,16 +17,15 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import NoSolutionError
-from kineverse.geometry import Rule, Scene
+from kineverse.geometry import Scene
 from kineverse.geometry.distance_queries import PreparedQuery
-from kineverse.geometry.objects import Exclusion
 from kineverse.lie import Array
-from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot
 from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 from .outcome import SkillError
@@ -75,7 +74,7 @@ class BlockedError(SkillError):
     """End of a skill before something in the way of an object."""
 
     def __init__(self, obstacle: Obstacle) -> None:
-        super().__init__("collision", str(obstacle))
+        super().__init__("collision", str(obstacle), obstacle.measures)
         self.obstacle = obstacle
 
 
@@ -85,9 +84,7 @@ def find_obstacle(
     state: State,
     target: float,
     *,
-    robot: str = "",
-    rules: Iterable[Rule] = (),
-    leave_out: Iterable[Exclusion] = (),
+    robot: Robot | None = None,
     start: State | None = None,
     least: float = OVERLAP,
 ) -> Obstacle | None:
@@ -96,12 +93,8 @@ def find_obstacle(
     What overlaps at the begin counts as far as it gets deeper than :class:`.FurnitureOverlaps` allows. The
     robot counts nowhere: it moves.
     """
-    own = tuple(rules), tuple(leave_out)
-
-    def make() -> _Sweep:
-        return _Sweep(model, robot, *own)
-
-    sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot), make)
+    key = "swept motion", robot and robot.name
+    sweep = cached_for_version(model, key, lambda: _Sweep(model, robot))
     sweep.start = start
     result = sweep.find(coordinate, state, target, least)
     return None if result is None else sweep.find_aside(result, state)
@@ -110,11 +103,8 @@ def find_obstacle(
 class _Sweep:
     """Scene in which objects are swept."""
 
-    def __init__(
-        self, model: ModelView, robot: str, rules: tuple[Rule, ...], leave_out: tuple[Exclusion, ...]
-    ) -> None:
-        self._model, self._robot = model, robot
-        self._scene = Scene(model, rules=rules, leave_out=leave_out)
+    def __init__(self, model: ModelView, robot: Robot | None) -> None:
+        self._model, self._robot, self._scene = model, robot, Scene.of(model)
         self._overlaps = FurnitureOverlaps(self._scene, robot)
         self._queries: dict[tuple[Symbol, bytes], tuple[PreparedQuery, FrameDependence]] = {}
         self.start: State | None = None
@@ -149,7 +139,7 @@ class _Sweep:
     def find_aside(self, found: Obstacle, state: State) -> Obstacle:
         """Return an obstacle with the coordinate that moves it, and where it leaves the path free."""
         model = self._model
-        free = [s for s in model.degrees_of_freedom if not (self._robot and is_of_robot(s.path, self._robot))]
+        free = [s for s in model.degrees_of_freedom if self._robot is None or not self._robot.moves(s)]
         moving = [
             s
             for s in free
@@ -183,9 +173,8 @@ class _Sweep:
             if first is None:
                 return
             k += first
-            # What rests on something touches for long.
             inputs = self._scene.collision_world.values
-            while True:
+            while True:  # what rests on something touches for long
                 yield k
                 k += 1
                 if k == len(values):

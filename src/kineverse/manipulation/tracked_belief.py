@@ -19,14 +19,10 @@ from kineverse.errors import InvalidValueError
 from kineverse.estimation import ObservedPose, Outliers, Tracker, pose_covariance
 from kineverse.estimation.noise import CHI_SQUARED_6
 from kineverse.lie import Array, inverse, pose_difference, rotation_z, transform
-from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import Observation, Sensors, World
-from kineverse.worlds.sensor_sampler import find_observed_frames, find_robot_base
-
-from .belief import check_believed
+from kineverse.worlds import Observation, Robot, Sensors
 
 
 class BaseFilter:
@@ -101,6 +97,8 @@ def motion_of(poses: Array) -> Array:
     return slopes
 
 
+USUAL = Sensors(position=0.003, position_per_metre=0.003, orientation=math.radians(0.5), encoders=1e-4)
+"""Noise that is expected of a robot whose sensors nobody has described: that of markers and a good camera."""
 _LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4  # of poses [m], [rad], for sensors without noise
 _MOVING, _RESTING = 0.04, 4e-4
 """Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
@@ -111,31 +109,29 @@ In the latter all of the tracker's process noise counts."""
 _STILL = 1e-3  # largest speed of a part that rests [m/s], [rad/s]
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
 """Error of the motion of joints relative to the commanded one, and independent of it [rad/√s], [m/√s]."""
-_HORIZON = 0.04  # longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays
+_HORIZON = 0.02  # longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays
 
 
 class TrackedBelief:
     """Belief that reads observations and commands, and never the truth.
 
     Coordinates that were never seen have their default value, and half the width of their limits as
-    deviation. If the time of the world goes back, as by a reset, all starts again: objects are believed where
-    they were, with that same deviation until they are seen.
+    deviation. If the time goes back, as by a reset of a simulated world, all starts again: objects are
+    believed where they were, with that same deviation until they are seen.
 
     Parameters
     ----------
     model
         Model of the robot and of everything that moves.
     robot
-        Prefix of the robot.
+        The robot in the model, or the prefix of its names.
     sensors
-        The noise to expect, with the frames of camera and markers; the settings of the world's own sensors.
+        The noise to expect, with the frames of camera and markers.
 
     Attributes
     ----------
     tracker
         Tracker of the coordinates of objects.
-    observation
-        The readings of the last update; None before the first.
     camera
         Frame from which distances to markers count; the robot's first frame if none is named like a camera.
     remarks
@@ -149,24 +145,22 @@ class TrackedBelief:
         If no marked frame moves with an object, or odometry drifts under a base that is not planar.
     """
 
-    def __init__(self, model: ModelView, robot: str, sensors: Sensors | None = None) -> None:
+    def __init__(self, model: ModelView, robot: Robot | str, sensors: Sensors | None = None) -> None:
         self.sensors = sensors = Sensors() if sensors is None else sensors
         self._model = model
+        robot = Robot.of(model, robot)
         remarks = []
-        frames = find_observed_frames(model, robot, sensors)
-        self.camera, marked = frames.camera, frames.marked
-        if not frames.has_camera:
+        self.camera, marked = sensors.find_frames(robot)
+        if sensors.camera is None and robot.camera is None:
             remarks.append(
-                f"No frame of '{robot}' is named like a camera, so markers are seen from '{self.camera}'; "
-                "camera= names another one."
+                f"No frame of '{robot.name}' is named like a camera, so markers are seen from "
+                f"'{self.camera}'; camera= names another one."
             )
         coordinates = {*model.degrees_of_freedom}
         moving = {name: coordinates.intersection(model.fk(name).symbols) for name in marked}
         self._landmarks = {name: np.asarray(model.fk(name)({})) for name in marked if not moving[name]}
         self._frames = tuple(
-            name
-            for name in marked
-            if moving[name] and not any(is_of_robot(s.path, robot) for s in moving[name])
+            name for name in marked if moving[name] and not any(robot.moves(s) for s in moving[name])
         )
         if not self._frames:
             raise InvalidValueError(
@@ -185,18 +179,18 @@ class TrackedBelief:
         self._coordinates_of = {
             name: tuple(s for s in moving[name] if s in self._groups) for name in self._frames
         }
-        base = find_robot_base(model, robot)
-        drifts = sensors.odometry > 0.0 or sensors.turn > 0.0
-        if drifts and base.coordinates and not base.is_planar:
+        base = robot.base
+        drifts = base is not None and (sensors.odometry > 0.0 or sensors.turn > 0.0)
+        if base is not None and drifts and not base.is_planar:
             raise InvalidValueError(
                 f"The odometry of '{base.child}' drifts, and its joint is none of x, y and a heading: there "
                 "is no filter for it. Give sensors without odometry= and turn=."
             )
-        self._base = base if drifts and base.coordinates else None
+        self._base = base if drifts else None
         if self._base is not None and not self._landmarks:
             remarks.append("No marked frame stands still, so nothing corrects the drift of the odometry.")
         self.remarks = tuple(remarks)
-        self._exact = base.coordinates
+        self._exact = () if base is None else base.coordinates
         self._filter = BaseFilter(sensors.odometry, sensors.turn, sensors.outliers > 0.0)
         self._speeds = tuple(speeds)
         self._shared: Array | None = None
@@ -206,12 +200,11 @@ class TrackedBelief:
                 model.jacobian(name, form="world_aligned", symbols=self._speeds) for name in self._frames
             ]
             self._jacobians = compile(np.concatenate([J.reshape(-1) for J in jacobians]))
-            offset = model.fk(base.child, relative_to=base.parent)(dict.fromkeys(base.coordinates, 0.0))
-            self._plane = np.asarray(model.fk(base.parent)({}) @ offset)
+            origin = dict.fromkeys(self._base.coordinates, 0.0)
+            offset = model.fk(self._base.child, relative_to=self._base.parent)(origin)
+            self._plane = np.asarray(model.fk(self._base.parent)({}) @ offset)
         self._encoded = tuple(
-            s
-            for s in model.symbols
-            if is_of_robot(s.path, robot) and not s.order and s not in base.coordinates
+            s for s in model.symbols if robot.moves(s) and not s.order and s not in self._exact
         )
         self._spread: Array = np.zeros(len(self._encoded))
         start = model.default_state()
@@ -222,19 +215,17 @@ class TrackedBelief:
             self._jacobian_places = [self._place[s] for s in self._jacobians.inputs]
         self._integrate = model.integrator(symbols=self._symbols)
         self._column = {v: k for k, v in enumerate(self._integrate.speeds)}
-        of_robot = np.array([is_of_robot(v.path, robot) for v in self._integrate.speeds])
-        self._of_robot = of_robot.astype(float)
+        self._of_robot = np.array([float(robot.moves(v)) for v in self._integrate.speeds])
         limits = np.array([model.limits(s) for s in self._symbols])
-        bounded = np.array([sensors.encoders > 0.0 or not is_of_robot(s.path, robot) for s in self._symbols])
+        bounded = np.array([sensors.encoders > 0.0 or not robot.moves(s) for s in self._symbols])
         self._lower = np.where(bounded, limits[:, 0], -np.inf)
         self._upper = np.where(bounded, limits[:, 1], np.inf)
         self._camera_pose = compile([model.fk(self.camera)])
-        self.observation: Observation | None = None
         self.seen: dict[Symbol, float] = {}
         self._history: list[tuple[float, float, Array]] = []
         self._moved: dict[Symbol, float] = {}
         self._refuted: dict[Symbol, float] = {}
-        self._now = self._picture = self._read = -math.inf
+        self._now = self._picture = self._read = self._looked = -math.inf
 
     def _make_tracker(self) -> Tracker:
         sensors = self.sensors
@@ -248,30 +239,33 @@ class TrackedBelief:
         tracker.reset({s: start[s] for s in tracker.symbols})
         return tracker
 
-    def update(self, world: World, commands: State | None = None) -> State:
+    def update(self, observation: Observation, time: float, commands: State | None = None) -> State:
         """Return the believed state of all coordinates at the present time.
 
-        The first call, and the first one after a reset, wait for compiled code of the tracker.
+        The first call, and the first one after a reset, wait for compiled code of the tracker. Readings with
+        the stamp of the last ones are the same again.
 
         Parameters
         ----------
-        world
-            The world, of which the time and the observation are read.
+        observation
+            The latest readings.
+        time
+            The present time [s].
         commands
             Speeds since the last update: commanded ones of the robot, and planned ones of objects.
         """
-        observation, now = world.observe(), world.time
-        if now < self._now or (now == self._now and observation.poses) or math.isinf(self._now):
+        if time < self._now or math.isinf(self._now):
             self._begin(observation.stamp)
-        elif now > self._now:
-            self._history.append((self._now, now, self._vector(commands)))
-        self.observation, self._now = observation, now
+        elif time > self._now:
+            self._history.append((self._now, time, self._vector(commands)))
+        self._now = time
         self._read_robot(observation)
-        if observation.poses:
+        if observation.poses and observation.stamp > self._looked:
+            self._looked = observation.stamp
             self._look(observation)
         oldest = min(self._read, self._picture)
         self._history = [one for one in self._history if one[1] > oldest]
-        horizon = min(now, observation.stamp + self.sensors.delay + _HORIZON)
+        horizon = min(time, observation.stamp + self.sensors.delay + _HORIZON)
         return self._predict(horizon)
 
     def _begin(self, stamp: float) -> None:
@@ -283,7 +277,7 @@ class TrackedBelief:
         self._moved.clear()
         self._refuted.clear()
         self.seen.clear()
-        self._now = self._read = -math.inf
+        self._now = self._read = self._looked = -math.inf
         self._picture = stamp
 
     def _vector(self, commands: Mapping[Symbol, float] | None) -> Array:
@@ -305,8 +299,8 @@ class TrackedBelief:
     def _read_robot(self, observation: Observation) -> None:
         stamp, joints = observation.stamp, observation.joints
         known = [s for s in joints if s in self._place]
-        if stamp == self._read:
-            return  # the same readings again
+        if stamp <= self._read:
+            return
         before = self._values.copy()
         self._values[[self._place[s] for s in known]] = [joints[s] for s in known]
         if self.sensors.encoders > 0.0:
@@ -448,5 +442,4 @@ class TrackedBelief:
             return math.sqrt(float(self._spread[self._encoded.index(coordinate)]))
         if self._base is not None and coordinate in self._base.coordinates:
             return float(self._filter.deviations[self._base.coordinates.index(coordinate)])
-        check_believed(self._place, coordinate)
         return 0.0 if coordinate in self._exact else math.inf

@@ -16,8 +16,8 @@ from kineverse.lie import rotation_angle
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.planning.trajectories.trajectory import Trajectory
-from kineverse.state import StateLike
-from kineverse.worlds import Contact, RunRecording
+from kineverse.state import State, StateLike
+from kineverse.worlds import Contact, RunRecording, SimulatedWorld
 from kineverse.worlds.recorder import RecordedStep
 
 from .drawables import TRACE, Drawable, Rgba, build_spheres, collect_drawables
@@ -152,8 +152,8 @@ class RecordedScene:
         self.drawing = RunDrawing(recording.model)
 
     def values_at(self, time: float) -> dict[str, float]:
-        """Return the true values of all symbols by name at a time [s]."""
-        return self.drawing.values(self.recording.states.at(time))
+        """Return the values of all symbols by name at a time [s], the true ones if they are recorded."""
+        return self.drawing.values(self.recording.motion.at(time))
 
     def at(self, time: float) -> RunMoment:
         """Return the things to draw at a time [s]."""
@@ -165,7 +165,7 @@ class RecordedScene:
         if not len(beliefs) or time < beliefs.times[0]:
             return {}
         poses = self.recording.belief_poses.last(time)
-        return self.drawing.find_ghosts(self.recording.states.at(time), beliefs.at(time), poses)
+        return self.drawing.find_ghosts(self.recording.motion.at(time), beliefs.at(time), poses)
 
     def _describe(self, time: float) -> list[str]:
         """Return lines about a time [s]: phase, contacts, and at the end the outcome."""
@@ -179,11 +179,12 @@ class RecordedScene:
 
 
 def as_trajectory(recording: RunRecording) -> Trajectory | None:
-    """Return the true states of a run as a trajectory with the same times; None without any.
+    """Return the states of a run as a trajectory with the same times, the true ones if there are any.
 
-    Before the first state it stands still. Velocities are differences of the neighbours.
+    None stands for a run without states. Before the first state it stands still. Velocities are differences
+    of the neighbours.
     """
-    states = recording.states
+    states = recording.motion
     if not len(states):
         return None
     columns = [k for k, s in enumerate(states.symbols) if s.role == "dof" and not s.order]
@@ -341,13 +342,21 @@ _AHEAD = 0.02  # time by which commands are followed to find the velocity of the
 class LiveRun:
     """Callable for the steps of a session, which shows them on a page.
 
-    It draws at most thirty times a second, and waits for the clock so that a world that is faster than real
-    time can be watched. If the steps have a ``reference`` and a ``command``, as those of a
+    It shows the true state of a simulated world, with the belief as a ghost; without a world, the belief. It
+    draws at most thirty times a second, and waits for the clock so that a world that is faster than real time
+    can be watched. If the steps have a ``reference`` and a ``command``, as those of a
     :class:`kineverse.manipulation.session.Session`, the way of the hand and the active constraints are shown.
     """
 
-    def __init__(self, page: Viewer, speed: float = 1.0, hand: str | None = None) -> None:
-        self._page, self._speed, self._hand = page, speed, hand
+    def __init__(
+        self,
+        page: Viewer,
+        world: SimulatedWorld | None = None,
+        *,
+        speed: float = 1.0,
+        hand: str | None = None,
+    ) -> None:
+        self._page, self._world, self._speed = page, world, speed
         self._drawing = RunDrawing(page.model)
         self._layer = RunLayer(page.server, self._drawing, "run")
         self._poses = None if hand is None else FramePoses(page.model, [hand])
@@ -355,12 +364,13 @@ class LiveRun:
         self.captions: Sequence[str] = ()
 
     def __call__(self, step: RecordedStep) -> None:
-        """Show a step at the present time of its world."""
-        now, world = time.monotonic(), step.world
+        """Show a step at its time."""
+        now = time.monotonic()
         if self._speed:
-            if not self._begin or world.time / self._speed < now - self._begin:
-                self._begin = now - world.time / self._speed  # the world is late, or begins anew
-            elif (early := world.time / self._speed - (now - self._begin)) > 0.0:
+            due = step.time / self._speed
+            if not self._begin or due < now - self._begin:
+                self._begin = now - due  # the robot is late, or begins anew
+            elif (early := due - (now - self._begin)) > 0.0:
                 time.sleep(min(early, 1.0))
                 now = time.monotonic()
         if now - self._drawn >= PERIOD:
@@ -380,28 +390,29 @@ class LiveRun:
         self._layer.remove()
 
     def _draw(self, step: RecordedStep) -> None:
-        world = step.world
-        truth = world.state
-        belief = step.state if step.state is not truth else None
-        ghosts = {} if belief is None else self._drawing.find_ghosts(truth, belief)
-        lines = [*self.captions, f"{world.time:.1f} s"] + ([f"phase: {step.phase}"] if step.phase else [])
+        shown = self._shown(step)
+        ghosts = {} if step.state is shown else self._drawing.find_ghosts(shown, step.state)
+        lines = [*self.captions, f"{step.time:.1f} s"] + ([f"phase: {step.phase}"] if step.phase else [])
         active = getattr(getattr(step, "command", None), "active", ())[:_MOST_ACTIVE]
         lines += [f"limited by {', '.join(active)}"] if active else []
-        lines += format_contact_lines(world.contacts())
+        lines += [] if self._world is None else format_contact_lines(self._world.contacts())
         reference = getattr(step, "reference", None)
         way, wanted = (None, None) if reference is None else (reference.ahead, reference.pose)
         vectors = {**(getattr(step, "vectors", None) or {}), **self._find_hand_velocity(step)}
-        self._page.move(self._drawing.values(truth))
+        self._page.move(self._drawing.values(shown))
         self._layer.draw(RunMoment(ghosts, find_arrows(vectors), lines, way, wanted))
+
+    def _shown(self, step: RecordedStep) -> State:
+        return step.state if self._world is None else self._world.state
 
     def _find_hand_velocity(self, step: RecordedStep) -> Vectors:
         """Return the commanded velocity of the hand [m/s], with the hand as its origin."""
         if self._poses is None or not step.commands:
             return {}
-        model, truth = self._page.model, step.world.state
+        model, here = self._page.model, self._shown(step)
         ends = [
             self._poses.evaluate(self._drawing.values(state))[0, :3, 3]
-            for state in (truth, model.integrate(truth, step.commands, _AHEAD))
+            for state in (here, model.integrate(here, step.commands, _AHEAD))
         ]
         return {"hand": (ends[0], np.subtract(ends[1], ends[0]) / _AHEAD)}
 

@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import moved_frames
-from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot, SimulatedWorld
 from kineverse.worlds.recorder import RecordedStep
 
 from .auto_camera import TRIAL_HEIGHT, find_extreme_points
@@ -32,7 +31,7 @@ _MOVED, _ROBOT = 2.0, 1.0  # weights of the object and of the robot in the choic
 
 
 class _Still(NamedTuple):
-    truth: State
+    shown: State
     belief: State | None
     way: Floats | None
 
@@ -40,12 +39,13 @@ class _Still(NamedTuple):
 class SkillStills:
     """Stills of a robot that opens and closes objects.
 
-    A thread draws them while the robot goes on with the next object; its errors are raised by :meth:`draw`.
+    They show the true state of a simulated world, with the belief as a ghost; without a world, the belief. A
+    thread draws them while the robot goes on with the next object; its errors are raised by :meth:`draw`.
     """
 
-    def __init__(self, model: ModelView, robot: str) -> None:
-        self._model, self._robot = model, robot
-        self._drawing = RunDrawing(model)
+    def __init__(self, robot: Robot, world: SimulatedWorld | None = None) -> None:
+        self._robot, self._model, self._world = robot, robot.model, world
+        self._drawing = RunDrawing(robot.model)
         self._rows: list[Future[list[npt.NDArray[np.uint8]]]] = []
         self._drawer = ThreadPoolExecutor(1, "kineverse-stills")
         self._grasped: list[_Still] = []
@@ -56,10 +56,10 @@ class SkillStills:
 
     def watch(self, step: RecordedStep, opening: bool) -> None:
         """Keep a step of the present row: the first and last of a held handle that opens, and the last."""
-        truth = step.world.state
+        shown = step.state if self._world is None else self._world.state
         reference = getattr(step, "reference", None)
         way = None if reference is None else reference.ahead
-        self._last = _Still(truth, None if step.state is truth else step.state, way)
+        self._last = _Still(shown, None if step.state is shown else step.state, way)
         if opening and step.phase == "move":
             self._grasped = [*self._grasped[:1], self._last]
 
@@ -83,7 +83,7 @@ class SkillStills:
     def _draw_row(self, coordinate: Symbol, row: list[_Still]) -> list[npt.NDArray[np.uint8]]:
         items, poses = collect_drawables(self._model), FramePoses(self._model)
         places = [
-            dict(zip(poses.names, poses.evaluate(self._drawing.values(still.truth)), strict=True))
+            dict(zip(poses.names, poses.evaluate(self._drawing.values(still.shown)), strict=True))
             for still in row
         ]
         moved = {*moved_frames(self._model, [coordinate])[coordinate]}
@@ -91,7 +91,7 @@ class SkillStills:
         camera = _choose_camera(items, places, weights)
         images = []
         for still, place in zip(row, places, strict=True):
-            ghosts = {} if still.belief is None else self._drawing.find_ghosts(still.truth, still.belief)
+            ghosts = {} if still.belief is None else self._drawing.find_ghosts(still.shown, still.belief)
             moment = RunMoment(ghosts, {}, way=still.way)
             parts = [*items, *self._drawing.draw_ghosts(moment)]
             images.append(draw_picture(parts, place, SIZE, camera, self._drawing.draw_arrows(moment)))
@@ -100,7 +100,7 @@ class SkillStills:
     def _weigh(self, part: Drawable, moved: set[str]) -> float:
         if part.frame in moved:
             return _MOVED
-        return _ROBOT if is_of_robot(part.frame, self._robot) else 0.0
+        return _ROBOT if self._robot.owns(part.frame) else 0.0
 
 
 def _choose_camera(

@@ -1,4 +1,4 @@
-"""Worlds in which skills are tried: they know nothing of controllers (layer 5)."""
+"""Robots, their interface, and simulated worlds that know nothing of controllers (layer 5)."""
 
 from typing import TYPE_CHECKING
 
@@ -10,9 +10,19 @@ if TYPE_CHECKING:
     from .mujoco_world import MujocoWorld as MujocoWorld
     from .recorder import Recorder as Recorder
     from .recording import RunRecording as RunRecording, read_run_recording as read_run_recording
-    from .run_metrics import Judge as Judge
+    from .robot import MobileBase as MobileBase, Robot as Robot
+    from .robot_interface import Observation as Observation, RobotInterface as RobotInterface
+    from .run_metrics import (
+        PlannedContact as PlannedContact,
+        RunMetrics as RunMetrics,
+        RunOverlap as RunOverlap,
+    )
     from .sensor_sampler import SensorSampler as SensorSampler
     from .sensors import Sensors as Sensors
-    from .world import Contact as Contact, Observation as Observation, World as World
+    from .simulated_world import (
+        Contact as Contact,
+        SimulatedWorld as SimulatedWorld,
+        TrueBelief as TrueBelief,
+    )
 
 lazy_face(__name__)

@@ -12,7 +12,7 @@ frame. Only overlaps that were not there at the start count. Shapes overlap from
 - Everything else counts, a door and its own frame included, but for pairs of bodies that a rule of the scene
   or of the model excepts.
 
-Skills that look ahead, the kinematic world, judges, and the execution of unlocking plans share this
+Skills that look ahead, the kinematic world, metrics, and the execution of unlocking plans share this
 rule. The default state excuses nothing but hulls: a drawer that stands fully out of a solid box at the start
 is in its way.
 """
@@ -32,11 +32,12 @@ from kineverse.geometry.distance_queries import PairFlags, PreparedQuery, flag_b
 from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
 from kineverse.model.body import Mesh
-from kineverse.model.frame import is_of_robot
 from kineverse.model.sampling import StateSamples
 from kineverse.model.symbolic_view import cached_for_version
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
+
+from .robot import Robot
 
 OVERLAP = 5e-4  # depth from which on furniture overlaps, beyond the allowance [m]: less is resting
 
@@ -62,17 +63,23 @@ class Overlap(NamedTuple):
 class FurnitureOverlaps:
     """Overlaps of furniture in a scene, other than those at the start.
 
-    The start is the default state until :meth:`begin` is called.
+    The start is the default state until :meth:`begin` is called. Without a robot all bodies are furniture.
     """
 
-    def __init__(self, scene: Scene, robot: str) -> None:
-        self.scene, self.robot = scene, robot
-        self._objects = [v for v in scene.model.speeds if not self._is_of_robot(v.path)]
+    def __init__(self, scene: Scene, robot: Robot | None) -> None:
+        self.scene = scene
+        self._robot = robot = None if robot is None or robot.is_mechanism else robot
+        self._objects = [v for v in scene.model.speeds if robot is None or not robot.moves(v)]
         self.counting = np.ones((len(scene.bodies),) * 2, dtype=bool)
         self._query = self.watch(self._objects)
         # Scenes without rules of their own find the same.
-        plain = len(scene.rules) == len(Scene(scene.model).rules)
-        key = ("furniture overlaps", robot, *scene.bodies, len(scene.collision_world.objects))
+        plain = len(scene.rules) == len(Scene.of(scene.model).rules)
+        key = (
+            "furniture overlaps",
+            None if robot is None else robot.name,
+            *scene.bodies,
+            len(scene.collision_world.objects),
+        )
         self._by_default, self._always = (
             cached_for_version(scene.model, key, self._sample) if plain else self._sample()
         )
@@ -87,8 +94,8 @@ class FurnitureOverlaps:
         scene, counting = self.scene, self.counting.copy()
 
         def choose() -> PairFlags:
-            bodies = scene.bodies
-            furniture = np.array([not self._is_of_robot(b) for b in bodies], dtype=bool)
+            bodies, robot = scene.bodies, self._robot
+            furniture = np.array([robot is None or not robot.owns(b) for b in bodies], dtype=bool)
             flags = apply_rules(np.ones((len(bodies),) * 2, dtype=np.uint8), bodies, scene.rules)
             moved = flag_relatively_moving(scene.model, bodies, moving)
             return np.asarray(flags * moved * flag_between(furniture, furniture) * counting)
@@ -163,7 +170,7 @@ class FurnitureOverlaps:
 
         These are the bodies that are made to overlap if they do so at the start.
         """
-        scene, model = self.scene, self.scene.model
+        scene, model, robot = self.scene, self.scene.model, self._robot
         home = model.default_state()
         scene.update(home)
         default = self._measure()
@@ -176,7 +183,8 @@ class FurnitureOverlaps:
             if not always[pair]
         }
         samples = StateSamples(model, count=_SAMPLES)
-        columns = {s: samples.values_of(s) for s in scene.inputs if not self._is_of_robot(s.path)}
+        free = [s for s in scene.inputs if robot is None or not robot.moves(s)]
+        columns = {s: samples.values_of(s) for s in free}
         for k in range(samples.size):
             if not most:
                 break
@@ -220,6 +228,3 @@ class FurnitureOverlaps:
     def _has_mesh(self, code: int) -> bool:
         objects = self.scene.collision_world.objects
         return any(isinstance(objects[k].shape.geometry, Mesh) for k in self._decode(code))
-
-    def _is_of_robot(self, name: str) -> bool:
-        return bool(self.robot) and is_of_robot(name, self.robot)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,9 +21,8 @@ from kineverse._checks import as_entries
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
-from kineverse.grasping.gripper_detection import Gripper, find_grippers
+from kineverse.grasping.gripper_detection import Gripper
 from kineverse.lie import Array
-from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
@@ -32,10 +30,12 @@ from kineverse.symbols import Symbol
 from .furniture_overlaps import FurnitureOverlaps
 from .kinematic_grip import TOUCH, KinematicGrip
 from .quasistatic import ObjectMotion
+from .robot import Robot
+from .robot_interface import Observation
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
-from .speed_commands import ROUNDING, SpeedCommands, check_settings, find_robot_coordinates
-from .world import Contact, Observation
+from .simulated_world import Contact
+from .speed_commands import ROUNDING, SpeedCommands, check_settings
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class KinematicWorld:
     model
         Model of the robot and of everything that moves.
     robot
-        Prefix of the robot: coordinates and bodies below it are the robot's.
+        The robot, or the prefix of its names in the model.
     gripper
         Gripper that holds things; None for the likeliest one of the robot, if it has any.
     grasp_tolerance
@@ -87,17 +87,18 @@ class KinematicWorld:
     MissingDependencyError
         If daqp (extra ``control``) or coal (extra ``geometry``) is not installed.
     UnknownNameError
-        If no coordinate of the model is below the prefix, or it has no constraint of a name.
+        If the model has no such robot, or no constraint of a name.
     InvalidValueError
         For parameters out of their range.
     """
 
     name = "kinematic"
+    peak_force = math.nan
 
     def __init__(
         self,
         model: ModelView,
-        robot: str,
+        robot: Robot | str,
         gripper: Gripper | None = None,
         *,
         grasp_tolerance: float = 0.006,
@@ -111,10 +112,8 @@ class KinematicWorld:
     ) -> None:
         sizes = {"grasp_tolerance": grasp_tolerance, "delay": delay, "slip[0]": slip[0], "slip[1]": slip[1]}
         check_settings({"timeout": timeout}, sizes)
-        self.model, self.robot, self._version = model, robot, model.version
-        self._is_robot = partial(is_of_robot, robot=robot)
-        self.timeout = float(timeout)
-        find_robot_coordinates(model, robot)
+        self.robot = robot = Robot.of(model, robot)
+        self.model, self._version, self.timeout = model, model.version, float(timeout)
         left_out = as_entries("leave_out=", leave_out, str, "names of constraints")
         for name in left_out:
             if name not in model.constraints:
@@ -127,19 +126,19 @@ class KinematicWorld:
             )
         remarks = [f"the constraint '{name}' is left out" for name in left_out]
         if gripper is None:
-            gripper = next(iter(find_grippers(model, robot)), None)
+            gripper = next(iter(robot.grippers), None)
             remarks.append(
-                f"no gripper of '{robot}' is known, so it holds nothing"
+                f"no gripper of '{robot.name}' is known, so it holds nothing"
                 if gripper is None
                 else f"the gripper at '{gripper.hand}' holds things"
             )
         fingers = () if gripper is None else gripper.joints
-        objects = [v for v in model.speeds if not self._is_robot(v.path)]
+        objects = [v for v in model.speeds if not robot.moves(v)]
         self._motion = ObjectMotion(
             FurnitureOverlaps(scene or Scene(model), robot),
             objects,
             [s.derivative() for s in fingers],
-            self._is_robot,
+            robot,
             left_out,
         )
         remarks += [f"'{name}' is not enforced: {why}" for name, why in self._motion.skipped]
@@ -150,7 +149,7 @@ class KinematicWorld:
                 self._motion, gripper, float(grasp_tolerance), (float(slip[0]), float(slip[1])), self._report
             )
         )
-        own = [v for v in model.speeds if self._is_robot(v.path)]
+        own = robot.speeds
         columns: dict[Symbol | str, int | None] = dict.fromkeys(model.speeds)
         columns |= {v: k for k, v in enumerate(own)}
         columns |= {str(v): k for v, k in columns.items()}
@@ -168,7 +167,7 @@ class KinematicWorld:
         self.reset(model.default_state())
 
     def __repr__(self) -> str:
-        return f"<KinematicWorld of '{self.robot}' at {self.time:g} s>"
+        return f"<KinematicWorld of '{self.robot.name}' at {self.time:g} s>"
 
     # -- what there is -------------------------------------------------------------------------------------
 
@@ -212,7 +211,7 @@ class KinematicWorld:
 
     def _touched(self) -> tuple[Contact, ...]:
         if self._contacts is None:
-            result = (one if self._is_robot(one.a) else one.swap() for one in self._touching())
+            result = (one if self.robot.owns(one.a) else one.swap() for one in self._touching())
             self._contacts = tuple(map(_make_contact, result))
         return self._contacts
 
@@ -239,10 +238,9 @@ class KinematicWorld:
         self._sampler.reset()
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
-        """Advance by a duration with speeds of the robot, as :meth:`.World.apply`.
+        """Advance by a duration with speeds of the robot, as :meth:`.RobotInterface.apply`.
 
-        Fingers keep the last speed that was given, until they close on something or reach a limit. Nothing
-        has changed after an error.
+        Fingers stop at what they close on, and at their limits. Nothing has changed after an error.
         """
         self._check_version()
         end = self._commands.take(speeds, duration, stamp, self._time)

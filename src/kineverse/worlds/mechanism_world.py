@@ -12,13 +12,16 @@ from collections.abc import Collection
 
 import numpy as np
 
+from kineverse._checks import as_positive
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-from .speed_commands import check_duration, parse_speeds
-from .world import Contact, Observation
+from .robot import Robot
+from .robot_interface import Observation
+from .simulated_world import Contact
+from .speed_commands import parse_speeds
 
 _ALLOWED = 1e-7  # violation of a constraint that counts as none, in its unit
 _NO_VALUE = 1e9
@@ -37,15 +40,16 @@ class MechanismWorld:
     """
 
     name = "mechanism"
-    robot = ""
     held = None
+    peak_force = math.nan
     timeout = math.inf
     remarks: tuple[str, ...] = (
         "there are no bodies, forces or contacts: coordinates move as far as constraints allow",
     )
 
     def __init__(self, model: ModelView, jammed: Collection[Symbol | str] = ()) -> None:
-        self.model, self._symbols, self._columns = model, model.symbols, model.speeds
+        self.model, self.robot = model, Robot.of_mechanism(model)
+        self._symbols, self._columns = model.symbols, model.speeds
         self.jammed = frozenset(model.degree_of_freedom(name) for name in jammed)
         self._integrate = model.integrator()
         self._checker = model.constraint_checker((*self._symbols, *self._columns))
@@ -78,11 +82,11 @@ class MechanismWorld:
         self._q, self._time = values.vector(self._symbols), 0.0
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
-        """Advance by a duration with speeds of the coordinates, as :meth:`.World.apply`.
+        """Advance by a duration with speeds of the coordinates, as :meth:`.RobotInterface.apply`.
 
         The stamp is not read.
         """
-        length = check_duration(duration)
+        length = as_positive(duration, "A duration", "number of seconds")
         v = parse_speeds(speeds, self._place, np.zeros(len(self._columns)))
         after = self._advance(self._q, v, length)
         if after is None:

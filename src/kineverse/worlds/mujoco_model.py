@@ -21,6 +21,7 @@ from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 
 from .mujoco_state import MujocoCoordinates
+from .robot import Robot
 
 CURVE_TOLERANCE = 0.01  # largest error of a joint on a curve, which MuJoCo has as a polynomial [m], [rad]
 _DRAWER = 3.0, 5.0
@@ -168,7 +169,7 @@ def add_contact_rules(
     model: ModelView,
     fingers: Iterable[Sequence[str]],
     friction: float,
-    is_robot: Callable[[str], bool],
+    robot: Robot,
     remark: Callable[[str], None],
 ) -> None:
     """Set the stiffness of constraints and exclude the pairs of bodies that do not collide.
@@ -190,8 +191,8 @@ def add_contact_rules(
     # Pairs that may touch are listed one by one; MuJoCo would leave out a door with a frame that moves.
     option.disableflags |= engine.mjtDisableBit.mjDSBL_FILTERPARENT
     bodies = [body.name for body in spec.bodies if body.geoms and body.name in model.frames]
-    furniture = np.array([not is_robot(name) for name in bodies], dtype=bool)
-    rules, objects = read_rules(model), [v for v in model.speeds if not is_robot(v.path)]
+    furniture = np.array([not robot.owns(name) for name in bodies], dtype=bool)
+    rules, objects = read_rules(model), [v for v in model.speeds if not robot.moves(v)]
     moved = flag_relatively_moving(model, bodies, objects)
     checked = np.where(
         flag_between(furniture, furniture),

@@ -17,7 +17,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-from .world import Contact
+from .simulated_world import Contact
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 

@@ -12,9 +12,8 @@ import numpy as np
 from kineverse._checks import finite_number
 from kineverse.errors import InvalidValueError, SimulationError, UnknownNameError, suggest
 from kineverse.formats.mjcf.mujoco_api import mujoco
-from kineverse.grasping.gripper_detection import Gripper, find_grippers
+from kineverse.grasping.gripper_detection import Gripper
 from kineverse.lie import Array
-from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
@@ -24,10 +23,12 @@ from .mujoco_gripper import GripperDrive
 from .mujoco_model import add_floor
 from .mujoco_servos import BANDWIDTH, JointServos, SpeedMap, base_coordinates
 from .mujoco_state import MujocoContacts, MujocoCoordinates
+from .robot import Robot
+from .robot_interface import Observation
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
-from .speed_commands import ROUNDING, SpeedCommands, check_settings, find_robot_coordinates
-from .world import Contact, Observation
+from .simulated_world import Contact
+from .speed_commands import ROUNDING, SpeedCommands, check_settings
 
 _MARGIN = 10.0
 _UNSTATED = 1.0  # limit of a speed that states none [m/s], [rad/s]: walking pace
@@ -48,6 +49,7 @@ class SimulationBounds:
         coordinates: MujocoCoordinates,
         model: ModelView,
         efforts: Mapping[Symbol, float],
+        robot: Robot,
         is_robot: Callable[[str], bool],
     ) -> None:
         engine, data = mujoco(), mujoco().MjData(compiled)
@@ -57,7 +59,7 @@ class SimulationBounds:
         of_robot = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
         limits, base = np.zeros(compiled.nv), np.zeros(compiled.nv)
         for symbol, dof in coordinates.dof.items():
-            if of_robot[compiled.dof_bodyid[dof]]:
+            if robot.moves(symbol):
                 limit = float(np.abs(model.limits(symbol.derivative())).min())
                 limits[dof] = limit if 0.0 < limit < math.inf else _UNSTATED
         for symbol in base_coordinates(model) & coordinates.dof.keys():
@@ -138,7 +140,7 @@ class MujocoWorld:
     FormatError
         Naming all motions of the model that MuJoCo cannot represent.
     UnknownNameError
-        If nothing of the model is below the prefix, or no furniture has a coordinate of ``door_friction``.
+        If the model has no such robot, or no furniture has a coordinate of ``door_friction``.
     InvalidValueError
         For parameters out of their range.
     """
@@ -148,7 +150,7 @@ class MujocoWorld:
     def __init__(
         self,
         model: ModelView,
-        robot: str,
+        robot: Robot | str,
         gripper: Gripper | None = None,
         *,
         step: float = 0.002,
@@ -169,14 +171,14 @@ class MujocoWorld:
         check_settings(positive, {"friction": friction, "delay": delay})
         if grasp not in _GRASPS:
             raise InvalidValueError(f"'grasp' of a world is 'friction' or 'tie', not {grasp!r}.")
-        self.model, self.robot = model, robot
+        self.robot = robot = Robot.of(model, robot)
+        self.model = model
         self._step, self.timeout = float(step), float(timeout)
         self._remarks: dict[str, None] = {}
-        coordinates = find_robot_coordinates(model, robot)
-        furniture = [s.path for s in model.degrees_of_freedom if not self._is_robot(s.path)]
+        furniture = [s.path for s in model.degrees_of_freedom if not robot.moves(s)]
         frictions = _friction_by_name(door_friction or {}, furniture)
         if gripper is None:
-            gripper = next(iter(find_grippers(model, robot)), None)
+            gripper = next(iter(robot.grippers), None)
         fingers = () if gripper is None else gripper.fingers
         spec = mujoco_model.export_spec(model, leave_out, self._remark)
         spec.option.timestep = self._step
@@ -185,11 +187,11 @@ class MujocoWorld:
         compiled = mujoco_model.compile_world(spec)
         mujoco_model.add_joint_friction(spec, compiled, furniture, frictions, self._remark)
         mujoco_model.add_tipping_springs(spec, model, self._remark)
-        mujoco_model.add_contact_rules(spec, model, fingers, friction, self._is_robot, self._remark)
+        mujoco_model.add_contact_rules(spec, model, fingers, friction, robot, self._remark)
         for body in spec.bodies:
             if self._is_robot(body.name):
                 body.gravcomp = 1.0
-        self._remark(f"gravity does not act on '{robot}': its servos are taken to carry the weight")
+        self._remark(f"gravity does not act on '{robot.name}': its servos are taken to carry the weight")
         compiled = mujoco_model.compile_world(spec)
         self._coordinates = MujocoCoordinates(model, compiled)
         pairs = mujoco_model.exclude_overlaps(
@@ -207,15 +209,15 @@ class MujocoWorld:
         compiled = mujoco_model.compile_world(spec)
         self._drive = None
         if gripper is None:
-            self._remark(f"no gripper of '{robot}' is known, so it holds nothing")
+            self._remark(f"no gripper of '{robot.name}' is known, so it holds nothing")
         else:
             self._drive = GripperDrive(
                 spec, compiled, self._coordinates, gripper, grip, self._step, grasp == "tie", self._remark
             )
             compiled = mujoco_model.compile_world(spec)
         held = () if self._drive is None else self._drive.coordinates
-        driven = [s for s in coordinates if s in self._coordinates.address and s not in held]
-        idle = [str(s) for s in coordinates if s not in self._coordinates.address]
+        driven = [s for s in robot.coordinates if s in self._coordinates.address and s not in held]
+        idle = [str(s) for s in robot.coordinates if s not in self._coordinates.address]
         if idle:
             self._remark(
                 f"no servo drives {', '.join(idle)}: each is not the position of one joint in MuJoCo"
@@ -232,7 +234,7 @@ class MujocoWorld:
         self._contacts = MujocoContacts(self._compiled, self._is_robot, fingers)
         self._servos.connect(self._compiled)
         self._bounds = SimulationBounds(
-            self._compiled, self._coordinates, model, self._servos.efforts, self._is_robot
+            self._compiled, self._coordinates, model, self._servos.efforts, robot, self._is_robot
         )
         if self._drive is not None:
             self._drive.connect(self._compiled, self._contacts, seed)
@@ -246,7 +248,7 @@ class MujocoWorld:
         self.reset(model.default_state())
 
     def __repr__(self) -> str:
-        return f"<MujocoWorld of '{self.robot}' at {self.time:g} s>"
+        return f"<MujocoWorld of '{self.robot.name}' at {self.time:g} s>"
 
     @property
     def time(self) -> float:
@@ -299,7 +301,7 @@ class MujocoWorld:
         self._sampler.reset()
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
-        """Advance by a duration with speeds of the robot, as :meth:`.World.apply`.
+        """Advance by a duration with speeds of the robot, as :meth:`.RobotInterface.apply`.
 
         The world stops at the first time step that is not before the end. Once both fingers touch one body
         they press it with the world's force, until a speed opens them.
@@ -368,7 +370,8 @@ class MujocoWorld:
         self._ticks += 1
 
     def _is_robot(self, name: str) -> bool:
-        return is_of_robot(name, self.robot)
+        """Return whether a body in MuJoCo is the robot's: of a frame's several ones most have a number."""
+        return self.robot.owns(name) or self.robot.owns(name.rpartition("/")[0])
 
     def _remark(self, text: str) -> None:
         self._remarks[text] = None

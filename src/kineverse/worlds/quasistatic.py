@@ -51,6 +51,7 @@ from .quasistatic_constraints import (
     pair_keys,
     project_twists,
 )
+from .robot import Robot
 
 SKIN = 1e-6  # gap to which objects are pushed [m]: below, normals of nearest points are not determined
 _REACH = 0.005  # distance beyond the robot's motion up to which gaps are rows [m]
@@ -74,7 +75,7 @@ class ObjectMotion:
         overlaps: FurnitureOverlaps,
         speeds: Sequence[Symbol],
         fingers: Sequence[Symbol],
-        is_robot: Callable[[str], bool],
+        robot: Robot,
         leave_out: Collection[str] = (),
     ) -> None:
         scene: Scene = overlaps.scene
@@ -85,20 +86,20 @@ class ObjectMotion:
         self._place = {s: k for k, s in enumerate(self.symbols)}
         self.q: Array = model.default_state().vector(self.symbols)
         motion = FrameDependence(model, speeds)
-        self.robot_bodies = tuple(b for b in scene.bodies if is_robot(b))
-        self.object_bodies = tuple(b for b in scene.bodies if not is_robot(b) and motion.moves(b))
+        self.robot_bodies = tuple(b for b in scene.bodies if robot.owns(b))
+        self.object_bodies = tuple(b for b in scene.bodies if not robot.owns(b) and motion.moves(b))
         self._penetrated: dict[tuple[int, ...], Array] = {}
         self._before: dict[tuple[int, ...], float] = {}
         self._query = scene.watch(self.robot_bodies, self.object_bodies, per_shape=True)
         self._ignored = np.zeros((len(scene.bodies),) * 2, dtype=bool)
         self._inputs = self._indices(scene.inputs)
         owners = scene.collision_world.table.body
-        moving = np.array([is_robot(b) for b in scene.bodies], dtype=bool)
+        moving = np.array([robot.owns(b) for b in scene.bodies], dtype=bool)
         self._robot_objects = np.flatnonzero(moving[owners[: scene.collision_world.table.moving]])
         self._robot_owners = owners[self._robot_objects]
         self._compile_twists(model)
         self._integrate = model.integrator(speeds, self.symbols)
-        self._limits = ObjectLimits(model, speeds, is_robot, leave_out)
+        self._limits = ObjectLimits(model, speeds, robot, leave_out)
         self.skipped = self._limits.skipped
         self._furniture = FurnitureContacts(
             overlaps, speeds, self.group, self._evaluate_twists, self._limits.link

@@ -25,6 +25,7 @@ from kineverse.model.velocity_constraints.velocity_rows import Recovery, Velocit
 from kineverse.symbols import Symbol
 
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps
+from .robot import Robot
 
 JAM = 0.5  # cosine of the angle between a normal and the motion that it causes, below which a contact jams
 _PARALLEL = 1e-3  # least eigenvalue of directions of motion that are not parallel
@@ -87,7 +88,7 @@ class ObjectLimits:
         self,
         model: ModelView,
         speeds: Sequence[Symbol],
-        is_robot: Callable[[str], bool],
+        robot: Robot,
         leave_out: Collection[str] = (),
     ) -> None:
         # Those of the robot alone have no entries in the columns, and are no rows.
@@ -105,7 +106,7 @@ class ObjectLimits:
         ]
         skipped = [(n, "accelerations are not limited") for n, c in kept.items() if c.order > 1]
         skipped += [pair for each in rows for pair in each.skipped if pair[1] not in _HARMLESS]
-        others = {n for n, c in kept.items() if not all(is_robot(s.path) for s in c.symbols)}
+        others = {n for n, c in kept.items() if not all(robot.moves(s) for s in c.symbols)}
         self.skipped = tuple(pair for pair in skipped if pair[0] in others)
         place = {s: k for k, s in enumerate(model.symbols)}
         self._positions, self._rates = (

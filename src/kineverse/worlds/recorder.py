@@ -1,9 +1,10 @@
-"""Recorder of runs in a world, as MCAP files with JSON messages.
+"""Recorder of runs, as MCAP files with JSON messages.
 
-Topics and their messages, times in [s] of the world:
+Topics and their messages, times in [s] of the robot:
 
 - ``/model``: the model as a native document, once
-- ``/state``, ``/belief``: ``stamp``, ``values`` by name; the belief also ``poses`` (4×4) by frame
+- ``/state``, the truth of a simulated world: ``stamp``, ``values`` by name
+- ``/belief``: the same, and ``poses`` (4×4) by frame
 - ``/command``: ``stamp``, ``speeds`` by name
 - ``/contacts``: ``stamp``, ``contacts`` with ``a``, ``b``, ``point``, ``normal``, ``distance``, ``force``
 - ``/observation``: ``stamp``, ``joints`` by name, ``poses`` (4×4) by frame, ``touching``
@@ -34,7 +35,8 @@ from kineverse.formats.document.writer import to_json
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 
-from .world import Contact, Observation, World
+from .robot_interface import Observation
+from .simulated_world import Contact, SimulatedWorld
 
 PROFILE = "kineverse"  # profile in the header of a recording
 
@@ -86,8 +88,8 @@ class RecordedStep(Protocol):
     """
 
     @property
-    def world(self) -> World:
-        """The world."""
+    def time(self) -> float:
+        """The time of the robot after the step [s]."""
 
     @property
     def state(self) -> State:
@@ -108,15 +110,20 @@ class Recorder:
     What was written up to half a second before the end can be read even if the process is killed. Use it as a
     context, or call :meth:`close`. It is a callable for the steps of a session::
 
-        with Recorder("run.mcap", world.model) as recorder:
+        with Recorder("run.mcap", world.model, world=world) as recorder:
             session = Session(world, on_step=recorder)
 
     Parameters
     ----------
     path
         Path that ends in ``.mcap``; an existing file is replaced.
+    model
+        Model of the robot and of everything around it.
     about
         Texts to keep, such as the robot, the world and the sensors.
+    world
+        Simulated world whose true states and contacts are written with each step of a session; None for a
+        robot of which nobody knows the truth, and for callers that write everything themselves.
 
     Raises
     ------
@@ -128,9 +135,14 @@ class Recorder:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], model: ModelView, about: Mapping[str, str] | None = None
+        self,
+        path: str | os.PathLike[str],
+        model: ModelView,
+        about: Mapping[str, str] | None = None,
+        *,
+        world: SimulatedWorld | None = None,
     ) -> None:
-        self.path = Path(path)
+        self.path, self._world = Path(path), world
         check_recording_name(path)
         document = to_json(model).encode()
         writer = import_mcap("mcap.writer")
@@ -214,16 +226,18 @@ class Recorder:
         self._send("/outcome", self._time, json.dumps(content, allow_nan=False).encode())
 
     def __call__(self, step: RecordedStep) -> None:
-        """Write everything of a step of a session at the present time of its world."""
-        world, now = step.world, step.world.time
-        truth = world.state
+        """Write everything of a step of a session at its time."""
+        now, world = step.time, self._world
+        truth = None if world is None else world.state
         if step.phase != self._phase:
             self.write_phase(now, step.phase)
-        self.write_state(now, truth)
-        if step.state is not truth and dict(step.state) != dict(truth):
+        if truth is not None:
+            self.write_state(now, truth)
+        if truth is None or (step.state is not truth and dict(step.state) != dict(truth)):
             self.write_belief(now, step.state)
         self.write_command(now, step.commands)
-        self.write_contacts(now, world.contacts())
+        if world is not None:
+            self.write_contacts(now, world.contacts())
         if isinstance(observation := getattr(step, "observation", None), Observation):
             self.write_observation(now, observation)
         if vectors := getattr(step, "vectors", None):

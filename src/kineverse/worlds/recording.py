@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 import os
 import struct
 import zlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
+import msgspec
 import numpy as np
 
 from kineverse.errors import (
@@ -33,7 +33,8 @@ from kineverse.state import State
 from kineverse.symbols import Symbol, parse_symbol_name
 
 from .recorder import TOPICS, import_mcap
-from .world import Contact, Observation
+from .robot_interface import Observation
+from .simulated_world import Contact
 
 MAX_CHUNK = 1 << 28  # largest chunk [byte], uncompressed
 MAX_TOTAL = 1 << 30  # largest content of a file [byte], uncompressed
@@ -79,6 +80,11 @@ class McapFile:
                 self._read_record(code, body)
         if finished and not self.complete:
             raise self._damaged("the records end without an end of data")
+
+    def find(self, topic: str) -> list[McapMessage]:
+        """Return the messages of a topic of a recording: those of its schema, as JSON."""
+        kind = "json", f"kineverse.{TOPICS[topic][0]}"
+        return [m for m in self.messages if m.topic == topic and (m.encoding, m.schema) == kind]
 
     def _split(self, data: memoryview, finished: bool) -> Iterator[tuple[int, bytes]]:
         """Yield the code and body of records; of a cut file, those that are whole."""
@@ -230,14 +236,15 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunRecording:
-    """Run in a world.
+    """Run of a robot.
 
     Attributes
     ----------
     path
         File that it was read from.
     states, beliefs, commands
-        True state, believed state, and commanded speeds over time.
+        True state, believed state, and commanded speeds over time. There are no true states of a robot of
+        which nobody knows the truth.
     belief_poses
         World poses (4, 4) by frame that the believed values alone do not give.
     contacts
@@ -271,13 +278,18 @@ class RunRecording:
     complete: bool = True
 
     @property
+    def motion(self) -> ValuesOverTime:
+        """The true states; without any, the believed ones."""
+        return self.states if len(self.states) else self.beliefs
+
+    @property
     def times(self) -> Array:
-        """Times (T,) of the true states [s]."""
-        return self.states.times
+        """Times (T,) of the states [s]."""
+        return self.motion.times
 
     @property
     def duration(self) -> float:
-        """Time of the last true state [s]."""
+        """Time of the last state [s]."""
         return float(self.times[-1]) if len(self.times) else 0.0
 
     def __repr__(self) -> str:
@@ -306,34 +318,39 @@ def read_run_recording(
     """
     path = Path(path)
     file = McapFile(path)
-    by_topic: dict[str, list[McapMessage]] = {topic: [] for topic in TOPICS}
-    for message in file.messages:
-        known = TOPICS.get(message.topic)
-        if known is not None and message.schema == f"kineverse.{known[0]}" and message.encoding == "json":
-            by_topic[message.topic].append(message)
-    if not by_topic["/model"]:
+    models = file.find("/model")
+    if not models:
         topics = sorted({message.topic for message in file.messages})
         text = f"its topics are {', '.join(topics[:12])}" if topics else "it has no messages"
         raise FormatError(
             f"{path.name}: no recording of a world, which has a /model of the schema kineverse.Model; {text}"
             f"{'' if file.complete else '; the file was cut'}."
         )
-    model = _read_model(by_topic["/model"][0].data, path, root)
-    decoder = _Decoder(path.name, model)
-    beliefs = decoder.decode(by_topic["/belief"], decoder.belief)
-    outcomes = by_topic["/outcome"]
+    model = _read_model(models[0].data, path, root)
+    decoder = _Decoder(file, path.name, model)
+    decode, name_values = decoder.decode, decoder.name_values
+    beliefs = [(time, name_values(m.values), _as_arrays(m.poses)) for time, m in decode("/belief", _Belief)]
+    outcomes = [content for _, content in decode("/outcome", dict[str, Any])]
     return RunRecording(
         path,
         model,
-        _tabulate(decoder.decode(by_topic["/state"], decoder.named_values("values")), path.name),
-        _tabulate([(time, values) for time, (values, _) in beliefs], path.name),
-        _tabulate(decoder.decode(by_topic["/command"], decoder.named_values("speeds")), path.name),
-        _as_recorded([(time, poses) for time, (_, poses) in beliefs]),
-        _as_recorded(decoder.decode(by_topic["/contacts"], decoder.contacts)),
-        _as_recorded(decoder.decode(by_topic["/observation"], decoder.observation)),
-        _as_recorded(decoder.decode(by_topic["/phase"], lambda content: decoder.text(content, "phase"))),
-        _as_recorded(decoder.decode(by_topic["/controller"], decoder.vectors)),
-        decoder.parse(outcomes[-1]) if outcomes else None,
+        _tabulate([(time, name_values(m.values)) for time, m in decode("/state", _State)], path.name),
+        _tabulate([(time, values) for time, values, _ in beliefs], path.name),
+        _tabulate([(time, name_values(m.speeds)) for time, m in decode("/command", _Command)], path.name),
+        _as_recorded((time, poses) for time, _, poses in beliefs),
+        _as_recorded(
+            (time, tuple(map(_make_contact, m.contacts))) for time, m in decode("/contacts", _Contacts)
+        ),
+        _as_recorded(
+            (time, Observation(m.stamp, name_values(m.joints), _as_arrays(m.poses), frozenset(m.touching)))
+            for time, m in decode("/observation", _Readings)
+        ),
+        _as_recorded((time, m.phase) for time, m in decode("/phase", _Phase)),
+        _as_recorded(
+            (time, {name: (np.array(one.origin), np.array(one.vector)) for name, one in m.vectors.items()})
+            for time, m in decode("/controller", _Controller)
+        ),
+        outcomes[-1] if outcomes else None,
         file.metadata.get("run", {}),
         file.complete,
     )
@@ -366,126 +383,93 @@ def _tabulate(rows: Sequence[tuple[float, dict[Symbol, float]]], source: str) ->
     )
 
 
-def _as_recorded(rows: Sequence[tuple[float, Any]]) -> Recorded:
+def _as_recorded(rows: Iterable[tuple[float, Any]]) -> Recorded:
     ordered = sorted(rows, key=lambda row: row[0])
     return Recorded(np.array([time for time, _ in ordered], dtype=float), tuple(one for _, one in ordered))
+
+
+_Vector: TypeAlias = tuple[float, float, float]
+_Row: TypeAlias = tuple[float, float, float, float]
+_Poses: TypeAlias = dict[str, tuple[_Row, _Row, _Row, _Row]]
+
+
+class _State(msgspec.Struct):
+    values: dict[str, float]
+
+
+class _Belief(_State):
+    poses: _Poses
+
+
+class _Command(msgspec.Struct):
+    speeds: dict[str, float]
+
+
+class _Touch(msgspec.Struct):
+    a: str
+    b: str
+    point: _Vector
+    normal: _Vector
+    distance: float
+    force: float | None = None
+
+
+class _Contacts(msgspec.Struct):
+    contacts: list[_Touch]
+
+
+class _Readings(msgspec.Struct):
+    stamp: float
+    joints: dict[str, float]
+    poses: _Poses
+    touching: list[str]
+
+
+class _Phase(msgspec.Struct):
+    phase: str
+
+
+class _Arrow(msgspec.Struct):
+    origin: _Vector
+    vector: _Vector
+
+
+class _Controller(msgspec.Struct):
+    vectors: dict[str, _Arrow]
 
 
 class _Decoder:
     """Decoder of the messages of one file, which checks all types, shapes and numbers."""
 
-    def __init__(self, source: str, model: Snapshot) -> None:
-        self._source, self._place = source, ""
+    def __init__(self, file: McapFile, source: str, model: Snapshot) -> None:
+        self._file, self._source, self._place = file, source, ""
         self._symbols: dict[str, Symbol] = {str(s): s for s in (*model.speeds, *model.default_state())}
 
-    def decode(
-        self, messages: Sequence[McapMessage], read: Callable[[dict[str, Any]], Entry]
-    ) -> list[tuple[float, Entry]]:
-        """Return what is read of each message, with its log time [s]."""
-        return [(message.time, read(self.parse(message))) for message in messages]
+    def decode(self, topic: str, kind: type[Entry]) -> Iterator[tuple[float, Entry]]:
+        """Yield the messages of a topic with their log times [s]."""
+        decoder = msgspec.json.Decoder(kind)
+        for message in self._file.find(topic):
+            self._place = f"{self._source}: {topic} at {message.time:.3f} s"
+            try:
+                content = decoder.decode(message.data)
+            except (ValueError, RecursionError) as error:
+                raise FormatError(f"{self._place}: {error}.") from None
+            yield message.time, content
 
-    def parse(self, message: McapMessage) -> dict[str, Any]:
-        self._place = f"{message.topic} at {message.time:.3f} s"
-        try:
-            content = json.loads(message.data, parse_constant=self._no_constant)
-        except (ValueError, RecursionError) as error:
-            if isinstance(error, FormatError):
-                raise
-            self._refuse(f"not JSON: {str(error)[:200]}")
-        if not isinstance(content, dict):
-            self._refuse("not an object")
-        return content
-
-    def _no_constant(self, text: str) -> NoReturn:
-        self._refuse(f"{text} is no number")
-
-    def _refuse(self, reason: str) -> NoReturn:
-        raise FormatError(f"{self._source}: {self._place}: {reason}.")
-
-    def _member(self, content: dict[str, Any], key: str, kind: type[Entry]) -> Entry:
-        value = content.get(key)
-        if not isinstance(value, kind):
-            noun = "an object" if issubclass(kind, dict) else "a list" if issubclass(kind, list) else "a text"
-            self._refuse(f"'{key}' is {noun}, not {value!r:.60}")
-        return value
-
-    def _number(self, value: object, key: str) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            self._refuse(f"'{key}' has {value!r:.60}, which is no number")
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if not math.isfinite(number):
-            self._refuse(f"'{key}' has a number that is not finite")
-        return number
-
-    def _array(self, value: object, key: str, shape: tuple[int, ...]) -> Array:
-        if not isinstance(value, list) or len(value) != shape[0]:
-            self._refuse(f"'{key}' has an array of another shape than {shape}")
-        if len(shape) > 1:
-            return np.array([self._array(row, key, shape[1:]) for row in value])
-        return np.array([self._number(number, key) for number in value])
-
-    def _symbol(self, name: str) -> Symbol:
-        """Return the symbol of a name; a belief may have others than the model."""
-        if name not in self._symbols:
+    def name_values(self, values: Mapping[str, float]) -> dict[Symbol, float]:
+        """Return values by symbol; a belief may have others than the model."""
+        for name in values.keys() - self._symbols.keys():
             try:
                 self._symbols[name] = Symbol(*parse_symbol_name(name))
             except ExpressionError as error:
-                self._refuse(f"{name!r:.80} is no name of a symbol: {error}")
-        return self._symbols[name]
+                raise FormatError(f"{self._place}: {name!r:.80} is no name of a symbol: {error}.") from None
+        return {self._symbols[name]: value for name, value in values.items()}
 
-    def named_values(self, key: str) -> Callable[[dict[str, Any]], dict[Symbol, float]]:
-        def read(content: dict[str, Any]) -> dict[Symbol, float]:
-            members = self._member(content, key, dict)
-            return {self._symbol(name): self._number(value, key) for name, value in members.items()}
 
-        return read
+def _as_arrays(poses: _Poses) -> dict[str, Array]:
+    return {name: np.array(rows) for name, rows in poses.items()}
 
-    def belief(self, content: dict[str, Any]) -> tuple[dict[Symbol, float], dict[str, Array]]:
-        return self.named_values("values")(content), self.poses(content, "poses")
 
-    def text(self, content: dict[str, Any], key: str) -> str:
-        return self._member(content, key, str)
-
-    def poses(self, content: dict[str, Any], key: str) -> dict[str, Array]:
-        members = self._member(content, key, dict)
-        return {name: self._array(rows, key, (4, 4)) for name, rows in members.items()}
-
-    def contacts(self, content: dict[str, Any]) -> tuple[Contact, ...]:
-        result = []
-        for one in self._member(content, "contacts", list):
-            if not isinstance(one, dict):
-                self._refuse(f"{one!r:.60} is no contact")
-            force = one.get("force")
-            result.append(
-                Contact(
-                    self.text(one, "a"),
-                    self.text(one, "b"),
-                    self._array(one.get("point"), "point", (3,)),
-                    self._array(one.get("normal"), "normal", (3,)),
-                    self._number(one.get("distance"), "distance"),
-                    math.nan if force is None else self._number(force, "force"),
-                )
-            )
-        return tuple(result)
-
-    def observation(self, content: dict[str, Any]) -> Observation:
-        touching = self._member(content, "touching", list)
-        if not all(isinstance(name, str) for name in touching):
-            self._refuse("'touching' is a list of names")
-        return Observation(
-            self._number(content.get("stamp"), "stamp"),
-            self.named_values("joints")(content),
-            self.poses(content, "poses"),
-            frozenset(touching),
-        )
-
-    def vectors(self, content: dict[str, Any]) -> dict[str, tuple[Array, Array]]:
-        result = {}
-        for name, one in self._member(content, "vectors", dict).items():
-            if not isinstance(one, dict):
-                self._refuse(f"{one!r:.60} is no vector")
-            result[name] = tuple(self._array(one.get(key), key, (3,)) for key in ("origin", "vector"))
-        return result  # type: ignore[return-value]
+def _make_contact(one: _Touch) -> Contact:
+    force = math.nan if one.force is None else one.force
+    return Contact(one.a, one.b, np.array(one.point), np.array(one.normal), one.distance, force)

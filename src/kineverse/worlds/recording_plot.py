@@ -26,8 +26,8 @@ def plot_recording(recording: RunRecording | str | os.PathLike[str], figure: Can
     """Draw a recorded run on an empty figure.
 
     The plots are: coordinates of the objects in truth, and dashed as they are believed; commanded speeds;
-    contacts between bodies. Bands are the phases. Without a robot's name in ``about``, a coordinate counts as
-    the robot's if a speed was commanded below the same prefix.
+    contacts between bodies. Without a truth all are as believed. Bands are the phases. Without a robot's name
+    in ``about``, a coordinate counts as the robot's if a speed was commanded below the same prefix.
     """
     if not isinstance(recording, RunRecording):
         recording = read_run_recording(recording)
@@ -35,10 +35,10 @@ def plot_recording(recording: RunRecording | str | os.PathLike[str], figure: Can
     robots = _robots(recording)
     objects = [
         str(s)
-        for s in recording.states.symbols
+        for s in recording.motion.symbols
         if s.role == "dof" and not s.order and not any(is_of_robot(s.path, robot) for robot in robots)
     ]
-    _draw_values(above, recording.states, objects, recording.beliefs)
+    _draw_values(above, recording.motion, objects, recording.beliefs)
     above.set_ylabel("object [rad], [m]")
     _draw_values(middle, recording.commands, list(map(str, recording.commands.symbols)))
     middle.set_ylabel("speed [rad/s], [m/s]")

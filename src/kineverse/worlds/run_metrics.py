@@ -1,4 +1,4 @@
-"""Judge of a run: measurements in the true states of a world, independent of the skill and of the world.
+"""Metrics of a run in the true states of a simulated world, independent of the skill and of its belief.
 
 - *limit violation*: largest excess of any constraint of the model. Positions are those of the states, speeds
   are differences of successive states by time; commanded speeds stand in where no coordinate is the integral
@@ -8,7 +8,8 @@
   pairs, which are listed. Of furniture that overlapped at the start, it is the depth beyond what is allowed
   by :class:`.FurnitureOverlaps`.
 - *overlap*: a penetration beyond 0.5 mm that came on the way.
-- *contact losses*: number of times that the robot touched the object and then did not, while pushing.
+- *contact losses*: number of times that the robot touched the object and then did not, while the skill
+  believed that it touches.
 - *grasp error*: largest motion of the held body in the hand since the hold began, in the middle between the
   fingers.
 - *jitter*: root mean square over time of the norm of the second differences of commanded speeds,
@@ -20,29 +21,507 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import as_count, finite_number
-from kineverse.compilation import CompiledFunction, compile
+from kineverse._checks import as_count
+from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.distance_queries import PreparedQuery
 from kineverse.grasping.gripper_detection import Gripper
 from kineverse.lie import Array, inverse, rotation_angle
-from kineverse.model.frame import is_of_robot
+from kineverse.model.frame import WORLD
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
-from kineverse.state import State, StateLike
+from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps
+from .simulated_world import SimulatedWorld
+
+CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
+
+_STILL = 5e-3
+_ROUNDING = 1e-9  # depth that is nothing but rounding [m]
+_TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap [m]
 
 
-class LimitJudge:
+class PlannedContact(NamedTuple):
+    """Contact that a skill plans: the depth of these bodies is no overlap."""
+
+    pusher: tuple[str, ...]  # bodies of the robot
+    pushed: tuple[str, ...]  # bodies of the object
+    touching: bool  # whether the skill believes that they touch
+
+
+class MeasuredStep(Protocol):
+    """Step of a skill, as :class:`kineverse.manipulation.session.Session` has it."""
+
+    @property
+    def commands(self) -> Mapping[Symbol, float]:
+        """The speeds of the step."""
+
+    @property
+    def state(self) -> State:
+        """The believed state."""
+
+    @property
+    def contact(self) -> PlannedContact | None:
+        """The contact that is planned; None without any."""
+
+
+class RunOverlap(NamedTuple):
+    """Overlap that came in a run."""
+
+    a: str  # names of the bodies
+    b: str
+    depth: float  # largest depth [m]
+    value: float  # value of the measured coordinate at which it came [m], [rad]; NaN without a coordinate
+    time: float  # stamp of the state in which it came [s]
+
+    def __str__(self) -> str:
+        where = "" if math.isnan(self.value) else f", from {self.value:.3f} on"
+        return f"On the way '{self.a}' and '{self.b}' overlapped by {1e3 * self.depth:.3g} mm{where}."
+
+
+class RunMetrics:
+    """Measures of a run in the true states of a simulated world, which no skill knows.
+
+    They begin at the present state of the world. It is a callable for the steps of a session, and skips those
+    in which the world's time stands still::
+
+        metrics = RunMetrics(world, coordinate)
+        session = Session(world, on_step=metrics)
+
+    Parameters
+    ----------
+    world
+        Simulated world, with a robot or without.
+    coordinate
+        Coordinate of the object, whose true value is noted where an overlap occurs, and compared with the
+        believed one.
+    gripper
+        Gripper that grasps or pushes; its bodies may touch the handle, and its hand is followed.
+    handle
+        Body that is grasped or pushed. Contacts with all bodies that move with it are counted; without a
+        handle, contacts with what a skill plans to push.
+    part, point
+        Frame whose true motion is measured, such as that of a part with an unknown joint, and a point in it
+        (3,) [m].
+    start
+        Earlier state in which furniture may have overlapped, such as the one before it was opened.
+    rules
+        Further rules about pairs of bodies that do not collide, as for :class:`kineverse.geometry.Scene`.
+    leave_out
+        Bodies that are not measured.
+    every
+        Number of steps from one search of penetrations to the next.
+    contact_gap
+        Largest gap of a contact [m].
+
+    Raises
+    ------
+    UnknownNameError
+        If the handle is no body with shapes, or the model has no such part.
+    InvalidValueError
+        For a point that is none, or a number of steps below 1.
+    """
+
+    def __init__(
+        self,
+        world: SimulatedWorld,
+        coordinate: Symbol | None = None,
+        *,
+        gripper: Gripper | None = None,
+        handle: str | None = None,
+        part: str | None = None,
+        point: npt.ArrayLike = (0.0, 0.0, 0.0),
+        start: State | None = None,
+        rules: Iterable[Rule] = (),
+        leave_out: Iterable[str] = (),
+        every: int = 1,
+        contact_gap: float = CONTACT_GAP,
+    ) -> None:
+        model, robot = world.model, world.robot
+        self._world, self._model, self._coordinate = world, model, coordinate
+        self._gripper, self._every, self._symbols = gripper, as_count("every=", every, 1), model.symbols
+        self._bodies: _BodyMetrics | None = None
+        # Mechanisms without shapes do not need the extra for geometry.
+        if handle is not None or any(body.collisions or body.visuals for body in model.bodies.values()):
+            scene = Scene(model, rules=rules, leave_out=leave_out)
+            self._bodies = _BodyMetrics(world, gripper, handle, start, scene, contact_gap)
+        self._limits = _LimitExcess(model, robot.speeds)
+        self._speed_place = {v: k for k, v in enumerate(robot.speeds)}
+        self._places = [self._compile_pose(frame) for frame in self._find_followed()]
+        self._part = None if part is None else self._compile_pose(part)
+        self._point = np.asarray(point, dtype=float)
+        if self._point.shape != (3,) or not np.isfinite(self._point).all():
+            raise InvalidValueError(f"point= has three coordinates in m, not {point!r:.60}.")
+        self._in_hand: dict[str, Callable[[Array], Array]] = {}
+        self.reset()
+
+    # -- what is measured ----------------------------------------------------------------------------------
+
+    @property
+    def value(self) -> float:
+        """True value of the coordinate [m], [rad]; NaN without a coordinate."""
+        return self._value_at(self._world.state)
+
+    @property
+    def violation(self) -> float:
+        """Largest excess of a constraint of the model, in its unit."""
+        return self._limits.violation
+
+    @property
+    def limit(self) -> str:
+        """Name of this constraint; empty without any excess."""
+        return self._limits.limit
+
+    @property
+    def excepted(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of bodies whose penetration does not count.
+
+        These are pairs of the robot that overlap at the begin of the run; the gripper with the handle and
+        with what it holds; the bodies of planned contacts; and pairs of furniture that overlapped at the
+        start, whose penetration counts as far as it exceeds what :class:`.FurnitureOverlaps` allows.
+        """
+        return () if self._bodies is None else self._bodies.excepted
+
+    @property
+    def overlap(self) -> RunOverlap | None:
+        """The deepest of the overlaps beyond 0.5 mm that came in the run; None without any."""
+        deepest = None if self._bodies is None else self._bodies.find_deepest()
+        return deepest if deepest is not None and deepest.depth > OVERLAP else None
+
+    @property
+    def way(self) -> float:
+        """Distance of the part's point from where it was at the begin [m]; NaN without a part."""
+        if self._part is None:
+            return math.nan
+        first, last = (pose @ np.append(self._point, 1.0) for pose in (self._first_pose, self._part_pose()))
+        return float(np.linalg.norm((last - first)[:3]))
+
+    @property
+    def turn(self) -> float:
+        """Angle by which the part has turned since the begin, from 0 to pi [rad]; NaN without a part."""
+        if self._part is None:
+            return math.nan
+        return float(rotation_angle(self._first_pose[:3, :3].T @ self._part_pose()[:3, :3]))
+
+    @property
+    def measures(self) -> dict[str, Any]:
+        """The figures of the run by name.
+
+        - ``limit_violation`` in the unit of the constraint ``limit``, 0 without any
+        - ``penetration`` [m] of the pair ``penetrating``, 0 without any, and ``penetration_from``, the value
+          of the coordinate at which it came, NaN without any or without a coordinate
+        - ``grasp_error`` [m] and ``grasp_rotation`` [rad], NaN if nothing was held
+        - ``contact_losses``
+        - ``jitter`` [m/s], [rad/s] and ``reversals`` [1/s], NaN without steps
+        - ``distance`` and ``hand_distance``, the distances of the robot's root and of the hand [m], NaN
+          without a robot or a gripper
+        - ``excepted``, pairs of bodies that do not count
+        - ``peak_force``, the largest force between the robot and another body [N], in a world with forces
+        - ``pressed``, the largest depth of the pusher in what it pushes [m], if a contact was planned
+        - ``estimate_mean`` and ``estimate_largest``, errors of the believed coordinate [m], [rad], if it was
+          believed
+        - ``way`` [m] and ``turn`` [rad] of the part, if there is one
+        """
+        rms = math.sqrt(self._squares / self._seconds) if self._seconds else math.nan
+        elapsed, bodies = self._stamp - self._first, self._bodies
+        deepest = (None if bodies is None else bodies.find_deepest()) or _NOTHING
+        found = {
+            "limit_violation": self._limits.violation,
+            "limit": self._limits.limit,
+            "penetration": deepest.depth,
+            "penetrating": (deepest.a, deepest.b),
+            "penetration_from": deepest.value,
+            "grasp_error": self._slip,
+            "grasp_rotation": self._turn,
+            "contact_losses": 0 if bodies is None else bodies.losses,
+            "jitter": rms,
+            "reversals": self._reversals / elapsed if self._commanded and elapsed > 0 else math.nan,
+            "distance": float(self._distances[0]) if self._world.robot.frames else math.nan,
+            "hand_distance": float(self._distances[-1]) if self._gripper is not None else math.nan,
+            "excepted": self.excepted,
+        }
+        if not math.isnan(self._peak_force):
+            found["peak_force"] = self._peak_force
+        if bodies is not None and bodies.pressed is not None:
+            found["pressed"] = bodies.pressed
+        if self._errors:
+            mean = sum(self._errors) / len(self._errors)
+            found |= {"estimate_mean": mean, "estimate_largest": max(self._errors)}
+        if self._part is not None:
+            found |= {"way": self.way, "turn": self.turn}
+        return found
+
+    def reset(self) -> None:
+        """Forget all measurements, and begin again at the present state of the world."""
+        self._limits.reset()
+        if self._bodies is not None:
+            self._bodies.reset()
+        self._slip = self._turn = math.nan
+        self._reversals, self._squares, self._seconds, self._steps = 0, 0.0, 0, 0
+        self._commanded: list[Array] = []
+        self._signs = np.zeros(len(self._world.robot.speeds))
+        self._held: str | None = None
+        self._errors: list[float] = []
+        self._peak_force = math.nan if math.isnan(self._world.peak_force) else 0.0
+        self._distances = np.zeros(2)
+        state = self._world.state
+        values = state.vector(self._symbols)
+        self._at = np.array([pose(values)[:3, 3] for pose in self._places]).reshape(-1, 3)
+        if self._part is not None:
+            self._first_pose = self._part(values)
+        self._first = self._stamp = -math.inf
+        self._measure(state, None, None)
+        self._first = self._stamp
+
+    def __call__(self, step: MeasuredStep) -> None:
+        """Measure the present state of the world after a step."""
+        state = self._world.state
+        if self._world.time <= self._stamp:
+            return
+        commanded = np.zeros(len(self._signs))
+        for v, value in step.commands.items():
+            if (k := self._speed_place.get(v)) is not None:
+                commanded[k] = value
+        self._measure_jitter(commanded)
+        if self._coordinate is not None and self._coordinate in step.state:
+            self._errors.append(abs(step.state[self._coordinate] - state[self._coordinate]))
+        if not math.isnan(force := self._world.peak_force):
+            self._peak_force = max(self._peak_force, force)
+        self._measure(state, commanded, step.contact)
+
+    # -- measurements --------------------------------------------------------------------------------------
+
+    def _measure(self, state: State, commanded: Array | None, contact: PlannedContact | None) -> None:
+        stamp, values = self._world.time, state.vector(self._symbols)
+        self._limits.update(values, stamp, commanded)
+        self._measure_hold(values)
+        places = np.array([pose(values)[:3, 3] for pose in self._places]).reshape(-1, 3)
+        self._distances[: len(places)] += np.linalg.norm(places - self._at, axis=1)
+        self._at = places
+        if self._bodies is not None:
+            searches = self._steps % self._every == 0
+            self._bodies.measure(values, stamp, self._value_at(state), contact, searches)
+        self._steps += 1
+        self._stamp = stamp
+
+    def _value_at(self, state: State) -> float:
+        return math.nan if self._coordinate is None else float(state[self._coordinate])
+
+    def _measure_jitter(self, commanded: Array) -> None:
+        self._commanded = [*self._commanded[-2:], commanded]
+        if len(self._commanded) == 3:
+            u, v, w = self._commanded
+            second = w - 2.0 * v + u
+            self._squares += float(second @ second)
+            self._seconds += 1
+        signs = np.where(np.abs(commanded) > _STILL, np.sign(commanded), 0.0)
+        self._reversals += int(np.count_nonzero(signs * self._signs < 0.0))
+        self._signs = np.where(signs != 0.0, signs, self._signs)
+
+    def _measure_hold(self, values: Array) -> None:
+        held = self._world.held
+        if held is None or self._gripper is None:
+            self._held = None
+            return
+        if held not in self._in_hand:
+            self._in_hand[held] = self._compile_pose(held, self._gripper.hand)
+        if self._bodies is not None:
+            self._bodies.permit(self._gripper.bodies, (held,))
+        pose, middle = self._in_hand[held](values), self._gripper.grasp_pose[:, 3]
+        if self._held != held:
+            self._held, self._pose, self._middle = held, pose, inverse(pose) @ middle
+            self._slip, self._turn = (0.0 if math.isnan(x) else x for x in (self._slip, self._turn))
+            return
+        apart = float(np.linalg.norm((pose @ self._middle - middle)[:3]))
+        turned = float(rotation_angle(pose[:3, :3] @ self._pose[:3, :3].T))
+        self._slip, self._turn = max(self._slip, apart), max(self._turn, turned)
+
+    # -- preparation ---------------------------------------------------------------------------------------
+
+    def _compile_pose(self, frame: str, relative_to: str = WORLD) -> Callable[[Array], Array]:
+        """Return the pose (4, 4) of a frame as a function of the values of all symbols."""
+        # A few calls a step: compiling C takes longer than all of them.
+        function = compile(self._model.fk(frame, relative_to), tier="interpreter")
+        at = np.array([self._symbols.index(s) for s in function.inputs], dtype=np.intp)
+
+        def evaluate(values: Array) -> Array:
+            return np.array(function(values[at]))
+
+        return evaluate
+
+    def _part_pose(self) -> Array:
+        assert self._part is not None
+        return self._part(self._world.state.vector(self._symbols))
+
+    def _find_followed(self) -> tuple[str, ...]:
+        """Return the frames whose paths are measured: the root of what moves of the robot, and the hand."""
+        robot = self._world.robot
+        bodies = robot.bodies or robot.frames
+        if not bodies:
+            return ()
+        motion = FrameDependence(self._model, robot.speeds)
+        moved = [b for b in bodies if motion.moves(b)] or bodies
+        root = min(moved, key=lambda b: len(motion.moving_ancestors(b)))
+        return (root,) if self._gripper is None else (root, self._gripper.hand)
+
+
+_NOTHING = RunOverlap("", "", 0.0, math.nan, math.nan)
+
+
+class _BodyMetrics:
+    """Overlaps and contacts of bodies in the states of a run."""
+
+    def __init__(
+        self,
+        world: SimulatedWorld,
+        gripper: Gripper | None,
+        handle: str | None,
+        start: State | None,
+        scene: Scene,
+        gap: float,
+    ) -> None:
+        self._robot, self._scene, self._start, self._gap = world.robot, scene, start, gap
+        place = {s: k for k, s in enumerate(world.model.symbols)}
+        self._values = np.array([place[s] for s in scene.inputs], dtype=np.intp)
+        self._own = [b for b in scene.bodies if self._robot.owns(b)]
+        self._penetrations = scene.watch(self._own, radius=0.0) if self._own else None
+        self._furniture = FurnitureOverlaps(scene, self._robot)
+        self._handle = handle
+        self._permitted_at_first: dict[str, set[str]] = {}
+        self._touches: PreparedQuery | None = None
+        self._presses: dict[tuple[tuple[str, ...], tuple[str, ...]], PreparedQuery] = {}
+        if handle is not None:
+            if handle not in scene.bodies:
+                raise UnknownNameError(
+                    f"The handle '{handle}' is no body with shapes. {suggest(handle, scene.bodies, 'body')}"
+                )
+            self._permitted_at_first[handle] = {*(() if gripper is None else gripper.bodies)}
+            self._touches = self._watch_contacts(handle)
+
+    def reset(self) -> None:
+        """Forget all measurements."""
+        self._overlaps: dict[tuple[str, str], RunOverlap] = {}
+        self.losses = 0
+        self.pressed: float | None = None  # largest depth of a planned contact [m]; None without any
+        self._permitted = {body: {*others} for body, others in self._permitted_at_first.items()}
+        self._overlapping_at_first: tuple[tuple[str, str], ...] = ()
+        self._touched, self._begun = False, False
+        if self._handle is None:
+            self._touches = None
+
+    def find_deepest(self) -> RunOverlap | None:
+        """Return the deepest overlap; None without any."""
+        return max(self._overlaps.values(), key=lambda one: one.depth, default=None)
+
+    @property
+    def excepted(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of bodies whose penetration does not count."""
+        permitted = ((a, b) for b, ones in sorted(self._permitted.items()) for a in sorted(ones))
+        return tuple(dict.fromkeys((*self._overlapping_at_first, *permitted, *self._furniture.excepted)))
+
+    def permit(self, ones: Iterable[str], others: Iterable[str]) -> None:
+        """Except penetrations of bodies into some others from now on."""
+        ones, added = frozenset(ones), False
+        for body in others:
+            known = self._permitted.setdefault(body, set())
+            added |= not ones <= known
+            known |= ones
+        if added and self._begun:
+            self._select_pairs()
+
+    def measure(
+        self, values: Array, stamp: float, value: float, contact: PlannedContact | None, searches: bool
+    ) -> None:
+        """Measure a state by the values of all symbols.
+
+        Its stamp [s] and the value of the coordinate [m], [rad] are noted with overlaps. Those are searched
+        if ``searches`` says so.
+        """
+        if contact is not None:
+            self.permit(contact.pusher, contact.pushed)
+        if searches or contact is not None or self._touches is not None:
+            self._scene.update(values[self._values])
+        if not self._begun:
+            self._begin()
+        if searches:
+            self._measure_penetration(stamp, value)
+        if contact is not None:
+            self._measure_press(contact)
+        if self._touches is not None:
+            touched = len(self._touches()) > 0
+            self.losses += contact is not None and contact.touching and self._touched and not touched
+            self._touched = touched
+
+    def _begin(self) -> None:
+        """Except what overlaps at the first state: pairs of the robot, and of furniture as far as it does."""
+        found = () if self._penetrations is None else self._penetrations()
+        deep = ((pair.a, pair.b) for pair in found if pair.distance < -_TOUCHING)
+        self._overlapping_at_first = tuple(
+            (a, b) for a, b in deep if self._robot.owns(a) and self._robot.owns(b)
+        )
+        self._furniture.begin(*(() if self._start is None else (self._start,)))
+        self._begun = True
+        self._select_pairs()
+
+    def _select_pairs(self) -> None:
+        number = {b: k for k, b in enumerate(self._scene.bodies)}
+        self._is_excepted = np.zeros((len(number),) * 2, dtype=bool)
+        for a, b in self.excepted:
+            if a in number and b in number:
+                self._is_excepted[number[a], number[b]] = self._is_excepted[number[b], number[a]] = True
+
+    def _watch_contacts(self, body: str) -> PreparedQuery:
+        """Return the query for contacts of the robot with what moves like a body."""
+        model, bodies = self._scene.model, self._scene.bodies
+        motion = FrameDependence(model, model.speeds)
+        group = [b for b in bodies if motion.moving_ancestors(b) == motion.moving_ancestors(body)]
+        rules = [Rule(a, b, True) for a in self._own for b in group if a != b]
+        return self._scene.watch(self._own, group, self._gap, rules=rules)
+
+    def _measure_press(self, contact: PlannedContact) -> None:
+        """Measure the depth of a planned contact, as far as the true model has its bodies."""
+        known = self._scene.bodies
+        pusher, pushed = (tuple(b for b in names if b in known) for names in contact[:2])
+        if not pusher or not pushed:
+            return
+        if self._touches is None:
+            self._touches = self._watch_contacts(pushed[0])
+        if (pusher, pushed) not in self._presses:
+            self._presses[pusher, pushed] = self._scene.watch(pusher, pushed, radius=0.0)
+        found = self._presses[pusher, pushed]()
+        depth = -float(found.distances[0]) if len(found) else 0.0
+        self.pressed = max(depth, self.pressed or 0.0)
+
+    def _measure_penetration(self, stamp: float, value: float) -> None:
+        if self._penetrations is not None:
+            result = self._penetrations()
+            for k in range(len(result)):
+                i, j = result.body_indices[k].tolist()
+                if not self._is_excepted[i, j]:
+                    pair = result[k]
+                    self._note(RunOverlap(pair.a, pair.b, -pair.distance, value, stamp))
+        for one in self._furniture.find(0.0):
+            self._note(RunOverlap(one.a, one.b, one.excess, value, stamp))
+
+    def _note(self, found: RunOverlap) -> None:
+        """Note the depth of two bodies, and where it came if it is the first one beyond 0.5 mm."""
+        known = self._overlaps.get((found.a, found.b))
+        if known is not None and (known.depth > OVERLAP or found.depth <= OVERLAP):
+            self._overlaps[found.a, found.b] = known._replace(depth=max(found.depth, known.depth))
+        elif found.depth > _ROUNDING:
+            self._overlaps[found.a, found.b] = found
+
+
+class _LimitExcess:
     """Largest excess of any constraint of a model in successive states, see *limit violation* above."""
 
     violation: float  # largest excess since the last reset, in the unit of its constraint
@@ -98,337 +577,3 @@ class LimitJudge:
         """Return the excess of each constraint: a constraint without a value is violated beyond measure."""
         self._checker(vector)
         return np.where(np.isnan(self._checker.excess), np.inf, self._checker.excess)
-
-
-CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
-
-_STILL = 5e-3
-_TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap [m]
-
-
-class JudgedOverlap(NamedTuple):
-    """Overlap that came in a run."""
-
-    a: str  # names of the bodies
-    b: str
-    depth: float  # largest depth [m]
-    value: float  # value of the judged coordinate at which it came [m], [rad]; NaN without a coordinate
-    time: float  # stamp of the state in which it came [s]
-
-    def __str__(self) -> str:
-        where = "" if math.isnan(self.value) else f", from {self.value:.3f} on"
-        return f"On the way '{self.a}' and '{self.b}' overlapped by {1e3 * self.depth:.3g} mm{where}."
-
-
-class Judge:
-    """Measurements of a run, updated after each step with the true state.
-
-    Parameters
-    ----------
-    robot
-        Prefix of the robot.
-    gripper
-        Gripper that grasps or pushes; its bodies may touch the handle.
-    handle
-        Body that is grasped or pushed. Contacts with all bodies that move with it are counted.
-    coordinate
-        Coordinate of the object, whose value is noted where an overlap occurs.
-    start
-        Earlier state in which furniture may have overlapped, such as the one before it was opened.
-    scene
-        Collision scene of the model, which from now on is the judge's; None for ``Scene(model)``.
-    every
-        Number of steps from one search of penetrations to the next.
-    contact_gap
-        Largest gap of a contact [m].
-
-    Attributes
-    ----------
-    excepted
-        Pairs of bodies whose penetration does not count: those of the robot that overlap at the begin of the
-        run, and those of the gripper with the handle; and pairs of furniture that overlapped at the start,
-        whose penetration counts as far as it exceeds what :class:`.FurnitureOverlaps` allows.
-
-    Raises
-    ------
-    UnknownNameError
-        If nothing of the model is below the prefix, or the handle is no body with shapes.
-    """
-
-    def __init__(
-        self,
-        model: ModelView,
-        robot: str,
-        gripper: Gripper | None = None,
-        handle: str | None = None,
-        *,
-        coordinate: Symbol | None = None,
-        start: State | None = None,
-        scene: Scene | None = None,
-        every: int = 1,
-        contact_gap: float = CONTACT_GAP,
-    ) -> None:
-        self.model, self.robot, self.gripper = model, robot, gripper
-        self._every = as_count("every=", every, 1)
-        self._symbols = model.symbols
-        self._scene = scene or Scene(model)
-        self._robot_bodies = [b for b in self._scene.bodies if is_of_robot(b, robot)]
-        if not self._robot_bodies:
-            prefixes = {name.partition("/")[0] for name in model.frames}
-            raise UnknownNameError(
-                f"No body of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
-            )
-        self._robot_speeds = [v for v in model.speeds if is_of_robot(v.path, robot)]
-        self._limits = LimitJudge(model, self._robot_speeds)
-        # Speeds are given by symbol or by name.
-        self._speed_place: dict[Symbol | str, int] = {v: k for k, v in enumerate(self._robot_speeds)}
-        self._speed_place |= {str(v): k for k, v in enumerate(self._robot_speeds)}
-        self._scene_values = self._indices(self._scene.inputs)
-        self._coordinate, self._start = coordinate, start
-        self._penetrations = self._scene.watch(self._robot_bodies, radius=0.0)
-        self._furniture = FurnitureOverlaps(self._scene, robot)
-        self._first_overlapping: tuple[tuple[str, str], ...] = ()
-        self._gripping: dict[str, set[str]] = {}
-        self._touches: PreparedQuery | None = None
-        if handle is not None:
-            self._watch_handle(handle, contact_gap)
-            self._gripping[handle] = {*self._gripper_bodies}
-        self._select_pairs()
-        # A few calls a step: compiling C takes longer than all of them.
-        self._place = compile([model.fk(name)[:3, 3] for name in self._followed()], tier="interpreter")
-        self._place_values = self._indices(self._place.inputs)
-        self._in_hand: dict[str, tuple[CompiledFunction[Array], npt.NDArray[np.intp]]] = {}
-        self.reset()
-
-    # -- what is measured ----------------------------------------------------------------------------------
-
-    @property
-    def excepted(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of bodies whose penetration does not count."""
-        gripping = ((a, b) for b, ones in sorted(self._gripping.items()) for a in sorted(ones))
-        return tuple(dict.fromkeys((*self._first_overlapping, *gripping, *self._furniture.excepted)))
-
-    @property
-    def overlap(self) -> JudgedOverlap | None:
-        """The deepest of the overlaps beyond 0.5 mm that came since the last reset; None without any."""
-        deep = (one for one in self._overlaps.values() if one.depth > OVERLAP)
-        return max(deep, key=lambda one: one.depth, default=None)
-
-    @property
-    def measures(self) -> dict[str, Any]:
-        """The figures since the last reset by name.
-
-        - ``limit_violation`` in the unit of the constraint ``limit``, 0 without any
-        - ``penetration`` [m] of the pair ``penetrating``, 0 without any, and ``penetration_from``, the value
-          of the coordinate at which it came, NaN without any or without a coordinate
-        - ``grasp_error`` [m] and ``grasp_rotation`` [rad], NaN if nothing was held
-        - ``contact_losses``
-        - ``jitter`` [m/s], [rad/s] and ``reversals`` [1/s], NaN without commands
-        - ``distance`` and ``hand_distance``, the distances of the robot's root and of the hand [m]
-        - ``excepted``, pairs of bodies that do not count
-        """
-        rms = math.sqrt(self._squares / self._seconds) if self._seconds else math.nan
-        elapsed = 0.0 if self._first is None or self._stamp is None else self._stamp - self._first
-        nothing = JudgedOverlap("", "", 0.0, math.nan, math.nan)
-        deepest = max(self._overlaps.values(), key=lambda one: one.depth, default=nothing)
-        return {
-            "limit_violation": self._limits.violation,
-            "limit": self._limits.limit,
-            "penetration": deepest.depth,
-            "penetrating": (deepest.a, deepest.b),
-            "penetration_from": deepest.value,
-            "grasp_error": self._slip,
-            "grasp_rotation": self._turn,
-            "contact_losses": self._losses,
-            "jitter": rms,
-            "reversals": self._reversals / elapsed if self._commanded and elapsed > 0 else math.nan,
-            "distance": float(self._distances[0]),
-            "hand_distance": float(self._distances[-1]) if self.gripper is not None else math.nan,
-            "excepted": self.excepted,
-        }
-
-    def allow(self, bodies: Iterable[str], pusher: Iterable[str] | None = None) -> None:
-        """Except penetrations of the gripper's bodies, or of other ones, into some that are pushed."""
-        ones = self._gripper_bodies if pusher is None else tuple(pusher)
-        for body in bodies:
-            self._gripping.setdefault(body, set()).update(ones)
-        self._select_pairs()
-
-    def reset(self) -> None:
-        """Forget all measurements."""
-        self._limits.reset()
-        self._overlaps: dict[tuple[str, str], JudgedOverlap] = {}
-        self._slip = self._turn = math.nan
-        self._losses, self._reversals = 0, 0
-        self._squares, self._seconds = 0.0, 0
-        self._first: float | None = None
-        self._stamp: float | None = None
-        self._steps = 0
-        self._commanded: list[Array] = []
-        self._signs = np.zeros(len(self._robot_speeds))
-        self._touched = False
-        self._held: str | None = None
-        self._distances = np.zeros(2)
-        self._places = np.zeros((0, 3))
-
-    def update(
-        self, state: State, speeds: StateLike | None = None, *, held: str | None = None, pushing: bool = False
-    ) -> None:
-        """Measure a state, the first one of a run or the one after a step.
-
-        Parameters
-        ----------
-        state
-            True state with its stamp.
-        speeds
-            Speeds that were commanded for the step by symbol or name [m/s], [rad/s]; None before the first.
-            Those of objects are not read.
-        held
-            Frame of the body in the gripper: ``world.held``.
-        pushing
-            Whether the robot is to touch the object: else contacts that end are no losses.
-
-        Raises
-        ------
-        InvalidValueError
-            For a state without stamp, or not after the last one.
-        """
-        stamp = None if state.stamp is None else finite_number(state.stamp)
-        if stamp is None or (self._stamp is not None and stamp <= self._stamp):
-            raise InvalidValueError(
-                f"Judged states have stamps that increase, and {state.stamp!r} s follows {self._stamp!r} s. "
-                "reset() begins a new run."
-            )
-        values = state.vector(self._symbols)
-        commanded = None if speeds is None else self._select_speeds(speeds)
-        self._limits.update(values, stamp, commanded)
-        if commanded is not None:
-            self._measure_jitter(commanded)
-        self._measure_hold(values, held)
-        self._measure_distance(values)
-        searches = self._steps % self._every == 0
-        if searches or self._touches is not None:
-            self._scene.update(values[self._scene_values])
-        if self._first is None:
-            self._begin()
-        if searches:
-            self._measure_penetration(state, stamp)
-        if self._touches is not None:
-            touched = len(self._touches()) > 0
-            self._losses += pushing and self._touched and not touched
-            self._touched = touched
-        self._steps += 1
-        if self._first is None:
-            self._first = stamp
-        self._stamp = stamp
-
-    @property
-    def _gripper_bodies(self) -> tuple[str, ...]:
-        return () if self.gripper is None else tuple(self.gripper.bodies)
-
-    # -- preparation ---------------------------------------------------------------------------------------
-
-    def _indices(self, symbols: Iterable[Symbol]) -> npt.NDArray[np.intp]:
-        place = {s: k for k, s in enumerate(self._symbols)}
-        return np.array([place[s] for s in symbols], dtype=np.intp)
-
-    def _watch_handle(self, handle: str, gap: float) -> None:
-        """Prepare the query of contacts of the robot with what moves like the handle."""
-        bodies = self._scene.bodies
-        if handle not in bodies:
-            raise UnknownNameError(
-                f"The handle '{handle}' is no body with shapes. {suggest(handle, bodies, 'body')}"
-            )
-        motion = FrameDependence(self.model, self.model.speeds)
-        group = [b for b in bodies if motion.moving_ancestors(b) == motion.moving_ancestors(handle)]
-        rules = [Rule(a, b, True) for a in self._robot_bodies for b in group if a != b]
-        self._touches = self._scene.watch(self._robot_bodies, group, gap, rules=rules)
-
-    def _begin(self) -> None:
-        """Except what overlaps at the first state: pairs of the robot, and of furniture as far as it does."""
-        robot = set(self._robot_bodies)
-        result = ((pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_TOUCHING)
-        self._first_overlapping = tuple((a, b) for a, b in result if a in robot and b in robot)
-        self._furniture.begin(*(() if self._start is None else (self._start,)))
-        self._select_pairs()
-
-    def _select_pairs(self) -> None:
-        number = {b: k for k, b in enumerate(self._scene.bodies)}
-        self._is_excepted = np.zeros((len(number),) * 2, dtype=bool)
-        for a, b in self.excepted:
-            if a in number and b in number:
-                self._is_excepted[number[a], number[b]] = self._is_excepted[number[b], number[a]] = True
-
-    def _followed(self) -> tuple[str, ...]:
-        """Return the frames whose paths are measured: the root of what moves of the robot, and the hand."""
-        motion = FrameDependence(self.model, self._robot_speeds)
-        moved = [b for b in self._robot_bodies if motion.moves(b)] or self._robot_bodies
-        root = min(moved, key=lambda b: len(motion.moving_ancestors(b)))
-        return (root,) if self.gripper is None else (root, self.gripper.hand)
-
-    def _select_speeds(self, speeds: StateLike) -> Array:
-        """Return the commanded speeds of the robot; 0 for missing ones."""
-        result = np.zeros(len(self._robot_speeds))
-        for v, value in speeds.items():
-            k = self._speed_place.get(v)
-            if k is not None:
-                result[k] = value
-        return result
-
-    # -- measurements --------------------------------------------------------------------------------------
-
-    def _measure_jitter(self, commanded: Array) -> None:
-        self._commanded = [*self._commanded[-2:], commanded]
-        if len(self._commanded) == 3:
-            u, v, w = self._commanded
-            second = w - 2.0 * v + u
-            self._squares += float(second @ second)
-            self._seconds += 1
-        signs = np.where(np.abs(commanded) > _STILL, np.sign(commanded), 0.0)
-        self._reversals += int(np.count_nonzero(signs * self._signs < 0.0))
-        self._signs = np.where(signs != 0.0, signs, self._signs)
-
-    def _measure_hold(self, values: Array, held: str | None) -> None:
-        if held is None or self.gripper is None:
-            self._held = None
-            return
-        if held not in self._in_hand:
-            relative = compile(self.model.fk(held, self.gripper.hand), tier="interpreter")
-            self._in_hand[held] = relative, self._indices(relative.inputs)
-            if held not in self._gripping:
-                self.allow([held])
-        function, at = self._in_hand[held]
-        pose = function(values[at])
-        middle = self.gripper.grasp_pose[:, 3]
-        if self._held != held:
-            self._held, self._pose, self._middle = held, pose, inverse(pose) @ middle
-            self._slip, self._turn = (0.0 if math.isnan(x) else x for x in (self._slip, self._turn))
-            return
-        apart = float(np.linalg.norm((pose @ self._middle - middle)[:3]))
-        turned = float(rotation_angle(pose[:3, :3] @ self._pose[:3, :3].T))
-        self._slip, self._turn = max(self._slip, apart), max(self._turn, turned)
-
-    def _measure_distance(self, values: Array) -> None:
-        places = np.array(self._place(values[self._place_values]))
-        if self._first is not None:
-            self._distances[: len(places)] += np.linalg.norm(places - self._places, axis=1)
-        self._places = places
-
-    def _measure_penetration(self, state: State, stamp: float) -> None:
-        result = self._penetrations()
-        for k in range(len(result)):
-            i, j = result.body_indices[k].tolist()
-            if not self._is_excepted[i, j]:
-                pair = result[k]
-                self._note_overlap(pair.a, pair.b, -pair.distance, state, stamp)
-        for one in self._furniture.find(0.0):
-            self._note_overlap(one.a, one.b, one.excess, state, stamp)
-
-    def _note_overlap(self, a: str, b: str, depth: float, state: State, stamp: float) -> None:
-        """Note a depth of two bodies, and where it came if it is the first one beyond 0.5 mm."""
-        known = self._overlaps.get((a, b))
-        if known is not None and (known.depth > OVERLAP or depth <= OVERLAP):
-            self._overlaps[a, b] = known._replace(depth=max(depth, known.depth))
-        elif depth > 0.0:
-            value = math.nan if self._coordinate is None else float(state[self._coordinate])
-            self._overlaps[a, b] = JudgedOverlap(a, b, depth, value, stamp)

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from kineverse._checks import finite_number
 from kineverse.compilation import CompiledFunction
 from kineverse.compilation import compile as compile_expressions
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, suggest
 from kineverse.geometry import Scene
 from kineverse.geometry.collision_world import CollisionWorld
 from kineverse.geometry.gjk import support
 from kineverse.lie import Array, inverse, quaternion, retract, rotation_z, transform
-from kineverse.model.body import is_empty_body
-from kineverse.model.frame import WORLD, is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+from .robot import Robot
+from .robot_interface import Observation
 from .sensors import Sensors
-from .world import Contact, Observation
+from .simulated_world import Contact
 
 _INSET = 0.9  # points lie at this fraction of the distance from the middle of a shape to its corners
 _MOST_SHAPES = 8  # largest number of shapes of a body whose points are tried
@@ -42,13 +41,14 @@ class LineOfSight:
     built into them. A camera inside of anything else sees nothing.
     """
 
-    def __init__(self, model: ModelView, camera: str, own: Collection[str], bodies: Iterable[str]) -> None:
+    def __init__(self, robot: Robot, camera: str, bodies: Iterable[str]) -> None:
+        model = robot.model
         motion = FrameDependence(model, model.degrees_of_freedom)
         known = Scene(model).bodies
         hidden = [name for name in known if not motion.moves_between(name, camera)]
         self._scene = _start(model, hidden)
         eye = compile_expressions(model.fk(camera))(model.default_state())[:3, 3]
-        while (hit := self._scene.ray(eye, (1.0, 0.0, 0.0))) and hit.distance == 0.0 and hit.body in own:
+        while (hit := self._scene.ray(eye, (1.0, 0.0, 0.0))) and hit.distance == 0.0 and robot.owns(hit.body):
             hidden.append(hit.body)
             self._scene = _start(model, hidden)
         world, shown = self._scene.collision_world, set(self._scene.bodies)
@@ -112,7 +112,7 @@ class SensorSampler:
     Parameters
     ----------
     robot
-        Prefix of the robot; empty for a model of a robot alone.
+        The robot, or the prefix of its names in the model; empty for a model of a robot alone.
     seed
         Seed of the noise. Equal seeds and calls give equal readings.
 
@@ -126,27 +126,28 @@ class SensorSampler:
 
     Raises
     ------
+    UnknownNameError
+        If the model has no such robot, or no frame that the settings name.
     InvalidValueError
         If a field of view or a line of sight is asked for, but the robot has no camera.
     """
 
-    def __init__(self, sensors: Sensors, model: ModelView, robot: str, seed: int = 0) -> None:
+    def __init__(self, sensors: Sensors, model: ModelView, robot: Robot | str, seed: int = 0) -> None:
         self.sensors, self._seed = sensors, seed
-        seen = find_observed_frames(model, robot, sensors)
-        if not seen.has_camera and (sensors.field_of_view is not None or sensors.sight):
+        self._robot = robot = Robot.of(model, robot)
+        self.camera, self.marked = sensors.find_frames(robot)
+        known = sensors.camera or robot.camera
+        if not known and (sensors.field_of_view is not None or sensors.sight):
             raise InvalidValueError(
-                f"What is visible depends on a camera, and no frame of '{robot}' is named like one. "
-                f"Name it by camera=. {suggest('head', seen.robot, 'frame')}"
+                f"What is visible depends on a camera, and no frame of '{robot.name}' is named like one. "
+                f"Name it by camera=. {suggest('head', robot.frames, 'frame')}"
             )
-        self.camera, self.marked = seen.camera, seen.marked
-        self._robot = robot
-        self._joints = tuple(s for s in model.symbols if is_of_robot(s.path, robot) and not s.order)
-        base = find_robot_base(model, robot)
-        self._base, self._planar = base.coordinates, base.is_planar
+        self._joints = tuple(s for s in model.symbols if robot.moves(s) and not s.order)
+        self._base = () if robot.base is None else robot.base.coordinates
         self._encoded = tuple(s for s in self._joints if s not in set(self._base))
         # Compiled for the first picture: many worlds are never observed.
         self._seen = [model.fk(name) for name in (self.camera, *self.marked)]
-        self._sight = LineOfSight(model, self.camera, seen.robot, self.marked) if sensors.sight else None
+        self._sight = LineOfSight(robot, self.camera, self.marked) if sensors.sight else None
         self.reset()
 
     @cached_property
@@ -227,7 +228,7 @@ class SensorSampler:
             return base
         step = base - self._true_base
         noise = self._odometry_noise.standard_normal(len(base))
-        if self._planar:
+        if self._robot.planar_base:
             # In the base's own axes: a wrong heading leads the position astray.
             step[:2] = rotation_z(-self._true_base[2])[:2, :2] @ step[:2]
             distance = math.sqrt(np.linalg.norm(step[:2]) + abs(step[2]))
@@ -278,88 +279,4 @@ class SensorSampler:
         for contact in contacts:
             known = not math.isnan(contact.force)
             if contact.force >= sensors.touch_force if known else contact.distance <= sensors.touch_gap:
-                yield from (name for name in (contact.a, contact.b) if is_of_robot(name, self._robot))
-
-
-class ObservedFrames(NamedTuple):
-    """Frames of a robot, that of its camera, and those with markers."""
-
-    robot: tuple[str, ...]
-    camera: str  # the robot's first frame if none is named like a camera
-    marked: tuple[str, ...]
-    has_camera: bool
-
-
-def find_observed_frames(model: ModelView, robot: str, sensors: Sensors) -> ObservedFrames:
-    """Return the frames that sensors concern, or raise UnknownNameError for those that do not exist."""
-    own = tuple(name for name in model.frames if is_of_robot(name, robot))
-    if not own:
-        prefixes = {name.partition("/")[0] for name in model.frames}
-        raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
-    camera = sensors.camera or find_camera(own)
-    marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
-    for name in (camera or own[0], *marked):
-        if name not in model.frames:
-            raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
-    return ObservedFrames(own, camera or own[0], marked, camera is not None)
-
-
-def find_marked_frames(model: ModelView, robot: str) -> tuple[str, ...]:
-    """Return the bodies of articulated objects, and the bodies that carry them, in the order of the model.
-
-    Bodies of the robot, and those that nothing moves and that carry nothing, are not among them.
-    """
-    objects = [s for s in model.degrees_of_freedom if not is_of_robot(s.path, robot)]
-    motion = FrameDependence(model, objects)
-    bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}
-    result = {name for name in bodies if motion.moves(name)}
-    for name, frame in model.frames.items():
-        if motion.moves_between(name, carrier := frame.parent):
-            while carrier != WORLD and carrier not in bodies:
-                carrier = model.frames[carrier].parent
-            result.add(carrier)
-    return tuple(name for name in model.frames if name in result and not is_of_robot(name, robot))
-
-
-_CAMERA_WORDS = (("head", "tilt"), ("camera",), ("head",))  # in names, the likeliest first
-
-
-def find_camera(frames: Sequence[str]) -> str | None:
-    """Return the frame that is named like a head that tilts, a camera or a head; None without any."""
-    for words in _CAMERA_WORDS:
-        for name in frames:
-            last = name.rpartition("/")[2].lower()
-            if all(word in last for word in words) and "optical" not in last:
-                return name
-    return None
-
-
-class RobotBase(NamedTuple):
-    """Joint that places a robot in the world."""
-
-    coordinates: tuple[Symbol, ...] = ()  # its coordinates; none if the robot stands still
-    is_planar: bool = False  # whether they are x, y and a heading
-    parent: str = ""  # its frames; empty if the robot stands still
-    child: str = ""
-
-
-def find_robot_base(model: ModelView, robot: str) -> RobotBase:
-    """Return the joint that places a robot in the world, the first one from the world to the robot."""
-    for record in model.articulations.values():
-        outside = record.parent == WORLD or not is_of_robot(record.parent, robot)
-        if record.coordinates and outside and is_of_robot(record.child, robot):
-            is_planar = _is_planar(model, record.parent, record.child, record.coordinates)
-            return RobotBase(record.coordinates, is_planar, record.parent, record.child)
-    return RobotBase()
-
-
-def _is_planar(model: ModelView, parent: str, child: str, coordinates: tuple[Symbol, ...]) -> bool:
-    """Return whether a pose is translation(x, y, 0) · rotation_z(θ) of three coordinates, after an offset."""
-    pose = model.fk(child, relative_to=parent)
-    if len(coordinates) != 3 or not set(pose.symbols) <= set(coordinates):
-        return False
-    x, y, angle = values = np.array([0.3, -0.7, 1.1])
-    function = compile_expressions([pose], coordinates, tier="interpreter")
-    (offset,), (placed,) = function(np.zeros(3)), function(values)
-    wanted = transform(rotation_z(angle), np.array([x, y, 0.0]))
-    return bool(np.allclose(placed, offset @ wanted, atol=1e-9))
+                yield from (name for name in (contact.a, contact.b) if self._robot.owns(name))

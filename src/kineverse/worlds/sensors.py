@@ -12,6 +12,9 @@ import numpy as np
 from kineverse._checks import check_flag, finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
+from kineverse.model.frame import WORLD
+
+from .robot import Robot
 
 NEAR = 0.5  # distance from the camera within which the noise of positions is constant [m]
 
@@ -116,6 +119,24 @@ class Sensors:
             limit = f" to {most:.4g}" if math.isfinite(most) else ""
             raise InvalidValueError(f"{name}= is {least}{limit}, not {given!r}.")
         object.__setattr__(self, name, number)
+
+    def find_frames(self, robot: Robot) -> tuple[str, tuple[str, ...]]:
+        """Return the frame of a robot's camera, and those of the markers that it may see.
+
+        Without any that is named like a camera, the first frame of the robot stands in for it.
+
+        Raises
+        ------
+        UnknownNameError
+            For frames that the model does not have.
+        """
+        camera = self.camera or robot.camera or next(iter(robot.frames), WORLD)
+        marked = robot.markers if self.marked is None else self.marked
+        frames = robot.model.frames
+        for name in (camera, *marked):
+            if name not in frames and name != WORLD:
+                raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, frames, 'frame')}")
+        return camera, marked
 
     def position_noise(self, distance: Array) -> Array:
         """Return the standard deviation of each coordinate at distances (...) from the camera [m]."""

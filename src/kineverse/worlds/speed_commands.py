@@ -9,11 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import finite_number
+from kineverse._checks import as_positive, finite_number
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
-from kineverse.model.frame import is_of_robot
-from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
@@ -25,12 +23,14 @@ class _Command(NamedTuple):
     speeds: Array
     start: float
     end: float
+    silent: float  # time from which the fingers stop, too
 
 
 class SpeedCommands:
     """Speeds (n,) that were commanded to a robot, each with the time in which it acts [s].
 
-    After its end everything stops but the fingers, which keep their last speed.
+    After its end everything stops but the fingers. These keep their last speed until no command has come for
+    the time-out: a hand whose controller is gone must not go on closing.
     """
 
     def __init__(
@@ -48,40 +48,49 @@ class SpeedCommands:
     def reset(self) -> None:
         """Forget all commands."""
         self.refused = 0
-        self._last: Array = np.zeros(len(self._fingers))
-        self._active = _Command(self._last, 0.0, 0.0)
+        self._last = self._active = _Command(np.zeros(len(self._fingers)), 0.0, 0.0, 0.0)
         self._coming: deque[_Command] = deque()
 
     def take(self, speeds: StateLike, duration: float, stamp: float | None, now: float) -> float:
         """Take speeds for a duration [s], and return its end; those with a stale stamp stop the robot."""
-        until = end = now + check_duration(duration)
+        until = end = now + as_positive(duration, "A duration", "number of seconds")
         taken = None if stamp is None else finite_number(stamp)
         if stamp is not None and taken is None:
             raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
-        vector = parse_speeds(speeds, self._columns, self._stop(self._last))
-        if taken is not None and now - self._timeout <= taken + ROUNDING <= now + 2 * ROUNDING:
+        vector = parse_speeds(
+            speeds, self._columns, self._stop(self._last, now <= self._last.silent + ROUNDING)
+        )
+        silent = now + self._timeout
+        if taken is None:
+            silent = max(silent, end)
+        elif now - self._timeout <= taken + ROUNDING <= now + 2 * ROUNDING:
             until = min(end, taken + self._timeout)
-        elif taken is not None:
+        else:
             self.refused += 1
             self._report(f"speeds with the stamp {taken:g} s are refused")
-            vector = self._stop(self._last)
-        self._last = vector
-        self._coming.append(_Command(vector, now + self._delay, until + self._delay))
+            vector, until, silent = self._last.speeds, now, self._last.silent
+        self._last = _Command(vector, now, until, silent)
+        shift = self._delay
+        self._coming.append(_Command(vector, now + shift, until + shift, silent + shift))
         return end
 
     def acting(self, time: float) -> Array:
         """Return the speeds that act at a time [s], which is not before that of the last call."""
         while self._coming and self._coming[0].start <= time + ROUNDING:
             self._active = self._coming.popleft()
-        return self._active.speeds if time < self._active.end - ROUNDING else self._stop(self._active.speeds)
+        active = self._active
+        if time < active.end - ROUNDING:
+            return active.speeds
+        return self._stop(active, time < active.silent - ROUNDING)
 
     def next_change(self, time: float) -> float:
         """Return the time after another one at which other speeds may act [s]; infinite if none is known."""
-        changes = (self._active.end, *(command.start for command in self._coming))
+        changes = self._active.end, self._active.silent, *(command.start for command in self._coming)
         return min((t for t in changes if t > time + ROUNDING), default=np.inf)
 
-    def _stop(self, speeds: Array) -> Array:
-        return np.where(self._fingers, speeds, 0.0)
+    def _stop(self, command: _Command, keeps_fingers: bool) -> Array:
+        """Return the speeds (n,) from the end of a command on."""
+        return np.where(self._fingers & keeps_fingers, command.speeds, 0.0)
 
 
 def parse_speeds(speeds: StateLike, columns: SpeedColumns, vector: Array) -> Array:
@@ -104,14 +113,6 @@ def parse_speeds(speeds: StateLike, columns: SpeedColumns, vector: Array) -> Arr
     return vector
 
 
-def check_duration(duration: float) -> float:
-    """Return the duration of a step [s], or raise InvalidValueError if it is no positive number."""
-    length = finite_number(duration)
-    if length is None or length <= 0:
-        raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
-    return length
-
-
 def check_settings(positive: Mapping[str, Any], others: Mapping[str, Any]) -> None:
     """Raise InvalidValueError for a setting of a world that is no positive number, or none from 0 on."""
     for name, value in (*positive.items(), *others.items()):
@@ -119,14 +120,3 @@ def check_settings(positive: Mapping[str, Any], others: Mapping[str, Any]) -> No
         if number is None or number < 0 or (name in positive and not number):
             kind = "positive number" if name in positive else "number from 0 on"
             raise InvalidValueError(f"'{name}' of a world is a {kind}, not {value!r}.")
-
-
-def find_robot_coordinates(model: ModelView, robot: str) -> list[Symbol]:
-    """Return the degrees of freedom of a robot, or raise UnknownNameError if it has none."""
-    result = [s for s in model.degrees_of_freedom if is_of_robot(s.path, robot)]
-    if not result:
-        prefixes = sorted({s.path.partition("/")[0] for s in model.degrees_of_freedom})
-        raise UnknownNameError(
-            f"No coordinate of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
-        )
-    return result

@@ -15,7 +15,7 @@ from kineverse.errors import KineverseError, NoSolutionError
 from kineverse.geometry import Rule
 from kineverse.grasping import find_handle
 from kineverse.manipulation import find_articulated_objects
-from kineverse.manipulation.base_sampling import find_free_state
+from kineverse.manipulation.robot_placement import find_free_state
 from kineverse.manipulation.robot_sources import RobotSource
 from kineverse.model.model import Model
 from kineverse.state import State
@@ -104,7 +104,7 @@ def run_kitchen(job: KitchenJob) -> list[Trial]:
     trials = []
     for case, one in zip(cases, objects, strict=False):
         targets = (one.shut + OPEN_SHARE * (one.opened - one.shut), one.shut)
-        trials += skills.open_then_close(case, model, world, start, targets)
+        trials += skills.open_then_close(case, world, start, targets)
     return trials
 
 

@@ -10,12 +10,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from kineverse.manipulation import Outcome, open_unknown
+from kineverse.manipulation import Outcome, judge_outcome, open_unknown
 from kineverse.manipulation.robot_sources import RobotSource
 from kineverse.manipulation.unknown_objects import forget_joint
 from kineverse.model.model import Model
 from kineverse.spatial import translation
-from kineverse.worlds import Sensors
+from kineverse.worlds import RunMetrics, Sensors
 
 from .execution import run_jobs
 from .manipulation import skills
@@ -107,16 +107,27 @@ def open_one(job: UnknownObjectJob) -> list[Trial]:
     case = skills.TrialCase(job.thing, robot, thing.part, job.setting, job.seed, measures=truth)
 
     def act(watch: skills.TrialWatch) -> Outcome:
-        return open_unknown(
-            watch.open_session(world, skills.DT),
+        gripper, point = world.robot.gripper(), model.fk(thing.handle, thing.part)(start)[:3, 3]
+        metrics = RunMetrics(
+            world,
+            model.symbol(thing.part),
+            gripper=gripper,
+            handle=thing.handle,
+            part=thing.part,
+            point=point,
+        )
+        outcome = open_unknown(
+            watch.open_session(skills.DT, metrics),
             thing.handle,
             model=forget_joint(model, thing.part, start),
             part=thing.part,
             sensors=Sensors.parse(job.setting.noise),
+            hand=gripper,
             seed=job.seed,
         )
+        return judge_outcome(outcome, metrics)
 
-    return [case.run("open unknown", model, act)]
+    return [case.run("open unknown", model, act, world)]
 
 
 def make_model(robot: RobotSource, thing: UnknownObject) -> Model:

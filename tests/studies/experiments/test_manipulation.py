@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +10,10 @@ import pytest
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
 from kineverse.gallery.lockboxes import THESIS, draw_lockbox
 from kineverse.geometry import Rule, Scene
-from kineverse.manipulation import Outcome, Session, TrackedBelief, TrueBelief
-from kineverse.manipulation.base_sampling import find_free_state
+from kineverse.manipulation import Outcome, Session, TrackedBelief
+from kineverse.manipulation.robot_placement import find_free_state
 from kineverse.manipulation.robot_sources import SHIPPED
-from kineverse.worlds import read_run_recording
+from kineverse.worlds import TrueBelief, read_run_recording
 from kineverse_studies.commands.reproduce import format_report
 from kineverse_studies.experiments import Options, kitchens, reproduce, table1_open, table1_push
 from kineverse_studies.experiments.execution import run_jobs
@@ -143,24 +142,16 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
     """A skill that fails at flaps, raises at a drawer, and fails to close another one."""
     calls = []
 
-    def open_object(session, what, *, target, seed):
+    def open_object(session, coordinate, *, target, **options):
+        what = str(coordinate)
         calls.append((what, target))
-        session.cpu["open"], session.cpu["plan"] = [1e-3, 2e-3], [5.0]
-        session.wall["open"] = [1e-3, 2e-3]
+        session.cpu["open"] = session.wall["open"] = [1e-3, 2e-3]
         if "pull_out" in what:
             raise RuntimeError("a bug")
         done = "larder_door" not in what and ("drawer_1" not in what or target > 0)
         return Outcome(done, target, "The arm collides.", "kinematic", 3.0, 2, {"grasp_error": 0.4})
 
-    class World(SimpleNamespace):
-        def __init__(self, model, robot, *, sensors, seed):
-            super().__init__(model=model, robot=robot, name="kinematic", time=0.0, timeout=0.1)
-
-        def reset(self, state):
-            self.state = state
-
     monkeypatch.setattr(skills, "open_object", open_object)
-    monkeypatch.setattr(skills, "KinematicWorld", World)
     trials = kitchens.run_kitchen(kitchens.KitchenJob("kitchens/2", SHIPPED["hsr"]))
     model = kitchens.make_kitchen_with(SHIPPED["hsr"], "kitchens/2")
     objects = [str(s) for s in model.degrees_of_freedom if str(s).startswith("kitchen/")]
@@ -322,10 +313,10 @@ def test_trial_watch_keeps_commands_of_the_last_session_and_records(tmp_path):
     (recorded,) = make_settings(Options(record=tmp_path / "new"))
     world = recorded.make_world(model, "hsr", robot.start_state(model))
     x, lift = (model.symbol(f"hsr/{name}").derivative() for name in ("base/x", "arm_lift_joint"))
-    with TrialWatch(recorded, model, {"case": "a b", "what": "x/y"}, film=True) as watch:
-        watch.open_session(world, 0.02).act({x: 9.0})
+    with TrialWatch(recorded, model, world, {"case": "a b", "what": "x/y"}, film=True) as watch:
+        watch.open_session(0.02).act({x: 9.0})
         world.reset(robot.start_state(model))
-        session = watch.open_session(world, 0.02)
+        session = watch.open_session(0.02)
         for speeds in ({x: 0.1}, {lift: 0.05}, {}):
             session.act(speeds)
         watch.write_outcome(Outcome(True, 0.0, "", "kinematic", 0.06, 3))
@@ -349,12 +340,16 @@ def test_setting_believes_the_truth_only_without_noise():
 def test_papers_controller_moves_an_object_only_where_it_touches():
     robot = SHIPPED["hsr"]
     setup = make_push_setup(robot, table1_push.SHIPPED_KITCHEN, "folding door")
-    what, touches, commanded = setup.model.symbol(setup.what), [], []
+    what, touches, speeds = setup.model.symbol(setup.what), [], []
     world = TrialSetting().make_world(setup.model, "hsr", setup.start, dt=0.1)
-    session = Session(world, dt=0.1, on_step=lambda own: commanded.append(own.command.speeds))
-    outcome = push_as_published(session, robot, what, 500, lambda push: touches.append(push.touching))
+
+    def look(session):
+        touches.append(session.contact.touching)
+        speeds.append(session.command.speeds[what.derivative()])
+
+    session = Session(world, dt=0.1, belief=TrueBelief(world), on_step=look)
+    outcome = push_as_published(session, world, robot, what, 500)
     assert outcome, outcome.reason
-    speeds = [speeds[what.derivative()] for speeds in commanded]
     assert max(map(abs, speeds)) > 0.05
     assert not touches[0]
     assert [v for v, touched in zip(speeds, touches, strict=True) if not touched] == pytest.approx(

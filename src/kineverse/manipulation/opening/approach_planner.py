@@ -12,11 +12,11 @@ from kineverse.control import Controller
 from kineverse.grasping import Grasp, Gripper, Handle, sample_grasps
 from kineverse.lie import Array
 from kineverse.manipulation.base_drive import BaseDrive, DriveSearch, Place
-from kineverse.model.frame import is_of_robot
-from kineverse.model.model_view import ModelView
+from kineverse.model.symbolic_view import cached_for_version
 from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot
 
 from .base_placement import BasePlacement, PlacementSearch
 
@@ -34,8 +34,7 @@ class Approach:
     why: str = ""  # why there is none; empty if there is one
     trajectory: Trajectory | None = None
     tuck: Trajectory | None = None  # path of the arm before the drive; None if it stays
-    places: Array | None = None  # places (K, 3) of the drive; None if the base does not drive by itself
-    base: Mapping[Symbol, float] | None = None  # values of the coordinates of a base on wheels at the end
+    places: Array | None = None  # places (K, 3) of the drive; None if there is none
 
     def __bool__(self) -> bool:
         return not self.why
@@ -50,21 +49,16 @@ class ApproachPlanner:
     """Planner of paths to configurations, with the hand empty.
 
     A base that moves freely is planned with the arm. One on wheels drives first, with the arm as it is or,
-    where that leads nowhere, with a compact one. A base on wheels that cannot turn on the spot, or that
-    touches something where it stands, has no drive.
+    where that leads nowhere, with a compact one.
     """
 
     def __init__(self, search: PlacementSearch) -> None:
         self.search = search
         self.planner = Planner(search.model, search.moving, rules=search.scene.rules)
-        standing = {*search.standing}
-        self.drive = (
-            BaseDrive(
-                search.model, search.base, search.scene, search.robot_bodies, search.others, search.margin
-            )
-            if standing and standing == {*search.base}
-            else None
-        )
+        self.drive: BaseDrive | None = None
+        if search.standing and {*search.standing} == {*search.base}:
+            bodies = search.robot_bodies, search.others
+            self.drive = BaseDrive(search.model, search.base, search.scene, *bodies, search.margin)
         self._searches: dict[State, DriveSearch] = {}
         self._tucked: dict[State, tuple[Trajectory, State] | None] = {}
 
@@ -74,7 +68,9 @@ class ApproachPlanner:
         """Plan a path from a state to values of the robot's coordinates."""
         planner, base = self.planner, {s: float(wanted[s]) for s in self.search.standing}
         places, tuck, arms = None, None, state
-        if base and self.drive is not None and self.drive.is_possible and self._drives(state).begins_free:
+        if max((abs(state[s] - v) for s, v in base.items()), default=0.0) > _HERE:
+            if why := self.explain_standing(state):
+                return Approach(why)
             result = self._find_drive(state, base)
             if result is None:
                 return Approach("no path for the base, with the arm as it is or compact")
@@ -85,7 +81,17 @@ class ApproachPlanner:
         path = planner.plan(here, planner.space.nearest_turn(end, here), seconds=seconds, seed=seed)
         if not path.found:
             return Approach(path.why)
-        return Approach("", path.trajectory(), tuck, places, base)
+        return Approach("", path.trajectory(), tuck, places)
+
+    def explain_standing(self, state: State) -> str:
+        """Return why a base on wheels cannot drive from where it is; empty if it can, or has no wheels."""
+        if not self.search.standing:
+            return ""
+        if self.drive is None or not self.drive.is_possible:
+            return "The base cannot turn on the spot, so it does not drive by itself."
+        if not self._drives(state).begins_free:
+            return "The robot begins in contact, so its base does not drive."
+        return ""
 
     def plan_to(self, state: State, placement: BasePlacement, seed: int) -> Approach:
         """Plan a path from a state to the pose before the handle of a placement, within 2 s."""
@@ -106,8 +112,6 @@ class ApproachPlanner:
         """Return places of a drive, the path of the arm before it, and the state of the arm on the way."""
         x, y, angle = (base[s] for s in self.search.base)
         goal: Place = (x, y, angle)
-        if max(abs(state[s] - v) for s, v in base.items()) < _HERE:
-            return np.array([goal]), None, state
         places = self._drives(state).find(goal)
         if places is not None:
             return places, None, state
@@ -155,19 +159,24 @@ _KEPT_GRASPS = 15  # number of sets of grasps that are kept
 
 
 class Opener:
-    """Searches, planner and controllers of a gripper in a model, made once."""
+    """Searches, planner and controllers of a gripper in a version of a model, made once."""
 
-    def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
-        self.model, self.gripper = model, gripper
-        self.search = PlacementSearch(model, gripper, state)
+    def __init__(self, robot: Robot, gripper: Gripper, state: State) -> None:
+        self.model, self.robot, self.gripper = robot.model, robot, gripper
+        self.search = PlacementSearch(robot.model, robot, gripper, state)
         self.approaches = ApproachPlanner(self.search)
         self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
         self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
 
+    @classmethod
+    def of(cls, robot: Robot, gripper: Gripper, state: State) -> Opener:
+        """Return the one of a gripper, for openings from any state; it is made for the first one."""
+        key = "opener", robot.name, gripper.hand
+        return cached_for_version(robot.model, key, lambda: cls(robot, gripper, state))
+
     def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:
         """Return the grasps of a handle where everything but the robot is as in a state, up to a slant."""
-        robot = self.gripper.robot
-        others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
+        others = tuple(v for s, v in state.items() if not self.robot.moves(s))
         key = handle.frame, handle.coordinate, seed, slant, others
         if key not in self._grasps:
             result = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import count
@@ -17,18 +17,25 @@ from kineverse._checks import as_count
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
 from kineverse.grasping import Grasp, Gripper
-from kineverse.grasping.hand_model import find_box_corners
-from kineverse.lie import Array, inverse
-from kineverse.manipulation.base_sampling import BaseSampler, find_planar_base
+from kineverse.lie import Array
+from kineverse.manipulation.base_sampling import BaseSampler
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules
-from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot
 
-from .cartesian_paths import TOLERANCE, CartesianPaths
-from .grasp_selection import PlacementSampler
-from .path_collisions import OWN_MARGIN, CandidatePath, PathCheck, PathContacts, interpolate_poses
+from .arm_paths import (
+    OWN_MARGIN,
+    TOLERANCE,
+    CandidatePath,
+    CartesianPaths,
+    PathCheck,
+    PathContacts,
+    find_highest_passage,
+    find_highest_reach,
+    interpolate_poses,
+)
 
 NO_PATH, NO_PLACE = "no path to the handle", "no free place of the base"  # reasons of refusals
 _DIFFERENCE = 0.025  # difference of the values at the ends of a path and of its reversal [m], [rad]
@@ -58,7 +65,7 @@ class BasePlacement:
     seconds
         Duration of the search [s].
     stands
-        Whether the robot has no mobile base, so that each sample is an arm instead of a base.
+        Whether the robot's base stands where it is, so that each sample is an arm instead of a base.
     """
 
     grasp: Grasp | None
@@ -96,11 +103,135 @@ class BasePlacement:
     def why(self) -> str:
         """Text with the number of samples and the reasons of failures."""
         failed = ", ".join(f"{n} {reason}" for reason, n in self.reasons.most_common(6) if n)
-        what = "arms of a robot without a mobile base" if self.stands else "bases"
+        what = "arms of a robot that stands" if self.stands else "bases"
         result = (
             f"Found after {self.samples} {what}" if self else f"None of {self.samples} {what} goes through"
         )
         return f"{result}; failed: {failed}." if failed else f"{result}."
+
+
+_BASE_EASE, _BASE_SPEED = (0.1, 0.01), 1.0
+"""Weights of a base that can move relative to those of joints, so that it moves where they are not enough, or
+nearly stands where there is little room; and its speed where the model has no limit [m/s]."""
+_WHOLE_ARM, _STANDING_EASE = 6, (0.1, 0.0, 0.0)  # joints of an arm that needs no base, weights of its base
+_QUICK, _SOON = 0.5, 4.0  # speed of joints with full weight [m/s], [rad/s]; time to reach most arms [s]
+
+
+class PlacementSampler:
+    """Random bases, arms and grasps."""
+
+    def __init__(
+        self, model: ModelView, moving: Sequence[Symbol], standing: Sequence[Symbol], base: Sequence[Symbol]
+    ) -> None:
+        self.moving, self.standing, self.base = tuple(moving), tuple(standing), tuple(base)
+        limits = np.array([model.limits(s) for s in moving], dtype=float).reshape(-1, 2)
+        self.lower, self.upper = limits.T
+        self._bounded = np.isfinite(limits).all(axis=1)
+        speeds = [min(abs(v) for v in model.limits(s.derivative())) for s in moving]
+        self.speeds = np.array([v if 0.0 < v < math.inf else _BASE_SPEED for v in speeds])
+        on_base = np.array([s in self.base for s in moving], dtype=bool)
+        joints = np.minimum(1.0, self.speeds / _QUICK)
+        whole_arm = on_base.any() and (~on_base).sum() >= _WHOLE_ARM
+        weights = _STANDING_EASE if whole_arm else _BASE_EASE
+        self.eases = tuple(np.where(on_base, weight, joints) for weight in weights)
+        self._on_base = on_base
+
+    def stands(self, ease: Array) -> bool:
+        """Return True if the base stands along paths with weights (n,)."""
+        return not ease[self._on_base].any()
+
+    def choose_grasps(
+        self,
+        random: np.random.Generator,
+        grasps: Sequence[Grasp],
+        free: npt.NDArray[np.int_],
+        count: int,
+        upright: bool,
+    ) -> npt.NDArray[np.intp]:
+        """Return indices (N,) of grasps: good ones mostly, or all tilts alike; none if none is free."""
+        usable = np.flatnonzero(free > 0)
+        if not len(usable):
+            return np.zeros(0, dtype=np.intp)
+        size = len(usable)
+        if upright:
+            rank = random.geometric(min(1.0, 4.0 / size), count) - 1
+            return usable[np.where(rank < size, rank, random.integers(size, size=count))]
+        # Some paths need a hand that comes from above or from the side, and few grasps are such.
+        tilts = np.array([grasp.tilt for grasp in grasps])[usable]
+        wanted = random.uniform(tilts.min(), tilts.max(), count)
+        order = np.argsort(tilts, kind="stable")
+        near = np.searchsorted(tilts[order], wanted) + random.integers(-2, 3, count)
+        return np.asarray(usable[order[np.clip(near, 0, size - 1)]])
+
+    def draw(
+        self,
+        random: np.random.Generator,
+        states: Sequence[State],
+        hands: Array,
+        approaches: Array,
+        starts: int,
+        bases: BaseSampler,
+    ) -> tuple[Array, Array]:
+        """Return random arms (N, n), and bases (N, m) in front of poses of the hand (N, 4, 4)."""
+        count = len(hands)
+        Q = self._draw_arms(random, states[0], count)
+        still = np.tile(states[0].vector(self.standing), (count, 1))
+        if self.base:
+            first = slice(None, None, starts)
+            places = bases.draw(random, states, hands[first, :2, 3], (approaches - hands)[first, :2, 3])
+            places = np.repeat(places, starts, axis=0)[:count]
+            for k, s in enumerate(self.base):
+                columns, array = (self.moving, Q) if s in self.moving else (self.standing, still)
+                array[:, columns.index(s)] = places[:, k]
+        return Q, still
+
+    def find_places(self, Q: Array, still: Array) -> Array:
+        """Return the places of the base (N, 3) in arms (N, n) and values (N, m) of what stands."""
+        columns = [
+            Q[:, self.moving.index(s)] if s in self.moving else still[:, self.standing.index(s)]
+            for s in self.base
+        ]
+        return np.stack(columns, axis=1)
+
+    def stay(self, random: np.random.Generator, state: State, count: int) -> tuple[Array, Array]:
+        """Return arms (N, n) on a base that stays, (N, m): half of them as in a state, the others random."""
+        kept = self._on_base | (random.random((count, 1)) < 0.5)
+        Q = np.where(kept, state.vector(self.moving), self._draw_arms(random, state, count))
+        return Q, np.tile(state.vector(self.standing), (count, 1))
+
+    def _draw_arms(self, random: np.random.Generator, state: State, count: int) -> Array:
+        here = state.vector(self.moving)
+        lower = np.where(self._bounded, self.lower, here - math.pi)
+        upper = np.where(self._bounded, self.upper, here + math.pi)
+        soon = random.random((count, 1)) < 0.75
+        span = _SOON * self.speeds
+        low = np.where(soon, np.minimum(np.maximum(lower, here - span), upper), lower)
+        high = np.where(soon, np.maximum(np.minimum(upper, here + span), lower), upper)
+        return random.uniform(low, high)
+
+    def cost(self, state: State, paths: Array, approaches: Array, ends: npt.NDArray[np.int_]) -> Array:
+        """Return the costs (N,) of paths (N, K, n) until indices (N,): their times, and nearness to limits.
+
+        ``approaches`` (N, n) are the configurations before the hand is at the handle; the time [s] to get
+        there from a state counts as well.
+        """
+        away = approaches - state.vector(self.moving)
+        away = np.where(self._bounded, away, (away + math.pi) % (2 * math.pi) - math.pi)
+        for s in self.base[:2]:
+            if s in self.moving:
+                k = self.moving.index(s)
+                away[:, k] = approaches[:, k] - state[s]
+        there = (np.abs(away) / self.speeds).max(axis=1, initial=0.0)
+        steps = (np.abs(np.diff(paths, axis=1)) / self.speeds).max(axis=2, initial=0.0)
+        used = np.arange(steps.shape[1]) < ends[:, None]
+        along = (steps * used).sum(axis=1)
+        # Joints that their limits hold are as near to them everywhere.
+        has_range = self._bounded & (self.lower < self.upper)
+        lower, upper, bounded = self.lower[has_range], self.upper[has_range], paths[:, :, has_range]
+        room = np.minimum(bounded - lower, upper - bounded) / (upper - lower)
+        room = np.where(np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
+        least = room.min(axis=(1, 2), initial=1.0)
+        return np.asarray(along + there - 40.0 * np.minimum(least, 0.1))
 
 
 _STEP = 0.05  # distance of neighbouring values of the object along its path [m], [rad]
@@ -126,6 +257,10 @@ class PlacementSearch:
     ----------
     model
         Model of the robot and of everything around it.
+    robot
+        The robot, or the prefix of its names.
+    gripper
+        The gripper that is to hold the object.
     state
         State of everything; the robot's idle coordinates keep these values.
     margin
@@ -139,20 +274,23 @@ class PlacementSearch:
         Scene of the checks, with the rules for pairs that overlap always.
     """
 
-    def __init__(self, model: ModelView, gripper: Gripper, state: State, margin: float = 0.006) -> None:
+    def __init__(
+        self, model: ModelView, robot: Robot | str, gripper: Gripper, state: State, margin: float = 0.006
+    ) -> None:
         self.model, self.gripper, self.margin = model, gripper, margin
+        self.robot = robot = Robot.of(model, robot)
         symbols = model.symbols_of(gripper.hand)
         free = {s for s in symbols if s in model.degrees_of_freedom and s not in gripper.joints}
         self.standing = tuple(s for s in symbols if s in model.rates and s in free)
         self.moving = tuple(s for s in symbols if s in free and s not in self.standing)
-        self.base = find_planar_base(model, symbols)
+        self.base = robot.planar_base if {*robot.planar_base} <= {*symbols} else ()
         self.coordinates = (*self.moving, *self.standing)
         self.samples = PlacementSampler(model, self.moving, self.standing, self.base)
         self.paths = CartesianPaths(model, gripper.hand, self.moving, self.standing, self.samples.eases[0])
         self.scene = Scene(model)
         bodies = self.scene.bodies
-        self.robot_bodies = tuple(b for b in bodies if gripper.robot and is_of_robot(b, gripper.robot))
-        others = tuple(b for b in bodies if b not in self.robot_bodies)
+        self.robot_bodies = tuple(b for b in bodies if robot.owns(b))
+        others = tuple(b for b in bodies if not robot.owns(b))
         if not others:
             raise InvalidValueError("The model has nothing but the robot, so there is nothing to hold.")
         self.others = others
@@ -201,6 +339,7 @@ class PlacementSearch:
         target: float,
         *,
         accept: Callable[[BasePlacement], bool] = lambda placement: True,
+        stays: bool = False,
         samples: int = 600,
         batch: int = 100,
         seed: int = 0,
@@ -225,6 +364,8 @@ class PlacementSearch:
             Wanted value of the object's coordinate [m], [rad].
         accept
             Function that says whether a placement is taken; the search goes on if not.
+        stays
+            Whether a mobile base stays where it is.
         samples, batch
             Largest number of bases, and how many are tried at once.
         seed
@@ -239,8 +380,8 @@ class PlacementSearch:
         """
         samples, batch = as_count("samples", samples, 1), as_count("batch", batch, 1)
         random = np.random.default_rng(as_count("seed", seed, 0))
-        search = _Search(self, state, grasps, target, accept, random)
-        if not self.base:
+        search = _Search(self, state, grasps, target, accept, random, stands=stays or not self.base)
+        if search.stands:
             samples = batch
         for number in count():
             whole = number * batch < min(_WHOLE, samples)
@@ -252,9 +393,12 @@ class PlacementSearch:
             if result is not None or ended or search.refused >= _MOST_REFUSED:
                 break
             self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
+            if stays:
+                search.add_here(batch * _STARTS)
+                continue
             search.add(min(batch, samples - number * batch), _MIDDLES[number % len(_MIDDLES)])
-            if number == 1:
-                search.add_here()
+            if number == 1 and search.is_near:
+                search.add_here(_HERE)
         return result or search.nothing
 
     def retrace(
@@ -301,10 +445,12 @@ class _Search:
         target: float,
         accept: Callable[[BasePlacement], bool],
         random: np.random.Generator,
+        stands: bool = False,
     ) -> None:
+        self.stands = stands
         self.owner, self.state, self.grasps, self.random = owner, state, grasps, random
         self.begin, self.tried, self.reached = perf_counter(), 0, False
-        self.nowhere = bool(owner.base)
+        self.nowhere = not stands
         self.accept, self.refused = accept, 0
         self.coordinate = grasps[0].handle.coordinate
         start = float(state[self.coordinate])
@@ -325,20 +471,24 @@ class _Search:
         none = np.zeros((0, len(self.owner.coordinates)))
         return BasePlacement(
             None, self.owner.coordinates, none, none, self.values, none, none, self.tried, self.reasons,
-            perf_counter() - self.begin, not self.owner.base,
+            perf_counter() - self.begin, self.stands,
         )  # fmt: skip
 
     # -- sampling ------------------------------------------------------------------------------------------
 
-    def add_here(self) -> None:
-        """Sample arms and grasps where the base stands, if the hand is near the handle."""
+    @property
+    def is_near(self) -> bool:
+        """True if the hand is near the handle."""
         hand = np.asarray(self.owner.model.fk(self.grasps[0].gripper.hand)(self.state))
-        if np.linalg.norm(hand[:3, 3] - self.handles[0, :3, 3]) > _AROUND:
-            return
+        return bool(np.linalg.norm(hand[:3, 3] - self.handles[0, :3, 3]) <= _AROUND)
+
+    def add_here(self, count: int) -> None:
+        """Sample arms and grasps where the base stands."""
         samples = self.owner.samples
-        choice = samples.choose_grasps(self.random, self.grasps, self.free, _HERE, True)
+        self.tried += count // _STARTS if self.stands else 0
+        choice = samples.choose_grasps(self.random, self.grasps, self.free, count, True)
         if len(choice):
-            self._keep(*samples.stay(self.random, self.state, _HERE), choice, 0)
+            self._keep(*samples.stay(self.random, self.state, count), choice, 0)
 
     def add(self, batch: int, middle_share: float) -> None:
         """Sample bases, arms and grasps, and keep those that reach along the path."""
@@ -455,46 +605,3 @@ class _Search:
             self.grasps[candidate.choice], self.owner.coordinates, full[0][0], full[0],
             self.values[: end + 1], full[1], full[2], self.tried, self.reasons, perf_counter() - self.begin,
         )  # fmt: skip
-
-
-_ARMS = 200  # number of random arms from which the highest one is sought
-_STEPS = np.geomspace(0.5, 2e-3, 60)  # largest changes of a coordinate in the steps of the ascent [m], [rad]
-
-
-def find_highest_reach(scene: Scene, paths: CartesianPaths, gripper: Gripper, state: State) -> float:
-    """Return the greatest height of a point of a gripper over all arms [m].
-
-    It is sought by steepest ascent from random arms. Boxes stand for the shapes, so the height is rather too
-    great than too small. Contacts are left out.
-    """
-    hand_T_world = inverse(np.asarray(scene.model.fk(gripper.hand)(state)))
-    corners = []
-    for gap in (0.0, gripper.width):
-        scene.update(state.updated(gripper.values_at(gap)))
-        corners.append(find_box_corners(scene, gripper.bodies))
-    points = np.vstack(corners) @ hand_T_world[:3, :3].T + hand_T_world[:3, 3]
-    random = np.random.default_rng(0)
-    bounded = np.isfinite(paths.lower) & np.isfinite(paths.upper)
-    lower, upper = np.where(bounded, paths.lower, -np.pi), np.where(bounded, paths.upper, np.pi)
-    Q = random.uniform(lower, upper, (_ARMS, len(lower)))
-    highest = -np.inf
-    for most in _STEPS.tolist():
-        heights, slopes = paths.find_heights(Q, state.vector(paths.still), points)
-        highest = max(highest, float(heights.max()))
-        outward = ((paths.lower >= Q) & (slopes < 0.0)) | ((paths.upper <= Q) & (slopes > 0.0))
-        slopes = np.where(outward, 0.0, slopes)
-        steepest = np.abs(slopes).max(axis=1, initial=1e-9)
-        Q = np.clip(Q + most * slopes / steepest[:, None], paths.lower, paths.upper)
-    return highest
-
-
-def find_highest_passage(
-    scene: Scene, bodies: Iterable[str], state: State, coordinate: Symbol, values: Array
-) -> tuple[float, float]:
-    """Return the one of some values at which an object is the highest, and the height of its lowest point."""
-    names, lowest = tuple(bodies), []
-    for value in values.tolist():
-        scene.update(state.updated({coordinate: value}))
-        lowest.append(find_box_corners(scene, names)[:, 2].min())
-    highest = int(np.argmax(lowest))
-    return float(values[highest]), float(lowest[highest])

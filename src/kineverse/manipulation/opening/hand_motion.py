@@ -1,41 +1,45 @@
-"""Motions of a hand to a handle, with the held object, and away from it, step by step in a world."""
+"""Motions of a hand to a handle, with the held object, and away from it, step by step."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation import compile
-from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
+from kineverse.control import Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
+from kineverse.expressions import Expression
 from kineverse.geometry import Rule, Scene
-from kineverse.grasping import Grasp, Handle
+from kineverse.grasping import Grasp, Gripper, Handle
+from kineverse.grasping.grasp_sampling import RETREAT
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.outcome import SkillError
-from kineverse.manipulation.session import HandReference, Session, Speeds
-from kineverse.manipulation.slip_detection import SlipDetector
-from kineverse.model.frame import is_of_robot
+from kineverse.manipulation.session import HandReference, Session
+from kineverse.manipulation.skill_run import Pace, SkillRun
 from kineverse.planning import Trajectory, TrajectoryFollower
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import Judge
 
 from .approach_planner import Approach, Opener
+from .arm_paths import draw_retreats, find_least_time, row_at
 from .base_placement import BasePlacement
-from .cartesian_paths import find_least_time, row_at
-from .path_collisions import draw_retreats
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0  # time in which fingers open or close fully, and the largest one [s]
 _IDLE = 10  # number of steps in which fingers that stand still have not moved
 _LINE_SPEED = 0.1  # speed of the hand on the straight path to the handle and from it [m/s]
-_SETTLED, _MOST_SETTLING = 5e-4, 150
-"""Error of the hand's pose at the end of a straight path [m], [rad], and the most steps until it is met."""
+_SETTLED, _MOST_SETTLING = 5e-4, 3.0
+"""Error of the hand's pose at the end of a straight path [m], [rad], and the longest time until it is met
+[s]."""
+_LATE, _LINE_LATE = 0.1, 0.02
+"""Distances from a reference at which that stands still [m], [rad]: of an arm and a held object, and of a
+hand beside a handle, which must not cut corners."""
+_RESTING_AT_END = 0.2  # time for which a reference stands at the end of a trajectory [s]
+_AT_HANDLE = 0.02  # distance of a hand that may hold a handle, less than after any retreat [m]
 _REFERENCES = 24  # number of poses that pages show of a path
 _KNOWN, _MOST_LOOKING, _UNKNOWN = 1.5e-3, 1.0, 0.02
 """Deviation of a handle's position that is small [m], longest time to look until it is [s], and the deviation
@@ -53,10 +57,11 @@ Targets = TypeVar("Targets")
 
 
 class HandMotion:
-    """Motions of the hand of a robot at a handle."""
+    """Motions of the hand of a robot at a handle, and the path to it that was planned last."""
 
-    def __init__(self, session: Session, opener: Opener, handle: Handle, judge: Judge, until: float) -> None:
-        self.session, self.handle, self.judge, self.until = session, handle, judge, until
+    def __init__(self, run: SkillRun, opener: Opener, handle: Handle, seed: int = 0) -> None:
+        self.run, self.session, self.handle, self.seed = run, run.session, handle, seed
+        self.planned = Approach()
         self.gripper, self.search, self.approaches = opener.gripper, opener.search, opener.approaches
         self.controllers, self.model = opener.controllers, opener.search.model
         self.turns: Array = np.zeros(len(self.search.moving))
@@ -85,9 +90,9 @@ class HandMotion:
         """Stand until the handle is known well, or raise SkillError if it is not seen."""
         session = self.session
         session.phase = "look"
-        begin = session.world.time
-        while self.deviation > _KNOWN and session.world.time - begin < _MOST_LOOKING:
-            self.act({})
+        begin = session.time
+        while self.deviation > _KNOWN and session.time - begin < _MOST_LOOKING:
+            session.act({})
         if (deviation := self.deviation) > _UNKNOWN:
             coordinate = self.handle.coordinate
             raise SkillError(
@@ -108,32 +113,46 @@ class HandMotion:
         moved = {s: v for s, v in inside.items() if v != state[s]}
         return state.updated(moved) if moved else state
 
-    def approach(self, placement: BasePlacement, trajectory: Trajectory) -> None:
-        """Bring the hand along a trajectory before the handle, and then straight to the grasp."""
+    def plan(self, placement: BasePlacement) -> bool:
+        """Plan the path to a placement, and return whether there is one."""
+        self.planned = self.approaches.plan_to(self.session.state, placement, self.seed)
+        return bool(self.planned)
+
+    def explain(self, result: BasePlacement) -> SkillError:
+        """Return why no placement was found."""
+        standing = self.approaches.explain_standing(self.session.state)
+        why = f" {standing}" if standing else self.planned.barrier
+        return SkillError("reach" if standing else result.failure, f"{result.why}{why}")
+
+    def drive(self) -> bool:
+        """Drive a base on wheels as planned, with a compact arm where needed; return False if it stays."""
+        drive, places = self.approaches.drive, self.planned.places
+        if places is None:
+            return False
+        assert drive is not None
+        self.session.phase = "drive"
+        if self.planned.tuck is not None:
+            self.follow(self.planned.tuck)
+        self.session.reference = None
+        drive.follow(self.run, places)
+        return True
+
+    def follow_planned(self) -> None:
+        """Follow the planned path, from where the base has driven to."""
+        self.session.phase = "approach"
+        assert self.planned.trajectory is not None
+        self.follow(self.planned.trajectory)
+
+    def approach(self, placement: BasePlacement) -> None:
+        """Bring the hand along the planned path before the handle, and then straight to the grasp."""
         assert placement.grasp is not None
-        self.follow(trajectory)
+        self.follow_planned()
         self.move_fingers(self.gripper.opened)
         self.count_turns(placement.line[0])
         self.follow_line(placement.grasp.approach, placement.grasp.pose, self.rows(placement.line))
 
-    def drive(self, approach: Approach) -> None:
-        """Drive a base on wheels to its place, with a compact arm where that is needed."""
-        drive = self.approaches.drive
-        assert drive is not None
-        assert approach.places is not None
-        self.session.phase = "drive"
-        if approach.tuck is not None:
-            self.follow(approach.tuck)
-        self.session.reference = None
-
-        def act(speeds: Speeds) -> None:
-            self.check_time()
-            self.act(speeds)
-
-        drive.follow(self.session, approach.places, act)
-
     def follow(self, trajectory: Trajectory) -> None:
-        """Follow a trajectory."""
+        """Follow a trajectory, whose time waits where the robot is late."""
         session = self.session
 
         def make() -> tuple[Controller, TrajectoryFollower]:
@@ -142,16 +161,17 @@ class HandMotion:
 
         controller, follower = self.find_controller(("follow", trajectory.symbols), make)
         follower.trajectory = trajectory
-        begin = session.world.time
+        time, pace = 0.0, Pace(session, _LATE, speed=1.0)
         times = np.linspace(0.0, trajectory.duration, _REFERENCES)
         self.refer([self._hand(session.state.updated(trajectory.at(t))) for t in times.tolist()])
-        while session.world.time - begin < trajectory.duration + 0.2:
-            self.check_time()
-            self.refer_to((session.world.time - begin) / max(trajectory.duration, session.dt))
+        while time < trajectory.duration + _RESTING_AT_END:
+            self.refer_to(time / max(trajectory.duration, session.dt))
             with session.timed("approach"):
-                follower.set(controller, session.world.time - begin)
+                follower.set(controller, time, pace=pace.speed)
                 command = controller.step(self.state)
-            self.act(command.speeds, command)
+            away = session.state.vector(trajectory.symbols) - trajectory.positions_at(time)
+            self.run.act(command.speeds, command)
+            time += pace.advance(float(np.abs(away).max(initial=0.0)))
         session.reference = None
 
     def follow_line(self, start: Array, end: Array, rows: Array | None = None) -> None:
@@ -169,33 +189,34 @@ class HandMotion:
         bar = compile(self._bar, tier="interpreter")  # some hundred calls
         controller, (wanted, rate, posture, follow) = self.find_controller(("line", rows is None), make)
         displacement = end[:3, 3] - start[:3, 3]
-        seconds = float(np.linalg.norm(displacement)) / _LINE_SPEED
+        seconds = max(float(np.linalg.norm(displacement)) / _LINE_SPEED, 2.0 * session.dt)
         if rows is not None:
             seconds = max(seconds, find_least_time(rows, self.search.samples.speeds))
-        steps = max(2, math.ceil(seconds / session.dt))
-        speed = np.concatenate([end[:3, :3].T @ displacement / (steps * session.dt), np.zeros(3)])
+        speed = np.concatenate([end[:3, :3].T @ displacement / seconds, np.zeros(3)])
+        time, pace = 0.0, Pace(session, _LINE_LATE, speed=1.0)
         uncertain = [session.deviation(x) for x in (self._bar @ end)[:3, 3]]
         settled = max(_SETTLED, _SIGMAS * float(np.linalg.norm(uncertain)))
         self.refer(self._bar(session.state) @ np.array([start, end]))
-        for k in range(1, steps + _MOST_SETTLING):
-            self.check_time()
+        while time < seconds + _MOST_SETTLING:
             pose = end.copy()
-            share = min(1.0, k / steps)
+            share, later = (min(1.0, (time + k * session.dt) / seconds) for k in (1, 2))
             self.refer_to(share)
             pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
             with session.timed("line"):
                 state = self.state
                 controller.set(wanted, bar(state.vector(bar.inputs)) @ pose)
-                controller.set(rate, speed if k < steps else 0.0 * speed)
+                controller.set(rate, (pace.speed if share < 1.0 else 0.0) * speed)
                 if posture is not None and follow is not None and rows is not None:
                     # A base that lags would lead the arm along a path that was not checked.
-                    row, next_row = row_at(rows, share), row_at(rows, min(1.0, (k + 1) / steps))
+                    row, next_row = row_at(rows, share), row_at(rows, later)
                     controller.set(posture, row)
-                    controller.set(follow, (next_row - row) / session.dt)
+                    controller.set(follow, pace.speed * (next_row - row) / session.dt)
                 command = controller.step(state)
-            if k > steps and command.residuals["hand"] < settled:
+            error = command.residuals["hand"]
+            if share == 1.0 and error < settled:
                 break
-            self.act(command.speeds, command)
+            self.run.act(command.speeds, command)
+            time += pace.advance(error if share < 1.0 else 0.0)
         session.reference = None
 
     def count_turns(self, row: Array) -> None:
@@ -226,7 +247,7 @@ class HandMotion:
         """Close the fingers until they stand still, and return True if they stand around the bar."""
         self.session.phase = "close"
         self.move_fingers(self.gripper.closed)
-        self._await_readings()
+        self._await_observation()
         state, gripper = self.session.state, self.gripper
         self.fingers = {s: state[s] for s in gripper.joints}
         narrow = gripper.values_at(max(0.25 * grasp.thickness, grasp.thickness - _BESIDE))
@@ -247,14 +268,34 @@ class HandMotion:
         self.session.phase = "retract"
         if abs(state[self.handle.coordinate] - placement.values[-1]) > _ARRIVED:
             # The retreat of the placement was checked for an object that has arrived.
-            retreat = find_retreat(self, grasp, world_T_bar, world_T_hand)
-            self.follow_line(pose, inverse(world_T_bar) @ retreat.end, retreat.arms)
+            self._back_off(grasp)
             return
         end = dict(zip(placement.coordinates, placement.retreat[-1].tolist(), strict=True))
         gone = state.updated({**end, self.handle.coordinate: float(placement.values[-1])})
         away = pose.copy()
         away[:3, 3] += (inverse(self._bar(gone)) @ self._hand(gone))[:3, 3] - grasp.pose[:3, 3]
         self.follow_line(pose, away, self.rows(placement.retreat))
+
+    def let_go(self, grasp: Grasp | None = None) -> None:
+        """Open the fingers, and take the hand straight away from the handle."""
+        self.session.phase = "release"
+        self.move_fingers(self.gripper.opened)
+        self.session.phase = "retract"
+        self._back_off(grasp)
+
+    def _back_off(self, grasp: Grasp | None) -> None:
+        """Take the hand straight away from the handle, as far as it touches nothing."""
+        world_T_bar, world_T_hand = self._bar(self.session.state), self._hand(self.session.state)
+        end, arms = find_retreat(self, grasp, world_T_bar, world_T_hand)
+        bar_T_world = inverse(world_T_bar)
+        self.follow_line(bar_T_world @ world_T_hand, bar_T_world @ end, arms)
+
+    @property
+    def is_at_handle(self) -> bool:
+        """Hand at the handle: True if it may hold it, as after a skill that was broken off."""
+        search = self.search
+        search.scene.update(self.session.state)
+        return len(search.scene.watch(self.gripper.bodies, [self.handle.frame], _AT_HANDLE)()) > 0
 
     def rows(self, configurations: Array) -> Array:
         """Return the arms (K, n) of configurations of a placement, with the present turns."""
@@ -265,10 +306,8 @@ class HandMotion:
         tasks = list(tasks)
         still: list[Symbol | str] = [*self.search.standing, *self.gripper.joints]
         if not any(isinstance(task, Hold) for task in tasks):
-            moving, robot = {*self.search.moving}, self.gripper.robot
-            others = (s for s in self.model.degrees_of_freedom if s not in moving)
-            still += [s for s in others if not is_of_robot(s.path, robot)]
-        with self.session.timed("plan"):  # which lasts less in the interpreter than a compiler would take
+            still += [s for s in self.model.degrees_of_freedom if not self.search.robot.moves(s)]
+        with self.session.search():  # which lasts less in the interpreter than a compiler would take
             return Controller(self.model, tasks, dt=self.session.dt, fixed=still, **options)
 
     def find_controller(
@@ -286,9 +325,9 @@ class HandMotion:
     def move_fingers(self, values: Mapping[Symbol, float]) -> None:
         """Move the fingers to values, or until they stand still."""
         session, gripper = self.session, self.gripper
-        begin, session.reference = session.world.time, None
+        begin, session.reference = session.time, None
         steps: deque[tuple[State, float]] = deque(maxlen=_IDLE)
-        while session.world.time - begin < _MOST_CLOSING:
+        while session.time - begin < _MOST_CLOSING:
             state = session.state
             noise = max((session.deviation(s) for s in gripper.joints), default=0.0)
             speeds = {}
@@ -299,7 +338,7 @@ class HandMotion:
                 speeds[s.derivative()] = float(np.clip(wanted, max(-most, lower), min(most, upper)))
             if max((abs(values[s] - state[s]) for s in gripper.joints), default=0.0) < max(1e-5, noise):
                 break
-            self.act(speeds)
+            session.act(speeds)  # also when the time is up: a hand that opens lets go
             # Single steps are within the noise of encoders.
             steps.append((state, max(abs(v) for v in speeds.values()) * session.dt))
             moved = max(abs(session.state[s] - steps[0][0][s]) for s in gripper.joints)
@@ -307,26 +346,14 @@ class HandMotion:
             if len(steps) == _IDLE and moved < 0.1 * asked + 2.0 * noise:
                 break
 
-    def stand(self, seconds: float) -> None:
-        """Stand for a time [s]."""
-        end = self.session.world.time + seconds
-        while self.session.world.time < end - 1e-9:
-            self.act({})
-
-    def _await_readings(self) -> None:
+    def _await_observation(self) -> None:
         """Stand until readings of the present arrive; predicted fingers close through what they hold."""
         session = self.session
-        begin = session.world.time
-        while (seen := session.observation) is not None and seen.stamp < begin - 1e-9:
-            if session.world.time - begin > _MOST_LOOKING:
+        begin = session.time
+        while session.observation.stamp < begin - 1e-9:
+            if session.time - begin > _MOST_LOOKING:
                 raise SkillError("other", f"The sensors have been silent for {_MOST_LOOKING:g} s.")
-            self.act({})
-
-    def act(self, speeds: Mapping[Symbol, float], command: Command | None = None) -> None:
-        """Command speeds for one step, those of a controller's command if given, and judge it."""
-        session = self.session
-        session.act(speeds, command)
-        self.judge.update(session.world.state, session.commands, held=session.world.held)
+            session.act({})
 
     def refer(self, poses: npt.ArrayLike) -> None:
         """State the world poses (K, 4, 4) of the hand along the path that begins."""
@@ -337,14 +364,64 @@ class HandMotion:
         if self.session.reference is not None:
             self.session.reference.share = share
 
-    def check_time(self) -> None:
-        """Raise SkillError if the time is up."""
-        if self.session.world.time > self.until:
-            raise SkillError("time", f"The time is up in '{self.session.phase}'.")
+
+SLIPPED, PULLED_OUT = 0.008, 0.012
+"""Distances from its place in the hand from which on a handle has slipped [m]: of a modelled object, and of a
+part whose joint is unknown."""
+_SLIP_SIGMAS = 4.0  # standard deviations of the estimate that are added
+_EMPTY = 0.002  # motion of closed fingers from which on nothing is between them any more [m]
 
 
-_SPEED, _RAMP = 0.3, 0.5  # speed of an object on its path [m/s], [rad/s], and time from rest to it [s]
-_LATE = 0.1  # distance from the path at which the reference begins to wait [m], [rad]
+class SlipError(SkillError):
+    """Loss of a held handle."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__("other", reason)
+
+
+class SlipDetector:
+    """Watch over a bar in closed fingers, compared with its place in the hand at the start."""
+
+    def __init__(
+        self,
+        session: Session,
+        gripper: Gripper,
+        bar: Expression,
+        hand: Expression,
+        fingers: Mapping[Symbol, float],
+    ) -> None:
+        self._session, self._gripper, self._fingers = session, gripper, fingers
+        self.bar_T_hand = inverse(bar(session.state)) @ hand(session.state)
+        self._middle = gripper.grasp_pose[:, 3]
+        error = ((bar @ self.bar_T_hand - hand) @ self._middle)[:3]
+        self._limit = SLIPPED + _SLIP_SIGMAS * float(np.linalg.norm([session.deviation(x) for x in error]))
+        self._poses = compile([bar, hand], tier="interpreter")  # a call a step
+
+    def measure(self, state: State) -> float:
+        """Return the distance of the bar from its place in the hand at a state [m]."""
+        world_T_bar, world_T_hand = self._poses(state.vector(self._poses.inputs))
+        return float(np.linalg.norm(((world_T_bar @ self.bar_T_hand - world_T_hand) @ self._middle)[:3]))
+
+    def check(self, distance: float, coordinate: Symbol) -> None:
+        """Raise SlipError if the distance is too large, or if the fingers have closed further."""
+        empty = self._are_fingers_empty()
+        if empty or distance > self._limit:
+            how = "It is out of the hand." if empty else f"It moved {1e3 * distance:.0f} mm in the hand."
+            value = self._session.state[coordinate]
+            raise SlipError(f"The handle slipped at {value:.3f} of '{coordinate}'. {how}")
+
+    def _are_fingers_empty(self) -> bool:
+        gripper, state = self._gripper, self._session.state
+        closed = 0.0
+        for s, held in self._fingers.items():
+            range_ = gripper.closed[s] - gripper.opened[s]
+            noise = math.copysign(4.0 * self._session.deviation(s), range_)
+            further = (state[s] - held - noise) / range_ if range_ else 0.0
+            closed = max(closed, gripper.width * further)
+        return closed > _EMPTY
+
+
+_SPEED = 0.3  # speed of an object on its path [m/s], [rad/s]
 _MARGIN = 0.002  # least distance of bodies while the object moves [m]; placements keep more
 _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5  # least progress [m], [rad] in a time [s], and at the end
 _LOCKED, _STANDING = 1.5, 1e-3
@@ -378,8 +455,8 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
 
     key = "held", motion.handle.frame, coordinate
     controller, (grasped, wanted, posture, arm_speeds) = motion.find_controller(key, make)
-    share, speed, length = 0.0, 0.0, abs(target - values[0])
-    best, since = 0.0, session.world.time
+    share, length, pace = 0.0, abs(target - values[0]), Pace(session, _LATE)
+    best, since = 0.0, session.time
     controller.set(grasped, held)
     controller.set(arm_speeds, np.zeros(len(moving)))  # the path waits for the arm
     places = np.linspace(values[0], target, len(values)).tolist()
@@ -390,7 +467,6 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
         within = within + 1 if rest <= tolerance / 4 else 0
         if within >= enough:
             return
-        motion.check_time()
         with session.timed("open"):
             state = motion.state
             reference = row_at(rows, share)
@@ -399,21 +475,16 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             controller.set(wanted, np.array([value]))
             command = controller.step(state)
             # The reference waits for the slowest joint.
-            late = max(
-                float(np.abs(reference - state.vector(moving)).max(initial=0.0)),
-                abs(value - state[coordinate]),
-            )
-            speed = min(speed + _SPEED / _RAMP * session.dt, _SPEED)
-            speed *= min(1.0, max(0.0, 1.5 - late / _LATE))
-            share = min(1.0, share + speed * session.dt / length)
-            apart = slip.measure(state)
+            arm = np.abs(reference - state.vector(moving)).max(initial=0.0)
+            late = max(float(arm), abs(value - state[coordinate]))
         motion.refer_to(share)
-        motion.act(command.speeds, command)
-        slip.check(apart, coordinate)
+        motion.run.act(command.speeds, command)
+        share = min(1.0, share + pace.advance(late) * _SPEED / length)
+        slip.check(slip.measure(session.state), coordinate)
         done = abs(session.state[coordinate] - values[0])
         if done > best + _STALLED:
-            best, since = done, session.world.time
-        resting = session.world.time - since
+            best, since = done, session.time
+        resting = session.time - since
         if share == 1.0 and rest < 0.75 * tolerance and resting > _RESTING:
             return
         planned = abs(float(command.speeds.get(coordinate.derivative(), np.inf)))
@@ -429,25 +500,27 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
 _STEPS = 12  # number of arms along a retreat
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandRetreat:
-    """Straight path of a hand from a handle."""
+def find_retreat(
+    motion: HandMotion, grasp: Grasp | None, world_T_handle: Array, world_T_hand: Array
+) -> tuple[Array, Array | None]:
+    """Return the straight path from a handle that touches nothing, or goes the farthest before it does.
 
-    end: Array  # last pose world_T_hand (4, 4)
-    arms: Array | None  # configurations (L, n) of the arm along it; None if the arm does not reach the end
-
-
-def find_retreat(motion: HandMotion, grasp: Grasp, world_T_handle: Array, world_T_hand: Array) -> HandRetreat:
-    """Return the retreat that touches nothing, or the one that goes the farthest before it does.
-
-    It is the reversed approach of the grasp, or deviates from it along the bar.
+    That is the last pose world_T_hand (4, 4), and the configurations (L, n) of the arm on the way; None if it
+    does not reach the end. The path is the reversed approach of the grasp, or deviates from it along the bar.
+    The approach of a grasp that nobody knows is taken to be straight ahead of the hand.
     """
     search, state = motion.search, motion.state
-    lines = draw_retreats(grasp, world_T_handle, world_T_hand, _STEPS)
+    if grasp is None:
+        ahead = world_T_hand[:3, :3] @ motion.gripper.grasp_pose[:3, 0]
+        out = -RETREAT * world_T_handle[:3, :3].T @ ahead
+    else:
+        out = grasp.approach[:3, 3] - grasp.pose[:3, 3]
+    lines = draw_retreats(out, motion.handle.pose[:3, 2], world_T_handle, world_T_hand, _STEPS)
     arm, base = state.vector(search.moving), state.vector(search.standing)
     count, ends = len(lines), lines[:, -1]
     paths, reached = search.paths.follow(np.tile(arm, (count, 1)), np.tile(base, (count, 1)), lines)
-    best, farthest = HandRetreat(ends[0], None), 0
+    best: tuple[Array, Array | None] = (ends[0], None)
+    farthest = 0
     for end, path, number in zip(ends, paths, reached.tolist(), strict=True):
         if number < 2:
             continue
@@ -455,5 +528,5 @@ def find_retreat(motion: HandMotion, grasp: Grasp, world_T_handle: Array, world_
         hit = search.contacts.first(state, search.moving, rows, motion.handle.frame, opened=False)
         free = number if hit is None else hit
         if free > farthest:
-            best, farthest = HandRetreat(end, path if number == _STEPS else None), free
+            best, farthest = (end, path if number == _STEPS else None), free
     return best

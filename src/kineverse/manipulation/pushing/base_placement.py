@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +17,7 @@ from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
 from kineverse.errors import KineverseError
 from kineverse.lie import Array
-from kineverse.manipulation.base_sampling import BaseSampler, find_planar_base
-from kineverse.model.frame import is_of_robot
+from kineverse.manipulation.base_sampling import BaseSampler
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -52,7 +50,6 @@ class PushStart:
     samples: int  # number of sampled base poses
     reasons: Counter[str]  # number of samples by the reason of their failure
     steps: int  # number of steps of the push in the roll-out
-    seconds: float  # duration of the search [s]
     whole: bool = True  # whether the push reaches the target
 
     def __bool__(self) -> bool:
@@ -82,7 +79,7 @@ def find_push_start(
     steps: int = 900,
     seed: int = 0,
     least: float = 1.0,
-    accept: Callable[[State], str] | None = None,
+    accept: Callable[[State], str] = lambda start: "",
     report: Callable[[str], object] = lambda text: None,
 ) -> PushStart:
     """Return a start state of the robot from which a push goes through in a roll-out of its own prediction.
@@ -96,16 +93,16 @@ def find_push_start(
     in the way of the object. Robots without a mobile base are sampled over their arms alone, at those points
     that are within reach.
     """
-    begin, worked, reasons = perf_counter(), working_seconds(), Counter[str]()
+    worked, reasons = working_seconds(), Counter[str]()
     samples, seed = as_count("samples", samples, 1), as_count("seed", seed, 0)
     obstacle = pushing.find_obstacle(state)
     if obstacle is not None:  # wherever the robot stands
         reasons[f"{obstacle.body} at {obstacle.other}"] = 1
-        return PushStart(None, 0, reasons, 0, perf_counter() - begin)
+        return PushStart(None, 0, reasons, 0)
     sampler = _Sampler(pushing, state, np.random.default_rng(seed))
     if sampler.unreachable:
         reasons[_UNREACHED] = sampler.unreachable
-        return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
+        return PushStart(None, sampler.unreachable, reasons, 0)
     here, furthest, since = state[pushing.coordinate], 0.0, 0
     parts: list[tuple[float, int, State, int]] = []
     count = rolled = 0
@@ -113,7 +110,7 @@ def find_push_start(
         if since >= (_MOST_NO_FURTHER if furthest else _MOST_UNMOVED) or (not rolled and count >= _NOWHERE):
             break
         if count and count % _REPORTED == 0:
-            report(PushStart(None, count, reasons, 0, 0.0).why)
+            report(PushStart(None, count, reasons, 0).why)
         count += 1
         start = sampler.sample()
         if isinstance(start, str):
@@ -126,15 +123,14 @@ def find_push_start(
         furthest = max(furthest, distance) if distance > _MOVED else furthest
         if problem and problem != _NO_ROOM and distance >= least * abs(pushing.target - here):
             parts.append((-distance, count, start, end.steps))
-        if not problem and accept is not None:
-            problem = accept(start)
+        problem = problem or accept(start)
         if not problem:
-            return PushStart(start, count, reasons, end.steps, perf_counter() - begin)
+            return PushStart(start, count, reasons, end.steps)
         reasons[problem] += 1
     for _, _, start, taken in sorted(parts, key=lambda part: part[:2]):
-        if accept is None or not accept(start):
-            return PushStart(start, count, reasons, taken, perf_counter() - begin, False)
-    return PushStart(None, count, reasons, 0, perf_counter() - begin)
+        if not accept(start):
+            return PushStart(start, count, reasons, taken, False)
+    return PushStart(None, count, reasons, 0)
 
 
 class RollOut(NamedTuple):
@@ -151,7 +147,7 @@ def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.01
     pushing.reset()
     try:
         problem = pushing.first_contact(state) or str(pushing.find_obstacle(state) or "")
-        while not problem and not pushing.done(state, tolerance):
+        while not problem and abs(state[pushing.coordinate] - pushing.target) >= tolerance:
             command = pushing.step(state)
             if pushing.losses:
                 problem = "lost the contact"
@@ -180,12 +176,12 @@ class _Sampler:
         tip, axis = tool.locate_tip(model), tool.point_axis(model)
         self._point = Target("push/start/point", np.zeros(3))
         self._facing = Target("push/start/facing", np.array([1.0, 0.0, 0.0]))
-        still = [s for s in model.degrees_of_freedom if not is_of_robot(s.path, pushing.robot)]
+        still = [s for s in model.degrees_of_freedom if not pushing.robot.moves(s)]
         exact: list[Task] = [Hold(tip, self._point.expression, name="tip")]
         if axis.gradient():
             exact.append(Goal(axis, self._facing.expression, name="facing", weight=0.1))
         nearby = Goal(tip, self._point.expression, name="tip")
-        self.base = find_planar_base(model, model.symbols_of(tool.frame))
+        self.base = pushing.robot.planar_base
         # A pusher that cannot face the contact may still reach it with another part than its tip.
         goals: tuple[tuple[list[Task], float], ...] = (
             (exact, 2 * math.sin(_TILT / 2)), ([nearby], _NEARBY)
@@ -207,7 +203,7 @@ class _Sampler:
                 for (tasks, tolerance), last in zip(goals, clear, strict=True)
             ]
         self._tried = 0
-        robot_bodies = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
+        robot_bodies = [b for b in pushing.scene.bodies if pushing.robot.owns(b)]
         others = [b for b in pushing.scene.bodies if b not in robot_bodies]
         self._bases = BaseSampler(pushing.scene, self.base, robot_bodies, others, _MARGIN)
         self._points = pushing.surface.at(state)

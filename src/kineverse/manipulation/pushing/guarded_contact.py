@@ -5,7 +5,8 @@ A robot that is late presses: its servos are springs between where it should be 
     ℓ = ∫ u·(J q̇ - ẋ) dt
 
 of the tip x in the direction u of the push is known from the encoders. The commanded speed exceeds the
-measured one by a ramp, which shrinks with the lag, so that a press grows slowly and ends.
+measured one by a ramp, which shrinks with the lag, so that a press grows slowly and ends. Where the robot has
+stood between two steps, as it does while readings are missing, nothing is added to the lag.
 
 While a sensor reports a touch, the object is where the pusher is: the gap is 0, whatever the estimate says.
 The value of the coordinate is corrected so that it is, and moves with the pusher. An estimate in which the
@@ -30,6 +31,7 @@ _FORGET, _FORGET_DISTANCE = 1.0, 0.01
 """Time [s] and distance [m] after which a lag is forgotten: lag of acceleration and delays is no press, and
 what moves on gives way."""
 _REMEMBER = 0.1  # time for which a touch counts after the last report [s]
+STOPPED = 2.0  # number of periods between two steps from which on the robot has stood meanwhile
 _RETURN = 0.3  # time in which a correction returns to the estimate without a touch [s]
 _LEAST_RATE = 0.02  # least rate of a gap over the coordinate for a correction [m/rad]
 
@@ -65,31 +67,41 @@ class PushPress:
         """Weight of the latest estimate in a filter that makes noise of speeds as small as the ramp."""
         return self._dt / (self._dt + self.deviation / RAMP)
 
-    def report(self, touched: bool) -> None:
-        """Take the report of touch sensors for a step."""
-        self._touch = 0.0 if touched else self._touch + self._dt
+    def advance(
+        self,
+        estimate: float,
+        tip: Vector,
+        touching: bool,
+        *,
+        touched: bool = False,
+        passed: float | None = None,
+    ) -> float:
+        """Return the value of the coordinate at a step, by an estimate and the place of the tip.
 
-    def advance(self, estimate: float, tip: Vector, touching: bool) -> float:
-        """Return the value of the coordinate at a step."""
+        ``touched`` is what touch sensors report, and ``passed`` the time since the last step [s].
+        """
+        passed = self._dt if passed is None else passed
+        self._touch = 0.0 if touched else self._touch + passed
         moved = ZERO if self._tip is None else subtract(tip, self._tip)
         leverage = length(self._velocity)
         along = scale(1.0 / max(leverage, 1e-9), self._velocity)
         self._travel = travel = inner_product(along, moved)
         shift = self._sign * (estimate - self._estimate) if math.isfinite(self._estimate) else 0.0
         if touching and self.touched:
-            self.speed = max(travel / self._dt, 0.0)
+            self.speed = max(travel / passed, 0.0)
         else:
-            self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
+            self.speed = max(self.speed + self.weight * (shift * leverage / passed - self.speed), 0.0)
         if touching:
-            kept = self.lag * math.exp(-self._dt / _FORGET - max(travel, 0.0) / _FORGET_DISTANCE)
-            self.lag = max(kept + inner_product(along, self._planned) - travel, 0.0)
+            kept = self.lag * math.exp(-passed / _FORGET - max(travel, 0.0) / _FORGET_DISTANCE)
+            new = inner_product(along, self._planned) * passed - travel
+            self.lag = max(kept + (new if passed < STOPPED * self._dt else 0.0), 0.0)
         else:
             self.lag = 0.0
-        self._stuck = self._stuck + self._dt if touching and self.speed < STILL else 0.0
+        self._stuck = self._stuck + passed if touching and self.speed < STILL else 0.0
         if touching and self.touched and leverage > _LEAST_RATE:
             self.correction += self._sign * (max(travel, 0.0) / leverage - shift)
         elif not self.touched:
-            self.correction *= 1.0 - self._dt / _RETURN
+            self.correction *= max(1.0 - passed / _RETURN, 0.0)
         self._tip, self._estimate = tip, estimate
         return estimate + self.correction
 
@@ -107,7 +119,7 @@ class PushPress:
 
     def plan(self, velocity: Vector, tip_velocity: Vector) -> None:
         """Take the velocity of the contact point per unit of the push, and of the tip by a command."""
-        self._velocity, self._planned = velocity, scale(self._dt, tip_velocity)
+        self._velocity, self._planned = velocity, tip_velocity
 
     @property
     def depth(self) -> float:

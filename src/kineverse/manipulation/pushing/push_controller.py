@@ -25,24 +25,37 @@ import numpy as np
 from kineverse._runtime import no_collection
 from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError
-from kineverse.geometry import Rule, Scene
-from kineverse.geometry.objects import Exclusion
+from kineverse.geometry import Scene
 from kineverse.lie import Array
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules, match_bodies
 from kineverse.manipulation.swept_volume import Obstacle, find_obstacle
-from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
-from kineverse.worlds import Observation
+from kineverse.worlds import Observation, PlannedContact, Robot
 
-from .contact_pair import ContactRates, PairFinder, PushPair, PushView, make_view
-from .contact_points import PushPoint, PushSurface, find_push_tool
-from .contact_selection import CONE, CONE_END, ContactSelection
-from .guarded_contact import PushPress, TipAnchor
-from .push_program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
-from .vectors import ZERO, Vector, add, inner_product, length, move_point, scale, subtract
+from .contact_selection import (
+    CONE,
+    CONE_END,
+    ContactSelection,
+    PushPoint,
+    PushSurface,
+    find_push_tool,
+)
+from .guarded_contact import STOPPED, PushPress, TipAnchor
+from .push_program import (
+    LOST,
+    NEAR,
+    PRESS,
+    TOUCHING,
+    ContactRates,
+    PairFinder,
+    PushNumbers,
+    PushPair,
+    PushProgram,
+)
+from .vectors import ZERO, Vector, add, cross_product, inner_product, length, move_point, scale, subtract
 
 _APART = 4e-3  # gap between pusher and object away from the contact [m]
 _FUNNEL = 0.08  # largest height of the path to a contact above the surface [m]
@@ -64,22 +77,20 @@ class Pushing:
     ----------
     model
         Model of robot and object.
+    robot
+        The robot, or the prefix of its names.
     what
         The coordinate to change, as symbol or name.
     bodies
         Bodies of the robot that may touch the object, names or patterns: the pusher.
+    state
+        State in which the surface of the object is sampled, from there to the target.
     target
         Wanted value [m], [rad].
-    robot
-        Prefix of the robot; by default that of the first of ``bodies``.
-    object_frames
-        Bodies of the object that may be pushed, names or patterns; by default all that the coordinate moves.
     dt
         Time of a step [s].
     fixed
         Further coordinates that stay fixed.
-    rules, leave_out
-        Rules of the collision filter, and excluded bodies, as for :class:`.Scene`.
     logic
         ``"and"`` for the trend rule of :mod:`kineverse.logic`; for comparison ``"product"`` for the product
         rule, and None for no trends.
@@ -103,56 +114,46 @@ class Pushing:
     def __init__(
         self,
         model: ModelView,
+        robot: Robot | str,
         what: Symbol | str,
         bodies: str | Iterable[str],
         state: StateLike,
         *,
         target: float,
-        robot: str | None = None,
-        object_frames: str | Iterable[str] | None = None,
         dt: float = 0.02,
         fixed: Iterable[Symbol | str] = (),
-        rules: Iterable[Rule] = (),
-        leave_out: Iterable[Exclusion] = (),
         logic: str | None = "and",
     ) -> None:
         if logic not in ("and", "product", None):
             raise InvalidValueError(f"logic= is 'and', 'product' or None, not {logic!r}.")
-        self.model, self.target = model, float(target)
+        self.model, self.robot, self.target = model, Robot.of(model, robot), float(target)
         self.coordinate = coordinate = model.symbol(what) if isinstance(what, str) else what
         self._limits = lower, upper = model.limits(coordinate)
         if not lower - 1e-9 <= target <= upper + 1e-9:
             raise InvalidValueError(
                 f"'{coordinate}' is between {lower:g} and {upper:g}, so it cannot be pushed to {target:g}."
             )
-        self.rules, self.leave_out = tuple(rules), tuple(leave_out)
-        plain = Scene(model, rules=self.rules, leave_out=self.leave_out)
+        plain = Scene.of(model)
         self.pusher = match_bodies(plain.bodies, bodies, "bodies=")
-        self.robot = self.pusher[0].split("/")[0] if robot is None else robot
-        robot_bodies = tuple(b for b in plain.bodies if is_of_robot(b, self.robot))
+        robot_bodies = tuple(b for b in plain.bodies if self.robot.owns(b))
         moved = plain.bodies_moved_by([coordinate])
-        self.object_bodies = tuple(b for b in moved if b not in robot_bodies)
+        self.object_bodies = tuple(b for b in moved if not self.robot.owns(b))
         if not self.object_bodies:
             raise InvalidValueError(f"'{coordinate}' moves no body with a shape, so nothing can be pushed.")
-        pushed = self.object_bodies
-        if object_frames is not None:
-            pushed = match_bodies(pushed, object_frames, "object_frames=")
         at = model.default_state().updated(dict(state))
-        self.tool = find_push_tool(model, self.pusher, at, self.leave_out)
+        self.tool = find_push_tool(model, self.pusher, at)
         self.surface = PushSurface(
             model,
             coordinate,
-            pushed,
-            (*robot_bodies, *self.leave_out),
+            self.object_bodies,
+            robot_bodies,
             at,
             (at[coordinate], (at[coordinate] + target) / 2, target),
             self.tool.locate_tip(model),
         )
         furniture = furniture_rules(plain.bodies, robot_bodies)
         self.overlapping = find_overlapping_links(plain, robot_bodies, at)
-        self.scene = Scene(
-            model, rules=(*furniture, *self.overlapping, *self.rules), leave_out=self.leave_out
-        )
+        self.scene = Scene(model, rules=(*furniture, *self.overlapping))
         self._program = PushProgram(
             model, coordinate, self.target, self.tool, self.scene, dt=dt, fixed=fixed, logic=logic
         )
@@ -169,7 +170,7 @@ class Pushing:
         )
         self._hand = self.scene.bodies.index(self._hand_body())
         self._rates = ContactRates(slots, self._program.columns, self._hand)
-        self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
+        self._all = self.scene.watch(robot_bodies, "*", radius=0.0, moving=self.speeds)
         self._swept: tuple[tuple[float, ...], Obstacle | None] = (), None
         self.choice = ContactSelection(self.surface)
         self.press = PushPress(dt, self.surface.sign)
@@ -194,11 +195,8 @@ class Pushing:
         self._aside = math.inf
         self._margin = math.nan
         self.clearance = math.inf  # least distance at the last step of pairs that may not touch [m]
-        self._seen: tuple[PushPair | None, PushPoint, Vector] | None = None
-
-    def done(self, state: State, tolerance: float = 0.02) -> bool:
-        """Return True if the coordinate is within a tolerance of the target."""
-        return abs(state[self.coordinate] - self.target) < tolerance
+        self._contact: PushPair | None = None
+        self._stamp: float | None = None  # time of the last step [s]
 
     def first_contact(self, state: State) -> str:
         """Return which body of the robot penetrates something at a state; empty if none does."""
@@ -209,12 +207,9 @@ class Pushing:
 
     def find_obstacle(self, state: State) -> Obstacle | None:
         """Return the first thing in the way of the object to its target; None if the path is free."""
-        others = tuple(v for s, v in state.items() if not is_of_robot(s.path, self.robot))
+        others = tuple(v for s, v in state.items() if not self.robot.moves(s))
         if others != self._swept[0]:  # roll-outs begin where the object is, with the robot elsewhere
-            result = find_obstacle(
-                self.model, self.coordinate, state, self.target,
-                robot=self.robot, rules=self.rules, leave_out=self.leave_out,
-            )  # fmt: skip
+            result = find_obstacle(self.model, self.coordinate, state, self.target, robot=self.robot)
             self._swept = others, result
         return self._swept[1]
 
@@ -243,10 +238,12 @@ class Pushing:
         press.deviation = min(deviation, _LARGEST_DEVIATION) if deviation > _LEAST_DEVIATION else 0.0
         senses = press.deviation > 0.0
         read = None if observation is None else observation.joints
-        press.report(senses and observation is not None and not observation.touching.isdisjoint(self.pusher))
+        touched = senses and observation is not None and not observation.touching.isdisjoint(self.pusher)
         tip, point = self._locate(state)
         felt = tip if read is None else self._program.tip(state, read)
-        value = press.advance(state[self.coordinate], felt, self.touching)
+        value = press.advance(
+            state[self.coordinate], felt, self.touching, touched=touched, passed=self._count_time(state)
+        )
         if senses:
             state = state.updated({self.coordinate: min(max(value, self._limits[0]), self._limits[1])})
             tip, point = self._locate(state)
@@ -264,8 +261,16 @@ class Pushing:
         command = self._program.step(*self._numbers(tip, point, contact))
         moved: list[float] = (self._slots.twist(self._hand) @ command.vector).tolist()
         press.plan(point.velocity, move_point(moved, tip))
-        self._seen = contact, point, tip
+        self._contact = contact
         return command
+
+    def _count_time(self, state: State) -> float:
+        """Return the time since the last step [s]; after a stop, speeds grow from 0 again."""
+        dt, before, self._stamp = self.controller.dt, self._stamp, state.stamp
+        passed = dt if before is None or state.stamp is None else state.stamp - before
+        if passed >= STOPPED * dt:
+            self.controller.reset()
+        return passed if passed > 0.0 else dt
 
     def _locate(self, state: State) -> tuple[Vector, PushPoint | None]:
         chosen = self.choice.chosen
@@ -369,9 +374,29 @@ class Pushing:
         return pose
 
     @property
-    def view(self) -> PushView | None:
-        """Points and vectors of the last step; None before the first."""
-        return None if self._seen is None else make_view(*self._seen)
+    def gap(self) -> float:
+        """Distance of pusher and object at the last step [m]; infinite if they are far apart."""
+        return math.inf if self._contact is None else self._contact.gap
+
+    @property
+    def contact(self) -> PlannedContact:
+        """The bodies that the push brings together."""
+        return PlannedContact(self.pusher, self.object_bodies, self.touching)
+
+    @property
+    def vectors(self) -> dict[str, tuple[Array, Array]]:
+        """Vectors at the last step by name, each with its origin, for drawings (2022 paper, Fig. 6).
+
+        The nearest point p of the object is the origin of all: of the normal n, of the direction -∇p of the
+        push, of the active tangent, and of ``r - p`` to the nearest point of the pusher. There are none where
+        the pusher is far away.
+        """
+        if (contact := self._contact) is None:
+            return {}
+        n, push = contact.normal, scale(1.0 / max(length(contact.velocity), 1e-9), contact.velocity)
+        tangent = cross_product(cross_product(push, n), n)
+        named = {"n": n, "push": push, "tangent": tangent, "r - p": subtract(contact.r, contact.p)}
+        return {name: (np.array(contact.p), np.array(vector)) for name, vector in named.items()}
 
     def _keep_apart(self, contact: PushPair | None, pressing: bool) -> None:
         """Set the distance of pusher and object: of both apart, or of a pusher that feels for the object."""

@@ -1,15 +1,17 @@
-"""Quadratic program of pushes (2020 paper, eq. 5-11): tasks on parameters that each step sets."""
+"""Quadratic program of pushes (2020 paper, eq. 5-11), and the pair of bodies in contact that enters it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from kineverse.compilation import compile
 from kineverse.control import Command, Controller, Goal, Keep, Target
+from kineverse.control.contact_constraints import ContactSlots
 from kineverse.control.formulation import find_speeds
 from kineverse.control.tasks import Task
 from kineverse.expressions.expression import Expression, array, as_expression
@@ -22,8 +24,8 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .contact_points import PushTool
-from .vectors import Vector
+from .contact_selection import PushTool, find_alignment
+from .vectors import Vector, move_point, scale
 
 TOUCHING = 1e-3  # largest gap of a contact [m]
 LOST = 3e-3  # gap at which a contact is lost [m]
@@ -33,6 +35,7 @@ _REACH_SPEED = 0.5  # largest speed of the tip on its way to a contact [m/s]
 _TOUCH_SPEED = 0.15  # rate at which the trend of contact is followed [m/s]
 _SPIN_WEIGHT = 0.01  # against turns of the pusher about its axis, which change nothing but nearest points
 _MARGIN, _RADIUS = 5e-3, 0.035  # distance that pairs which may not touch keep, and from which they count [m]
+_MOST_PAIRS = 6
 _SMOOTH = 0.02
 _ANY = 1e3  # speed that restricts nothing
 _SIZES = {
@@ -188,3 +191,116 @@ class PushProgram:
         self._tip.input[:] = state.vector(self._tip_function.inputs)
         self._tip()
         return self._tip_symbols, np.array(self._tip.outputs[1])
+
+
+class PushPair(NamedTuple):
+    """Body of a pusher and body of an object that are near each other."""
+
+    robot: int  # indices of the bodies in the scene
+    thing: int
+    r: Vector  # nearest points on the robot and on the object [m]
+    p: Vector
+    normal: Vector  # unit vector from p to r
+    gap: float  # distance [m]
+    velocity: Vector  # velocity of p per unit of the object's motion to the target
+    alignment: float  # cosine between the velocity and -normal
+
+    @property
+    def tangents(self) -> tuple[Vector, Vector]:
+        """Two unit vectors that are orthogonal to the normal and to each other.
+
+        They may turn about the normal between two steps: both count alike. Duff et al., "Building an
+        Orthonormal Basis, Revisited" (2017).
+        """
+        x, y, z = self.normal
+        sign = math.copysign(1.0, z)
+        a = -1.0 / (sign + z)
+        b = a * x * y
+        return (1.0 + sign * a * x * x, sign * b, -sign * x), (b, sign + a * y * y, -y)
+
+
+class ContactRates:
+    """Derivatives of a contact over speeds: of the gap, and of the motion of a tip on the object.
+
+    They follow from the twists of the touching body, of the object and of the hand, by one compiled function.
+    """
+
+    def __init__(self, slots: ContactSlots, columns: Sequence[int], hand: int) -> None:
+        self._slots, self._hand = slots, hand
+        twists = Target("push/twist", np.zeros((3, *slots.twist(hand).shape)))
+        vectors = Target("push/vector", np.zeros((6, 3)))
+        r, p, normal, tip, *tangents = vectors.expression
+        robot, thing, carrier = (twist[:, list(columns)] for twist in twists.expression)
+        rows = [_along(normal, r, robot) - _along(normal, p, thing)]
+        rows += [_along(t, tip, carrier) - _along(t, tip, thing) for t in tangents]
+        self._first = len(twists.parameters)
+        inputs = (*twists.parameters, *vectors.parameters)
+        self._rows = compile([array([e for row in rows for e in row])], inputs).bind()
+
+    def __call__(self, contact: PushPair, tangents: tuple[Vector, Vector], tip: Vector) -> Array:
+        """Return the derivatives (3 n) of the gap, and of the motion along both tangents.
+
+        The array is overwritten by the next call.
+        """
+        rows, first = self._rows, self._first
+        rows.input[:first] = self._slots.twists([contact.robot, contact.thing, self._hand]).ravel()
+        one, other = tangents
+        rows.input[first:] = [*contact.r, *contact.p, *contact.normal, *tip, *one, *other]
+        rows()
+        return np.asarray(rows.outputs[0])
+
+
+def _along(direction: Expression, point: Expression, twist: Expression) -> Expression:
+    """Return the speeds (n,) along a direction of a point of a body with a twist (6, n)."""
+    return direction @ twist[:3] + np.cross(point, direction) @ twist[3:]
+
+
+class PairFinder:
+    """Search of the near pair of pusher and object that pushes best, and of the nearest other pair."""
+
+    def __init__(
+        self,
+        bodies: Sequence[str],
+        pusher: Collection[str],
+        object_bodies: Collection[str],
+        slots: ContactSlots,
+        column: int,
+        sign: float,
+    ) -> None:
+        pushers = np.array([b in pusher for b in bodies])
+        pushed = np.array([b in object_bodies for b in bodies])
+        forward = np.outer(pushers, pushed)
+        # 1 for pairs of pusher and object, -1 for the other order, 0 for all others.
+        kinds = forward.astype(np.int8) - forward.T.astype(np.int8)
+        self._kinds: list[list[int]] = kinds.tolist()
+        self._slots, self._column, self._sign = slots, column, sign
+
+    def nearest(self, found: DistanceResults) -> tuple[PushPair | None, float]:
+        """Return the pair that pushes best, and the clearance."""
+        best, clearance = None, math.inf
+        most, count = math.inf, 0
+        gaps = found.distances.tolist()
+        for row, (a, b) in enumerate(found.body_indices.tolist()):
+            kind, gap = self._kinds[a][b], gaps[row]
+            if not kind:
+                clearance = min(clearance, gap)
+            elif gap <= most and count < _MOST_PAIRS:
+                if not count:
+                    most = max(gap + TOUCHING, PRESS)
+                count += 1
+                pair = self._make_pair(found, row, gap, kind < 0)
+                if best is None or pair.alignment > best.alignment:
+                    best = pair
+            if clearance < math.inf and gap > most:
+                break
+        return best, clearance
+
+    def _make_pair(self, found: DistanceResults, row: int, gap: float, swapped: bool) -> PushPair:
+        robot, thing = found.body_indices[row].tolist()
+        a, b, c, d, e, f, u, v, w = found.witnesses[row].tolist()
+        r, p, n = (a, b, c), (d, e, f), (-u, -v, -w)
+        if swapped:
+            robot, thing, r, p, n = thing, robot, p, r, (u, v, w)
+        twist = self._slots.twist(thing)[:, self._column].tolist()
+        velocity = scale(self._sign, move_point(twist, p))
+        return PushPair(robot, thing, r, p, n, gap, velocity, find_alignment(n, velocity))

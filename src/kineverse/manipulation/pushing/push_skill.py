@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 
+from kineverse._checks import as_positive
 from kineverse.control import Goal
-from kineverse.errors import KineverseError
-from kineverse.geometry import Rule, Scene
-from kineverse.geometry.objects import Exclusion
-from kineverse.grasping import find_gripper
 from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
-from kineverse.manipulation.skill_arguments import (
-    check_positive,
+from kineverse.manipulation.skill_run import (
+    Pace,
+    SkillRun,
     check_target,
     choose_tolerance,
     explain_fixed,
     find_object_coordinate,
 )
-from kineverse.manipulation.swept_volume import find_obstacle
+from kineverse.manipulation.swept_volume import BlockedError
 from kineverse.planning import Path, Planner
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import Judge
 
 from .guarded_contact import STILL
 from .push_controller import Pushing
@@ -48,7 +45,7 @@ def plan_push_approach(
     model, tool = pushing.model, pushing.tool
     moving = [s.position for s in pushing.speeds if s.position != pushing.coordinate]
     free = [s for s in moving if s in model.degrees_of_freedom and s not in model.rates]
-    planner = Planner(model, free, rules=pushing.scene.rules, leave_out=pushing.leave_out)
+    planner = Planner(model, free, rules=pushing.scene.rules)
     planner.place(state)
     tip, axis = tool.locate_tip(model), tool.point_axis(model)
     at = pushing.surface.at(state)
@@ -83,6 +80,10 @@ _MOST_BLOCKED = 3  # number of contact points given up before an approach is pla
 _MOST_APPROACHES = 2
 _UNKNOWN, _LOOK = 0.05, 2.0  # deviation of an unknown coordinate [m], [rad], and time to look for it [s]
 _RETREAT_STEPS = 100
+_FOLLOWING, _LATE = 5.0, 0.1
+"""Gain on a path to a contact point [1/s], and distance from it at which it begins to wait [m], [rad]."""
+_SETTLING = 0.2  # time at the end of such a path [s]
+_SIGMAS = 2.0  # standard deviations by which an object that was at its target may seem to be off afterwards
 
 
 def push(
@@ -91,152 +92,61 @@ def push(
     *,
     target: float | None = None,
     bodies: str | Iterable[str] | None = None,
-    object_frames: str | Iterable[str] | None = None,
     seconds: float = 30.0,
     tolerance: float | None = None,
-    fixed: Iterable[Symbol | str] = (),
-    rules: Iterable[Rule] = (),
-    leave_out: Iterable[Exclusion] = (),
-    logic: str | None = "and",
     plan: bool = True,
     retreat: bool = False,
     pushing: Pushing | None = None,
-    judge: Judge | None = None,
-    on_step: Callable[[Pushing], object] | None = None,
 ) -> Outcome:
     """Push an articulated object to a value of its coordinate.
 
-    The controller finds contact points and changes them where it is blocked. After some of them a path is
-    planned to another one. Where the session's belief is an estimate, the robot first looks until it knows
-    the coordinate, and then feels for the object. What its limits hold is not pushed, nor is anything with
-    something in its way, see :func:`.find_obstacle`. The result is judged by the world's truth.
+    The robot first looks until it knows the coordinate. The controller finds contact points and changes them
+    where it is blocked. After some of them a path is planned to another one. What the robot believes with a
+    deviation is felt for. What its limits hold is not pushed, nor is anything with something in its way, see
+    :func:`.find_obstacle`.
 
     Parameters
     ----------
     session
-        Robot in a world.
+        The robot.
     what
         The coordinate of the object, as symbol or name.
     target
         Wanted value [m], [rad]; by default the limit nearest to the default value, where furniture is shut.
     bodies
         Bodies of the robot that may touch the object, names or patterns; by default those of its gripper.
-    object_frames
-        Bodies of the object that may be pushed, names or patterns; by default all that the coordinate moves.
     seconds
-        Largest time in the world [s].
+        Largest time by the robot's clock [s].
     tolerance
         Largest distance from the target [m], [rad]; by default 2 % of the distance, and 20 mm at a limit, see
         :func:`.choose_tolerance`.
-    fixed, rules, leave_out, logic
-        As for :class:`.Pushing`.
     plan
         Whether approaches are planned where the path of the controller is blocked.
     retreat
         Whether the pusher is taken away from the object at the end.
     pushing
-        A controller that was built before, for the same arguments.
-    judge
-        Judge that measures all steps; by default one of this push alone. It may have begun before.
-    on_step
-        Is called with the controller after each step, for drawings and recordings of its ``view``.
+        A controller that was built before, in place of ``target`` and ``bodies``.
 
     Returns
     -------
     Outcome
-        With ``measures``: those of :class:`.Judge`, ``losses``, ``blocked``, ``contacts``, ``jammed``,
-        ``planned``, ``tolerance``, ``peak_force`` [N] in a world with forces, and ``failure``:
-        ``"collision"``, ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the
-        path is free, if something is in the way.
+        With ``measures``: ``losses``, ``blocked``, ``contacts``, ``jammed``, ``planned``, ``target``,
+        ``tolerance``, and ``failure``: ``"collision"``, ``"time"`` or ``"other"``, if it was not done;
+        ``free``, the value up to which the path is free, if something is in the way.
 
     Raises
     ------
     UnknownNameError, InvalidValueError
         For a coordinate of the robot, and as :class:`.Pushing`.
     """
-    model, world = session.world.model, session.world
-    coordinate = find_object_coordinate(world, what)
-    seconds, target = check_positive("seconds", seconds), check_target(target)
+    coordinate, seconds = find_object_coordinate(session.robot, what), as_positive(seconds, "seconds=")
+    wanted, tolerance = check_target(target, tolerance)
     if pushing is not None:
-        target = pushing.target
-    elif target is None:
-        target = find_shut_value(model, coordinate)
-    tolerance = choose_tolerance(model, coordinate, session.state, target, tolerance)
-    first, begin = session.steps, world.time
-
-    def skip(done: bool, reason: str, failure: str = "other", **measures: Any) -> Outcome:
-        measures |= {} if done else {"failure": failure}
-        steps, passed = session.steps - first, world.time - begin
-        return Outcome(done, world.state[coordinate], reason, world.name, passed, steps, measures)
-
-    while session.deviation(coordinate) > _UNKNOWN:
-        if world.time - begin > _LOOK:
-            reason = (
-                f"'{coordinate}' is not known: its deviation is {session.deviation(coordinate):.2g} after "
-                f"{_LOOK:g} s. No camera sees a marker that it moves, or its track is lost."
-            )
-            return skip(False, reason)
-        session.phase = "look"
-        session.stop()
-    if pushing is None:
-        if abs(session.state[coordinate] - target) <= tolerance / 2:
-            done = abs(world.state[coordinate] - target) <= tolerance
-            return skip(done, f"'{coordinate}' is there from the start")
-        if why := explain_fixed(model, coordinate, session.state):
-            return skip(False, why)
-        own = tuple(rules), tuple(leave_out)
-        obstacle = find_obstacle(
-            model, coordinate, session.state, target,
-            robot=world.robot, rules=own[0], leave_out=own[1], start=session.start,
-        )  # fmt: skip
-        if obstacle is not None:
-            return skip(False, str(obstacle), **obstacle.measures)
-        if bodies is None:
-            bodies = find_gripper(model, world.robot).bodies
-        pushing = Pushing(
-            model,
-            coordinate,
-            bodies,
-            session.state,
-            target=target,
-            robot=world.robot,
-            object_frames=object_frames,
-            dt=session.dt,
-            fixed=fixed,
-            rules=own[0],
-            leave_out=own[1],
-            logic=logic,
-        )
-    elif (obstacle := pushing.find_obstacle(session.state)) is not None:
-        return skip(False, str(obstacle), **obstacle.measures)
-    pushing.reset()
-    session.peak_force = math.nan
-    measured = judge is None
-    if judge is None:
-        scene = Scene(model, rules=pushing.rules, leave_out=pushing.leave_out)
-        judge = Judge(model, world.robot, coordinate=coordinate, start=session.start, scene=scene)
-        judge.update(world.state)
-    judge.allow(pushing.object_bodies, pushing.pusher)
-    run = _Run(session, pushing, judge, seconds, tolerance, plan, on_step)
-    try:
-        failure = run.push()
-        if retreat:
-            run.retreat()
-    except SkillError as error:
-        failure = error
-    except KineverseError as error:
-        failure = SkillError("other", f"{type(error).__name__}: {error}")
-    run.act({})
-    value, overlap = world.state[coordinate], judge.overlap
-    there = abs(value - target) < tolerance and not session.untrusted
-    done = there and overlap is None
-    measures = {**(judge.measures if measured else {}), **run.measures(), "tolerance": tolerance}
-    if not done:
-        measures["failure"] = "collision" if there else failure.kind
-    reason = f"'{coordinate}' is at {value:.3g}" if there else str(failure)
-    if overlap is not None:
-        reason = f"{reason.removesuffix('.')}. {overlap}"
-    return Outcome(done, value, reason, world.name, run.time, run.steps, measures, done or run.claimed)
+        wanted = pushing.target
+    elif wanted is None:
+        wanted = find_shut_value(session.model, coordinate)
+    run = PushRun(session, coordinate, seconds, wanted, plan)
+    return run.perform(partial(run.push, bodies, pushing, tolerance, retreat))
 
 
 class _End:
@@ -271,132 +181,153 @@ class _End:
         return self._settled >= long or self._within >= long + _PATIENCE or self._pressed >= _PRESSED
 
 
-class _Run:
-    """Steps of one push."""
+class PushRun(SkillRun):
+    """Run of a push."""
+
+    coordinate: Symbol
 
     def __init__(
-        self,
-        session: Session,
-        pushing: Pushing,
-        judge: Judge,
-        seconds: float,
-        tolerance: float,
-        plan: bool,
-        on_step: Callable[[Pushing], object] | None,
+        self, session: Session, coordinate: Symbol, seconds: float, target: float, plan: bool
     ) -> None:
-        self._session, self._pushing, self._judge, self._on_step = session, pushing, judge, on_step
-        self.claimed = False
-        self._seconds, self._tolerance, self._plan = seconds, tolerance, plan
-        self._first, self._begin = session.steps, session.world.time
-        self._approaches = 0
+        super().__init__(session, coordinate, seconds)
+        self._target, self._plan = target, plan
+        self._tolerance, self._approaches = 0.0, 0
+        self._pushing: Pushing
 
-    @property
-    def steps(self) -> int:
-        return self._session.steps - self._first
+    def push(
+        self,
+        bodies: str | Iterable[str] | None,
+        pushing: Pushing | None,
+        tolerance: float | None,
+        retreat: bool,
+    ) -> str:
+        """Push until the object is at its target, and return why it is, or raise SkillError."""
+        session, model, coordinate, target = self.session, self.model, self.coordinate, self._target
+        self._look()
+        self._tolerance = tolerance = choose_tolerance(model, coordinate, session.state, target, tolerance)
+        self.measures |= {"target": target, "tolerance": tolerance}
+        if pushing is None:
+            if abs(self.value - target) <= tolerance / 2:
+                return f"'{coordinate}' is there from the start"
+            if why := explain_fixed(model, coordinate, session.state):
+                raise SkillError("other", why)
+            self.check_way(target)
+            with session.search(f"points of '{coordinate}' at which it can be pushed"):
+                own = self.robot.gripper().bodies if bodies is None else bodies
+                pushing = Pushing(
+                    model, self.robot, coordinate, own, session.state, target=target, dt=session.dt
+                )
+        elif (obstacle := pushing.find_obstacle(session.state)) is not None:
+            raise BlockedError(obstacle)
+        pushing.reset()
+        self._pushing = pushing
+        try:
+            failure = self._push_on()
+            if retreat:
+                self._retreat()
+        finally:
+            self.measures |= {
+                "losses": pushing.losses,
+                "blocked": pushing.choice.blocked,
+                "contacts": pushing.choice.contacts,
+                "jammed": pushing.choice.jammed,
+                "planned": self._approaches,
+            }
+        value, rest = self.value, abs(self.value - target)
+        allowed = 0.0 if failure is not None else _SIGMAS * session.deviation(coordinate)
+        if rest < tolerance + allowed:
+            return f"'{coordinate}' is at {value:.3g}"
+        raise failure or SkillError(
+            "other", f"'{coordinate}' was at its target, {target:.3g}, and then went on to {value:.3g}."
+        )
 
-    @property
-    def time(self) -> float:
-        return self._session.world.time - self._begin
+    def _look(self) -> None:
+        """Stand until the coordinate is known, or raise SkillError if it is not seen."""
+        session, coordinate = self.session, self.coordinate
+        while (deviation := session.deviation(coordinate)) > _UNKNOWN:
+            if session.time - self.begin > _LOOK:
+                raise SkillError(
+                    "other",
+                    f"'{coordinate}' is not known: its deviation is {deviation:.2g} after {_LOOK:g} s. No "
+                    "camera sees a marker that it moves, or its track is lost.",
+                )
+            session.phase = "look"
+            self.act({})
 
-    def push(self) -> SkillError:
-        """Push until the object is at its target, and return what prevented it if it is not there."""
-        session, pushing = self._session, self._pushing
-        contact = pushing.first_contact(session.state)
-        if contact:
+    def _push_on(self) -> SkillError | None:
+        """Push until the object is at its target, and return what prevented it; None if nothing did."""
+        session, pushing = self.session, self._pushing
+        if contact := pushing.first_contact(session.state):
             return SkillError("collision", f"The push begins with a {contact}.")
-        blocked = 0
-        end = _End(pushing, self._tolerance)
-        while self.time < self._seconds:
-            if end.reached(session.state):
-                self.claimed = True
-                return SkillError("other", "The estimate is at the target, and the world is not.")
+        blocked, end = 0, _End(pushing, self._tolerance)
+        while not end.reached(session.state):
+            if self.left < 0.0:
+                where = "touching" if pushing.touching else "on the way to a contact"
+                return SkillError("time", f"Out of time at {self.value:.3g}, {where}.")
             if pushing.choice.is_jammed:
-                force = session.peak_force
-                strength = "" if math.isnan(force) else f" with up to {force:.0f} N"
                 return SkillError(
                     "collision",
-                    f"The object does not move: pushed at {pushing.choice.jammed} points{strength}, it stays "
-                    f"at {session.state[pushing.coordinate]:.3g}. It may be locked, jammed or blocked.",
+                    f"The object does not move: pushed at {pushing.choice.jammed} points, it stays at "
+                    f"{self.value:.3g}. It may be locked, jammed or blocked.",
                 )
             if pushing.choice.blocked - blocked >= _MOST_BLOCKED and self._plan:
                 blocked = pushing.choice.blocked
-                problem = self._approach()
-                if problem:
+                if problem := self._approach():
                     return SkillError("collision", problem)
             if end.near:
-                self.act({})  # an object that has run on by itself is not followed
-                continue
-            self._step("push")
-        where = "touching" if pushing.touching else "on the way to a contact"
-        return SkillError("time", f"Out of time at {session.state[pushing.coordinate]:.3g}, {where}.")
+                session.act({})  # an object that has run on by itself is not followed
+            else:
+                self._step("push")
+        return None
 
     def _step(self, phase: str) -> None:
-        session, pushing = self._session, self._pushing
+        """Act by the controller's command for one step, also for a retreat when the time is up."""
+        session, pushing = self.session, self._pushing
         session.phase = phase
         with session.timed("push"):
-            state, observation, deviation = session.state, session.observation, 0.0
-            if observation is not None:
-                deviation = pushing.find_deviation(state, session.belief.deviation)
-            command = pushing.step(state, observation if deviation else None, deviation)
-        session.vectors = {} if pushing.view is None else pushing.view.vectors
-        self.act(command.speeds)
+            state = session.state
+            deviation = pushing.find_deviation(state, session.belief.deviation)
+            command = pushing.step(state, session.observation if deviation else None, deviation)
+        session.contact, session.vectors = pushing.contact, pushing.vectors
+        session.act(command.speeds, command)
         session.vectors = {}
-        if self._on_step is not None:
-            self._on_step(pushing)
-
-    def act(self, speeds: Mapping[Symbol, float]) -> None:
-        """Command speeds for one step, and judge it; none stop the robot, also where the world fails."""
-        session, before = self._session, self._session.world.time
-        if speeds:
-            session.act(speeds)
-        else:
-            session.stop()
-        if session.world.time > before:
-            self._judge.update(session.world.state, session.commands, pushing=self._pushing.touching)
 
     def _approach(self) -> str:
         """Plan a path to another contact point and follow it; return what prevents it."""
+        session, pushing = self.session, self._pushing
         if self._approaches >= _MOST_APPROACHES:
-            tried = self._pushing.choice.contacts
+            tried = pushing.choice.contacts
             return f"No contact point was reached, of {tried} and {self._approaches} plans."
         self._approaches += 1
-        session, pushing = self._session, self._pushing
-        self.retreat()  # a path that begins with a contact cannot be planned
+        self._retreat()  # a path that begins with a contact cannot be planned
         self.act({})
-        path, point = plan_push_approach(pushing, session.state)
+        with session.search("a path to another point of the object"):
+            path, point = plan_push_approach(pushing, session.state)
         if not path.found:
             return f"Blocked, and no path leads to a contact point. {path.why}"
         self._follow(path)
-        pushing.controller.reset()
         pushing.choose(session.state, point)
         return ""
 
     def _follow(self, path: Path) -> None:
-        session, trajectory = self._session, path.trajectory()
-        session.phase = "approach"
-        dt = session.dt
-        times = np.arange(dt, trajectory.duration + dt, dt).clip(max=trajectory.duration)
-        for wanted in trajectory.positions_at(times):
-            here = session.state.vector(trajectory.symbols)
-            rates = (wanted - here) * (1 / dt)
-            self.act({s.derivative(): float(v) for s, v in zip(trajectory.symbols, rates, strict=True)})
+        """Follow a path, which waits where the robot is late."""
+        session, trajectory = self.session, path.trajectory()
+        session.phase, symbols = "approach", trajectory.symbols
+        time, pace = 0.0, Pace(session, _LATE, speed=1.0)
+        while time < trajectory.duration + _SETTLING:
+            now = trajectory.positions_at(time)
+            later, away = (
+                trajectory.positions_at(time + pace.speed * session.dt),
+                now - session.state.vector(symbols),
+            )
+            rates = (later - now) / session.dt + _FOLLOWING * away
+            self.act({s.derivative(): v for s, v in zip(symbols, rates.tolist(), strict=True)})
+            time += pace.advance(float(np.abs(away).max()))
 
-    def retreat(self) -> None:
+    def _retreat(self) -> None:
         self._pushing.retreating = True
         for _ in range(_RETREAT_STEPS):
             self._step("retreat")
-            view = self._pushing.view
-            if view is not None and math.isinf(view.distance):
+            if math.isinf(self._pushing.gap):
                 break
         self._pushing.retreating = False
-
-    def measures(self) -> dict[str, Any]:
-        pushing, force = self._pushing, self._session.peak_force
-        return {
-            **({} if math.isnan(force) else {"peak_force": force}),
-            "losses": pushing.losses,
-            "blocked": pushing.choice.blocked,
-            "contacts": pushing.choice.contacts,
-            "jammed": pushing.choice.jammed,
-            "planned": self._approaches,
-        }

@@ -11,11 +11,10 @@ import numpy as np
 from kineverse.compilation import compile
 from kineverse.estimation import PlausibilityMonitor, pose_covariance
 from kineverse.lie import Array, inverse, pose_difference, retract, rotation_angle, skew
-from kineverse.model.frame import WORLD, is_of_robot
+from kineverse.model.frame import WORLD
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import Observation, Sensors, World
-from kineverse.worlds.sensor_sampler import find_camera
+from kineverse.worlds import Observation, Robot, Sensors
 
 from .unmodelled_joint import JointPath, UnknownPart
 
@@ -61,27 +60,21 @@ def is_near(a: Array, b: Array) -> bool:
     return bool(np.linalg.norm(error[:3]) <= _NEAR and np.linalg.norm(error[3:]) <= _TURNED)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PartLook:
-    """Look at the part that is no outlier."""
-
-    pose: Array  # pose (4, 4) of the part relative to what it moves in
-    covariance: Array  # covariance (6, 6) of its errors
-    time: float  # time [s]
-
-
 class PartBelief:
     """Belief in which the robot is read by its encoders, and a part of unknown motion is seen.
 
     Before a hand holds the part, it stands where the mean of all looks is. In a hand it is where the hand is,
     times the mean of the last looks at the part in the hand. So the estimate does not lag behind the motion,
     and looks that are far from it are outliers.
+
+    ``looks`` has the others since the part was held: poses (4, 4) relative to what it moves in, and the
+    covariances (6, 6) of their errors.
     """
 
     def __init__(
         self,
         unknown: UnknownPart,
-        world: World,
+        robot: Robot,
         state: State,
         hand: str,
         markers: Sequence[str],
@@ -92,22 +85,21 @@ class PartBelief:
         self.unknown, self.sensors = unknown, sensors
         self.monitor: PlausibilityMonitor | None = None
         self.seen: dict[str, None] = {}
-        self._ancestors = tuple(ancestors)
-        own = [name for name in model.frames if is_of_robot(name, world.robot)]
         self._symbols = {s for s in model.symbols if not s.order}
-        self._camera = compile(model.fk(sensors.camera or find_camera(own) or own[0]))
+        self._camera = compile(model.fk(sensors.camera or robot.camera or robot.frames[0]))
         self._hand = compile(model.fk(hand))
         self._state = model.default_state().updated({s: v for s, v in state.items() if s in self._symbols})
         self._marker_T_part = {name: np.asarray(model.fk(unknown.frame, name)({})) for name in markers}
         self._world_T_parent = np.asarray(model.fk(unknown.parent)(self._state))
         self._before = self._world_T_parent @ unknown.origin
         self.held: PoseMean | None = None
-        self.looks: list[PartLook] = []
+        self.still = PoseMean(_STATIC_LOOKS)
+        self.looks: list[tuple[Array, Array]] = []
         self.path: JointPath | None = None
+        self._references = {name: PoseMean(_STATIC_LOOKS) for name in ancestors}
         self._beside: str | None = None
         self._world_T_hand = np.eye(4)
-        self._earlier = self._stamp = 0.0
-        self.reset()
+        self._looked = -math.inf  # stamp of the latest poses [s]
 
     @property
     def is_seen(self) -> bool:
@@ -170,41 +162,42 @@ class PartBelief:
         self._before = self.pose
         self.held, self.path, self.still = None, None, PoseMean(_STATIC_LOOKS)
 
-    def reset(self) -> None:
-        """Forget all looks, as the time of the world restarts."""
-        self.held, self.path, self.looks = None, None, []
-        self._earlier, self._stamp = self._earlier + self._stamp, 0.0
-        self.observation: Observation | None = None
-        self.still = PoseMean(_STATIC_LOOKS)
-        self._references = {name: PoseMean(_STATIC_LOOKS) for name in self._ancestors}
+    def update(self, observation: Observation, time: float, commands: State | None = None) -> State:
+        """Return the state of the model of the part by the latest readings.
 
-    def update(self, world: World, commands: State | None = None) -> State:
-        """Return the state of the model of the part after reading the sensors."""
-        self.observation = seen = world.observe()
-        self._stamp = seen.stamp
-        joints = {s: v for s, v in seen.joints.items() if s in self._symbols}
+        Readings that are as old as the sensors' delay say are of the present. Poses with the stamp of the
+        last ones are the same again.
+        """
+        joints = {s: v for s, v in observation.joints.items() if s in self._symbols}
         self._state = self._state.updated(joints)
         self._world_T_hand = self._hand(self._state.vector(self._hand.inputs))
-        self.seen |= dict.fromkeys(seen.poses)
-        for name, mean in self._references.items():
-            if name in seen.poses:
-                mean.add(seen.poses[name])
-        if self.monitor is not None and seen.poses:
-            known = {name: pose for name, pose in seen.poses.items() if name in self.monitor.frames}
-            self.monitor.update(known, at=self._earlier + seen.stamp)
-        if any(name in seen.poses for name in self._marker_T_part):
-            self._look(seen)
+        if observation.poses and observation.stamp > self._looked:
+            self._looked = observation.stamp
+            self._look(observation)
         if self.path is not None and self.held is not None and self.held.pose is not None:
             self.path.project(inverse(self.reference_pose) @ self._world_T_hand @ self.held.pose)
         part = self.unknown.values(inverse(self._world_T_parent) @ self.pose)
         self._state = self._state.updated(part)
-        return State(self._state, stamp=seen.stamp, source="looks")
+        stamp = min(time, observation.stamp + self.sensors.delay)
+        return State(self._state, stamp=stamp, source="looks")
 
     def deviation(self, coordinate: Symbol) -> float:
         """Return 0: only coordinates of the robot are used, and its encoders are exact enough."""
         return 0.0
 
     def _look(self, seen: Observation) -> None:
+        """Take new poses of the part, of what it moves in, and of what a test of its joint reads."""
+        self.seen |= dict.fromkeys(seen.poses)
+        for name, mean in self._references.items():
+            if name in seen.poses:
+                mean.add(seen.poses[name])
+        if self.monitor is not None:
+            known = {name: pose for name, pose in seen.poses.items() if name in self.monitor.frames}
+            self.monitor.update(known, at=seen.stamp)
+        if any(name in seen.poses for name in self._marker_T_part):
+            self._look_at_part(seen)
+
+    def _look_at_part(self, seen: Observation) -> None:
         """Take a look at the part; several markers are weighted by their information."""
         looks: list[tuple[Array, Array]] = []
         believed = self.held.pose if self.held is not None else self.still.pose
@@ -223,7 +216,7 @@ class PartBelief:
         elif self.held.add(inverse(frame) @ pose):
             relative = inverse(self.reference_pose)
             turn = np.kron(np.eye(2), relative[:3, :3])
-            self.looks.append(PartLook(relative @ pose, turn @ covariance @ turn.T, seen.stamp))
+            self.looks.append((relative @ pose, turn @ covariance @ turn.T))
 
     def _covariance(self, world_T_marker: Array, world_T_part: Array) -> Array:
         """Return the covariance (6, 6) of an observed pose of the part in the world."""

@@ -14,9 +14,11 @@ from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation import Fit
 from kineverse.grasping import Handle, find_handle
+from kineverse.grasping.finger_branches import path_to_root
 from kineverse.lie import Array, inverse, log_se3, pose_difference, to_quaternion
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
+from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.spatial import axis_angle, translation
@@ -154,6 +156,19 @@ def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
             edit.attach(frame, child, translation(0, 0, 0))
     (coordinate,) = model.fk(frame, parent).symbols
     return coordinate
+
+
+def place_frame(model: Model, frame: str, pose: Array) -> None:
+    """Put the furniture that carries a frame where the frame has a pose (4, 4) in the world."""
+    if frame == WORLD:
+        return
+    if model.fk(frame).symbols:
+        raise InvalidValueError(
+            f"'{frame}' is moved by joints itself; name a frame that stands still as beside=."
+        )
+    *_, top = (name for name in path_to_root(model, frame) if name != WORLD)
+    with model.edit() as edit:
+        edit.attach(top, WORLD, pose @ inverse(model.fk(frame)({})) @ model.fk(top)({}), f"seen {top}")
 
 
 class JointPath:

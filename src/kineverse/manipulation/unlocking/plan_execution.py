@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from kineverse._checks import finite_number
+from kineverse._checks import as_positive
 from kineverse.control import Controller, Goal
-from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
-from kineverse.geometry import Scene
+from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.skill_run import SkillRun
 from kineverse.manipulation.swept_volume import Obstacle, find_obstacle
 from kineverse.model.model_view import ModelView
 from kineverse.reasoning import UnlockingPlan, UnlockingStep, plan_unlocking
 from kineverse.reasoning.unlocking_plan import BUDGET
 from kineverse.state import State
 from kineverse.symbols import Symbol, parameter
-from kineverse.worlds import World
-from kineverse.worlds.furniture_overlaps import FurnitureOverlaps
-from kineverse.worlds.run_metrics import LimitJudge
 
 TOLERANCE = 1e-4  # distance from a target at which it is reached [m] or [rad]
 _TARGET = "unlocking/target"
@@ -36,7 +34,7 @@ class PartMover:
     model
         Model of the parts as far as it is known.
     session
-        Session in a world whose coordinates are driven, such as :class:`kineverse.worlds.MechanismWorld`.
+        Session with what drives the coordinates, such as a :class:`kineverse.worlds.MechanismWorld`.
     patience
         Time without progress after which a coordinate counts as stuck [s].
     speed
@@ -51,11 +49,9 @@ class PartMover:
     def __init__(
         self, model: ModelView, session: Session, *, patience: float = 1.0, speed: float = 0.4
     ) -> None:
-        for what, number in (("patience", patience), ("speed", speed)):
-            if not (finite_number(number) or 0.0) > 0:
-                raise InvalidValueError(f"The {what} of a moved part is a positive number, not {number!r}.")
         self.model, self.session = model, session
-        self._patience, self._speed = float(patience), float(speed)
+        self._patience = as_positive(patience, "The patience of a moved part")
+        self._speed = as_positive(speed, "The speed of a moved part")
         self._target = parameter(_TARGET, 0.0)
         self._controllers: dict[Symbol, Controller] = {}
 
@@ -70,15 +66,15 @@ class PartMover:
         controller.set(self._target, target)
         start = nearest = session.state[symbol]
         session.phase = f"{'raise' if target > start else 'lower'} {symbol}"
-        since = session.world.time
+        since = session.time
         while abs(session.state[symbol] - target) > tolerance:
             with session.timed("unlock"):
                 command = controller.step(session.state)
             session.act(command.speeds, command)
             here = session.state[symbol]
             if abs(here - target) < abs(nearest - target) - tolerance:
-                nearest, since = here, session.world.time
-            elif session.world.time - since > self._patience:
+                nearest, since = here, session.time
+            elif session.time - since > self._patience:
                 break
         return session.state[symbol]
 
@@ -95,7 +91,6 @@ class PartMover:
 
 
 _SHARE = 0.1  # largest distance from a target, as a share of its distance beyond the threshold
-_VIOLATED = 1e-6  # excess of a constraint from which on it is violated, in its unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +135,9 @@ class UnlockingExecution:
     Attributes
     ----------
     done
-        Whether all coordinates of the goal are where they were wanted, in the world's truth, and no part went
-        through anything.
+        Whether all coordinates of the goal are where they were wanted, by the readings.
+    reason
+        Reason of the end.
     moves
         All moves, those that did not reach their target included.
     plan
@@ -152,43 +148,24 @@ class UnlockingExecution:
         Coordinates that did not move when they should have, without which further plans were made.
     obstacles
         What was in the way of parts, which were then not moved.
-    overlap, overlapping
-        Largest depth of two bodies that came on the way in the states of the world [m], 0 up to 0.5 mm, and
-        their names.
-    violation, constraint
-        Largest excess of a constraint of the model in the states of the world, and its name; empty if no
-        constraint was violated.
     seconds
-        Time in the world [s].
+        Time that it took [s].
     state
         Believed state at the end.
     """
 
     done: bool
+    reason: str
     moves: tuple[ExecutedMove, ...]
     plan: UnlockingPlan
     plans: int
     stuck: tuple[Symbol, ...]
-    violation: float
-    constraint: str
+    obstacles: tuple[Obstacle, ...]
     seconds: float
     state: State
-    obstacles: tuple[Obstacle, ...] = ()
-    overlap: float = 0.0
-    overlapping: tuple[str, str] = ("", "")
 
     def __bool__(self) -> bool:
         return self.done
-
-    @property
-    def reason(self) -> str:
-        """Reason of the end."""
-        if self.done:
-            return "the goal is reached"
-        if self.overlap:
-            one, other = self.overlapping
-            return f"on the way '{one}' and '{other}' overlapped by {1e3 * self.overlap:.3g} mm"
-        return " ".join([*map(str, self.obstacles), str(self.plan)])
 
     def as_data(self) -> dict[str, Any]:
         """Return the execution as data for JSON."""
@@ -198,35 +175,26 @@ class UnlockingExecution:
             "moves": [move.as_data() for move in self.moves],
             "plans": self.plans,
             "stuck": [str(s) for s in self.stuck],
-            "violation": self.violation,
-            "constraint": self.constraint,
             "obstacles": [str(one) for one in self.obstacles],
-            "overlap": self.overlap,
-            "overlapping": list(self.overlapping),
             "seconds": self.seconds,
             "state": {str(s): value for s, value in self.state.items()},
         }
 
     def __str__(self) -> str:
-        lines = [f"{n}. {move}" for n, move in enumerate(self.moves, 1)]
-        if self.constraint:
-            lines.append(f"violated on the way: {self.constraint}, by {format_number(self.violation, 3)}")
-        return "\n".join([*lines, self.reason])
+        return "\n".join([*(f"{n}. {move}" for n, move in enumerate(self.moves, 1)), self.reason])
 
 
 def execute_unlocking(
-    world: World,
+    session: Session,
     goal: Mapping[Symbol, float] | Mapping[str, float],
     *,
     model: ModelView | None = None,
     fixed: Collection[Symbol | str] = (),
     budget: float = BUDGET,
-    dt: float = 0.05,
     patience: float = 1.0,
     speed: float = 0.4,
-    on_step: Callable[[Session], object] | None = None,
 ) -> UnlockingExecution:
-    """Plan how a goal is reached, and move the parts of a mechanism in a world accordingly.
+    """Plan how a goal is reached, and move the parts of a mechanism accordingly.
 
     Each move of :func:`kineverse.reasoning.plan_unlocking` is made by the velocity controller, in whose
     program the locks are rows. If a part ends anywhere but at its target, the plan is made again from there,
@@ -235,115 +203,94 @@ def execute_unlocking(
 
     Parameters
     ----------
-    world
-        World whose coordinates are driven, such as :class:`kineverse.worlds.MechanismWorld`.
+    session
+        Session with what drives the coordinates, such as a :class:`kineverse.worlds.MechanismWorld`.
     goal
         Positions to reach, by coordinate or its name [m] or [rad].
     model
-        Model by which it is planned and controlled; None for the model of the world.
+        Model by which it is planned and controlled; None for that of the session.
     fixed
         Coordinates that are known not to move.
     budget
         Time for each plan [s].
-    dt
-        Control period [s].
     patience
         Time without progress after which a part counts as stuck [s].
     speed
         Largest speed [m/s] or [rad/s]; limits of the model count as well.
-    on_step
-        Is called with the session after each step, for recordings and output.
 
     Raises
     ------
     UnknownNameError, InvalidValueError
         As :func:`kineverse.reasoning.plan_unlocking`; also for times and speeds that are not positive.
     """
-    known = world.model if model is None else model
-    judge, overlaps = LimitJudge(known), _OverlapJudge(world)
-    begin = world.time
+    mover = PartMover(model or session.model, session, patience=patience, speed=speed)
+    return _Execution(mover, goal, fixed, budget).run()
 
-    def measure(session: Session) -> None:
-        truth = world.state
-        judge.update(truth.vector(judge.symbols), world.time)
-        overlaps.update()
-        if on_step is not None:
-            on_step(session)
 
-    session = Session(world, dt=dt, on_step=measure)
-    judge.update(world.state.vector(judge.symbols), begin)
-    mover = PartMover(known, session, patience=patience, speed=speed)
-    moves, stuck, plans = list[ExecutedMove](), list[Symbol](), 0
-    obstacles: list[Obstacle] = []
-    while True:
-        plan = plan_unlocking(known, goal, session.state, fixed=[*fixed, *stuck], budget=budget)
-        plans += 1
-        made: list[ExecutedMove] = []
-        for step in plan.steps:
-            made.append(_make_move(mover, step, obstacles))
-            if not made[-1].done:
+class _Execution(SkillRun):
+    def __init__(
+        self,
+        mover: PartMover,
+        goal: Mapping[Symbol, float] | Mapping[str, float],
+        fixed: Collection[Symbol | str],
+        budget: float,
+    ) -> None:
+        super().__init__(mover.session, None, math.inf)
+        self.mover, self.goal, self.fixed, self.budget = mover, goal, fixed, budget
+        self.moves, self.stuck, self.obstacles = list[ExecutedMove](), list[Symbol](), list[Obstacle]()
+        self.plan, self.plans = self._make_plan(), 0
+
+    def run(self) -> UnlockingExecution:
+        outcome = self.perform(self._reach_goal)
+        return UnlockingExecution(
+            outcome.done,
+            outcome.reason,
+            tuple(self.moves),
+            self.plan,
+            self.plans,
+            tuple(self.stuck),
+            tuple(self.obstacles),
+            outcome.seconds,
+            self.session.state,
+        )
+
+    def _make_plan(self) -> UnlockingPlan:
+        fixed = [*self.fixed, *self.stuck]
+        return plan_unlocking(
+            self.mover.model, self.goal, self.session.state, fixed=fixed, budget=self.budget
+        )
+
+    def _reach_goal(self) -> str:
+        """Make plans and their moves until the goal is reached, or raise SkillError if no plan is left."""
+        while True:
+            self.plans += 1
+            for step in self.plan.steps:
+                self.moves.append(self._move(step))
+                if not self.moves[-1].done:
+                    self.stuck.append(step.coordinate)
+                    break
+            else:
                 break
-        moves += made
-        if not made or made[-1].done:
-            break
-        stuck.append(made[-1].step.coordinate)
-    truth = world.state
-    return UnlockingExecution(
-        plan.verdict == "found"
-        and all(abs(truth[s] - x) <= 2 * TOLERANCE for s, x in plan.goal.items())
-        and not overlaps.depth,
-        tuple(moves),
-        plan,
-        plans,
-        tuple(stuck),
-        judge.violation,
-        judge.limit if judge.violation > _VIOLATED else "",
-        world.time - begin,
-        session.state,
-        tuple(obstacles),
-        overlaps.depth,
-        overlaps.pair,
-    )
+            with self.session.search():
+                self.plan = self._make_plan()
+        state = self.session.state
+        reached = all(abs(state[s] - x) <= 2 * TOLERANCE for s, x in self.plan.goal.items())
+        if self.plan.verdict == "found" and reached:
+            return "the goal is reached"
+        raise SkillError("other", " ".join([*map(str, self.obstacles), str(self.plan)]))
 
-
-class _OverlapJudge:
-    """Judge of overlaps in the states of a world, of parts with shapes."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self._overlaps: FurnitureOverlaps | None = None
-        self.depth, self.pair = 0.0, ("", "")
-        if _has_shapes(world.model):
-            self._scene = Scene(world.model)
-            self._overlaps = FurnitureOverlaps(self._scene, "")
-            self._scene.update(world.state)
-            self._overlaps.begin()
-
-    def update(self) -> None:
-        if self._overlaps is None:
-            return
-        self._scene.update(self._world.state)
-        for one in self._overlaps.find()[:1]:
-            if one.excess > self.depth:
-                self.depth, self.pair = one.excess, (one.a, one.b)
-
-
-def _has_shapes(model: ModelView) -> bool:
-    return any(body.collisions or body.visuals for body in model.bodies.values())
-
-
-def _make_move(mover: PartMover, step: UnlockingStep, obstacles: list[Obstacle]) -> ExecutedMove:
-    """Make one move of a plan, unless something is in its way, which is added to the obstacles."""
-    model, state = mover.model, mover.session.state
-    if _has_shapes(model):
-        obstacle = find_obstacle(model, step.coordinate, state, step.target)
-        if obstacle is not None:
-            obstacles.append(obstacle)
-            return ExecutedMove(step, float(state[step.coordinate]), 0.0, False)
-    tolerance = TOLERANCE
-    if step.threshold is not None and step.threshold != step.target:
-        tolerance = min(tolerance, _SHARE * abs(step.target - step.threshold))
-    begin = mover.session.world.time
-    reached = mover.move(step.coordinate, step.target, tolerance)
-    done = abs(reached - step.target) <= tolerance
-    return ExecutedMove(step, reached, mover.session.world.time - begin, done)
+    def _move(self, step: UnlockingStep) -> ExecutedMove:
+        """Make one move of a plan, unless something is in its way, which is added to the obstacles."""
+        session, mover = self.session, self.mover
+        if any(body.collisions or body.visuals for body in mover.model.bodies.values()):
+            obstacle = find_obstacle(mover.model, step.coordinate, session.state, step.target)
+            if obstacle is not None:
+                self.obstacles.append(obstacle)
+                return ExecutedMove(step, float(session.state[step.coordinate]), 0.0, False)
+        tolerance = TOLERANCE
+        if step.threshold is not None and step.threshold != step.target:
+            tolerance = min(tolerance, _SHARE * abs(step.target - step.threshold))
+        begin = session.time
+        reached = mover.move(step.coordinate, step.target, tolerance)
+        done = abs(reached - step.target) <= tolerance
+        return ExecutedMove(step, reached, session.time - begin, done)

@@ -366,14 +366,15 @@ class TrajectoryFollower:
             )
         self._trajectory = other
 
-    def set(self, controller: Controller, time: float) -> None:
+    def set(self, controller: Controller, time: float, *, pace: float = 1.0) -> None:
         """Set the targets of a controller for its step at a time of the trajectory [s].
 
         The rate is the mean one of the coming control period, so that a motion without disturbances stays
-        on the trajectory. After the end, the goals hold the last position.
+        on the trajectory. It is less for a pace below 1, at which the time of the trajectory goes on. After
+        the end, the goals hold the last position.
         """
         dt, trajectory = controller.dt, self._trajectory
-        now, later = trajectory.positions_at(float(time)), trajectory.positions_at(float(time) + dt)
+        now, later = trajectory.positions_at(float(time)), trajectory.positions_at(float(time) + pace * dt)
         controller.set(self._position, now)
         controller.set(self._speed, (later - now) / dt)
 

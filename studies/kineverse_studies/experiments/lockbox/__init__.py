@@ -50,7 +50,8 @@ def record_thesis_box(folder: Path) -> None:
         run = run_unlocking(THESIS, recorder=recorder)
         recorder.write_outcome({"done": run.done, "reason": f"{run.steps} steps"})
     with _start(folder, "plan") as (world, recorder):
-        recorder.write_outcome(execute_unlocking(world, THESIS.goal, on_step=recorder).as_data())
+        session = Session(world, dt=_DT, on_step=recorder)
+        recorder.write_outcome(execute_unlocking(session, THESIS.goal).as_data())
     with _start(folder, "unknown-locks") as (world, recorder):
         model = make_lockbox_model(remove_locks(THESIS), None)
         mover = PartMover(model.snapshot(), Session(world, dt=_DT, on_step=recorder))
@@ -61,7 +62,8 @@ def record_thesis_box(folder: Path) -> None:
 @contextmanager
 def _start(folder: Path, name: str) -> Iterator[tuple[MechanismWorld, Recorder]]:
     world = MechanismWorld(make_lockbox_model(THESIS, None))
-    with Recorder(folder / f"thesis-{name}.mcap", world.model, {"box": "thesis", "by": name}) as recorder:
+    about = {"box": "thesis", "by": name}
+    with Recorder(folder / f"thesis-{name}.mcap", world.model, about, world=world) as recorder:
         yield world, recorder
 
 

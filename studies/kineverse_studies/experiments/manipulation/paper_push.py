@@ -7,7 +7,6 @@ numbers in each step. As in the authors' code, other parts that will move are no
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from kineverse.manipulation.robot_sources import RobotSource
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import PlannedContact, SimulatedWorld
 
 CONTACT = 0.01  # gap below which the object may move, ε of the 2020 paper [m]
 _FAR, _ANY, _TOLERANCE = 20.0, 1e3, 0.02
@@ -30,7 +30,7 @@ _FAR, _ANY, _TOLERANCE = 20.0, 1e3, 0.02
 
 class PaperPush:
     def __init__(self, model: ModelView, what: Symbol, link: str, handle: str, dt: float) -> None:
-        self.touching, self.view = False, None  # as of :class:`.Pushing`, without a view
+        self.contact = PlannedContact((link,), (), False)  # nothing but a handle may be penetrated
         self._scene, self._link, self._frames = Scene(model), link, (model.fk(link), model.fk(handle))
         self._nearest = self._scene.watch(link, handle, _FAR)
         self._numbers = Target("push/contact", np.zeros((3, 3)))
@@ -55,22 +55,22 @@ class PaperPush:
         points = zip(self._frames, (near.point_a, near.point_b), strict=True)
         inside = [(inverse(np.asarray(frame(state))) @ [*point, 1.0])[:3] for frame, point in points]
         self.controller.set(self._numbers, [*inside, -near.normal])
-        self.touching = near.distance < CONTACT
+        self.contact = self.contact._replace(touching=near.distance < CONTACT)
         return self.controller.step(state)
 
 
 def push_as_published(
-    session: Session, robot: RobotSource, what: Symbol, steps: int, on_step: Callable[[PaperPush], object]
+    session: Session, world: SimulatedWorld, robot: RobotSource, what: Symbol, steps: int
 ) -> Outcome:
     """Push an object to 0 by the papers' controller alone, in at most so many steps."""
-    world, link = session.world, f"{robot.prefix}/{robot.push_link}"
-    push = PaperPush(world.model, what, link, find_handle(world.model, what).frame, session.dt)
+    model, link = session.model, f"{robot.prefix}/{robot.push_link}"
+    push = PaperPush(model, what, link, find_handle(model, what).frame, session.dt)
     while session.steps < steps and abs(world.state[what]) >= _TOLERANCE:
         with session.timed("push"):
             command = push.step(session.state)
-        on_step(push)
+        session.contact = push.contact
         session.act(command.speeds, command)
     value = world.state[what]
     done = abs(value) < _TOLERANCE
     reason = f"'{what}' is at {value:.3g}" if done else f"Out of time at {value:.3g}."
-    return Outcome(done, value, reason, world.name, world.time, session.steps)
+    return Outcome(done, value, reason, world.name, session.time, session.steps)

@@ -12,22 +12,39 @@ from pathlib import Path
 from time import process_time
 from typing import Any
 
-from kineverse.errors import FormatError, InvalidValueError, KineverseError
-from kineverse.geometry import Scene
-from kineverse.grasping import find_gripper, find_handle
-from kineverse.manipulation import Belief, Outcome, Session, TrackedBelief, TrueBelief, open_object
-from kineverse.manipulation.pushing import Pushing, push
+from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
+from kineverse.grasping import find_handle
+from kineverse.manipulation import (
+    Belief,
+    JudgedOutcome,
+    Outcome,
+    Session,
+    TrackedBelief,
+    judge_outcome,
+    open_object,
+    push,
+    stand_at_handle,
+)
 from kineverse.manipulation.pushing.base_placement import find_push_start
-from kineverse.manipulation.pushing.contact_pair import PushView
+from kineverse.manipulation.pushing.push_controller import Pushing
 from kineverse.manipulation.robot_sources import SHIPPED, RobotSource, find_robot
-from kineverse.manipulation.skill_arguments import find_object_coordinate
+from kineverse.manipulation.skill_run import find_object_coordinate
 from kineverse.model.model import Model
+from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
-from kineverse.worlds import Judge, KinematicWorld, MujocoWorld, Recorder, Sensors, World
+from kineverse.worlds import (
+    KinematicWorld,
+    MujocoWorld,
+    Recorder,
+    RunMetrics,
+    Sensors,
+    SimulatedWorld,
+    TrueBelief,
+)
 from kineverse.worlds.recorder import import_mcap
 from kineverse_studies.experiments.registry import BOTH, WORLDS, Options
 
-from .paper_push import PaperPush, push_as_published
+from .paper_push import push_as_published
 from .trials import Failure, Moment, Trial, find_failure
 
 _AUTHORS = {
@@ -75,20 +92,20 @@ class TrialSetting:
 
     def make_world(
         self, model: Model, robot: str, state: StateLike, seed: int = 0, dt: float = _USUAL_STEP
-    ) -> World:
+    ) -> SimulatedWorld:
         """Return the world at a state, in which nothing is held, for steps of a length [s]."""
         kind = MujocoWorld if self.world == "mujoco" else KinematicWorld
         sensors = Sensors.parse(self.noise) if self.noise else None
         # Commands come at least every second step, also where an estimate is a picture old.
         more: dict[str, Any] = {"timeout": 2.0 * dt} if dt > _USUAL_STEP else {}
-        world: World = kind(model, robot, sensors=sensors, seed=seed, **more)
+        world: SimulatedWorld = kind(model, robot, sensors=sensors, seed=seed, **more)
         world.reset(state)
         return world
 
-    def make_belief(self, world: World) -> Belief:
+    def make_belief(self, world: SimulatedWorld) -> Belief:
         """Return the belief on which a skill acts: the truth without noise, else an estimate."""
         if not self.noise:
-            return TrueBelief()
+            return TrueBelief(world)
         return TrackedBelief(world.model, world.robot, Sensors.parse(self.noise))
 
 
@@ -110,29 +127,37 @@ def make_settings(options: Options) -> tuple[TrialSetting, ...]:
 
 class TrialWatch(ExitStack):
     def __init__(
-        self, setting: TrialSetting, model: Model, about: Mapping[str, str], *, film: bool = False
+        self,
+        setting: TrialSetting,
+        model: ModelView,
+        world: SimulatedWorld | None,
+        about: Mapping[str, str],
+        *,
+        film: bool = False,
     ) -> None:
         super().__init__()
-        self._setting, self._model, self._about, self._film = setting, model, about, film
+        self._setting, self._model, self._world, self._about = setting, model, world, about
+        self._film = film
         self._recorder: Recorder | None = None
         self._watchers: tuple[Callable[[Session], object], ...] = ()
         self.session: Session | None = None
         self.moments: list[Moment] = []
         self.commands: list[tuple[float, dict[str, float]]] = []
-        self.view: PushView | None = None
 
     def __enter__(self) -> TrialWatch:
         if self._setting.record is not None:
             name = "-".join(re.sub(r"[^\w]+", "_", word).strip("_") for word in self._about.values())
-            recorder = Recorder(self._setting.record / f"{name}.mcap", self._model, self._about)
+            path = self._setting.record / f"{name}.mcap"
+            recorder = Recorder(path, self._model, self._about, world=self._world)
             self._recorder = self.enter_context(recorder)
         return self
 
-    def open_session(self, world: World, dt: float, *watchers: Callable[[Session], object]) -> Session:
-        self._watchers, self.view = watchers, None
+    def open_session(self, dt: float, *watchers: Callable[[Session], object]) -> Session:
+        assert self._world is not None
+        self._watchers = watchers
         self.moments, self.commands = [], []
-        belief = self._setting.make_belief(world)
-        self.session = Session(world, dt=dt, belief=belief, on_step=self._look)
+        belief = self._setting.make_belief(self._world)
+        self.session = Session(self._world, dt=dt, belief=belief, on_step=self._look)
         return self.session
 
     def write_outcome(self, outcome: Outcome) -> None:
@@ -142,23 +167,16 @@ class TrialWatch(ExitStack):
     def _look(self, session: Session) -> None:
         for watch in self._watchers:
             watch(session)
-        if self.view is not None:
-            session.vectors = name_vectors(self.view)
         if self._recorder is not None:
             self._recorder(session)
         if not self._film:
             return
-        now, state = session.world.time, session.world.state
-        self.commands.append((now - session.dt, {str(s): float(v) for s, v in session.commands.items()}))
+        assert self._world is not None
+        begin = session.time - session.dt
+        self.commands.append((begin, {str(s): float(v) for s, v in session.commands.items()}))
         if session.steps % _FILM_STEPS == 0:
-            values = {str(s): float(v) for s, v in state.items()}
-            self.moments.append(Moment(now, session.phase, values, session.vectors))
-
-
-def name_vectors(view: PushView) -> dict[str, tuple[Any, Any]]:
-    """Return the vectors of a push by name, each with its origin: n, push and tangent at p, and r - p."""
-    found = {"n": view.n, "push": view.push, "tangent": view.tangent, "r - p": view.r - view.p}
-    return {name: (view.p, vector) for name, vector in found.items()}
+            values = {str(s): float(v) for s, v in self._world.state.items()}
+            self.moments.append(Moment(session.time, session.phase, values, session.vectors))
 
 
 def list_series(commands: Iterable[tuple[float, Mapping[str, float]]]) -> dict[str, list[float]]:
@@ -173,8 +191,6 @@ def list_series(commands: Iterable[tuple[float, Mapping[str, float]]]) -> dict[s
 
 DT = 0.02  # control period [s]
 _SAMPLES = 200  # of the base placement
-_PLANS = ("plan", "place", "placement")
-"""Computations that are no control steps, by the first word of their names in a session."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +203,13 @@ class TrialCase:
     film: bool = False  # whether the trial has commanded speeds as series, and a film
     measures: tuple[tuple[str, Any], ...] = ()  # further figures of the trial
 
-    def run(self, skill: str, model: Model, act: Callable[[TrialWatch], Outcome]) -> Trial:
+    def run(
+        self,
+        skill: str,
+        model: ModelView,
+        act: Callable[[TrialWatch], Outcome],
+        world: SimulatedWorld | None = None,
+    ) -> Trial:
         """Return the trial of a skill. Any error is a failure of the class ``other``, and is named."""
         setting, begin = self.setting, process_time()
         about = {
@@ -197,7 +219,7 @@ class TrialCase:
             "skill": skill,
             "world": setting.world,
         }
-        with TrialWatch(setting, model, about, film=self.film) as watch:
+        with TrialWatch(setting, model, world, about, film=self.film) as watch:
             try:
                 outcome = act(watch)
             except Exception as error:  # one of many trials must not end the others
@@ -206,7 +228,6 @@ class TrialCase:
             watch.write_outcome(outcome)
         session = watch.session
         cpu, wall = ({}, {}) if session is None else (session.cpu, session.wall)
-        names = [name for name in cpu if not name.startswith(_PLANS)]
         return Trial(
             self.case,
             self.robot.name,
@@ -218,8 +239,8 @@ class TrialCase:
             outcome.reason,
             float(outcome.seconds),
             int(outcome.steps),
-            tuple(t for name in names for t in cpu[name]),
-            tuple(t for name in names for t in wall[name]),
+            tuple(t for times in cpu.values() for t in times),
+            tuple(t for times in wall.values() for t in times),
             {**dict(self.measures), **outcome.measures, "cpu_seconds": process_time() - begin},
             setting.world,
             setting.noise,
@@ -228,13 +249,13 @@ class TrialCase:
             tuple(watch.moments),
         )
 
-    def fail(self, skill: str, model: Model, failure: Failure, reason: str) -> Trial:
+    def fail(self, skill: str, model: ModelView, failure: Failure, reason: str) -> Trial:
         outcome = Outcome(False, math.nan, reason, self.setting.world, 0.0, 0, {"failure": failure})
         return self.run(skill, model, lambda watch: outcome)
 
 
 def open_then_close(
-    case: TrialCase, model: Model, world: World, start: State, targets: tuple[float, float]
+    case: TrialCase, world: SimulatedWorld, start: State, targets: tuple[float, float]
 ) -> list[Trial]:
     world.reset(start)
     trials: list[Trial] = []
@@ -243,14 +264,21 @@ def open_then_close(
 
         def act(watch: TrialWatch, target: float = target) -> Outcome:
             nonlocal session
-            earlier = session
-            session = watch.open_session(world, DT)
+            coordinate, gripper = find_object_coordinate(world.robot, case.what), world.robot.gripper()
+            handle = find_handle(world.model, coordinate)
+            metrics = RunMetrics(world, coordinate, gripper=gripper, handle=handle.frame, start=start)
+            earlier, session = session, watch.open_session(DT, metrics)
             if earlier is not None:
                 session.made.extend(earlier.made)
                 session.start = earlier.start
-            return open_object(session, case.what, target=target, seed=case.seed)
+            if stand_at_handle(session, world, handle, target, gripper=gripper, seed=case.seed):
+                metrics.reset()
+            outcome = open_object(
+                session, coordinate, target=target, hand=gripper, handle=handle, seed=case.seed
+            )
+            return judge_outcome(outcome, metrics)
 
-        trials.append(case.run(skill, model, act))
+        trials.append(case.run(skill, world.model, act, world))
         if not trials[-1].done:
             break
     return trials
@@ -258,33 +286,28 @@ def open_then_close(
 
 def try_push(
     pushing: Pushing,
-    world: World,
+    world: SimulatedWorld,
     start: State,
+    metrics: RunMetrics,
     open_session: Callable[[], Session],
     *,
     seconds: float = 24.0,
     seed: int = 0,
-    place: bool = True,
-    on_step: Callable[[Pushing], object] | None = None,
-) -> tuple[Outcome, int, str]:
+) -> tuple[JudgedOutcome, int, str]:
     """Push from a start; if that fails, from one that base placement finds.
 
     Return the outcome, the number of samples of the placement, 0 without any, and why the first push failed.
     """
 
-    def attempt(state: State) -> Outcome:
+    def attempt(state: State) -> JudgedOutcome:
         world.reset(state)
-        return push(
-            open_session(),
-            pushing.coordinate,
-            seconds=seconds,
-            pushing=pushing,
-            plan=not place,
-            on_step=on_step,
-        )
+        metrics.reset()
+        session = open_session()
+        outcome = push(session, pushing.coordinate, seconds=seconds, pushing=pushing, plan=False)
+        return judge_outcome(outcome, metrics)
 
     outcome = attempt(start)
-    if outcome or not place:
+    if outcome:
         return outcome, 0, ""
     found = find_push_start(pushing, start, samples=_SAMPLES, seed=seed)
     return attempt(found.state) if found.state is not None else outcome, found.samples, outcome.reason
@@ -292,8 +315,7 @@ def try_push(
 
 def run_push_trial(
     case: TrialCase,
-    model: Model,
-    world: World,
+    world: SimulatedWorld,
     start: State,
     skill: str,
     *,
@@ -305,55 +327,23 @@ def run_push_trial(
     """Return the trial of a push: from a start, or from one that base placement finds; or as published."""
 
     def act(watch: TrialWatch) -> Outcome:
-        bodies = find_gripper(model, world.robot).bodies
-        coordinate = find_object_coordinate(world, case.what)
-        pushing = Pushing(model, coordinate, bodies, start, target=0.0, robot=world.robot, dt=dt, logic=logic)
-        judge = PushJudge(pushing, world, watch)
-        look, seconds, placed, first = judge.watch_controller, steps * dt, 0, ""
-        if baseline:
-            world.reset(start)
-            session = watch.open_session(world, dt, judge)
-            outcome = push_as_published(session, case.robot, coordinate, steps, look)
-        else:
-            begin = partial(watch.open_session, world, dt, judge)
-            outcome, placed, first = try_push(
-                pushing, world, start, begin, seconds=seconds, seed=case.seed, on_step=look
-            )
-        more = {"placed": placed, "first": first, **judge.measures}
-        return replace(outcome, measures={**outcome.measures, **more})
-
-    return case.run(skill, model, act)
-
-
-class PushJudge:
-    def __init__(self, pushing: Pushing, world: World, watch: TrialWatch) -> None:
-        model = world.model
+        coordinate, gripper = find_object_coordinate(world.robot, case.what), world.robot.gripper()
         try:
-            handle = find_handle(model, pushing.coordinate).frame
-        except KineverseError:
+            handle = find_handle(world.model, coordinate).frame
+        except UnknownNameError:
             handle = None
-        self._judge = Judge(model, world.robot, find_gripper(model, world.robot), handle)
-        self._scene = Scene(model, rules=(*pushing.overlapping, *pushing.rules), leave_out=pushing.leave_out)
-        self._pair = self._scene.watch(pushing.pusher, pushing.object_bodies, radius=0.0)
-        self._watch, self._touching = watch, False
-        self._force = self._pressed = 0.0
-        self._session: Session | None = None
+        world.reset(start)
+        metrics = RunMetrics(world, coordinate, gripper=gripper, handle=handle)
+        begin = partial(watch.open_session, dt, metrics)
+        if baseline:
+            outcome = push_as_published(begin(), world, case.robot, coordinate, steps)
+            return replace(outcome, measures={**outcome.measures, **metrics.measures, "placed": 0})
+        pushing = Pushing(
+            world.model, world.robot, coordinate, gripper.bodies, start, target=0.0, dt=dt, logic=logic
+        )
+        outcome, placed, first = try_push(
+            pushing, world, start, metrics, begin, seconds=steps * dt, seed=case.seed
+        )
+        return replace(outcome, measures={**outcome.measures, "placed": placed, "first": first})
 
-    def watch_controller(self, pushing: Pushing | PaperPush) -> None:
-        self._touching, self._watch.view = pushing.touching, pushing.view
-
-    def __call__(self, session: Session) -> None:
-        if session is not self._session:
-            self._session, self._touching, self._force, self._pressed = session, False, 0.0, 0.0
-            self._judge.reset()
-        world = session.world
-        self._judge.update(world.state, session.commands, held=world.held, pushing=self._touching)
-        self._force = max(self._force, getattr(world, "peak_force", math.nan))
-        self._scene.update(world.state)
-        if len(found := self._pair()):
-            self._pressed = max(self._pressed, -float(found.distances[0]))
-
-    @property
-    def measures(self) -> dict[str, Any]:
-        """Measures of the judge, ``peak_force`` [N] in a world that has it, and ``pressed``, a depth [m]."""
-        return {**self._judge.measures, "peak_force": self._force or math.nan, "pressed": self._pressed}
+    return case.run(skill, world.model, act, world)

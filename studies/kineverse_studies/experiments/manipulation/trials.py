@@ -217,6 +217,7 @@ QUALITY = (
     Column("contact_losses", "contact losses", worst("contact_losses"), 6),
     Column("penetration_mm", "penetration [mm]", worst("penetration", 1e3)),
     Column("penetrating", "deepest pair", _deepest_pair),
+    Column("pressed_mm", "pressed [mm]", worst("pressed", 1e3)),
     Column("jitter", "jitter", worst("jitter")),
     Column("peak_force", "force [N]", worst("peak_force")),
 )

@@ -220,7 +220,7 @@ def run_openings(job: OpeningJob) -> list[Trial]:
     for setting in job.settings:
         case = skills.TrialCase(job.thing, job.robot, str(setup.what), setting, job.seed, film=True)
         world = setting.make_world(setup.model, job.robot.prefix, start)
-        trials += skills.open_then_close(case, setup.model, world, start, (DONE * upper, lower))
+        trials += skills.open_then_close(case, world, start, (DONE * upper, lower))
     return trials
 
 
