@@ -19,6 +19,7 @@ from .outcome import Outcome, SkillError
 from .session import Session
 from .swept_volume import BlockedError, find_obstacle
 
+_PAUSE = 0.1  # time without a step after which a reference begins at rest, however long a command acts [s]
 _RAMP = 0.5  # time from rest to the usual speed [s]
 _PATIENCE = 4.0  # longest time for which a reference waits [s]
 
@@ -139,8 +140,9 @@ class Pace:
         """
         session = self._session
         passed, self._last = session.time - self._last, session.time
-        if passed > session.interface.timeout:
-            self.speed, self._moved, passed = 0.0, session.time, session.dt
+        pause = min(session.interface.timeout, _PAUSE)
+        if passed > pause:
+            self.speed, self._moved, passed = 0.0, session.time, pause
         share = min(1.0, max(0.0, 1.5 - distance / self._late))
         self.speed = share * min(1.0, self.speed + passed / _RAMP)
         if share > 0.0:

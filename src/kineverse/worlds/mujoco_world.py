@@ -378,7 +378,6 @@ class MujocoWorld:
 
 
 def _friction_by_name(given: Mapping[Any, float], furniture: list[str]) -> dict[str, float]:
-    """Return friction by the name of a coordinate of furniture, after checking it."""
     result = {}
     for key, value in given.items():
         number = finite_number(value)

@@ -478,7 +478,6 @@ class _Search:
 
     @property
     def is_near(self) -> bool:
-        """True if the hand is near the handle."""
         hand = np.asarray(self.owner.model.fk(self.grasps[0].gripper.hand)(self.state))
         return bool(np.linalg.norm(hand[:3, 3] - self.handles[0, :3, 3]) <= _AROUND)
 
