@@ -181,6 +181,13 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
     assert "larder_door" in format_report(report)
 
 
+def test_hand_that_left_aside_takes_the_path_back_from_there():
+    """The gripper of the Fetch leaves the oven's handle along the bar."""
+    trials = kitchens.run_kitchen(kitchens.KitchenJob("kitchen", SHIPPED["fetch"], only="kitchen/oven_door"))
+    assert [(t.skill, t.done, t.reason) for t in trials if not t.done] == []
+    assert [t.skill for t in trials] == ["open", "close"]
+
+
 @pytest.mark.long
 def test_leader_follower_opens_the_drawer_within_the_papers_tolerance():
     setup = make_opening_setup(SHIPPED["hsr"], OBJECTS["drawer"])

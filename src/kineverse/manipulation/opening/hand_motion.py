@@ -145,7 +145,16 @@ class HandMotion:
         self.follow_planned()
         self.move_fingers(self.gripper.opened)
         self.count_turns(placement.line[0])
-        self.follow_line(placement.grasp.approach, placement.grasp.pose, self.rows(placement.line))
+        # A hand that takes a path back comes from where it left, and not on the line of the grasp.
+        start = self._place_hand(placement, placement.line[0], placement.values[0])
+        self.follow_line(start, placement.grasp.pose, self.rows(placement.line))
+
+    def _place_hand(self, placement: BasePlacement, row: Array, value: float) -> Array:
+        """Return the pose bar_T_hand at a configuration (n,) of a placement and a value of the object."""
+        wanted = dict(zip(placement.coordinates, row.tolist(), strict=True))
+        state = self.session.state.updated({**wanted, self.handle.coordinate: float(value)})
+        pose: Array = inverse(self.bar(state)) @ self.hand(state)
+        return pose
 
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory, whose time waits where the robot is late."""
@@ -266,10 +275,9 @@ class HandMotion:
             # The retreat of the placement was checked for an object that has arrived.
             self._back_off(grasp)
             return
-        end = dict(zip(placement.coordinates, placement.retreat[-1].tolist(), strict=True))
-        gone = state.updated({**end, self.handle.coordinate: float(placement.values[-1])})
+        gone = self._place_hand(placement, placement.retreat[-1], placement.values[-1])
         away = pose.copy()
-        away[:3, 3] += (inverse(self.bar(gone)) @ self.hand(gone))[:3, 3] - grasp.pose[:3, 3]
+        away[:3, 3] += gone[:3, 3] - grasp.pose[:3, 3]
         self.follow_line(pose, away, self.rows(placement.retreat))
 
     def let_go(self, grasp: Grasp | None = None) -> None:
