@@ -16,7 +16,7 @@ from kineverse.symbols import Symbol
 from .mujoco_servos import sampled_inertia
 from .mujoco_state import MujocoContacts, MujocoCoordinates
 
-TOUCH_FORCE = 1.0  # normal force of each finger [N] above which a body between them is held
+_TOUCH_FORCE = 1.0  # normal force of each finger [N] above which a body between them is held
 _FINGER_MASS = 2.0  # of a finger with its motor [kg]: light ones do not carry the force of their ties
 _SMALLEST_LEVER = 0.02
 _STIFFNESS = 10.0  # speed by the distance of a finger from its set point [1/s]
@@ -143,7 +143,7 @@ class GripperDrive:
         """Return the body that both fingers press, the one with most force; None if there is none."""
         result = {body: min(forces) for body, forces in self._contacts.grip(data).items()}
         best = max(result, key=result.__getitem__, default=None)
-        return best if best is not None and result[best] > TOUCH_FORCE else None
+        return best if best is not None and result[best] > _TOUCH_FORCE else None
 
     def _leverage(self, compiled: Any, data: Any) -> Array:
         """Return |∂y_1/∂q| + |∂y_2/∂q| by coordinate (n,), with all joints that follow."""

@@ -21,8 +21,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps
+from .robot_interface import PlannedContact, SkillStep
 from .simulated_world import SimulatedWorld
 
 CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
@@ -48,30 +49,6 @@ CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
 _STILL = 5e-3
 _ROUNDING = 1e-9  # depth that is nothing but rounding [m]
 _TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap [m]
-
-
-class PlannedContact(NamedTuple):
-    """Contact that a skill plans: the depth of these bodies is no overlap."""
-
-    pusher: tuple[str, ...]  # bodies of the robot
-    pushed: tuple[str, ...]  # bodies of the object
-    touching: bool  # whether the skill believes that they touch
-
-
-class MeasuredStep(Protocol):
-    """Step of a skill, as :class:`kineverse.manipulation.session.Session` has it."""
-
-    @property
-    def commands(self) -> Mapping[Symbol, float]:
-        """The speeds of the step."""
-
-    @property
-    def state(self) -> State:
-        """The believed state."""
-
-    @property
-    def contact(self) -> PlannedContact | None:
-        """The contact that is planned; None without any."""
 
 
 class RunOverlap(NamedTuple):
@@ -277,7 +254,7 @@ class RunMetrics:
         self._measure(state, None, None)
         self._first = self._stamp
 
-    def __call__(self, step: MeasuredStep) -> None:
+    def __call__(self, step: SkillStep) -> None:
         """Measure the present state of the world after a step."""
         state = self._world.state
         if self._world.time <= self._stamp:
