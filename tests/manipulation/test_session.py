@@ -124,6 +124,17 @@ def test_patience_ends(cart, joints, says):
     assert not session.broken
 
 
+def test_a_session_begins_with_the_first_look_that_succeeds(cart):
+    cart.joints, cart.x = dict, 0.7
+    session = Session(cart)
+    assert session.start.stamp is None
+    cart.joints = lambda: {X: cart.x}
+    session.act({})
+    assert session.start[X] == 0.7
+    session.act({"cart/x:velocity": 0.5})
+    assert session.start[X] == 0.7 < session.state[X]
+
+
 def test_a_robot_whose_clock_stands_still_is_waited_for_by_ours(cart):
     session = Session(cart, patience=0.1)
     cart.apply = lambda speeds, duration, stamp=None: None

@@ -110,7 +110,7 @@ class Session:
     state
         The believed state.
     start
-        The believed state at the begin of the session.
+        The believed state at the first look.
     time
         Time of the robot after the last step [s].
     observation
@@ -189,10 +189,10 @@ class Session:
         self._unknown: dict[str, None] = {}  # observed frames that the model does not have
         self._not_rigid: dict[str, None] = {}  # frames of which poses have been observed that are none
         self.state: State = self.model.default_state()
+        self.start = self.state
         self.observation = Observation(-math.inf, {})
         with suppress(SkillError):  # of what does not answer now, the first skill says it
             self.refresh()
-        self.start = self.state
 
     # -- what is known ---------------------------------------------------------------------------------------
 
@@ -417,6 +417,8 @@ class Session:
         if not self._problem:
             self._check_poses()
             self.state = self.belief.update(self.observation, self.time, State(speeds))
+            if self.start.stamp is None:  # the first look, of a robot that did not answer before
+                self.start = self.state
 
     def _check_joints(self) -> str:
         """Return what is wrong with the latest stamp and encoders; empty if nothing is."""
