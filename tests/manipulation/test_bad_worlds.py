@@ -230,6 +230,19 @@ def test_what_nobody_sees_at_the_end_is_not_done(upper):
     assert "no marker of it has been seen" in outcome.reason
 
 
+def test_what_is_pushed_out_of_sight_and_gets_stuck_is_not_done():
+    model = room().copy()
+    with model.edit() as edit:
+        edit.constrain("stuck", 0.1, kv.position("drawer"), 1.0)
+    world = KinematicWorld(model, "robot", sensors=Sensors.parse("3mm,0.5deg,30Hz"))
+    world.reset(opened(drawer=0.3) | {"robot/base/y": -1.0})
+    robot = Faulty(world, "hidden", "drawer")
+    robot.model = room()
+    outcome = push(Session(robot), "drawer", bodies=PUSHER, seconds=40.0)
+    assert not outcome
+    assert "no marker of it has been seen" in outcome.reason
+
+
 def test_what_is_out_of_sight_for_a_while_is_done_once_it_is_seen_again():
     robot = make("hidden", lasting=4.5)
     outcome = open_object(Session(robot), DRAWER, target=0.3)
