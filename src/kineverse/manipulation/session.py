@@ -217,7 +217,7 @@ class Session:
             return self.belief.deviation(what)
         if what.shape != ():
             raise ShapeError(f"Only a scalar has a deviation, not an expression of shape {what.shape}.")
-        own = {s: self.belief.deviation(s) for s in what.symbols}
+        own = {s: self.deviation(s) for s in what.symbols}
         slopes = {s: float(what.partial([s])(self.state)[0]) for s, deviation in own.items() if deviation}
         return math.hypot(*(k * own[s] for s, k in slopes.items() if k))
 
