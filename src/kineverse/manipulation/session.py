@@ -39,6 +39,7 @@ Result = TypeVar("Result")
 
 STALE = 0.06  # age of the latest readings from which on the robot waits for newer ones [s]
 _RIGID = 1e-4  # largest element of RᵀR - I, and of the last row from (0, 0, 0, 1), of a pose
+_STOPPING = 2.0  # longest wall time that a stop waits for an answer, also after an interruption [s]
 _MADE = 64  # number of motions that are remembered
 _NAMED = 3  # number of names that a message lists
 
@@ -82,7 +83,8 @@ class Session:
                 command = controller.step(session.state)
             session.act(command.speeds)
 
-    Readings that are old or wrong do not end a skill: the robot stands still and waits for better ones.
+    Readings that are old or wrong do not end a skill: the robot stands still and waits for better ones. A
+    session is used by one thread at a time.
 
     Parameters
     ----------
@@ -330,7 +332,7 @@ class Session:
         self.command = None
         if not self.broken:
             with suppress(SkillError):
-                self._advance({}, stamp=None)
+                self._advance({}, stamp=None, longest=_STOPPING)
 
     def _find_problem(self, before: float) -> str:
         """Return why the robot must not move by the present state; empty if it may."""
@@ -366,7 +368,7 @@ class Session:
             resolved[speed] = number
         return resolved
 
-    def _advance(self, speeds: Speeds, stamp: float | None) -> None:
+    def _advance(self, speeds: Speeds, stamp: float | None, longest: float = math.inf) -> None:
         """Command speeds for one step, with the time of their state; a stop has None and is never too old."""
         self.commands = {s: v for s, v in speeds.items() if self.robot.moves(s)}
 
@@ -374,8 +376,10 @@ class Session:
             self.interface.apply(self.commands, self.dt, stamp=stamp)
             return self._read()
 
-        self.observation, self.time = self._call(step)
-        self._update(speeds)
+        before = self.time
+        self.observation, self.time = self._call(step, longest)
+        # Over a longer time the robot has stopped by itself, and speeds of the step say nothing.
+        self._update(speeds if self.time - before <= self.dt + self.interface.timeout else {})
         self.steps += 1
         if self._on_step is not None:
             self._on_step(self)
@@ -389,13 +393,13 @@ class Session:
                 raise InvalidValueError(f"{name}= of an Observation is a mapping, not {given!r:.60}.")
         return observation, now
 
-    def _call(self, function: Callable[[], Result]) -> Result:
+    def _call(self, function: Callable[[], Result], longest: float = math.inf) -> Result:
         """Call a function of the interface; raise SkillError if it fails or takes too long."""
         if self.broken:
             raise SkillError("other", self.broken)
         name = self.interface.name
         try:
-            return function() if self._caller is None else self._caller.call(function)
+            return function() if self._caller is None else self._caller.call(function, longest)
         except _NoAnswerError as error:
             self.commands = {}
             self.broken = f"The robot '{name}' has not answered for {error} s."
@@ -499,8 +503,8 @@ class _Caller:
     def __del__(self) -> None:
         self._calls.put(None)
 
-    def call(self, function: Callable[[], Result]) -> Result:
-        """Return the result of a function, or raise what it raises; _NoAnswerError after the time-out."""
+    def call(self, function: Callable[[], Result], longest: float = math.inf) -> Result:
+        """Return the result of a function, or raise what it raises; _NoAnswerError after a time [s]."""
         if self._thread is None:
             self._thread = Thread(target=_serve, args=(self._calls,), daemon=True, name="robot interface")
             self._thread.start()
@@ -517,8 +521,9 @@ class _Caller:
                 done.set()
 
         self._calls.put(run)
-        if not done.wait(self._timeout):
-            raise _NoAnswerError(f"{self._timeout:g}")
+        timeout = min(self._timeout, longest)
+        if not done.wait(timeout):
+            raise _NoAnswerError(f"{timeout:g}")
         if errors:
             raise errors[0]
         return results[0]

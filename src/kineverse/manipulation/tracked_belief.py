@@ -97,7 +97,9 @@ def motion_of(poses: Array) -> Array:
     return slopes
 
 
-USUAL = Sensors(position=0.003, position_per_metre=0.003, orientation=math.radians(0.5), encoders=1e-4)
+USUAL = Sensors(
+    position=0.003, position_per_metre=0.003, orientation=math.radians(0.5), encoders=1e-4, outliers=0.02
+)
 """Noise that is expected of a robot whose sensors nobody has described: that of markers and a good camera."""
 _FLOOR = 1e-4, 1e-4  # least noise of poses [m], [rad], for sensors without noise
 _MOVING, _RESTING = 0.04, 4e-4
