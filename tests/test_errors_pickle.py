@@ -40,6 +40,7 @@ ERRORS = error_classes()
 ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "SkillError": ("collision", "it hit the table"),
     "ArmEndError": ("reach", "the arm ends"),
+    "SlipError": ("other", "the handle slipped"),
     "BlockedError": (Obstacle(position("door"), 1.0, "door", "wall", 0.5, 0.1, 0.4),),
     "UnsupportedError": ("A loop cannot be written.", True, True),
     "ConflictError": ("it met another", ("joint door",), ("frames/door",), 7, "robot"),

@@ -157,7 +157,7 @@ def test_contact_points_lie_on_the_surface_and_move_as_finite_differences_say() 
         assert near is not None
         assert near.body == "flap/panel"
         assert near.distance == pytest.approx(0.01, abs=1e-9)
-        one = surface.point_at(start, k)
+        _, one = surface.locate(start, k)
         np.testing.assert_allclose(one.velocity, at.velocities[k], atol=1e-12)
         assert one.alignment == pytest.approx(at.alignment[k])
     # Pushed perpendicularly, with the shorter lever near the hinge.

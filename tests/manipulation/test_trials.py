@@ -56,6 +56,10 @@ def test_what_is_claimed_is_done_if_it_is_true(world):
     apart = judge_outcome(replace(believed, measures=believed.measures | {"target": 0.2}), metrics)
     assert (apart.done, apart.claimed, apart.measures["failure"]) == (False, True, "other")
     assert f"The world says {apart.value:.4g}, not 0.2 ± " in apart.reason
+    for unknown in (RunMetrics(world), believed), (metrics, replace(believed, measures={"target": 0.3})):
+        unproven = judge_outcome(unknown[1], unknown[0])
+        assert (unproven.done, unproven.claimed) == (False, True)
+        assert "No truth was measured" in unproven.reason
     no = judge_outcome(open_object(session, DRAWER, target=0.1, seconds=0.5), metrics)
     assert (no.done, no.claimed, no.measures["failure"]) == (False, False, "time")
 

@@ -15,7 +15,7 @@ from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.skill_run import SkillRun
 from kineverse.manipulation.unknown_objects import forget_joint
 from kineverse.manipulation.unknown_objects.joint_learning import JointLearning
-from kineverse.manipulation.unknown_objects.part_belief import PartBelief, PoseMean, measure_way
+from kineverse.manipulation.unknown_objects.part_belief import PartBelief, PoseMean
 from kineverse.manipulation.unknown_objects.unknown_opening import (
     ArmEndError,
     UnknownOpeningRun,
@@ -23,6 +23,7 @@ from kineverse.manipulation.unknown_objects.unknown_opening import (
 )
 from kineverse.manipulation.unknown_objects.unmodelled_joint import JointPath, free_part, write_joint
 from kineverse.worlds import KinematicWorld, Observation, Robot, RunMetrics, Sensors
+from kineverse.worlds.run_metrics import measure_way
 from robot_interface_proxy import InterfaceOnly
 
 DOOR, HANDLE = "shelf_door/door", "shelf_door/door_handle"
@@ -94,7 +95,7 @@ def test_family_is_known_before_8_cm_with_outliers(path, family, seed):
         learning.update(moved, moved / 0.38 if family == "revolute" else 0.0, 0.0)
     found = learning.learned
     assert found is not None
-    assert found.family == family
+    assert found.fit.family == family
     assert found.distance < 0.08
 
 

@@ -110,8 +110,7 @@ def test_a_run_without_a_known_truth_shows_the_belief(tmp_path):
     model, path = cupboard(), tmp_path / "run.mcap"
     with Recorder(path, model) as recorder:
         for time in (0.5, 1.0):
-            step = SimpleNamespace(time=time, state=state(model, cupboard__door=time), commands={}, phase="")
-            recorder(step)
+            recorder.write_belief(time, state(model, cupboard__door=time))
     scene = RecordedScene(read_run_recording(path))
     assert scene.trajectory.duration == 1.0
     assert scene.values_at(1.0)["cupboard/door"] == 1.0

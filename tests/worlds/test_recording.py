@@ -37,8 +37,9 @@ def step(model, world: SimpleNamespace, k: int, **more):
     world.state, world.contacts = truth, lambda: [TOUCH][: k % 2]
     believed = truth.updated({"cupboard/door": k * 0.02 / 3 + 0.01})
     commands = {X.derivative(): 0.1 * math.sin(k)}
+    known = {"observation": Observation(0.02 * k, {}), "vectors": {}} | more
     return SimpleNamespace(
-        time=0.02 * k, state=believed, commands=commands, phase="pull" if k > 20 else "reach", **more
+        time=0.02 * k, state=believed, commands=commands, phase="pull" if k > 20 else "reach", **known
     )
 
 

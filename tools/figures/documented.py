@@ -327,7 +327,13 @@ MANIPULATION = (
         },
         short_forms.pushes,
     ),
-    _table_of_trials("push-worst", "table1-push", "Worst of all", _WORST, short_forms.pushes),
+    _table_of_trials(
+        "push-worst",
+        "table1-push",
+        "Worst of all",
+        {**_WORST, "pressed [mm]": LARGEST},
+        short_forms.pushes,
+    ),
     _table_of_trials(
         "push-steps",
         "table1-push",

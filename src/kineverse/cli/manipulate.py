@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief
     from kineverse.manipulation.swept_volume import Obstacle
     from kineverse.worlds import SimulatedWorld
-    from kineverse.worlds.recorder import RecordedStep
+    from kineverse.worlds.robot_interface import SkillStep
 
 DONE, NOT_DONE = 0, 1
 
@@ -255,7 +255,7 @@ def _act(
     skill: str,
     scene: ManipulationScene,
     world: SimulatedWorld,
-    watchers: list[Callable[[RecordedStep], object]],
+    watchers: list[Callable[[SkillStep], object]],
     record: str | None,
 ) -> JudgedOutcome:
     belief: Belief = TrueBelief(world)
@@ -284,7 +284,7 @@ def _act(
             recorder = stack.enter_context(Recorder(record, scene.model, about, world=world))
             watchers.append(recorder)
 
-        def look(step: RecordedStep) -> None:
+        def look(step: SkillStep) -> None:
             for watch in watchers:
                 watch(step)
 
@@ -363,7 +363,7 @@ class _PhaseLines:
     def __init__(self, scene: ManipulationScene, world: SimulatedWorld) -> None:
         self._scene, self._world, self._phase = scene, world, ""
 
-    def __call__(self, session: RecordedStep) -> None:
+    def __call__(self, session: SkillStep) -> None:
         if session.phase != self._phase:
             self._phase, scene = session.phase, self._scene
             value = f"{self._world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()

@@ -30,7 +30,7 @@ from .plan_arguments import parse_robot
 
 if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief
-    from kineverse.worlds.recorder import RecordedStep
+    from kineverse.worlds.robot_interface import SkillStep
 
 OPENING = 0.4  # distance from shut at which closing and pushing begin [m], [rad]
 _NEXT_STEP = (
@@ -224,7 +224,7 @@ class SkillTrial:
         scene: ManipulationScene,
         world: SimulatedWorld,
         belief: Belief,
-        look: Callable[[RecordedStep], None],
+        look: Callable[[SkillStep], None],
     ) -> None:
         self._arguments, self._scene, self._world = arguments, scene, world
         self._belief, self._look = belief, look

@@ -12,6 +12,7 @@ from kineverse.geometry import Scene
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Robot
 
 _NEAREST, _FARTHEST = 0.3, 1.1  # distance of a base from the point that the hand has to reach [m]
 _SIDE, _TURN = math.radians(110.0), math.radians(60.0)  # of base from hand, of its front from the point [rad]
@@ -20,17 +21,10 @@ _SIDE, _TURN = math.radians(110.0), math.radians(60.0)  # of base from hand, of 
 class BaseSampler:
     """Random places of a mobile base at which it touches nothing, as far as there are some."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        base: Sequence[Symbol],
-        robot_bodies: Sequence[str],
-        others: Sequence[str],
-        margin: float,
-    ) -> None:
-        self.base = tuple(base)
-        self._scene = scene
-        carried = [b for b in robot_bodies if {*scene.model.symbols_of(b)} <= {*base}]
+    def __init__(self, scene: Scene, robot: Robot, base: Sequence[Symbol], margin: float) -> None:
+        self.base, self._scene = tuple(base), scene
+        others = [b for b in scene.bodies if not robot.owns(b)]
+        carried = [b for b in scene.bodies if robot.owns(b) and {*scene.model.symbols_of(b)} <= {*base}]
         self._watch = scene.watch(carried, others, margin) if base and carried else None
 
     def draw(

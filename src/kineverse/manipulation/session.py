@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import perf_counter, thread_time
-from typing import TYPE_CHECKING, TypeVar
+from traceback import extract_tb
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -36,6 +38,8 @@ Speeds = Mapping[Symbol, float]
 Result = TypeVar("Result")
 
 STALE = 0.06  # age of the latest readings from which on the robot waits for newer ones [s]
+_RIGID = 1e-4  # largest element of RᵀR - I, and of the last row from (0, 0, 0, 1), of a pose
+_STOPPING = 2.0  # longest wall time that a stop waits for an answer, also after an interruption [s]
 _MADE = 64  # number of motions that are remembered
 _NAMED = 3  # number of names that a message lists
 
@@ -79,7 +83,8 @@ class Session:
                 command = controller.step(session.state)
             session.act(command.speeds)
 
-    Readings that are old or wrong do not end a skill: the robot stands still and waits for better ones.
+    Readings that are old or wrong do not end a skill: the robot stands still and waits for better ones. A
+    session is used by one thread at a time.
 
     Parameters
     ----------
@@ -107,7 +112,7 @@ class Session:
     state
         The believed state.
     start
-        The believed state at the begin of the session.
+        The believed state at the first look.
     time
         Time of the robot after the last step [s].
     observation
@@ -154,6 +159,10 @@ class Session:
         for name, value in (("dt", dt), ("timeout", timeout), ("patience", patience)):
             if value is not None or name != "timeout":
                 as_positive(value, f"{name}=", "time in s, such as 0.02")
+        if not (isinstance(interface.timeout, (int, float)) and interface.timeout > 0.0):
+            raise InvalidValueError(
+                f"timeout of a robot's interface is a positive time in s, not {interface.timeout!r}."
+            )
         if dt > interface.timeout + 1e-9:
             raise InvalidValueError(
                 f"dt={dt:g} s is longer than the time-out of the robot, {interface.timeout:g} s: it would "
@@ -180,11 +189,12 @@ class Session:
         self.made: deque[BasePlacement] = deque(maxlen=_MADE)
         self._problem = ""  # what is wrong with the latest readings
         self._unknown: dict[str, None] = {}  # observed frames that the model does not have
+        self._not_rigid: dict[str, None] = {}  # frames of which poses have been observed that are none
         self.state: State = self.model.default_state()
+        self.start = self.state
         self.observation = Observation(-math.inf, {})
         with suppress(SkillError):  # of what does not answer now, the first skill says it
             self.refresh()
-        self.start = self.state
 
     # -- what is known ---------------------------------------------------------------------------------------
 
@@ -209,9 +219,14 @@ class Session:
             return self.belief.deviation(what)
         if what.shape != ():
             raise ShapeError(f"Only a scalar has a deviation, not an expression of shape {what.shape}.")
-        own = {s: self.belief.deviation(s) for s in what.symbols}
+        own = {s: self.deviation(s) for s in what.symbols}
         slopes = {s: float(what.partial([s])(self.state)[0]) for s, deviation in own.items() if deviation}
         return math.hypot(*(k * own[s] for s, k in slopes.items() if k))
+
+    def time_unseen(self, coordinate: Symbol) -> float:
+        """Return for how long no marker of a coordinate has been seen [s]; 0 if its belief has no markers."""
+        seen = getattr(self.belief, "seen", {})
+        return max(0.0, self.time - float(seen.get(coordinate, self.time)))
 
     def refresh(self) -> None:
         """Read the sensors without a step, such as after a search, or after a reset of a simulated world."""
@@ -279,8 +294,9 @@ class Session:
         UnknownNameError, InvalidValueError
             For speeds that the model does not have, and those that are not finite. Then nothing has changed.
         SkillError
-            If the robot does not answer within the time-out, its simulation is not to be trusted, or no
-            readings of the present have come within the patience. Robots stop by themselves then.
+            If the robot does not answer within the time-out, or its interface raises something, its
+            simulation is not to be trusted, or no readings of the present have come within the patience.
+            Robots stop by themselves then.
         """
         resolved = self._resolve(speeds)
         before, self.command = self.time, command
@@ -316,7 +332,7 @@ class Session:
         self.command = None
         if not self.broken:
             with suppress(SkillError):
-                self._advance({}, stamp=None)
+                self._advance({}, stamp=None, longest=_STOPPING)
 
     def _find_problem(self, before: float) -> str:
         """Return why the robot must not move by the present state; empty if it may."""
@@ -352,7 +368,7 @@ class Session:
             resolved[speed] = number
         return resolved
 
-    def _advance(self, speeds: Speeds, stamp: float | None) -> None:
+    def _advance(self, speeds: Speeds, stamp: float | None, longest: float = math.inf) -> None:
         """Command speeds for one step, with the time of their state; a stop has None and is never too old."""
         self.commands = {s: v for s, v in speeds.items() if self.robot.moves(s)}
 
@@ -360,31 +376,44 @@ class Session:
             self.interface.apply(self.commands, self.dt, stamp=stamp)
             return self._read()
 
-        try:
-            self.observation, self.time = self._call(step)
-        except SimulationError as error:
-            self.broken = str(error)
-            raise SkillError("other", self.broken) from error
-        self._update(speeds)
+        before = self.time
+        self.observation, self.time = self._call(step, longest)
+        # Over a longer time the robot has stopped by itself, and speeds of the step say nothing.
+        self._update(speeds if self.time - before <= self.dt + self.interface.timeout else {})
         self.steps += 1
         if self._on_step is not None:
             self._on_step(self)
 
     def _read(self) -> tuple[Observation, float]:
-        return self.interface.observe(), float(self.interface.time)
+        observation, now = self.interface.observe(), float(self.interface.time)
+        if not isinstance(observation, Observation):
+            raise InvalidValueError(f"observe() returned {observation!r:.60}, and no Observation.")
+        for name in ("joints", "poses"):
+            if not isinstance(given := getattr(observation, name), Mapping):
+                raise InvalidValueError(f"{name}= of an Observation is a mapping, not {given!r:.60}.")
+        return observation, now
 
-    def _call(self, function: Callable[[], Result]) -> Result:
-        """Call a function of the interface, or raise SkillError if it takes longer than the time-out."""
+    def _call(self, function: Callable[[], Result], longest: float = math.inf) -> Result:
+        """Call a function of the interface; raise SkillError if it fails or takes too long."""
         if self.broken:
             raise SkillError("other", self.broken)
-        if self._caller is None:
-            return function()
+        name = self.interface.name
         try:
-            return self._caller.call(function)
-        except TimeoutError as error:
+            return function() if self._caller is None else self._caller.call(function, longest)
+        except _NoAnswerError as error:
             self.commands = {}
-            self.broken = f"The robot '{self.interface.name}' has not answered for {error} s."
+            self.broken = f"The robot '{name}' has not answered for {error} s."
             raise SkillError("other", self.broken) from None
+        except SimulationError as error:
+            self.broken = str(error)
+            raise SkillError("other", self.broken) from error
+        except Exception as error:  # a driver raises what it likes
+            where = extract_tb(error.__traceback__)[-1]
+            self._problem = (
+                f"The interface of the robot '{name}' raised {type(error).__name__}: {error} "
+                f"({Path(where.filename).name}, line {where.lineno})."
+            )
+            raise SkillError("other", self._problem) from error
 
     def _update(self, speeds: Speeds) -> None:
         """Update the belief by the latest readings, unless something is wrong with them."""
@@ -392,42 +421,62 @@ class Session:
         if not self._problem:
             self._check_poses()
             self.state = self.belief.update(self.observation, self.time, State(speeds))
+            if self.start.stamp is None:  # the first look, of a robot that did not answer before
+                self.start = self.state
 
     def _check_joints(self) -> str:
         """Return what is wrong with the latest stamp and encoders; empty if nothing is."""
         observation = self.observation
         if finite_number(observation.stamp) is None or not math.isfinite(self.time):
             return f"The robot's readings have the stamp {observation.stamp!r} at {self.time!r} s."
+        if (early := observation.stamp - self.time) > STALE:  # nobody could tell when they are old
+            return f"The robot's readings are of {observation.stamp:.3f} s, {early:.3f} s after its time."
         if missing := self._coordinates.difference(observation.joints):
             return f"The robot's readings lack {_list(map(str, missing))}."
         bad = [str(s) for s, v in observation.joints.items() if finite_number(v) is None]
         return f"The robot's readings of {_list(bad)} are no finite numbers." if bad else ""
 
     def _check_poses(self) -> None:
-        """Leave out observed poses that are no numbers, and those of frames that the model does not have."""
+        """Leave out observed poses that are not rigid, and those of frames that the model does not have."""
         poses = self.observation.poses
         frames = self.model.frames
         self._unknown |= dict.fromkeys(name for name in poses if name not in frames)
-        good = {
-            name: pose
-            for name, pose in poses.items()
-            if name in frames and np.shape(pose) == (4, 4) and np.isfinite(pose).all()
-        }
+        good = {name: pose for name, pose in poses.items() if name in frames}
+        if good and not _are_rigid([*good.values()]):
+            bad = dict.fromkeys(name for name, pose in good.items() if not _are_rigid([pose]))
+            self._not_rigid |= bad
+            good = {name: pose for name, pose in good.items() if name not in bad}
         if len(good) < len(poses):
             self.observation = replace(self.observation, poses=good)
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks on the readings, such as on poses of frames that the model does not have."""
-        if not self._unknown:
-            return ()
-        return (f"Poses are observed of frames that the model does not have: {_list(self._unknown)}.",)
+        texts = {
+            "Poses are observed of frames that the model does not have": self._unknown,
+            "Poses were observed that are no rigid transforms": self._not_rigid,
+        }
+        return tuple(f"{text}: {_list(names)}." for text, names in texts.items() if names)
 
 
 def _list(names: Iterator[str] | list[str] | Mapping[str, None]) -> str:
     known = sorted(names)
     more = f" and {len(known) - _NAMED} more" if len(known) > _NAMED else ""
     return ", ".join(f"'{name}'" for name in known[:_NAMED]) + more
+
+
+def _are_rigid(poses: list[Any]) -> bool:
+    """Return whether all poses are rigid transforms (4, 4)."""
+    try:
+        matrices = np.array(poses, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    if matrices.shape[1:] != (4, 4) or not np.isfinite(matrices).all():
+        return False
+    rotations = matrices[:, :3, :3]
+    off = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max()
+    last = np.abs(matrices[:, 3] - (0.0, 0.0, 0.0, 1.0)).max()
+    return bool(max(off, last) <= _RIGID and (np.linalg.det(rotations) > 0.0).all())
 
 
 def _make_belief(model: ModelView, robot: Robot) -> Belief:
@@ -437,6 +486,10 @@ def _make_belief(model: ModelView, robot: Robot) -> Belief:
     from .tracked_belief import USUAL, TrackedBelief  # for start-up time: it needs all of estimation
 
     return TrackedBelief(model, robot, USUAL)
+
+
+class _NoAnswerError(Exception):
+    """End of the time-out of a call [s]; a driver's own TimeoutError is another thing."""
 
 
 class _Caller:
@@ -450,8 +503,8 @@ class _Caller:
     def __del__(self) -> None:
         self._calls.put(None)
 
-    def call(self, function: Callable[[], Result]) -> Result:
-        """Return the result of a function, or raise what it raises; TimeoutError after the time-out [s]."""
+    def call(self, function: Callable[[], Result], longest: float = math.inf) -> Result:
+        """Return the result of a function, or raise what it raises; _NoAnswerError after a time [s]."""
         if self._thread is None:
             self._thread = Thread(target=_serve, args=(self._calls,), daemon=True, name="robot interface")
             self._thread.start()
@@ -468,8 +521,9 @@ class _Caller:
                 done.set()
 
         self._calls.put(run)
-        if not done.wait(self._timeout):
-            raise TimeoutError(f"{self._timeout:g}")
+        timeout = min(self._timeout, longest)
+        if not done.wait(timeout):
+            raise _NoAnswerError(f"{timeout:g}")
         if errors:
             raise errors[0]
         return results[0]
@@ -478,3 +532,4 @@ class _Caller:
 def _serve(calls: SimpleQueue[Callable[[], object] | None]) -> None:
     while (call := calls.get()) is not None:
         call()
+        del call  # it has the session, whose end ends this thread

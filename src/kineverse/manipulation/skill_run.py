@@ -19,7 +19,10 @@ from .outcome import Outcome, SkillError
 from .session import Session
 from .swept_volume import BlockedError, find_obstacle
 
+_PAUSE = 0.1  # time without a step after which a reference begins at rest, however long a command acts [s]
 _RAMP = 0.5  # time from rest to the usual speed [s]
+_UNSEEN, _LOOK = 1.0, 2.0  # longest time without a marker before an object is done, and to look for one [s]
+_SIGMAS = 2.0  # standard deviations by which an object at its target may seem to be off
 _PATIENCE = 4.0  # longest time for which a reference waits [s]
 
 
@@ -98,6 +101,7 @@ class SkillRun:
         try:
             session.await_readings()
             reason = skill()
+            self._look_again()
         except SkillError as failure:
             reason, kind = str(failure), failure.kind
             self.measures |= failure.measures
@@ -108,6 +112,29 @@ class SkillRun:
                 session.stop()
             session.phase, session.reference, session.vectors, session.contact = "", None, {}, None
         return self.finish(reason, kind)
+
+    def _look_again(self) -> None:
+        """Wait until the object is seen at its target; raise SkillError for one that is not, or elsewhere.
+
+        What is not seen is believed to move as it was commanded to.
+        """
+        session, coordinate = self.session, self.coordinate
+        if coordinate is None or session.time_unseen(coordinate) <= _UNSEEN:
+            return
+        begin = session.time
+        while (unseen := session.time_unseen(coordinate)) > _UNSEEN:
+            if session.time - begin > _LOOK:
+                raise SkillError(
+                    "other",
+                    f"'{coordinate}' is believed at {self.value:.4g}, but no marker of it has been seen for "
+                    f"{unseen:.3g} s.",
+                )
+            session.act({})
+        off = abs(self.value - self.measures.get("target", self.value))
+        if off > self.measures.get("tolerance", 0.0) + _SIGMAS * session.deviation(coordinate):
+            raise SkillError(
+                "other", f"'{coordinate}' was out of sight, and is seen at {self.value:.4g} now."
+            )
 
     def finish(self, reason: str, failure: str = "") -> Outcome:
         """Return the outcome of a run that ends here, for a reason; it is done without a kind of failure."""
@@ -139,8 +166,9 @@ class Pace:
         """
         session = self._session
         passed, self._last = session.time - self._last, session.time
-        if passed > session.interface.timeout:
-            self.speed, self._moved, passed = 0.0, session.time, session.dt
+        pause = min(session.interface.timeout, _PAUSE)
+        if passed > pause:
+            self.speed, self._moved, passed = 0.0, session.time, pause
         share = min(1.0, max(0.0, 1.5 - distance / self._late))
         self.speed = share * min(1.0, self.speed + passed / _RAMP)
         if share > 0.0:

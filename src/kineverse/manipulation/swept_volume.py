@@ -101,8 +101,6 @@ def find_obstacle(
 
 
 class _Sweep:
-    """Scene in which objects are swept."""
-
     def __init__(self, model: ModelView, robot: Robot | None) -> None:
         self._model, self._robot, self._scene = model, robot, Scene.of(model)
         self._overlaps = FurnitureOverlaps(self._scene, robot)
@@ -112,7 +110,6 @@ class _Sweep:
     def find(
         self, coordinate: Symbol, state: State, target: float, least: float = OVERLAP
     ) -> Obstacle | None:
-        """Return the first obstacle of a coordinate on its way to a target; None without."""
         scene, start = self._scene, float(state[coordinate])
         if start == target or coordinate not in scene.inputs:
             return None

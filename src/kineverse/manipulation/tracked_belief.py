@@ -97,9 +97,11 @@ def motion_of(poses: Array) -> Array:
     return slopes
 
 
-USUAL = Sensors(position=0.003, position_per_metre=0.003, orientation=math.radians(0.5), encoders=1e-4)
+USUAL = Sensors(
+    position=0.003, position_per_metre=0.003, orientation=math.radians(0.5), encoders=1e-4, outliers=0.02
+)
 """Noise that is expected of a robot whose sensors nobody has described: that of markers and a good camera."""
-_LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4  # of poses [m], [rad], for sensors without noise
+_FLOOR = 1e-4, 1e-4  # least noise of poses [m], [rad], for sensors without noise
 _MOVING, _RESTING = 0.04, 4e-4
 """Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
 and .002 rad/√s and .0013 m/√s at rest."""
@@ -229,9 +231,7 @@ class TrackedBelief:
 
     def _make_tracker(self) -> Tracker:
         sensors = self.sensors
-        covariance = pose_covariance(
-            max(sensors.position, _LEAST_POSITION), max(sensors.orientation, _LEAST_ORIENTATION)
-        )
+        covariance = pose_covariance(*sensors.pose_noise(0.0, *_FLOOR))
         outliers = Outliers(min(sensors.outliers, 0.5), sensors.reach) if sensors.outliers > 0.0 else None
         observed = [ObservedPose(name, covariance=covariance) for name in self._frames]
         tracker = Tracker(self._model, observed, outliers=outliers)
@@ -375,10 +375,7 @@ class TrackedBelief:
 
     def _deviations(self, poses: Array, eye: Array) -> Array:
         """Return the stated deviations (m, 2) of positions and rotations of poses (m, 4, 4) [m], [rad]."""
-        position = self.sensors.position_noise(np.linalg.norm(poses[:, :3, 3] - eye, axis=1))
-        result = np.full((len(poses), 2), max(self.sensors.orientation, _LEAST_ORIENTATION))
-        result[:, 0] = np.maximum(position, _LEAST_POSITION)
-        return result
+        return self.sensors.pose_noise(np.linalg.norm(poses[:, :3, 3] - eye, axis=1), *_FLOOR).T
 
     def _correct(self, observation: Observation, poses: Array, eye: Array) -> tuple[Array, Array]:
         """Correct the base by landmarks; return poses that it carries, and the covariance it adds to them."""
@@ -405,7 +402,7 @@ class TrackedBelief:
         if self._shared is None:
             J = self._jacobians(self._values[self._jacobian_places]).reshape(-1, 6, len(self._speeds))
             weights = np.repeat([self.sensors.position, self.sensors.orientation], 3)
-            W = 1.0 / np.maximum(weights, _LEAST_POSITION) ** 2
+            W = 1.0 / np.maximum(weights, _FLOOR[0]) ** 2
             A = np.einsum("kia,i,kib->ab", J, W, J) + 1e-9 * np.eye(len(self._speeds))
             X = np.linalg.solve(A, np.einsum("kia,i,kib->ab", J, W, self._carried))
             self._shared = np.einsum("ia,ab,ib->i", X, self._filter.covariance, X)

@@ -62,6 +62,8 @@ def judge_outcome(outcome: Outcome, metrics: RunMetrics) -> JudgedOutcome:
         if metrics.way < way - _SHORT_WAY or metrics.turn < turn - _SHORT_TURN:
             opened = f"{100 * metrics.way:.0f} cm and {math.degrees(metrics.turn):.0f}°"
             objections.append(f"The world says that it is open by {opened}.")
+    if math.isnan(value - target - tolerance) and math.isnan(metrics.way):
+        objections.append("No truth was measured: metrics need the coordinate of the object, or its part.")
     if not outcome:
         objections = []  # the skill has said why
     if overlap is not None:

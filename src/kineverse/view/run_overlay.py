@@ -18,7 +18,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.planning.trajectories.trajectory import Trajectory
 from kineverse.state import State, StateLike
 from kineverse.worlds import Contact, RunRecording, SimulatedWorld
-from kineverse.worlds.recorder import RecordedStep
+from kineverse.worlds.robot_interface import SkillStep
 
 from .drawables import TRACE, Drawable, Rgba, build_spheres, collect_drawables
 from .html import BREAK, FONT, HtmlBox, element
@@ -363,7 +363,7 @@ class LiveRun:
         self._drawn = self._begin = 0.0
         self.captions: Sequence[str] = ()
 
-    def __call__(self, step: RecordedStep) -> None:
+    def __call__(self, step: SkillStep) -> None:
         """Show a step at its time."""
         now = time.monotonic()
         if self._speed:
@@ -389,7 +389,7 @@ class LiveRun:
         """Remove everything of the run from the page."""
         self._layer.remove()
 
-    def _draw(self, step: RecordedStep) -> None:
+    def _draw(self, step: SkillStep) -> None:
         shown = self._shown(step)
         ghosts = {} if step.state is shown else self._drawing.find_ghosts(shown, step.state)
         lines = [*self.captions, f"{step.time:.1f} s"] + ([f"phase: {step.phase}"] if step.phase else [])
@@ -402,10 +402,10 @@ class LiveRun:
         self._page.move(self._drawing.values(shown))
         self._layer.draw(RunMoment(ghosts, find_arrows(vectors), lines, way, wanted))
 
-    def _shown(self, step: RecordedStep) -> State:
+    def _shown(self, step: SkillStep) -> State:
         return step.state if self._world is None else self._world.state
 
-    def _find_hand_velocity(self, step: RecordedStep) -> Vectors:
+    def _find_hand_velocity(self, step: SkillStep) -> Vectors:
         """Return the commanded velocity of the hand [m/s], with the hand as its origin."""
         if self._poses is None or not step.commands:
             return {}

@@ -13,7 +13,7 @@ from kineverse.model.frame_dependence import moved_frames
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Robot, SimulatedWorld
-from kineverse.worlds.recorder import RecordedStep
+from kineverse.worlds.robot_interface import SkillStep
 
 from .auto_camera import TRIAL_HEIGHT, find_extreme_points
 from .camera import Camera, fit_camera
@@ -54,7 +54,7 @@ class SkillStills:
     def __bool__(self) -> bool:
         return bool(self._rows)
 
-    def watch(self, step: RecordedStep, opening: bool) -> None:
+    def watch(self, step: SkillStep, opening: bool) -> None:
         """Keep a step of the present row: the first and last of a held handle that opens, and the last."""
         shown = step.state if self._world is None else self._world.state
         reference = getattr(step, "reference", None)

@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from .recorder import Recorder as Recorder
     from .recording import RunRecording as RunRecording, read_run_recording as read_run_recording
     from .robot import MobileBase as MobileBase, Robot as Robot
-    from .robot_interface import Observation as Observation, RobotInterface as RobotInterface
-    from .run_metrics import (
+    from .robot_interface import (
+        Observation as Observation,
         PlannedContact as PlannedContact,
-        RunMetrics as RunMetrics,
-        RunOverlap as RunOverlap,
+        RobotInterface as RobotInterface,
     )
+    from .run_metrics import RunMetrics as RunMetrics, RunOverlap as RunOverlap
     from .sensor_sampler import SensorSampler as SensorSampler
     from .sensors import Sensors as Sensors
     from .simulated_world import (

@@ -13,7 +13,6 @@ hold began.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.spatial import log_so3, skew
 from kineverse.symbols import Symbol
 
-from .quasistatic import SKIN, ObjectMotion
+from .quasistatic import SKIN, ObjectMotion, Residual
 from .quasistatic_constraints import Gaps
 
 TOUCH = 1e-4  # gap below which bodies touch [m]
@@ -36,14 +35,6 @@ _OPPOSED = 0.5  # least cosine of the angle between the normal of a contact that
 _ASLANT = 0.2  # least part of a finger's motion along the normal of a contact that stops it
 
 _ROUNDS = 6
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Hold:
-    """Held body, and the error of the hold with its derivatives at values of the model's symbols."""
-
-    body: str
-    error: Callable[[Array], tuple[Array, Array]]
 
 
 class _HoldError:
@@ -67,12 +58,12 @@ class _HoldError:
         )
         self._count = len(model.symbols)
 
-    def bind(self, hand_T_body: Array, middle: Array) -> Callable[[Array], tuple[Array, Array]]:
-        """Return the error (6,) and its derivatives (6, n) as a function of the model's symbols."""
+    def bind(self, hand_T_body: Array, middle: Array, q: Array) -> Residual:
+        """Return the error (6,) in the world [m] and its derivatives (6, n), at what ``q`` is when asked."""
         evaluator, count = self._function.bind(), self._count
         evaluator.input[count:] = [*hand_T_body[:3].ravel(), *middle]
 
-        def evaluate(q: Array) -> tuple[Array, Array]:
+        def evaluate() -> tuple[Array, Array]:
             evaluator.input[:count] = q
             evaluator()
             error, derivatives = evaluator.outputs
@@ -114,13 +105,9 @@ class KinematicGrip:
         ]
         self._errors: dict[str, _HoldError] = {}
         self.speeds: Array = np.zeros(len(self._at))
-        self._hold: _Hold | None = None
+        self.held: str | None = None  # frame of the held body
+        self._error: Residual  # of the hold
         self._may_hold = True
-
-    @property
-    def held(self) -> str | None:
-        """Frame of the held body."""
-        return None if self._hold is None else self._hold.body
 
     def reset(self) -> None:
         """Let go, and stop the fingers."""
@@ -133,13 +120,13 @@ class KinematicGrip:
         self.speeds[:] = speeds
         if (speeds * self._closing < 0.0).any():
             self._may_hold = True
-            if self._hold is not None:
-                self._report(f"'{self._hold.body}' is released")
+            if self.held is not None:
+                self._report(f"'{self.held}' is released")
                 self._let_go()
 
     def steps(self, h: float) -> Array:
         """Return the motion of the fingers in a time h, within their limits (k,) [m], [rad]."""
-        if self._hold is not None:
+        if self.held is not None:
             return np.zeros(len(self._at))
         q = self._motion.q[self._at]
         low, high = np.minimum(self._range[:, 0], q), np.maximum(self._range[:, 1], q)
@@ -148,7 +135,7 @@ class KinematicGrip:
     def move(self, h: float, moved: float) -> None:
         """Move fingers and objects in a time h [s], after the rest of the robot has moved."""
         motion = self._motion
-        if self._hold is not None:
+        if self.held is not None:
             motion.resolve(h, moved, self._error)
             self._check()
             return
@@ -205,16 +192,11 @@ class KinematicGrip:
         if body not in self._errors:
             model, speeds = motion.scene.model, motion.columns[: motion.count]
             self._errors[body] = _HoldError(model, self.gripper.hand, body, speeds)
-        error = self._errors[body].bind(inverse(hand) @ world_T_body, middle[:3])
-        self._hold = _Hold(body, error)
+        self._error = self._errors[body].bind(inverse(hand) @ world_T_body, middle[:3], motion.q)
+        self.held = body
         same = [b for k, b in enumerate(motion.scene.bodies) if motion.group[k] == best]
         motion.ignore(self.gripper.bodies, same)
         self._report(f"'{body}' is held")
-
-    def _error(self) -> tuple[Array, Array]:
-        """Return the error of the hold in axes of the world (6,) [m], and its Jacobian (6, n)."""
-        assert self._hold is not None
-        return self._hold.error(self._motion.q)
 
     def _check(self) -> None:
         """Lose the held body if it is too far from its place in the hand."""
@@ -228,7 +210,7 @@ class KinematicGrip:
             self._let_go()
 
     def _let_go(self) -> None:
-        self._hold = None
+        self.held = None
         self._motion.ignore()
 
     def _hand(self) -> Array:

@@ -118,22 +118,17 @@ class MujocoCoordinates:
 
         Coordinates without limits are within half a turn, loops stay where they are.
         """
-        free, lower, upper = self._ranges()
+        compiled, free = self._compiled, np.array(sorted(self.address.values()), dtype=int)
+        joints = [int(np.flatnonzero(compiled.jnt_qposadr == at)[0]) for at in free.tolist()]
+        limited = compiled.jnt_limited[joints].astype(bool)
+        lower = np.where(limited, compiled.jnt_range[joints, 0], -np.pi)
+        upper = np.where(limited, compiled.jnt_range[joints, 1], np.pi)
 
         def move(data: Any, draw: Callable[[Array, Array], Array]) -> None:
             data.qpos[free] = draw(lower, upper)
             self.follow(data.qpos)
 
         return move
-
-    def _ranges(self) -> tuple[Array, Array, Array]:
-        """Return the places of hinges and slides in ``qpos``, and the ends of their ranges."""
-        compiled, free = self._compiled, np.array(sorted(self.address.values()), dtype=int)
-        joints = [int(np.flatnonzero(compiled.jnt_qposadr == at)[0]) for at in free.tolist()]
-        limited = compiled.jnt_limited[joints].astype(bool)
-        lower = np.where(limited, compiled.jnt_range[joints, 0], -np.pi)
-        upper = np.where(limited, compiled.jnt_range[joints, 1], np.pi)
-        return free, lower, upper
 
 
 def _pose(position: Array, wxyz: Array) -> Array:

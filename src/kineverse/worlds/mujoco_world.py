@@ -19,9 +19,8 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from . import mujoco_model
-from .mujoco_gripper import GripperDrive
 from .mujoco_model import add_floor
-from .mujoco_servos import BANDWIDTH, JointServos, SpeedMap, base_coordinates
+from .mujoco_servos import BANDWIDTH, GripperDrive, JointServos, SpeedMap, base_coordinates
 from .mujoco_state import MujocoContacts, MujocoCoordinates
 from .robot import Robot
 from .robot_interface import Observation
@@ -378,7 +377,6 @@ class MujocoWorld:
 
 
 def _friction_by_name(given: Mapping[Any, float], furniture: list[str]) -> dict[str, float]:
-    """Return friction by the name of a coordinate of furniture, after checking it."""
     result = {}
     for key, value in given.items():
         number = finite_number(value)

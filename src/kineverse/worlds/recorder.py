@@ -23,7 +23,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,9 +33,9 @@ from kineverse._extras import install_command
 from kineverse.errors import FormatError, InvalidValueError, KineverseError, MissingDependencyError
 from kineverse.formats.document.writer import to_json
 from kineverse.model.model_view import ModelView
-from kineverse.state import State, StateLike
+from kineverse.state import StateLike
 
-from .robot_interface import Observation
+from .robot_interface import Observation, SkillStep
 from .simulated_world import Contact, SimulatedWorld
 
 PROFILE = "kineverse"  # profile in the header of a recording
@@ -78,30 +78,6 @@ TOPICS: dict[str, tuple[str, dict[str, Any]]] = {
 """Topics, with the name of the schema and the properties of its messages."""
 
 _FLUSH = 0.5  # longest time of the world that is lost if the process is killed [s]
-
-
-class RecordedStep(Protocol):
-    """Step of a skill, as :class:`kineverse.manipulation.session.Session` has it.
-
-    If there are attributes ``observation`` (an :class:`.Observation`) and ``vectors`` (as for
-    :meth:`Recorder.write_vectors`), they are recorded too.
-    """
-
-    @property
-    def time(self) -> float:
-        """The time of the robot after the step [s]."""
-
-    @property
-    def state(self) -> State:
-        """The believed state."""
-
-    @property
-    def commands(self) -> Mapping[Any, float]:
-        """The speeds of the last step."""
-
-    @property
-    def phase(self) -> str:
-        """Name of the present phase."""
 
 
 class Recorder:
@@ -225,7 +201,7 @@ class Recorder:
         content = _plain(dataclasses.asdict(outcome) if known else dict(outcome))
         self._send("/outcome", self._time, json.dumps(content, allow_nan=False).encode())
 
-    def __call__(self, step: RecordedStep) -> None:
+    def __call__(self, step: SkillStep) -> None:
         """Write everything of a step of a session at its time."""
         now, world = step.time, self._world
         truth = None if world is None else world.state
@@ -238,10 +214,9 @@ class Recorder:
         self.write_command(now, step.commands)
         if world is not None:
             self.write_contacts(now, world.contacts())
-        if isinstance(observation := getattr(step, "observation", None), Observation):
-            self.write_observation(now, observation)
-        if vectors := getattr(step, "vectors", None):
-            self.write_vectors(now, vectors)
+        self.write_observation(now, step.observation)
+        if step.vectors:
+            self.write_vectors(now, step.vectors)
 
     def close(self) -> None:
         """Finish the file; further calls do nothing."""

@@ -67,7 +67,7 @@ class Robot:
         self, model: ModelView, name: str, frames: Sequence[str], *, srdf: Srdf | None = None
     ) -> None:
         self.model, self.name, self._srdf, self._version = model, name, srdf, model.version
-        self.frames = tuple(frames)
+        self.frames, self._owned = tuple(frames), frozenset(frames)
         self.coordinates = tuple(s for s in model.degrees_of_freedom if self.moves(s))
         self.speeds = tuple(v for v in model.speeds if self.moves(v))
 
@@ -121,15 +121,11 @@ class Robot:
 
     def owns(self, frame: str) -> bool:
         """Return whether a frame is one of the robot's."""
-        return frame in self._frame_set
+        return frame in self._owned
 
     def moves(self, symbol: Symbol) -> bool:
         """Return whether a coordinate, or a derivative of one, is the robot's; the model need not have it."""
         return is_of_robot(symbol.path, self.name)
-
-    @cached_property
-    def _frame_set(self) -> frozenset[str]:
-        return frozenset(self.frames)
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -144,9 +140,8 @@ class Robot:
             outside = record.parent == WORLD or not self.owns(record.parent)
             if record.coordinates and outside and self.owns(record.child):
                 pose = self.model.fk(record.child, relative_to=record.parent)
-                placing = tuple(
-                    s for s in record.coordinates if s in pose.symbols
-                )  # not the steering of a car
+                # Not the steering of a car.
+                placing = tuple(s for s in record.coordinates if s in pose.symbols)
                 return MobileBase(placing, record.parent, record.child, _is_planar(pose, placing))
         return None
 

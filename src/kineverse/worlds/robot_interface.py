@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
-from kineverse.state import StateLike
+from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .robot import Robot
@@ -90,3 +90,27 @@ class RobotInterface(Protocol):
 
     def observe(self) -> Observation:
         """Return the latest sensor readings that have arrived."""
+
+
+class PlannedContact(NamedTuple):
+    """Contact that a skill plans: the depth of these bodies is no overlap."""
+
+    pusher: tuple[str, ...]  # bodies of the robot
+    pushed: tuple[str, ...]  # bodies of the object
+    touching: bool  # whether the skill believes that they touch
+
+
+class SkillStep(Protocol):
+    """Step of a skill, as a :class:`kineverse.manipulation.Session` has it: it is recorded and measured."""
+
+    time: float  # time of the robot after the step [s]
+    phase: str  # name of the present phase
+    state: State  # the believed state
+    observation: Observation
+    contact: PlannedContact | None  # the contact that is planned; None without any
+    # Vectors of the controller by name, each after its origin in the world [m].
+    vectors: Mapping[str, tuple[Array, Array]]
+
+    @property
+    def commands(self) -> Mapping[Any, float]:
+        """The speeds of the step."""

@@ -21,8 +21,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .furniture_overlaps import OVERLAP, FurnitureOverlaps
+from .robot_interface import PlannedContact, SkillStep
 from .simulated_world import SimulatedWorld
 
 CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
@@ -48,30 +49,6 @@ CONTACT_GAP = 1e-3  # largest gap of a contact of a push [m]
 _STILL = 5e-3
 _ROUNDING = 1e-9  # depth that is nothing but rounding [m]
 _TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap [m]
-
-
-class PlannedContact(NamedTuple):
-    """Contact that a skill plans: the depth of these bodies is no overlap."""
-
-    pusher: tuple[str, ...]  # bodies of the robot
-    pushed: tuple[str, ...]  # bodies of the object
-    touching: bool  # whether the skill believes that they touch
-
-
-class MeasuredStep(Protocol):
-    """Step of a skill, as :class:`kineverse.manipulation.session.Session` has it."""
-
-    @property
-    def commands(self) -> Mapping[Symbol, float]:
-        """The speeds of the step."""
-
-    @property
-    def state(self) -> State:
-        """The believed state."""
-
-    @property
-    def contact(self) -> PlannedContact | None:
-        """The contact that is planned; None without any."""
 
 
 class RunOverlap(NamedTuple):
@@ -200,17 +177,12 @@ class RunMetrics:
     @property
     def way(self) -> float:
         """Distance of the part's point from where it was at the begin [m]; NaN without a part."""
-        if self._part is None:
-            return math.nan
-        first, last = (pose @ np.append(self._point, 1.0) for pose in (self._first_pose, self._part_pose()))
-        return float(np.linalg.norm((last - first)[:3]))
+        return self._measure_part()[0]
 
     @property
     def turn(self) -> float:
         """Angle by which the part has turned since the begin, from 0 to pi [rad]; NaN without a part."""
-        if self._part is None:
-            return math.nan
-        return float(rotation_angle(self._first_pose[:3, :3].T @ self._part_pose()[:3, :3]))
+        return self._measure_part()[1]
 
     @property
     def measures(self) -> dict[str, Any]:
@@ -282,7 +254,7 @@ class RunMetrics:
         self._measure(state, None, None)
         self._first = self._stamp
 
-    def __call__(self, step: MeasuredStep) -> None:
+    def __call__(self, step: SkillStep) -> None:
         """Measure the present state of the world after a step."""
         state = self._world.state
         if self._world.time <= self._stamp:
@@ -358,9 +330,11 @@ class RunMetrics:
 
         return evaluate
 
-    def _part_pose(self) -> Array:
-        assert self._part is not None
-        return self._part(self._world.state.vector(self._symbols))
+    def _measure_part(self) -> tuple[float, float]:
+        if self._part is None:
+            return math.nan, math.nan
+        now = self._part(self._world.state.vector(self._symbols))
+        return measure_way(self._first_pose, now, self._point)
 
     def _find_followed(self) -> tuple[str, ...]:
         """Return the frames whose paths are measured: the root of what moves of the robot, and the hand."""
@@ -408,7 +382,6 @@ class _BodyMetrics:
             self._touches = self._watch_contacts(handle)
 
     def reset(self) -> None:
-        """Forget all measurements."""
         self._overlaps: dict[tuple[str, str], RunOverlap] = {}
         self.losses = 0
         self.pressed: float | None = None  # largest depth of a planned contact [m]; None without any
@@ -419,12 +392,10 @@ class _BodyMetrics:
             self._touches = None
 
     def find_deepest(self) -> RunOverlap | None:
-        """Return the deepest overlap; None without any."""
         return max(self._overlaps.values(), key=lambda one: one.depth, default=None)
 
     @property
     def excepted(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of bodies whose penetration does not count."""
         permitted = ((a, b) for b, ones in sorted(self._permitted.items()) for a in sorted(ones))
         return tuple(dict.fromkeys((*self._overlapping_at_first, *permitted, *self._furniture.excepted)))
 
@@ -521,6 +492,12 @@ class _BodyMetrics:
             self._overlaps[found.a, found.b] = found
 
 
+def measure_way(first: Array, last: Array, point: Array) -> tuple[float, float]:
+    """Return the distance [m] of a point (3,) of a part between two poses (4, 4), and the angle [rad]."""
+    a, b = (pose @ np.append(point, 1.0) for pose in (first, last))
+    return float(np.linalg.norm((b - a)[:3])), float(rotation_angle(first[:3, :3].T @ last[:3, :3]))
+
+
 class _LimitExcess:
     """Largest excess of any constraint of a model in successive states, see *limit violation* above."""
 
@@ -544,13 +521,11 @@ class _LimitExcess:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all measurements."""
         self.violation, self.limit = 0.0, ""
         self._stamp: float | None = None
         self._values: Array = np.zeros(len(self.symbols))
 
     def update(self, values: Array, stamp: float, commanded: Array | None = None) -> None:
-        """Measure a state."""
         vector, count = self._vector, len(self.symbols)
         rates = vector[count:]
         rates[:] = 0.0

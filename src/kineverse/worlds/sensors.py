@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse._checks import check_flag, finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
@@ -142,6 +143,14 @@ class Sensors:
         """Return the standard deviation of each coordinate at distances (...) from the camera [m]."""
         return self.position + self.position_per_metre * np.maximum(0.0, distance - NEAR)
 
+    def pose_noise(self, distances: npt.ArrayLike, position: float, orientation: float) -> Array:
+        """Return the standard deviations (2, ...) of positions and orientations at distances from the camera.
+
+        They are ``position`` [m] and ``orientation`` [rad] at least: no camera is exact.
+        """
+        positions = np.maximum(self.position_noise(np.asarray(distances)), position)
+        return np.array([positions, np.full_like(positions, max(self.orientation, orientation))])
+
     @classmethod
     def parse(cls, text: str) -> Sensors:
         """Return the settings that a text states, such as ``3mm+3mm/m,0.5deg,30Hz,drop=0.1,delay=30ms``.
@@ -215,7 +224,6 @@ _ENTRY = re.compile(r"(?P<number>[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?|\.[0-9]+)\s
 
 
 def _parse_entry(entry: str) -> list[tuple[str, Any]]:
-    """Return the settings of one entry as (name, value)."""
     if entry in _WORDS:
         return [_WORDS[entry]]
     key, equals, value = (part.strip() for part in entry.partition("="))

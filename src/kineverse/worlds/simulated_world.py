@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from kineverse.errors import UnknownNameError, suggest
 from kineverse.lie import Array
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
@@ -78,5 +79,9 @@ class TrueBelief:
         return self._world.state
 
     def deviation(self, coordinate: Symbol) -> float:
-        """Return 0."""
+        """Return 0, or raise UnknownNameError for a coordinate that the world does not have."""
+        state = self._world.state
+        if coordinate not in state:
+            known = suggest(str(coordinate), map(str, state), "coordinate")
+            raise UnknownNameError(f"The belief says nothing about '{coordinate}'. {known}")
         return 0.0

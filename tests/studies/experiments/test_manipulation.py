@@ -149,7 +149,8 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
         if "pull_out" in what:
             raise RuntimeError("a bug")
         done = "larder_door" not in what and ("drawer_1" not in what or target > 0)
-        return Outcome(done, target, "The arm collides.", "kinematic", 3.0, 2, {"grasp_error": 0.4})
+        measures = {"grasp_error": 0.4, "target": session.state[coordinate], "tolerance": 0.02}
+        return Outcome(done, target, "The arm collides.", "kinematic", 3.0, 2, measures)
 
     monkeypatch.setattr(skills, "open_object", open_object)
     trials = kitchens.run_kitchen(kitchens.KitchenJob("kitchens/2", SHIPPED["hsr"]))
@@ -179,6 +180,13 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
     (row,) = numbers["robots"]
     assert (row["robot"], row["world"], row["objects"]) == ("hsr", "kinematic", len(objects))
     assert "larder_door" in format_report(report)
+
+
+def test_hand_that_left_aside_takes_the_path_back_from_there():
+    """The gripper of the Fetch leaves the oven's handle along the bar."""
+    trials = kitchens.run_kitchen(kitchens.KitchenJob("kitchen", SHIPPED["fetch"], only="kitchen/oven_door"))
+    assert [(t.skill, t.done, t.reason) for t in trials if not t.done] == []
+    assert [t.skill for t in trials] == ["open", "close"]
 
 
 @pytest.mark.long

@@ -39,11 +39,6 @@ class Approach:
     def __bool__(self) -> bool:
         return not self.why
 
-    @property
-    def barrier(self) -> str:
-        """Sentence that there is no path, to be added to another one; empty if there is a path."""
-        return f" There is no path to the handle: {self.why}" if self.why else ""
-
 
 class ApproachPlanner:
     """Planner of paths to configurations, with the hand empty.

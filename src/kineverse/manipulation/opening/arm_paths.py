@@ -180,7 +180,6 @@ class PathContacts:
 
     def __init__(
         self,
-        model: ModelView,
         scene: Scene,
         gripper: Gripper,
         robot_bodies: Sequence[str],
@@ -190,7 +189,8 @@ class PathContacts:
         self.scene, self.gripper, self.margin = scene, gripper, margin
         self.robot_bodies, self.others = tuple(robot_bodies), tuple(others)
         self._self_watch = scene.watch(self.robot_bodies, self.robot_bodies, OWN_MARGIN)
-        self.hand = {b for b in robot_bodies if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
+        speeds_of = scene.model.speeds_of
+        self.hand = {b for b in robot_bodies if b in gripper.bodies or not speeds_of(b, gripper.hand)}
         self._around: dict[str, PreparedQuery] = {}
         self._beside: dict[str, PreparedQuery] = {}
         self._found: tuple[PreparedQuery, float] | None = None

@@ -295,15 +295,11 @@ class PlacementSearch:
             raise InvalidValueError("The model has nothing but the robot, so there is nothing to hold.")
         self.others = others
         add_rules = self.scene.collision_world.add_rules
-        add_rules(
-            (
-                *find_overlapping_links(self.scene, self.robot_bodies, state),
-                *furniture_rules(bodies, self.robot_bodies),
-            )
-        )
+        overlapping = find_overlapping_links(self.scene, self.robot_bodies, state)
+        add_rules((*overlapping, *furniture_rules(bodies, self.robot_bodies)))
         add_rules(self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN))
-        self.contacts = PathContacts(model, self.scene, gripper, self.robot_bodies, others, margin)
-        self.bases = BaseSampler(self.scene, self.base, self.robot_bodies, others, margin)
+        self.contacts = PathContacts(self.scene, gripper, self.robot_bodies, others, margin)
+        self.bases = BaseSampler(self.scene, robot, self.base, margin)
         self._reach: float | None = None
 
     def _random_states(self, state: State) -> Iterator[State]:
@@ -478,7 +474,6 @@ class _Search:
 
     @property
     def is_near(self) -> bool:
-        """True if the hand is near the handle."""
         hand = np.asarray(self.owner.model.fk(self.grasps[0].gripper.hand)(self.state))
         return bool(np.linalg.norm(hand[:3, 3] - self.handles[0, :3, 3]) <= _AROUND)
 

@@ -13,14 +13,14 @@ import numpy.typing as npt
 from kineverse.compilation import compile
 from kineverse.control import Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
-from kineverse.expressions import Expression
 from kineverse.geometry import Rule, Scene
-from kineverse.grasping import Grasp, Gripper, Handle
+from kineverse.grasping import Grasp, Handle
 from kineverse.grasping.grasp_sampling import RETREAT
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.outcome import SkillError
-from kineverse.manipulation.session import HandReference, Session
+from kineverse.manipulation.session import HandReference
 from kineverse.manipulation.skill_run import Pace, SkillRun
+from kineverse.model.model_view import ModelView
 from kineverse.planning import Trajectory, TrajectoryFollower
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -52,6 +52,7 @@ _POSTURE = 0.5  # weight of the arm relative to the object
 _ARRIVED = 0.05  # distance from the end of a path up to which the retreat there is meant [m], [rad]
 _BESIDE = 0.008  # difference of the gap to the thickness of the bar if it is not between the fingers [m]
 _KEPT = 8  # number of controllers that are kept
+_MARGIN = 0.002  # least distance of bodies while the object moves [m]; placements keep more
 
 Targets = TypeVar("Targets")
 
@@ -65,8 +66,8 @@ class HandMotion:
         self.gripper, self.search, self.approaches = opener.gripper, opener.search, opener.approaches
         self.controllers, self.model = opener.controllers, opener.search.model
         self.turns: Array = np.zeros(len(self.search.moving))
-        self._hand, self._bar = self.model.fk(self.gripper.hand), self.model.fk(handle.frame)
-        self._slope = self._bar[:3, 3].partial([handle.coordinate])
+        self.hand, self.bar = self.model.fk(self.gripper.hand), self.model.fk(handle.frame)
+        self._slope = self.bar[:3, 3].partial([handle.coordinate])
         limits = {s: self.model.limits(s) for s in (*self.search.moving, handle.coordinate)}
         self._limits = {s: (float(a), float(b)) for s, (a, b) in limits.items()}
         self.fingers: dict[Symbol, float] = {}  # where they stood around the bar
@@ -79,12 +80,6 @@ class HandMotion:
             return 0.0
         slope = self._slope(session.state)
         return deviation * float(np.linalg.norm(slope))
-
-    @property
-    def holding_rules(self) -> tuple[Rule, ...]:
-        """Rules of a scene in which the hand holds the handle."""
-        held = (Rule(b, self.handle.frame, False, "grasped") for b in self.gripper.bodies)
-        return (*self.search.scene.rules, *held)
 
     def look(self) -> None:
         """Stand until the handle is known well, or raise SkillError if it is not seen."""
@@ -120,9 +115,10 @@ class HandMotion:
 
     def explain(self, result: BasePlacement) -> SkillError:
         """Return why no placement was found."""
-        standing = self.approaches.explain_standing(self.session.state)
-        why = f" {standing}" if standing else self.planned.barrier
-        return SkillError("reach" if standing else result.failure, f"{result.why}{why}")
+        if standing := self.approaches.explain_standing(self.session.state):
+            return SkillError("reach", f"{result.why} {standing}")
+        why = f" There is no path to the handle: {self.planned.why}" if self.planned.why else ""
+        return SkillError(result.failure, f"{result.why}{why}")
 
     def drive(self) -> bool:
         """Drive a base on wheels as planned, with a compact arm where needed; return False if it stays."""
@@ -149,7 +145,16 @@ class HandMotion:
         self.follow_planned()
         self.move_fingers(self.gripper.opened)
         self.count_turns(placement.line[0])
-        self.follow_line(placement.grasp.approach, placement.grasp.pose, self.rows(placement.line))
+        # A hand that takes a path back comes from where it left, and not on the line of the grasp.
+        start = self._place_hand(placement, placement.line[0], placement.values[0])
+        self.follow_line(start, placement.grasp.pose, self.rows(placement.line))
+
+    def _place_hand(self, placement: BasePlacement, row: Array, value: float) -> Array:
+        """Return the pose bar_T_hand at a configuration (n,) of a placement and a value of the object."""
+        wanted = dict(zip(placement.coordinates, row.tolist(), strict=True))
+        state = self.session.state.updated({**wanted, self.handle.coordinate: float(value)})
+        pose: Array = inverse(self.bar(state)) @ self.hand(state)
+        return pose
 
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory, whose time waits where the robot is late."""
@@ -163,7 +168,7 @@ class HandMotion:
         follower.trajectory = trajectory
         time, pace = 0.0, Pace(session, _LATE, speed=1.0)
         times = np.linspace(0.0, trajectory.duration, _REFERENCES)
-        self.refer([self._hand(session.state.updated(trajectory.at(t))) for t in times.tolist()])
+        self.refer([self.hand(session.state.updated(trajectory.at(t))) for t in times.tolist()])
         while time < trajectory.duration + _RESTING_AT_END:
             self.refer_to(time / max(trajectory.duration, session.dt))
             with session.timed("approach"):
@@ -182,11 +187,11 @@ class HandMotion:
             # The initial values are of no run: a controller with others would be compiled for these alone.
             wanted, rate = Target("hand/pose", np.eye(4)), Target("hand/rate", np.zeros(6))
             posture, follow, goals = (None, None, []) if rows is None else self.posture()
-            error = same_pose(wanted.expression, self._hand)
+            error = same_pose(wanted.expression, self.hand)
             goal = Goal(error, gain=FOLLOWING, rate=rate.expression, name="hand")
             return self.controller([goal, *goals]), (wanted, rate, posture, follow)
 
-        bar = compile(self._bar, tier="interpreter")  # some hundred calls
+        bar = compile(self.bar, tier="interpreter")  # some hundred calls
         controller, (wanted, rate, posture, follow) = self.find_controller(("line", rows is None), make)
         displacement = end[:3, 3] - start[:3, 3]
         seconds = max(float(np.linalg.norm(displacement)) / _LINE_SPEED, 2.0 * session.dt)
@@ -194,9 +199,9 @@ class HandMotion:
             seconds = max(seconds, find_least_time(rows, self.search.samples.speeds))
         speed = np.concatenate([end[:3, :3].T @ displacement / seconds, np.zeros(3)])
         time, pace = 0.0, Pace(session, _LINE_LATE, speed=1.0)
-        uncertain = [session.deviation(x) for x in (self._bar @ end)[:3, 3]]
+        uncertain = [session.deviation(x) for x in (self.bar @ end)[:3, 3]]
         settled = max(_SETTLED, _SIGMAS * float(np.linalg.norm(uncertain)))
-        self.refer(self._bar(session.state) @ np.array([start, end]))
+        self.refer(self.bar(session.state) @ np.array([start, end]))
         while time < seconds + _MOST_SETTLING:
             pose = end.copy()
             share, later = (min(1.0, (time + k * session.dt) / seconds) for k in (1, 2))
@@ -263,17 +268,16 @@ class HandMotion:
         state, grasp = self.session.state, placement.grasp
         assert grasp is not None
         self.move_fingers(self.gripper.opened)
-        world_T_bar, world_T_hand = self._bar(state), self._hand(state)
+        world_T_bar, world_T_hand = self.bar(state), self.hand(state)
         pose = inverse(world_T_bar) @ world_T_hand
         self.session.phase = "retract"
         if abs(state[self.handle.coordinate] - placement.values[-1]) > _ARRIVED:
             # The retreat of the placement was checked for an object that has arrived.
             self._back_off(grasp)
             return
-        end = dict(zip(placement.coordinates, placement.retreat[-1].tolist(), strict=True))
-        gone = state.updated({**end, self.handle.coordinate: float(placement.values[-1])})
+        gone = self._place_hand(placement, placement.retreat[-1], placement.values[-1])
         away = pose.copy()
-        away[:3, 3] += (inverse(self._bar(gone)) @ self._hand(gone))[:3, 3] - grasp.pose[:3, 3]
+        away[:3, 3] += gone[:3, 3] - grasp.pose[:3, 3]
         self.follow_line(pose, away, self.rows(placement.retreat))
 
     def let_go(self, grasp: Grasp | None = None) -> None:
@@ -285,7 +289,7 @@ class HandMotion:
 
     def _back_off(self, grasp: Grasp | None) -> None:
         """Take the hand straight away from the handle, as far as it touches nothing."""
-        world_T_bar, world_T_hand = self._bar(self.session.state), self._hand(self.session.state)
+        world_T_bar, world_T_hand = self.bar(self.session.state), self.hand(self.session.state)
         end, arms = find_retreat(self, grasp, world_T_bar, world_T_hand)
         bar_T_world = inverse(world_T_bar)
         self.follow_line(bar_T_world @ world_T_hand, bar_T_world @ end, arms)
@@ -302,13 +306,21 @@ class HandMotion:
         return configurations[:, : len(self.search.moving)] + self.turns
 
     def controller(self, tasks: Iterable[Task], **options: Any) -> Controller:
-        """Return a controller of the robot's coordinates, and of objects' if something is held."""
-        tasks = list(tasks)
+        """Return a controller of the robot's coordinates."""
         still: list[Symbol | str] = [*self.search.standing, *self.gripper.joints]
-        if not any(isinstance(task, Hold) for task in tasks):
-            still += [s for s in self.model.degrees_of_freedom if not self.search.robot.moves(s)]
+        still += [s for s in self.model.degrees_of_freedom if not self.search.robot.moves(s)]
         with self.session.search():  # which lasts less in the interpreter than a compiler would take
             return Controller(self.model, tasks, dt=self.session.dt, fixed=still, **options)
+
+    def holding_controller(
+        self, model: ModelView, tasks: Iterable[Task], still: Iterable[Symbol] = ()
+    ) -> Controller:
+        """Return a controller of a hand that holds the handle, with rows for all other near bodies."""
+        held = (Rule(b, self.handle.frame, False, "grasped") for b in self.gripper.bodies)
+        fixed = [*self.search.standing, *self.gripper.joints, *still]
+        with self.session.search():
+            scene = Scene(model, rules=(*self.search.scene.rules, *held))
+            return Controller(model, tasks, dt=self.session.dt, fixed=fixed, scene=scene, margin=_MARGIN)
 
     def find_controller(
         self, key: Hashable, make: Callable[[], tuple[Controller, Targets]]
@@ -375,54 +387,41 @@ _EMPTY = 0.002  # motion of closed fingers from which on nothing is between them
 class SlipError(SkillError):
     """Loss of a held handle."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__("other", reason)
-
 
 class SlipDetector:
     """Watch over a bar in closed fingers, compared with its place in the hand at the start."""
 
-    def __init__(
-        self,
-        session: Session,
-        gripper: Gripper,
-        bar: Expression,
-        hand: Expression,
-        fingers: Mapping[Symbol, float],
-    ) -> None:
-        self._session, self._gripper, self._fingers = session, gripper, fingers
+    def __init__(self, motion: HandMotion) -> None:
+        self._motion, session, bar, hand = motion, motion.session, motion.bar, motion.hand
         self.bar_T_hand = inverse(bar(session.state)) @ hand(session.state)
-        self._middle = gripper.grasp_pose[:, 3]
+        self._middle = motion.gripper.grasp_pose[:, 3]
         error = ((bar @ self.bar_T_hand - hand) @ self._middle)[:3]
         self._limit = SLIPPED + _SLIP_SIGMAS * float(np.linalg.norm([session.deviation(x) for x in error]))
         self._poses = compile([bar, hand], tier="interpreter")  # a call a step
 
-    def measure(self, state: State) -> float:
-        """Return the distance of the bar from its place in the hand at a state [m]."""
+    def check(self) -> None:
+        """Raise SlipError if the bar is too far from its place, or if the fingers have closed further."""
+        state, coordinate = self._motion.session.state, self._motion.handle.coordinate
         world_T_bar, world_T_hand = self._poses(state.vector(self._poses.inputs))
-        return float(np.linalg.norm(((world_T_bar @ self.bar_T_hand - world_T_hand) @ self._middle)[:3]))
-
-    def check(self, distance: float, coordinate: Symbol) -> None:
-        """Raise SlipError if the distance is too large, or if the fingers have closed further."""
-        empty = self._are_fingers_empty()
+        moved = (world_T_bar @ self.bar_T_hand - world_T_hand) @ self._middle
+        distance, empty = float(np.linalg.norm(moved[:3])), self._are_fingers_empty()
         if empty or distance > self._limit:
             how = "It is out of the hand." if empty else f"It moved {1e3 * distance:.0f} mm in the hand."
-            value = self._session.state[coordinate]
-            raise SlipError(f"The handle slipped at {value:.3f} of '{coordinate}'. {how}")
+            where = f"{state[coordinate]:.3f} of '{coordinate}'"
+            raise SlipError("other", f"The handle slipped at {where}. {how}")
 
     def _are_fingers_empty(self) -> bool:
-        gripper, state = self._gripper, self._session.state
-        closed = 0.0
-        for s, held in self._fingers.items():
+        gripper, session = self._motion.gripper, self._motion.session
+        state, closed = session.state, 0.0
+        for s, held in self._motion.fingers.items():
             range_ = gripper.closed[s] - gripper.opened[s]
-            noise = math.copysign(4.0 * self._session.deviation(s), range_)
+            noise = math.copysign(4.0 * session.deviation(s), range_)
             further = (state[s] - held - noise) / range_ if range_ else 0.0
             closed = max(closed, gripper.width * further)
         return closed > _EMPTY
 
 
 _SPEED = 0.3  # speed of an object on its path [m/s], [rad/s]
-_MARGIN = 0.002  # least distance of bodies while the object moves [m]; placements keep more
 _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5  # least progress [m], [rad] in a time [s], and at the end
 _LOCKED, _STANDING = 1.5, 1e-3
 """Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
@@ -432,11 +431,11 @@ _STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target 
 
 def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
     """Move a held object along the path of a placement."""
-    bar, hand = motion.model.fk(motion.handle.frame), motion.model.fk(motion.gripper.hand)
+    bar, hand = motion.bar, motion.hand
     session, coordinate, grasp = motion.session, motion.handle.coordinate, placement.grasp
     assert grasp is not None
     session.phase = "move"
-    slip = SlipDetector(session, motion.gripper, bar, hand, motion.fingers)
+    slip = SlipDetector(motion)
     held = slip.bar_T_hand
     target = float(placement.values[-1])
     moving = motion.search.moving
@@ -449,8 +448,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
         posture, arm_speeds, goals = motion.posture()
         hold = Hold(same_pose(bar @ grasped.expression, hand), gain=FOLLOWING, name="grasp")
         goal = Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")
-        scene = Scene(motion.model, rules=motion.holding_rules)
-        result = motion.controller([hold, goal, *goals], scene=scene, margin=_MARGIN)
+        result = motion.holding_controller(motion.model, [hold, goal, *goals])
         return result, (grasped, wanted, posture, arm_speeds)
 
     key = "held", motion.handle.frame, coordinate
@@ -480,7 +478,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
         motion.refer_to(share)
         motion.run.act(command.speeds, command)
         share = min(1.0, share + pace.advance(late) * _SPEED / length)
-        slip.check(slip.measure(session.state), coordinate)
+        slip.check()
         done = abs(session.state[coordinate] - values[0])
         if done > best + _STALLED:
             best, since = done, session.time

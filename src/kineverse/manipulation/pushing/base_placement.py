@@ -203,9 +203,7 @@ class _Sampler:
                 for (tasks, tolerance), last in zip(goals, clear, strict=True)
             ]
         self._tried = 0
-        robot_bodies = [b for b in pushing.scene.bodies if pushing.robot.owns(b)]
-        others = [b for b in pushing.scene.bodies if b not in robot_bodies]
-        self._bases = BaseSampler(pushing.scene, self.base, robot_bodies, others, _MARGIN)
+        self._bases = BaseSampler(pushing.scene, pushing.robot, self.base, _MARGIN)
         self._points = pushing.surface.at(state)
         score = pushing.choice.score(self._points)
         good = np.flatnonzero(score > score.max() - _CANDIDATES)

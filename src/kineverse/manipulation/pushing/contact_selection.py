@@ -134,10 +134,6 @@ class PushSurface:
         )
         return PushContacts(points, normals, velocities, alignment, speeds / max(speeds.max(), 1e-9))
 
-    def point_at(self, state: State, index: int) -> PushPoint:
-        """Return one point at a state."""
-        return self.locate(state, index)[1]
-
     def locate(self, state: State, index: int) -> tuple[Vector, PushPoint]:
         """Return the tip of the pusher and one point at a state."""
         one, symbols = self._one, self._symbols
@@ -285,7 +281,7 @@ class ContactSelection:
         self.chosen = self.rank(state, tip, math.inf)[0] if index is None else index
         self.contacts += 1
         self.restart()
-        return self._surface.point_at(state, self.chosen)
+        return self._surface.locate(state, self.chosen)[1]
 
     def give_up(self, touching: bool, rest: Vector) -> None:
         """Leave the present contact point for another one."""
@@ -314,7 +310,6 @@ class PushTool:
     frame: str  # frame that carries the group
     tip: Array  # point in this frame (3,) [m]
     axis: Array  # unit vector in this frame in which the group points (3,)
-    bodies: tuple[str, ...]  # bodies of the group
 
     def locate_tip(self, model: ModelView) -> Expression:
         """Return the point in the world (3,), as an expression [m]."""
@@ -356,7 +351,7 @@ def find_push_tool(model: ModelView, bodies: Sequence[str], state: State) -> Pus
     heights = tips @ axis
     tip = tips[heights > heights.max() - _FRONT].mean(axis=0)
     R, t = fk[frame][:3, :3], fk[frame][:3, 3]
-    return PushTool(frame, R.T @ (tip - t), R.T @ axis, tuple(bodies))
+    return PushTool(frame, R.T @ (tip - t), R.T @ axis)
 
 
 def _front(placed: tuple[Solid, Array, Array], axis: Array) -> Array:

@@ -218,7 +218,7 @@ class Pushing:
         symbols, jacobian = self._program.tip_jacobian(state)
         normal = velocity = ZERO
         if self.choice.chosen is not None:
-            point = self.surface.point_at(state, self.choice.chosen)
+            _, point = self.surface.locate(state, self.choice.chosen)
             normal, velocity = point.normal, point.velocity
         rates = dict(zip(symbols, (np.array(normal) @ jacobian).tolist(), strict=True))
         rates[self.coordinate] = inner_product(normal, velocity)

@@ -12,8 +12,9 @@ from kineverse.estimation import Fit, Identifier, PlausibilityMonitor, pose_cova
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
+from kineverse.worlds.run_metrics import measure_way
 
-from .part_belief import PartBelief, measure_way
+from .part_belief import PartBelief
 from .unmodelled_joint import find_joint, place_frame, write_joint
 
 CERTAIN = 0.97  # least probability: between nested families such as hinge and screw, .99 is hardly exceeded
@@ -31,11 +32,6 @@ class LearnedJoint:
     distance: float  # motion of the part until the decision [m], and its angle [rad]
     turn: float
     time: float  # time of the decision [s]
-
-    @property
-    def family(self) -> str:
-        """Name of the family."""
-        return self.fit.family
 
 
 class JointLearning:
@@ -76,16 +72,16 @@ class JointLearning:
         certain = fit.probability >= CERTAIN and not result.is_ambiguous and fit.joint_values.shape[1] == 1
         self._looks = self._looks + 1 if certain and fit.family == self._family else int(certain)
         self._family = fit.family if certain else ""
-        if self._looks >= _LOOKS and (self.learned is None or self.learned.family != fit.family):
+        if self._looks >= _LOOKS and (self.learned is None or self.learned.fit.family != fit.family):
             self.learned = LearnedJoint(fit, distance, turn, time)
             return True
-        if self.learned is None or not certain or fit.family != self.learned.family:
+        if self.learned is None or not certain or fit.family != self.learned.fit.family:
             return False
         self.learned = LearnedJoint(fit, self.learned.distance, self.learned.turn, self.learned.time)
         return True
 
 
-_DISTANCE, _LEAST_POSITION, _LEAST_ORIENTATION = 1.0, 1e-3, 2e-3
+_DISTANCE, _FLOOR = 1.0, (1e-3, 2e-3)
 """Distance of the camera, and least standard deviations, for the test of a believed joint [m], [rad]."""
 _MOVED, _TURNED = 0.01, math.radians(1.0)  # motion of furniture that is reported [m], [rad]
 
@@ -95,8 +91,7 @@ def watch_joint(model: Model, belief: PartBelief) -> PlausibilityMonitor | None:
     if find_joint(model, belief.unknown.frame) is None:
         return None
     sensors = belief.sensors
-    position = float(sensors.position_noise(np.asarray(_DISTANCE)))
-    noise = pose_covariance(max(position, _LEAST_POSITION), max(sensors.orientation, _LEAST_ORIENTATION))
+    noise = pose_covariance(*sensors.pose_noise(_DISTANCE, *_FLOOR))
     frames = [name for name in belief.seen if name in model.frames]
     return PlausibilityMonitor(model, frames, noise=noise, outliers=sensors.outliers > 0.0 or None)
 
@@ -118,7 +113,7 @@ def revise_joint(model: Model, belief: PartBelief, learned: LearnedJoint) -> tup
 
     Furniture that stands elsewhere than the model has it is put where it was seen.
     """
-    words = f"Its joint is {learned.family}, certain after {100 * learned.distance:.1f} cm and "
+    words = f"Its joint is {learned.fit.family}, certain after {100 * learned.distance:.1f} cm and "
     words += f"{math.degrees(learned.turn):.1f}°."
     if belief.beside != WORLD:
         before = np.asarray(model.fk(belief.beside)({}))

@@ -10,7 +10,7 @@ import numpy as np
 
 from kineverse.compilation import compile
 from kineverse.estimation import PlausibilityMonitor, pose_covariance
-from kineverse.lie import Array, inverse, pose_difference, retract, rotation_angle, skew
+from kineverse.lie import Array, inverse, pose_difference, retract, skew
 from kineverse.model.frame import WORLD
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -18,7 +18,7 @@ from kineverse.worlds import Observation, Robot, Sensors
 
 from .unmodelled_joint import JointPath, UnknownPart
 
-_FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4  # least noise of poses [m], [rad]: no camera is exact
+_FLOOR = 2e-4, 2e-4  # least noise of poses [m], [rad]: no camera is exact
 _HELD_LOOKS, _STATIC_LOOKS = 16.0, 60.0
 """Number of looks that a mean is worth: of the part in the hand, which slips, and of what stands still."""
 _NEAR, _TURNED = 0.06, 0.35  # distance [m] and angle [rad] from the believed pose that make an outlier
@@ -221,11 +221,8 @@ class PartBelief:
     def _covariance(self, world_T_marker: Array, world_T_part: Array) -> Array:
         """Return the covariance (6, 6) of an observed pose of the part in the world."""
         camera = self._camera(self._state.vector(self._camera.inputs))
-        distance = float(np.linalg.norm(camera[:3, 3] - world_T_marker[:3, 3]))
-        position = float(self.sensors.position_noise(np.asarray(distance)))
-        noise = pose_covariance(
-            max(position, _FLOOR_POSITION), max(self.sensors.orientation, _FLOOR_ORIENTATION)
-        )
+        distance = np.linalg.norm(camera[:3, 3] - world_T_marker[:3, 3])
+        noise = pose_covariance(*self.sensors.pose_noise(distance, *_FLOOR))
         # An error of the marker's orientation displaces the part by the lever between both.
         moved = np.eye(6)
         moved[:3, 3:] = -skew(world_T_part[:3, 3] - world_T_marker[:3, 3])
@@ -242,9 +239,3 @@ def _fuse(looks: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     whole = np.linalg.inv(sum(informations))
     step = whole @ sum(info @ error for info, error in zip(informations, errors, strict=True))
     return retract(first, step), whole
-
-
-def measure_way(first: Array, last: Array, point: Array) -> tuple[float, float]:
-    """Return the distance [m] of a point (3,) of a part between two poses (4, 4), and the angle [rad]."""
-    a, b = (pose @ np.append(point, 1.0) for pose in (first, last))
-    return float(np.linalg.norm((b - a)[:3])), float(rotation_angle(first[:3, :3].T @ last[:3, :3]))

@@ -6,17 +6,14 @@ import math
 
 import numpy as np
 
-from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
+from kineverse.control import Command, Goal, Hold, Target, same_pose
 from kineverse.estimation import Fit
-from kineverse.geometry import Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
 from kineverse.manipulation.opening.arm_paths import row_at
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.swept_volume import find_obstacle
 from kineverse.model.model import Model
-from kineverse.model.model_view import ModelView
 from kineverse.state import State
-from kineverse.symbols import Symbol
 
 from .part_belief import PartBelief
 from .unmodelled_joint import JointPath, place_frame, write_joint
@@ -30,7 +27,6 @@ _RAMP = 0.5  # time in which the pull begins [s]
 _STEP = 0.03  # distance of the handle between two arms that are found for a learned joint [m]
 _QUICK = 0.5  # speed from which on joints take their whole part [m/s], [rad/s]
 _UNSURE = 0.01  # depth of obstacles along a learned joint, which is off by millimetres [m]
-_MARGIN = 0.002  # least distance of bodies while the part moves [m]
 
 
 class StraightPull:
@@ -52,11 +48,10 @@ class StraightPull:
         self._direction = motion.handle.pose[:3, :3] @ np.array(direction)
         model, unknown = motion.model, belief.unknown
         self._part_T_bar = np.asarray(model.fk(motion.handle.frame, unknown.frame)({}))
-        hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
         self._place = Target("pull/place", bar_T_hand)
-        hold = Hold(same_pose(bar @ self._place.expression, hand), gain=_GAIN, name="grasp")
-        still = [*motion.search.standing, *motion.gripper.joints, unknown.handle.coordinate]
-        self._controller = _make_controller(motion, model, [hold], [*still, *unknown.floating])
+        hold = Hold(same_pose(motion.bar @ self._place.expression, motion.hand), gain=_GAIN, name="grasp")
+        still = unknown.handle.coordinate, *unknown.floating
+        self._controller = motion.holding_controller(model, [hold], still)
         self._time = 0.0  # of the pull, without the time in which the robot waits [s]
         self._point = motion.handle.pose[:3, 3]
         self.likely: JointPath | None = None
@@ -106,9 +101,8 @@ class LearnedPull:
         twist = adjoint(inverse(model.fk(motion.handle.frame, unknown.frame)({}))) @ path.twist()
         speed = PATH_SPEED / point_speed(twist, motion.handle.pose[:3, 3])
         goal = Goal(self.coordinate, end, speed=speed, name="object")
-        still: list[Symbol] = [*motion.search.standing, *motion.gripper.joints]
         self._posture, self._speeds, goals = motion.posture()
-        self._controller = _make_controller(motion, model, [hold, goal, *goals], still)
+        self._controller = motion.holding_controller(model, [hold, goal, *goals])
         self._lead = path.direction * speed / _GAIN
         self._find_arms(path.start + path.direction * opened, unknown.frame_T_handle @ bar_T_hand)
 
@@ -158,12 +152,3 @@ def learn_model(model: Model, belief: PartBelief, fit: Fit) -> Model:
     place_frame(copy, belief.beside, belief.reference_pose)
     write_joint(copy, belief.unknown.frame, fit, belief.beside)
     return copy
-
-
-def _make_controller(
-    motion: HandMotion, model: ModelView, tasks: list[Hold | Goal], still: list[Symbol]
-) -> Controller:
-    """Return a controller with rows for near bodies, in which the hand may touch the handle."""
-    with motion.session.search():
-        scene = Scene(model, rules=motion.holding_rules)
-        return Controller(model, tasks, dt=motion.session.dt, fixed=still, scene=scene, margin=_MARGIN)

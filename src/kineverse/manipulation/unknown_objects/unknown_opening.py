@@ -27,9 +27,10 @@ from kineverse.manipulation.tracked_belief import TrackedBelief
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import Robot, Sensors
+from kineverse.worlds.run_metrics import measure_way
 
 from .joint_learning import JointLearning, revise_joint, watch_joint
-from .part_belief import PartBelief, measure_way
+from .part_belief import PartBelief
 from .pulling_policy import LearnedPull, StraightPull, learn_model, point_speed
 from .unmodelled_joint import JointPath, UnknownPart, find_joint, free_part
 
@@ -221,7 +222,7 @@ class UnknownOpeningRun(SkillRun):
             return replace(outcome, measures=measures)
         verdict, words = revise_joint(self.model, self.belief, learned)
         measures |= {
-            "family": learned.family,
+            "family": learned.fit.family,
             "decided_way": learned.distance,
             "decided_turn": learned.turn,
             "decided_seconds": learned.time,

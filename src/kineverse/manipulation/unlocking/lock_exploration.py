@@ -181,7 +181,6 @@ class _Explorer:
         return {known.coordinates[move.key] for move, lock in known.locks.items() if lock.is_erratic}
 
     def run(self, goal: dict[Symbol, float], most: int) -> LockExploration:
-        """Try until the goal is reached, or nothing is left to try."""
         while True:
             plan = self.plan(goal)
             done = plan.verdict == "found" and not plan.steps
@@ -287,7 +286,6 @@ class _Explorer:
         return []
 
     def list_locks(self) -> tuple[LearnedLock, ...]:
-        """Return what is known about each lock that was tried."""
         names, result = self.known.coordinates, list[LearnedLock]()
         for move, lock in self.known.locks.items():
             if lock.is_tried:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeAlias
 
 Side: TypeAlias = Literal[1, -1]
-_SIDES: tuple[Side, Side] = (1, -1)
+SIDES: tuple[Side, Side] = (1, -1)
 Configuration: TypeAlias = tuple[float, ...]
 
 _HELD = 0.1  # relative probability of a condition that holds at the start: boxes come shut
@@ -102,7 +102,7 @@ class LockHypothesis:
     def sufficient(self) -> list[dict[KeySide, None]]:
         """Return for each alternative the conditions under which the part was seen to move."""
         ends = enumerate(zip(*self.limits, strict=True))
-        sides = [KeySide(k, side) for k, _ in ends if k != self.number for side in _SIDES]
+        sides = [KeySide(k, side) for k, _ in ends if k != self.number for side in SIDES]
         return [dict.fromkeys(s for s in sides if self.narrows(s, box)) for box in self.boxes]
 
     def narrows(self, s: KeySide, box: Enclosure) -> bool:

@@ -17,14 +17,13 @@ from kineverse.logic import less
 from kineverse.model.model import Model
 from kineverse.state import State
 
-from .lock_hypothesis import Configuration, Enclosure, KeySide, LockHypothesis, Side
+from .lock_hypothesis import SIDES, Configuration, Enclosure, KeySide, LockHypothesis
 
 Costs: TypeAlias = dict[KeySide, float]
 Option: TypeAlias = tuple[float, KeySide, float]
 """Condition that explains a refusal: its rank, the condition, and the tries that it takes to fulfil it."""
 
 SAME = 1e-3  # difference of positions that counts as none, as a share of a coordinate's range
-_SIDES: tuple[Side, Side] = (1, -1)
 _SPEED = 1.0  # speed limit of a learned lock where the model has none [m/s] or [rad/s]
 _DOUBT = 5.0  # tries by which a condition counts as more costly after a plan was refuted because of it
 _MOST_CHOICES = 500
@@ -47,7 +46,7 @@ class LockModel:
         self.locks = {
             KeySide(k, direction): LockHypothesis(k, self.limits, here)
             for k in range(len(ends))
-            for direction in _SIDES
+            for direction in SIDES
         }
         self.priority: list[int] = np.random.default_rng(seed).permutation(len(ends)).tolist()
         self._doubts = dict[tuple[KeySide, KeySide], float]()
@@ -151,7 +150,7 @@ class LockModel:
                 if k in wanted:
                     upper, lower = (
                         self._bound(KeySide(k, direction), conditions[KeySide(k, direction)])
-                        for direction in _SIDES
+                        for direction in SIDES
                     )
                     edit.constrain(name, lower, self.coordinates[k].derivative(), upper, tag=name)
         self._written = wanted
@@ -161,7 +160,6 @@ class LockModel:
         return f"{self.coordinates[k]}/learned"
 
     def _bound(self, move: KeySide, conditions: Sequence[Collection[KeySide]]) -> Expression:
-        """Return the bound of a speed in one direction."""
         limit = abs(self.model.limits(self.coordinates[move.key].derivative())[move.side > 0])
         most = move.side * (limit if 0.0 < limit < math.inf else _SPEED)
         if not conditions:
