@@ -3,7 +3,7 @@
 The bodies that a coordinate moves are placed along the path so densely that no point of them moves by more
 than :data:`STEP` at a time. There they are checked against everything that is not the robot's and that they
 move relative to: fixed furniture, furniture that other coordinates move, and what carries the object itself.
-:class:`.FurnitureOverlaps` excepts overlaps that mean nothing, as it does for worlds and their judge.
+:class:`.FurnitureOverlaps` excepts overlaps that mean nothing, as it does for worlds and metrics.
 """
 
 from __future__ import annotations

@@ -244,7 +244,7 @@ class OpeningRun(SkillRun):
         except SlipError as slip:
             self.slips.append(str(slip))
         except SkillError as error:
-            if error.kind == "time" or self.session.broken:
+            if error.kind == "time" or self.session.fault:
                 raise
             stall = error
         try:
@@ -280,6 +280,8 @@ class OpeningRun(SkillRun):
                 return result
             failure = self.motion.explain(result)
         except SkillError as error:  # no grasp has room
+            if self.session.fault:
+                raise
             failure = error
         back = self._retrace(whole=False)
         if back is None:
@@ -359,10 +361,10 @@ class OpeningRun(SkillRun):
                 plan=False,
                 retreat=True,
             )
-            if not outcome and self.rest > (1.0 - _LEAST_PUSH / 2) * before:
+            if session.fault or (not outcome and self.rest > (1.0 - _LEAST_PUSH / 2) * before):
                 raise SkillError(outcome.measures["failure"], outcome.reason)
         except SkillError as error:
-            if session.broken:
+            if session.fault:
                 raise
             late = error.kind == "time" and self.left < _LATE
             if late or not begun or attempt + 1 == _MOST_PUSHES:
