@@ -247,10 +247,13 @@ class OpenCloseRunner:
 
     def open_and_close(self, one: ArticulatedObject) -> OpenCloseReport:
         """Open an object and close it, and report it."""
-        session, self.current = self.session, one
+        self.current = one
         if self._failed:
             self._world.reset(self._start)
-            session.refresh()
+            if self.session.broken:  # a simulation that was not to be trusted begins anew
+                self.session = Session(self._world, belief=self.session.belief, on_step=self._look)
+            self.session.refresh()
+        session = self.session
         counted = {name: len(times) for name, times in session.cpu.items()}
         self.opening = True
         opened, closed = self._move(one, one.opened), None
