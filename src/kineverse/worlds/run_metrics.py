@@ -255,9 +255,20 @@ class RunMetrics:
         self._first = self._stamp
 
     def __call__(self, step: SkillStep) -> None:
-        """Measure the present state of the world after a step."""
-        state = self._world.state
-        if self._world.time <= self._stamp:
+        """Measure the present state of the world after a step.
+
+        Raises
+        ------
+        InvalidValueError
+            If the world was reset since the last step: it would be another run.
+        """
+        state, now = self._world.state, self._world.time
+        if now < self._stamp:
+            raise InvalidValueError(
+                f"The world was measured at {self._stamp:.6g} s, and now at {now:.6g} s. "
+                "After a reset of the world, reset() of the metrics begins again."
+            )
+        if now == self._stamp:
             return
         commanded = np.zeros(len(self._signs))
         for v, value in step.commands.items():
