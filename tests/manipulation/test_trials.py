@@ -61,6 +61,11 @@ def test_what_is_claimed_is_done_if_it_is_true(world):
         unproven = judge_outcome(unknown[1], unknown[0])
         assert (unproven.done, unproven.claimed) == (False, True)
         assert "No truth was measured" in unproven.reason
+    unwatched = RunMetrics(world, world.model.symbol(DRAWER))
+    session.act({})
+    unmeasured = judge_outcome(believed, unwatched)
+    assert (unmeasured.done, unmeasured.claimed) == (False, True)
+    assert "The run was not measured" in unmeasured.reason
     no = judge_outcome(open_object(session, DRAWER, target=0.1, seconds=0.5), metrics)
     assert (no.done, no.claimed, no.measures["failure"]) == (False, False, "time")
 

@@ -64,6 +64,8 @@ def judge_outcome(outcome: Outcome, metrics: RunMetrics) -> JudgedOutcome:
             objections.append(f"The world says that it is open by {opened}.")
     if math.isnan(value - target - tolerance) and math.isnan(metrics.way):
         objections.append("No truth was measured: metrics need the coordinate of the object, or its part.")
+    if not metrics.is_complete:
+        objections.append("The run was not measured: give its metrics to the session, as on_step=.")
     if not outcome:
         objections = []  # the skill has said why
     if overlap is not None:
