@@ -150,7 +150,7 @@ class RunMetrics:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the world has been measured up to its present time."""
+        """True if the world has been measured up to its present time."""
         return self._world.time == self._stamp
 
     @property
