@@ -30,6 +30,7 @@ from kineverse_studies.experiments.lockbox.unknown_locks import (
     count_systematic_tries,
     permute_parts,
 )
+from robot_interface_proxy import InterfaceOnly
 
 COUNT = 4
 LIMITS = Enclosure((0.0,) * COUNT, (1.0,) * COUNT)
@@ -161,7 +162,7 @@ def test_random_boxes_are_opened_and_certain_conditions_are_true(box):
 def test_exploration_in_a_world_by_the_controller():
     box = draw_lockbox(5, 3)
     model, world = make_lockbox_model(remove_locks(box), None), MechanismWorld(make_lockbox_model(box, None))
-    mover = PartMover(model.snapshot(), Session(world, dt=0.05))
+    mover = PartMover(model.snapshot(), Session(InterfaceOnly(world), dt=0.05))
     assert explore_locks(model, box.goal, mover.move)
     (goal,) = box.goal
     assert world.state[kv.position(goal)] == pytest.approx(box.goal[goal], abs=2e-4)

@@ -18,6 +18,7 @@ from kineverse.articulations import OmniBase
 from kineverse.control.contact_constraints import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.geometry import Scene
+from kineverse.manipulation.belief import TrackedBelief
 from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.pushing import base_placement, push_program, vectors
 from kineverse.manipulation.pushing.base_placement import RollOut, find_push_start, roll_out
@@ -29,7 +30,6 @@ from kineverse.manipulation.pushing.push_skill import PushRun, plan_push_approac
 from kineverse.manipulation.pushing.vectors import move_point
 from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.session import Session
-from kineverse.manipulation.tracked_belief import TrackedBelief
 from kineverse.worlds import KinematicWorld, MujocoWorld, Observation, Robot, RunMetrics, Sensors, TrueBelief
 from kineverse_studies.experiments.table1_push import SHIPPED_KITCHEN, make_push_setup
 from robot_interface_proxy import InterfaceOnly

@@ -10,7 +10,7 @@ import pytest
 import kineverse as kv
 from kineverse.errors import InfeasibleError, InvalidValueError
 from kineverse.manipulation import Robot, Session, SkillError
-from kineverse.manipulation.belief import EncoderBelief
+from kineverse.manipulation.session import EncoderBelief
 from kineverse.manipulation.skill_run import Pace, SkillRun
 from kineverse.state import State
 from kineverse.worlds import Observation

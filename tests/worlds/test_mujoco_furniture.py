@@ -16,6 +16,7 @@ from kineverse.manipulation.session import Session
 from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Box, Inertia, Pose, Shape
 from kineverse.worlds import MujocoWorld, TrueBelief
+from robot_interface_proxy import InterfaceOnly
 
 pytest.importorskip("mujoco")
 
@@ -150,7 +151,7 @@ def test_speeds_and_forces_beyond_reason_end_a_run():
     world = MujocoWorld(room(), "robot")
     for speed in (1e3, 1e30, math.nan):
         world.reset(world.model.default_state())
-        session = Session(world, belief=TrueBelief(world))
+        session = Session(InterfaceOnly(world), belief=TrueBelief(world))
         session.act({"robot/x:velocity": 0.1})
         before = world.state["room/door"]
         world._data.joint("room/door").qvel[:] = speed
@@ -162,7 +163,7 @@ def test_speeds_and_forces_beyond_reason_end_a_run():
         with pytest.raises(SimulationError, match="not to be trusted"):
             world.apply({}, 0.02)
     world.reset(world.model.default_state())
-    session = Session(world, belief=TrueBelief(world))
+    session = Session(InterfaceOnly(world), belief=TrueBelief(world))
     session.act({"robot/x:velocity": 0.1})
     assert not session.broken
     assert world._bounds.force > 10 * EFFORT

@@ -24,9 +24,8 @@ from .output import format_table, join_lines, shorten_text, show_activity
 from .pages import add_page_options, check_picture_path, handle_interrupts, page_options, print_address
 
 if TYPE_CHECKING:
-    from kineverse.manipulation import OpenCloseReport, Outcome, Session
+    from kineverse.manipulation import Belief, OpenCloseReport, Outcome, Session
     from kineverse.manipulation.articulated_objects import ArticulatedObject
-    from kineverse.manipulation.belief import Belief
     from kineverse.view.run_overlay import LiveRun
     from kineverse.view.skill_stills import SkillStills
     from kineverse.view.viewer import Viewer

@@ -39,8 +39,7 @@ from .pages import (
 )
 
 if TYPE_CHECKING:
-    from kineverse.manipulation import JudgedOutcome
-    from kineverse.manipulation.belief import Belief
+    from kineverse.manipulation import Belief, JudgedOutcome
     from kineverse.manipulation.swept_volume import Obstacle
     from kineverse.worlds import SimulatedWorld
     from kineverse.worlds.robot_interface import SkillStep

@@ -29,7 +29,7 @@ from .output import join_lines, print_line, show_activity
 from .plan_arguments import parse_robot
 
 if TYPE_CHECKING:
-    from kineverse.manipulation.belief import Belief
+    from kineverse.manipulation import Belief
     from kineverse.worlds.robot_interface import SkillStep
 
 OPENING = 0.4  # distance from shut at which closing and pushing begin [m], [rad]

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
         ArticulatedObject as ArticulatedObject,
         find_articulated_objects as find_articulated_objects,
     )
-    from .belief import Belief as Belief
+    from .session import Belief as Belief, Session as Session
     from .opening import (
         BasePlacement as BasePlacement,
         PlacementSearch as PlacementSearch,
@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from .outcome import Outcome as Outcome, SkillError as SkillError
     from .pushing import push as push
     from .robot_placement import PlacedRobot as PlacedRobot, place_robot as place_robot
-    from .session import Session as Session
     from .skill_run import SkillRun as SkillRun
-    from .tracked_belief import TrackedBelief as TrackedBelief
+    from .belief import TrackedBelief as TrackedBelief
     from .trials import (
         JudgedOutcome as JudgedOutcome,
         OpenCloseReport as OpenCloseReport,

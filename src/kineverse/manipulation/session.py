@@ -14,7 +14,7 @@ from queue import SimpleQueue
 from threading import Event, Thread
 from time import perf_counter, thread_time
 from traceback import extract_tb
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -28,7 +28,6 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, PlannedContact, Robot, RobotInterface
 
-from .belief import Belief, EncoderBelief
 from .outcome import SkillError
 
 if TYPE_CHECKING:
@@ -71,6 +70,46 @@ class HandReference:
     @property
     def _place(self) -> float:
         return float(np.clip(self.share, 0.0, 1.0)) * (len(self.poses) - 1)
+
+
+class Belief(Protocol):
+    """Source of the state that a controller uses."""
+
+    def update(self, observation: Observation, time: float, commands: State | None = None) -> State:
+        """Return the believed state of all coordinates after a step; its stamp is a time of the robot [s].
+
+        Parameters
+        ----------
+        observation
+            The latest readings of the robot's sensors.
+        time
+            The present time, in that of the readings' stamps [s].
+        commands
+            The speeds since the last update: commanded ones of the robot, and planned ones of objects.
+        """
+
+    def deviation(self, coordinate: Symbol) -> float:
+        """Return the standard deviation of a coordinate [m], [rad]; 0 if it is known exactly."""
+
+
+class EncoderBelief:
+    """Belief that reads encoders alone: of a driven mechanism, or a robot that has nothing to see.
+
+    All other coordinates keep their default values, and their deviations are infinite.
+    """
+
+    def __init__(self, model: ModelView, robot: Robot) -> None:
+        self._state, self._robot = model.default_state(), robot
+
+    def update(self, observation: Observation, time: float, commands: State | None = None) -> State:
+        """Return the state with the readings of the encoders."""
+        read = {s: value for s, value in observation.joints.items() if s in self._state}
+        self._state = State({**self._state, **read}, stamp=observation.stamp, source="encoders")
+        return self._state
+
+    def deviation(self, coordinate: Symbol) -> float:
+        """Return 0 for a coordinate of the robot, and infinity for others."""
+        return 0.0 if self._robot.moves(coordinate) else math.inf
 
 
 class Session:
@@ -510,7 +549,7 @@ def _make_belief(model: ModelView, robot: Robot) -> Belief:
     """Return a belief from sensors that nobody has described, of all that can be observed."""
     if not any(model.symbols_of(name) for name in robot.markers):
         return EncoderBelief(model, robot)
-    from .tracked_belief import USUAL, TrackedBelief  # for start-up time: it needs all of estimation
+    from .belief import USUAL, TrackedBelief  # for start-up time: it needs all of estimation
 
     return TrackedBelief(model, robot, USUAL)
 

@@ -12,12 +12,11 @@ from kineverse.state import State
 from kineverse.worlds import RunMetrics, SimulatedWorld
 
 from .articulated_objects import ArticulatedObject
-from .belief import Belief
 from .opening.approach_planner import Opener
 from .opening.base_placement import BasePlacement
 from .opening.grasped_opening import open_object
 from .outcome import Outcome
-from .session import Session
+from .session import Belief, Session
 
 _SHORT_WAY, _SHORT_TURN = 0.03, math.radians(6.0)
 """Distance [m] and angle [rad] by which a part may be less open than the skill believes."""

@@ -45,6 +45,7 @@ from kineverse_studies.experiments.table1_open.programs import (
     open_by_program,
 )
 from kineverse_studies.experiments.table1_push import find_kitchens, make_push_report, make_push_setup
+from robot_interface_proxy import InterfaceOnly
 
 
 def _trial(what, failure="", *, skill="open", placements=0, case="7", cpu=()):
@@ -355,7 +356,7 @@ def test_papers_controller_moves_an_object_only_where_it_touches():
         touches.append(session.contact.touching)
         speeds.append(session.command.speeds[what.derivative()])
 
-    session = Session(world, dt=0.1, belief=TrueBelief(world), on_step=look)
+    session = Session(InterfaceOnly(world), dt=0.1, belief=TrueBelief(world), on_step=look)
     outcome = push_as_published(session, world, robot, what, 500)
     assert outcome, outcome.reason
     assert max(map(abs, speeds)) > 0.05

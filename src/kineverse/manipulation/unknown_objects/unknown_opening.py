@@ -16,6 +16,7 @@ from kineverse.grasping import Grasp, Gripper, sample_grasps
 from kineverse.grasping.finger_branches import path_to_root
 from kineverse.grasping.graspable_features import find_parts
 from kineverse.lie import Array, adjoint, exp_se3, inverse
+from kineverse.manipulation.belief import TrackedBelief
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.approach_planner import Approach, Opener
 from kineverse.manipulation.opening.hand_motion import PULLED_OUT, HandMotion
@@ -23,7 +24,6 @@ from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_run import SkillRun
 from kineverse.manipulation.swept_volume import BlockedError
-from kineverse.manipulation.tracked_belief import TrackedBelief
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import Robot, Sensors

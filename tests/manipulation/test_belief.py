@@ -10,6 +10,7 @@ from kineverse.manipulation import Session, TrackedBelief
 from kineverse.state import State
 from kineverse.worlds import Robot, Sensors
 from kineverse.worlds.sensor_sampler import SensorSampler
+from robot_interface_proxy import InterfaceOnly
 
 NOISE = "3mm+3mm/m,0.5deg,30Hz,drop=0.1"
 DT = 0.02
@@ -235,7 +236,7 @@ def test_outliers_are_left_out(model):
 def test_session_tells_deviations_and_observations(model):
     world, belief = start(model, door=0.7)
     world.reset({"door": 0.7})
-    session = Session(world, belief=belief)
+    session = Session(InterfaceOnly(world), belief=belief)
     session.stop()
     assert session.observation.stamp == session.time == 0.02
     door = session.deviation("door")
