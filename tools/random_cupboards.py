@@ -347,12 +347,15 @@ def run_robot(robot: str, cupboard: Cupboard, folder: Path) -> Run:
     world.reset(state)
     states: list[dict[str, float]] = []
 
+    metrics = RunMetrics(world, what)
+
     def read() -> None:
         truth = world.state
         states.append({link.name: truth[f"cupboard/{link.name}_joint"] for link in _moving(cupboard)})
 
     def look(session: Session) -> None:
         read()
+        metrics(session)
 
     def open_session() -> Session:
         return Session(world, belief=TrueBelief(world), on_step=look)
@@ -361,7 +364,7 @@ def run_robot(robot: str, cupboard: Cupboard, folder: Path) -> Run:
     if cupboard.skill == "push":
         bodies = world.robot.gripper().bodies
         pushing = Pushing(model, world.robot, what, bodies, state, target=cupboard.target)
-        outcome, _, _ = try_push(pushing, world, state, RunMetrics(world, what), open_session)
+        outcome, _, _ = try_push(pushing, world, state, metrics, open_session)
     else:
         outcome = open_object(open_session(), what, target=cupboard.target)
     read()

@@ -36,8 +36,9 @@ def asked(monkeypatch, fails):
         if len(calls) in fails:
             raise fails[len(calls)]
         session.phase = "move"
-        world = session.interface
+        world, now = session.interface, session.time
         world.reset(world.state.updated({coordinate: target}))
+        world._time = now  # in the same run
         session.refresh()
         for _ in range(2):
             session.stop()

@@ -12,6 +12,7 @@ from kineverse.errors import InfeasibleError, InvalidValueError
 from kineverse.manipulation import Robot, Session, SkillError
 from kineverse.manipulation.session import EncoderBelief
 from kineverse.manipulation.skill_run import Pace, SkillRun
+from kineverse.state import State
 from kineverse.worlds import Observation
 
 X = kv.position("cart/x")
@@ -70,13 +71,35 @@ def test_speeds_of_objects_are_not_sent(cart):
     assert cart.sent[-1][0] == session.commands == {X.derivative(): 0.1}
 
 
+class Elsewhere(EncoderBelief):
+    """Belief that the cart is at 9 m."""
+
+    def update(self, observation, time, commands=None):
+        state = super().update(observation, time, commands)
+        return State({**state, X: 9.0}, stamp=state.stamp)
+
+
 def test_another_belief_counts_for_a_while(cart):
-    session, other = Session(cart), EncoderBelief(cart.model, cart.robot)
-    before = session.belief
+    session = Session(cart)
+    before, other = session.belief, Elsewhere(cart.model, cart.robot)
     with session.believing(other):
         assert session.belief is other
         session.act({"cart/x:velocity": 0.5})
+        assert session.state[X] == 9.0
     assert session.belief is before
+    assert session.state[X] == cart.x
+    assert session.state.stamp == cart.time
+
+
+def test_a_session_ends_with_an_edit_of_its_model(cart):
+    session = Session(cart)
+    with cart.model.edit() as edit:
+        edit.add_frame("door", "world", kv.rotation_z(kv.position("door")))
+    for use in (lambda: session.act({}), session.refresh, lambda: SkillRun(session, X, 10.0)):
+        with pytest.raises(InvalidValueError, match="was edited"):
+            use()
+    session.stop()
+    assert cart.sent == [({}, None)]
 
 
 def test_a_search_that_takes_long_is_followed_by_new_readings(cart):
@@ -222,6 +245,37 @@ def test_what_ends_a_run_from_outside_stops_the_robot_and_goes_on(cart, error):
         run.perform(drive(run, 3, error))
     assert cart.sent[-1][0] == {}
     assert run.session.phase == ""
+
+
+def test_what_does_not_stop_is_not_done(cart):
+    run, apply = SkillRun(Session(cart), X, 10.0), cart.apply
+
+    def fail(speeds, duration, *, stamp=None):
+        if not speeds:
+            raise OSError("the cable is out")
+        apply(speeds, duration, stamp=stamp)
+
+    cart.apply = fail
+    outcome = run.perform(drive(run, 3))
+    assert (outcome.done, outcome.measures) == (False, {"failure": "other"})
+    assert outcome.reason.startswith("It is there. The interface of the robot 'rail' raised OSError")
+
+
+@pytest.mark.parametrize(
+    ("seen", "deviation", "says"),
+    [
+        ({}, 0.01, "no marker of it has been seen."),
+        ({X: -2.0}, 0.01, "no marker of it has been seen for 4 s."),
+        ({X: math.inf}, math.inf, "its track is lost."),
+        ({X: math.inf}, 0.01, "It is there."),
+    ],
+)
+def test_what_is_not_seen_is_not_done(cart, seen, deviation, says):
+    session = Session(cart)
+    session.belief.seen, session.belief.deviation = seen, lambda _: deviation
+    outcome = SkillRun(session, X, 10.0).perform(lambda: "It is there.")
+    assert outcome.done == (says == "It is there.")
+    assert says in outcome.reason
 
 
 def test_run_that_moves_nothing_takes_no_step(cart):

@@ -10,6 +10,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.articulations import Ackermann
+from kineverse.errors import SimulationError
 from kineverse.grasping import find_handle
 from kineverse.manipulation import (
     OpenCloseRunner,
@@ -60,6 +61,11 @@ def test_what_is_claimed_is_done_if_it_is_true(world):
         unproven = judge_outcome(unknown[1], unknown[0])
         assert (unproven.done, unproven.claimed) == (False, True)
         assert "No truth was measured" in unproven.reason
+    unwatched = RunMetrics(world, world.model.symbol(DRAWER))
+    session.act({})
+    unmeasured = judge_outcome(believed, unwatched)
+    assert (unmeasured.done, unmeasured.claimed) == (False, True)
+    assert "The run was not measured" in unmeasured.reason
     no = judge_outcome(open_object(session, DRAWER, target=0.1, seconds=0.5), metrics)
     assert (no.done, no.claimed, no.measures["failure"]) == (False, False, "time")
 
@@ -102,6 +108,32 @@ def test_several_objects_are_opened_and_closed(world):
     assert report.grasp_error < 1e-3
     assert len(report.steps) > 100
     assert not report.pushed
+
+
+class Unstable(KinematicWorld):
+    """World that cannot be trusted any more from 1 s on, until its first reset after that."""
+
+    failed, healed = False, False
+
+    def reset(self, state):
+        self.healed = self.failed
+        super().reset(state)
+
+    def apply(self, speeds, duration, *, stamp=None):
+        if self.time > 1.0 and not self.healed:
+            self.failed = True
+            raise SimulationError("It has exploded.")
+        super().apply(speeds, duration, stamp=stamp)
+
+
+def test_objects_after_a_simulation_that_failed_are_opened(world):
+    unstable = Unstable(world.model, "robot")
+    objects = [one for one in find_articulated_objects(world.model, "robot") if one.coordinate.path == DRAWER]
+    runner = OpenCloseRunner(unstable, start(world.model), belief=TrueBelief(unstable))
+    first, second = (runner.open_and_close(objects[0]) for _ in range(2))
+    assert not first
+    assert "It has exploded." in first.reason
+    assert second, second.reason
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 import kineverse as kv
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.gallery.lockboxes import THESIS, draw_tangled_lockbox, make_lockbox_model, make_rings
-from kineverse.manipulation import Session, execute_unlocking
+from kineverse.manipulation import PartMover, Session, execute_unlocking
 from kineverse.worlds import MechanismWorld, RunMetrics
 from kineverse_studies.experiments.lockbox.unknown_locks import can_be_opened
 from robot_interface_proxy import InterfaceOnly
@@ -48,6 +48,24 @@ def test_keys_return():
     done, _ = execute(MechanismWorld(make_lockbox_model(box)), goal_of(box))
     assert done
     assert len(done.moves) == 5
+
+
+def test_a_move_that_ends_early_stops():
+    world = MechanismWorld(three_sliders(a=B > 0.5), [B])
+    mover, commands = PartMover(world.model, session := Session(world, dt=0.05)), []
+    assert mover.move(B, 1.0) == pytest.approx(0.0)
+    assert not session.commands
+
+    def interrupt(step):
+        commands.append(dict(step.commands))
+        if len(commands) == 3:
+            raise KeyboardInterrupt
+
+    mover = PartMover(world.model, Session(world, dt=0.05, on_step=interrupt))
+    with pytest.raises(KeyboardInterrupt):
+        mover.move(C, 1.0)
+    assert all(commands[:3])
+    assert commands[3:] == [{}]
 
 
 def test_jammed_part_is_left_out_of_the_next_plan():

@@ -136,10 +136,12 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
 
 
 def _search(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Gripper, ...], list[str]]:
-    """Return the grippers, and for each link without one the reason; those without a description are kept."""
-    if srdf is not None:
-        return _search_anew(model, robot, srdf)
-    return cached_for_version(model, ("grippers", robot), lambda: _search_anew(model, robot, None))
+    """Return the grippers, and for each link without one the reason; kept for a version of the model."""
+    key = "grippers", robot, id(srdf)
+    _, result = cached_for_version(
+        model, key, lambda: (srdf, _search_anew(model, robot, srdf))
+    )  # with the description, so that no other one gets its id
+    return result
 
 
 def _search_anew(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Gripper, ...], list[str]]:

@@ -174,6 +174,8 @@ class Session:
         Durations of the computations of each step by the name given to :meth:`timed` [s].
     made
         Placements of completed grasped motions, oldest first; reversed, they serve to move the object back.
+    fault
+        Why the robot's interface has ended the present skill, or the last one; empty if it has not.
     broken
         Why the robot's interface can be used no more; empty if it can.
 
@@ -211,7 +213,8 @@ class Session:
         self.model = interface.model
         self.robot = Robot.of(self.model, interface.robot)
         self.belief: Belief = belief or _make_belief(self.model, self.robot)
-        self.broken = ""
+        self.fault = self.broken = ""
+        self._version = self.model.version
         self._patience = patience
         self._caller = None if timeout is None else _Caller(timeout)
         self._speeds: dict[object, Symbol] = {name: s for s in self.model.speeds for name in (s, str(s))}
@@ -263,12 +266,24 @@ class Session:
         return math.hypot(*(k * own[s] for s, k in slopes.items() if k))
 
     def time_unseen(self, coordinate: Symbol) -> float:
-        """Return for how long no marker of a coordinate has been seen [s]; 0 if its belief has no markers."""
-        seen = getattr(self.belief, "seen", {})
-        return max(0.0, self.time - float(seen.get(coordinate, self.time)))
+        """Return for how long no marker of a coordinate has been seen [s]; 0 if the belief has no markers.
+
+        It is infinite if none has been seen since the belief began.
+        """
+        seen = getattr(self.belief, "seen", None)
+        return 0.0 if seen is None else max(0.0, self.time - float(seen.get(coordinate, -math.inf)))
 
     def refresh(self) -> None:
-        """Read the sensors without a step, such as after a search, or after a reset of a simulated world."""
+        """Read the sensors without a step, such as after a search, or after a reset of a simulated world.
+
+        Raises
+        ------
+        InvalidValueError
+            If the model was edited since the session was made.
+        SkillError
+            If the robot does not answer, or its interface raises something.
+        """
+        self._check_version()
         self.observation, self.time = self._call(self._read)
         self._update({})
 
@@ -281,6 +296,7 @@ class Session:
             yield
         finally:
             self.belief = before
+            self._update({})  # so that the state is never that of the other one
 
     # -- what is computed ------------------------------------------------------------------------------------
 
@@ -331,12 +347,14 @@ class Session:
         Raises
         ------
         UnknownNameError, InvalidValueError
-            For speeds that the model does not have, and those that are not finite. Then nothing has changed.
+            For speeds that the model does not have, those that are not finite, and a model that was edited
+            since the session was made. Then nothing has changed.
         SkillError
             If the robot does not answer within the time-out, or its interface raises something, its
             simulation is not to be trusted, or no readings of the present have come within the patience.
             Robots stop by themselves then.
         """
+        self._check_version()
         resolved = self._resolve(speeds)
         before, self.command = self.time, command
         self._advance(resolved, stamp=self.state.stamp if resolved else None)
@@ -355,7 +373,8 @@ class Session:
         while problem := self._find_problem(before):
             waited = max(self.time - begin, time.monotonic() - wall)
             if waited > self._patience:
-                raise SkillError("other", f"{problem} The robot has waited for {waited:.3g} s.")
+                self.fault = f"{problem} The robot has waited for {waited:.3g} s."
+                raise SkillError("other", self.fault)
             earlier = self.time
             self._advance(self._fingers_at_rest, stamp=None)
             if self.time <= earlier:
@@ -372,6 +391,13 @@ class Session:
         if not self.broken:
             with suppress(SkillError):
                 self._advance({}, stamp=None, longest=_STOPPING)
+
+    def _check_version(self) -> None:
+        if self.model.version != self._version:
+            raise InvalidValueError(
+                "The model of this session was edited, and its robot and its belief are of the model before. "
+                "Make another session, or this one of model.snapshot()."
+            )
 
     def _find_problem(self, before: float) -> str:
         """Return why the robot must not move by the present state; empty if it may."""
@@ -435,20 +461,21 @@ class Session:
     def _call(self, function: Callable[[], Result], longest: float = math.inf) -> Result:
         """Call a function of the interface; raise SkillError if it fails or takes too long."""
         if self.broken:
+            self.fault = self.broken
             raise SkillError("other", self.broken)
         name = self.interface.name
         try:
             return function() if self._caller is None else self._caller.call(function, longest)
         except _NoAnswerError as error:
             self.commands = {}
-            self.broken = f"The robot '{name}' has not answered for {error} s."
+            self.fault = self.broken = f"The robot '{name}' has not answered for {error} s."
             raise SkillError("other", self.broken) from None
         except SimulationError as error:
-            self.broken = str(error)
+            self.fault = self.broken = str(error)
             raise SkillError("other", self.broken) from error
         except Exception as error:  # a driver raises what it likes
             where = extract_tb(error.__traceback__)[-1]
-            self._problem = (
+            self.fault = self._problem = (
                 f"The interface of the robot '{name}' raised {type(error).__name__}: {error} "
                 f"({Path(where.filename).name}, line {where.lineno})."
             )

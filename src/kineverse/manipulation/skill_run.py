@@ -97,7 +97,7 @@ class SkillRun:
         The skill returns why it is done, and raises SkillError if it is not.
         """
         session = self.session
-        reason, kind = "", ""
+        reason, kind, session.fault = "", "", ""
         try:
             session.await_readings()
             reason = skill()
@@ -111,6 +111,8 @@ class SkillRun:
             if session.commands:
                 session.stop()
             session.phase, session.reference, session.vectors, session.contact = "", None, {}, None
+        if session.fault and not kind:  # such as by the stop: it may move on
+            reason, kind = f"{reason} {session.fault}".strip(), "other"
         return self.finish(reason, kind)
 
     def _look_again(self) -> None:
@@ -119,22 +121,27 @@ class SkillRun:
         What is not seen is believed to move as it was commanded to.
         """
         session, coordinate = self.session, self.coordinate
-        if coordinate is None or session.time_unseen(coordinate) <= _UNSEEN:
+        if coordinate is None or not self._find_unseen(coordinate):
             return
         begin = session.time
-        while (unseen := session.time_unseen(coordinate)) > _UNSEEN:
+        while why := self._find_unseen(coordinate):
             if session.time - begin > _LOOK:
-                raise SkillError(
-                    "other",
-                    f"'{coordinate}' is believed at {self.value:.4g}, but no marker of it has been seen for "
-                    f"{unseen:.3g} s.",
-                )
+                raise SkillError("other", f"'{coordinate}' is believed at {self.value:.4g}, but {why}.")
             session.act({})
         off = abs(self.value - self.measures.get("target", self.value))
         if off > self.measures.get("tolerance", 0.0) + _SIGMAS * session.deviation(coordinate):
             raise SkillError(
                 "other", f"'{coordinate}' was out of sight, and is seen at {self.value:.4g} now."
             )
+
+    def _find_unseen(self, coordinate: Symbol) -> str:
+        """Return why a coordinate is believed without being seen; empty if it is seen."""
+        unseen = self.session.time_unseen(coordinate)
+        if math.isinf(unseen):
+            return "no marker of it has been seen"
+        if unseen > _UNSEEN:
+            return f"no marker of it has been seen for {unseen:.3g} s"
+        return "its track is lost" if math.isinf(self.session.deviation(coordinate)) else ""
 
     def finish(self, reason: str, failure: str = "") -> Outcome:
         """Return the outcome of a run that ends here, for a reason; it is done without a kind of failure."""

@@ -3,7 +3,7 @@
 The bodies that a coordinate moves are placed along the path so densely that no point of them moves by more
 than :data:`STEP` at a time. There they are checked against everything that is not the robot's and that they
 move relative to: fixed furniture, furniture that other coordinates move, and what carries the object itself.
-:class:`.FurnitureOverlaps` excepts overlaps that mean nothing, as it does for worlds and their judge.
+:class:`.FurnitureOverlaps` excepts overlaps that mean nothing, as it does for worlds and metrics.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def find_obstacle(
 ) -> Obstacle | None:
     """Return the first thing in the way of an object from its value to a target; None if the path is free.
 
-    What overlaps at the begin counts as far as it gets deeper than :class:`.FurnitureOverlaps` allows. The
+    What overlaps at the start counts as far as it gets deeper than :class:`.FurnitureOverlaps` allows. The
     robot counts nowhere: it moves.
     """
     key = "swept motion", robot and robot.name
@@ -154,7 +154,7 @@ class _Sweep:
         return replace(found, carrier=carriers[0]) if carriers else found
 
     def _query(self, coordinate: Symbol) -> tuple[PreparedQuery, FrameDependence]:
-        """Return the query for what a coordinate moves and counts since the begin, and its motion."""
+        """Return the query for what a coordinate moves and counts since the start, and its motion."""
         key = coordinate, self._overlaps.counting.tobytes()
         if key not in self._queries:
             motion = FrameDependence(self._model, [coordinate])

@@ -63,6 +63,8 @@ def judge_outcome(outcome: Outcome, metrics: RunMetrics) -> JudgedOutcome:
             objections.append(f"The world says that it is open by {opened}.")
     if math.isnan(value - target - tolerance) and math.isnan(metrics.way):
         objections.append("No truth was measured: metrics need the coordinate of the object, or its part.")
+    if not metrics.is_complete:
+        objections.append("The run was not measured: give its metrics to the session, as on_step=.")
     if not outcome:
         objections = []  # the skill has said why
     if overlap is not None:
@@ -246,10 +248,13 @@ class OpenCloseRunner:
 
     def open_and_close(self, one: ArticulatedObject) -> OpenCloseReport:
         """Open an object and close it, and report it."""
-        session, self.current = self.session, one
+        self.current = one
         if self._failed:
             self._world.reset(self._start)
-            session.refresh()
+            if self.session.broken:  # a simulation that was not to be trusted begins anew
+                self.session = Session(self._world, belief=self.session.belief, on_step=self._look)
+            self.session.refresh()
+        session = self.session
         counted = {name: len(times) for name, times in session.cpu.items()}
         self.opening = True
         opened, closed = self._move(one, one.opened), None

@@ -203,7 +203,7 @@ class KinematicWorld:
         """Return the bodies of the robot that touch something else, and those of furniture that collide.
 
         Bodies of the robot touch from a gap of 0.1 mm on. Furniture collides if it penetrates by more than
-        that, and more than at the begin and at the default state. Forces are NaN.
+        that, and more than at the start and at the default state. Forces are NaN.
         """
         overlaps = self._motion.overlaps.find_beyond(TOUCH)
         deepest = {(one.a, one.b): one for one, _ in reversed(overlaps)}

@@ -149,6 +149,11 @@ class RunMetrics:
         return self._value_at(self._world.state)
 
     @property
+    def is_complete(self) -> bool:
+        """True if the world has been measured up to its present time."""
+        return self._world.time == self._stamp
+
+    @property
     def violation(self) -> float:
         """Largest excess of a constraint of the model, in its unit."""
         return self._limits.violation
@@ -162,7 +167,7 @@ class RunMetrics:
     def excepted(self) -> tuple[tuple[str, str], ...]:
         """Pairs of bodies whose penetration does not count.
 
-        These are pairs of the robot that overlap at the begin of the run; the gripper with the handle and
+        These are pairs of the robot that overlap at the start of the run; the gripper with the handle and
         with what it holds; the bodies of planned contacts; and pairs of furniture that overlapped at the
         start, whose penetration counts as far as it exceeds what :class:`.FurnitureOverlaps` allows.
         """
@@ -176,12 +181,12 @@ class RunMetrics:
 
     @property
     def way(self) -> float:
-        """Distance of the part's point from where it was at the begin [m]; NaN without a part."""
+        """Distance of the part's point from where it was at the start [m]; NaN without a part."""
         return self._measure_part()[0]
 
     @property
     def turn(self) -> float:
-        """Angle by which the part has turned since the begin, from 0 to pi [rad]; NaN without a part."""
+        """Angle by which the part has turned since the start, from 0 to pi [rad]; NaN without a part."""
         return self._measure_part()[1]
 
     @property
@@ -255,9 +260,20 @@ class RunMetrics:
         self._first = self._stamp
 
     def __call__(self, step: SkillStep) -> None:
-        """Measure the present state of the world after a step."""
-        state = self._world.state
-        if self._world.time <= self._stamp:
+        """Measure the present state of the world after a step.
+
+        Raises
+        ------
+        InvalidValueError
+            If the world was reset since the last step: it would be another run.
+        """
+        state, now = self._world.state, self._world.time
+        if now < self._stamp:
+            raise InvalidValueError(
+                f"The world was measured at {self._stamp:.6g} s, and now at {now:.6g} s. "
+                "After a reset of the world, reset() of the metrics begins again."
+            )
+        if now == self._stamp:
             return
         commanded = np.zeros(len(self._signs))
         for v, value in step.commands.items():

@@ -166,7 +166,7 @@ class Opener:
     @classmethod
     def of(cls, robot: Robot, gripper: Gripper, state: State) -> Opener:
         """Return the one of a gripper, for openings from any state; it is made for the first one."""
-        key = "opener", robot.name, gripper.hand
+        key = "opener", robot.name, gripper  # itself: another one of the same hand may have other fingers
         return cached_for_version(robot.model, key, lambda: cls(robot, gripper, state))
 
     def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:

@@ -62,7 +62,7 @@ def open_object(
     not lead to the target, the object is released on the way and grasped again. Where no grasp leads on,
     such as at an oven door whose handle faces the floor, it is pushed. A base on two wheels drives to its
     place before the arm moves; one that cannot turn on the spot stays where it is. A hand that is at the
-    handle from the begin, as after a skill that was broken off, lets go first. Nothing is moved where
+    handle from the start, as after a skill that was broken off, lets go first. Nothing is moved where
     something is in the way of the object, see :func:`.find_obstacle`.
 
     Parameters
@@ -177,7 +177,7 @@ class OpeningRun(SkillRun):
         wanted = f"{self.target:.4g} ± {self.tolerance:.2g}"
         return f"'{self.coordinate}' is at {self.value:.4g}, as wanted ({wanted}){how}."
 
-    # -- what prevents it from the begin -------------------------------------------------------------------
+    # -- what prevents it from the start -------------------------------------------------------------------
 
     def _choose_target(self) -> None:
         """Choose target and tolerance, or raise SkillError if the object cannot go there."""
@@ -244,7 +244,7 @@ class OpeningRun(SkillRun):
         except SlipError as slip:
             self.slips.append(str(slip))
         except SkillError as error:
-            if error.kind == "time" or self.session.broken:
+            if error.kind == "time" or self.session.fault:
                 raise
             stall = error
         try:
@@ -280,6 +280,8 @@ class OpeningRun(SkillRun):
                 return result
             failure = self.motion.explain(result)
         except SkillError as error:  # no grasp has room
+            if self.session.fault:
+                raise
             failure = error
         back = self._retrace(whole=False)
         if back is None:
@@ -359,10 +361,10 @@ class OpeningRun(SkillRun):
                 plan=False,
                 retreat=True,
             )
-            if not outcome and self.rest > (1.0 - _LEAST_PUSH / 2) * before:
+            if session.fault or (not outcome and self.rest > (1.0 - _LEAST_PUSH / 2) * before):
                 raise SkillError(outcome.measures["failure"], outcome.reason)
         except SkillError as error:
-            if session.broken:
+            if session.fault:
                 raise
             late = error.kind == "time" and self.left < _LATE
             if late or not begun or attempt + 1 == _MOST_PUSHES:

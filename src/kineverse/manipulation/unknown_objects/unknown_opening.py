@@ -21,7 +21,7 @@ from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.approach_planner import Approach, Opener
 from kineverse.manipulation.opening.hand_motion import PULLED_OUT, HandMotion
 from kineverse.manipulation.outcome import Outcome, SkillError
-from kineverse.manipulation.session import STALE, Session
+from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_run import SkillRun
 from kineverse.manipulation.swept_volume import BlockedError
 from kineverse.model.model import Model
@@ -150,6 +150,8 @@ def open_unknown(
         )
     if sensors is None:
         sensors = session.belief.sensors if isinstance(session.belief, TrackedBelief) else Sensors()
+    with suppress(SkillError):  # which the run says
+        session.refresh()  # a robot's time runs on between two skills
     before = model.default_state()
     before = before.updated({s: v for s, v in session.state.items() if s in before})
     unknown = free_part(model, part, handle, before)
@@ -332,7 +334,7 @@ class UnknownOpeningRun(SkillRun):
         """Let go of the part, if there is time and anything is read."""
         session = self.session
         self.belief.release()
-        if self.left >= 0.0 and not session.broken and session.time - (session.state.stamp or 0.0) <= STALE:
+        if self.left >= 0.0 and not session.fault:
             self._retract(grasp)
 
     def _retract(self, grasp: Grasp | None = None) -> None:

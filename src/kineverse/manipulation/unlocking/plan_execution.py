@@ -58,7 +58,8 @@ class PartMover:
     def move(self, coordinate: Symbol | str, target: float, tolerance: float = TOLERANCE) -> float:
         """Move a coordinate to a target, and return the position where it ends [m] or [rad].
 
-        It ends within the tolerance of the target, or where it has come no nearer for the patience.
+        It ends within the tolerance of the target, or where it has come no nearer for the patience. It
+        stops there, and where it is broken off, such as by Ctrl-C.
         """
         symbol = self.model.degree_of_freedom(coordinate)
         controller, session = self._controller(symbol), self.session
@@ -67,15 +68,20 @@ class PartMover:
         start = nearest = session.state[symbol]
         session.phase = f"{'raise' if target > start else 'lower'} {symbol}"
         since = session.time
-        while abs(session.state[symbol] - target) > tolerance:
-            with session.timed("unlock"):
-                command = controller.step(session.state)
-            session.act(command.speeds, command)
-            here = session.state[symbol]
-            if abs(here - target) < abs(nearest - target) - tolerance:
-                nearest, since = here, session.time
-            elif session.time - since > self._patience:
-                break
+        try:
+            while abs(session.state[symbol] - target) > tolerance:
+                with session.timed("unlock"):
+                    command = controller.step(session.state)
+                session.act(command.speeds, command)
+                here = session.state[symbol]
+                if abs(here - target) < abs(nearest - target) - tolerance:
+                    nearest, since = here, session.time
+                elif session.time - since > self._patience:
+                    session.stop()  # nothing presses on while the next move is sought
+                    break
+        except BaseException:  # also if the user interrupts it
+            session.stop()
+            raise
         return session.state[symbol]
 
     def _controller(self, symbol: Symbol) -> Controller:
