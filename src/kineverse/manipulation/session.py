@@ -230,6 +230,7 @@ class Session:
         self.wall: dict[str, list[float]] = {}
         self.made: deque[BasePlacement] = deque(maxlen=_MADE)
         self._problem = ""  # what is wrong with the latest readings
+        self._frames = frozenset(self.model.frames)
         self._unknown: dict[str, None] = {}  # observed frames that the model does not have
         self._not_rigid: dict[str, None] = {}  # frames of which poses have been observed that are none
         self.state: State = self.model.default_state()
@@ -505,7 +506,7 @@ class Session:
     def _check_poses(self) -> None:
         """Leave out observed poses that are not rigid, and those of frames that the model does not have."""
         poses = self.observation.poses
-        frames = self.model.frames
+        frames = self._frames
         self._unknown |= dict.fromkeys(name for name in poses if name not in frames)
         good = {name: pose for name, pose in poses.items() if name in frames}
         if good and not _are_rigid([*good.values()]):
