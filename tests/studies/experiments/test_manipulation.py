@@ -183,6 +183,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
     assert "larder_door" in format_report(report)
 
 
+@pytest.mark.long
 def test_hand_that_left_aside_takes_the_path_back_from_there():
     """The gripper of the Fetch leaves the oven's handle along the bar."""
     trials = kitchens.run_kitchen(kitchens.KitchenJob("kitchen", SHIPPED["fetch"], only="kitchen/oven_door"))
