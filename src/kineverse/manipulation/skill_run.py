@@ -23,6 +23,7 @@ _PAUSE = 0.1  # time without a step after which a reference begins at rest, howe
 _RAMP = 0.5  # time from rest to the usual speed [s]
 _UNSEEN, _LOOK = 1.0, 2.0  # longest time without a marker before an object is done, and to look for one [s]
 _SIGMAS = 2.0  # standard deviations by which an object at its target may seem to be off
+CREEP = 0.25  # least share of the usual speed of a reference on a planned path
 _PATIENCE = 4.0  # longest time for which a reference waits [s]
 
 
@@ -159,11 +160,12 @@ class Pace:
     """Pace of a reference along a path, which waits for a robot that is late by a distance [m], [rad].
 
     It begins at rest, unless the reference does so itself (``speed=1``), and again after a pause in which the
-    robot has stopped: nothing catches up. ``speed`` is the present share of the usual speed.
+    robot has stopped: nothing catches up. ``speed`` is the present share of the usual speed. A reference on a
+    planned path creeps on (``least``), however late the robot is: what it leans against may give way.
     """
 
-    def __init__(self, session: Session, late: float, *, speed: float = 0.0) -> None:
-        self._session, self._late, self.speed = session, late, speed
+    def __init__(self, session: Session, late: float, *, speed: float = 0.0, least: float = 0.0) -> None:
+        self._session, self._late, self.speed, self._least = session, late, speed, least
         self._last = self._moved = session.time
 
     def advance(self, distance: float) -> float:
@@ -176,7 +178,7 @@ class Pace:
         pause = min(session.interface.timeout, _PAUSE)
         if passed > pause:
             self.speed, self._moved, passed = 0.0, session.time, pause
-        share = min(1.0, max(0.0, 1.5 - distance / self._late))
+        share = min(1.0, max(self._least, 1.5 - distance / self._late))
         self.speed = share * min(1.0, self.speed + passed / _RAMP)
         if share > 0.0:
             self._moved = session.time

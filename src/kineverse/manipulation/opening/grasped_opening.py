@@ -348,9 +348,9 @@ class OpeningRun(SkillRun):
             raise failure  # starts of pushes are elsewhere
         try:
             pushing, seconds = self._find_push(self._seed + attempt)
+            begun = True
             self.motion.drive()
             self.motion.follow_planned()
-            begun = True
             outcome = push(
                 session,
                 self.coordinate,

@@ -19,7 +19,7 @@ from kineverse.grasping.grasp_sampling import RETREAT
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import HandReference
-from kineverse.manipulation.skill_run import Pace, SkillRun
+from kineverse.manipulation.skill_run import CREEP, Pace, SkillRun
 from kineverse.model.model_view import ModelView
 from kineverse.planning import Trajectory, TrajectoryFollower
 from kineverse.state import State
@@ -166,7 +166,7 @@ class HandMotion:
 
         controller, follower = self.find_controller(("follow", trajectory.symbols), make)
         follower.trajectory = trajectory
-        time, pace = 0.0, Pace(session, _LATE, speed=1.0)
+        time, pace = 0.0, Pace(session, _LATE, speed=1.0, least=CREEP)
         times = np.linspace(0.0, trajectory.duration, _REFERENCES)
         self.refer([self.hand(session.state.updated(trajectory.at(t))) for t in times.tolist()])
         while time < trajectory.duration + _RESTING_AT_END:
@@ -198,7 +198,7 @@ class HandMotion:
         if rows is not None:
             seconds = max(seconds, find_least_time(rows, self.search.samples.speeds))
         speed = np.concatenate([end[:3, :3].T @ displacement / seconds, np.zeros(3)])
-        time, pace = 0.0, Pace(session, _LINE_LATE, speed=1.0)
+        time, pace = 0.0, Pace(session, _LINE_LATE, speed=1.0, least=CREEP)
         uncertain = [session.deviation(x) for x in (self.bar @ end)[:3, 3]]
         settled = max(_SETTLED, _SIGMAS * float(np.linalg.norm(uncertain)))
         self.refer(self.bar(session.state) @ np.array([start, end]))
