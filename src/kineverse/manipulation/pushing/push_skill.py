@@ -14,6 +14,7 @@ from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_run import (
+    CREEP,
     Pace,
     SkillRun,
     check_target,
@@ -313,7 +314,7 @@ class PushRun(SkillRun):
         """Follow a path, which waits where the robot is late."""
         session, trajectory = self.session, path.trajectory()
         session.phase, symbols = "approach", trajectory.symbols
-        time, pace = 0.0, Pace(session, _LATE, speed=1.0)
+        time, pace = 0.0, Pace(session, _LATE, speed=1.0, least=CREEP)
         while time < trajectory.duration + _SETTLING:
             now = trajectory.positions_at(time)
             later, away = (
