@@ -13,12 +13,17 @@ INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INST
 # What the demo and every command in the README need.
 DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording exchange)
 
-.PHONY: help demo test sanitize fuzz faults format clean
+# Where there are wheels of ROS 2, and what tf2_msgs is compiled with; elsewhere tests of real nodes are skipped.
+WHEELS := $(shell $(PYTHON) -c 'import platform as p; print(p.system(), p.machine(), *p.python_version_tuple()[:2])')
+ROS := $(if $(and $(filter Linux-x86_64-3-11,$(subst $() ,-,$(WHEELS))),$(shell command -v cmake),$(shell command -v c++)),$(VENV)/ros.installed)
+
+.PHONY: help demo test ros sanitize fuzz faults format clean
 .NOTPARALLEL:
 
 help:
 	@echo "make demo    a robot opens and closes a kitchen in the browser (ARGS=--headless: a table, a picture, and end)"
 	@echo "make test    formatter, linter, types, layers, tests"
+	@echo "make ros     an environment with ROS 2, .venv/ros, for kineverse ros without an installation of it"
 	@echo "make sanitize  all C with sanitizers, and the tests that use it (ARGS=--short: a little of each)"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
 	@echo "make faults  damage files of model servers and kill their processes (ARGS='store --damages 1000')"
@@ -28,17 +33,19 @@ help:
 demo: $(VENV)/demo.installed
 	$(BIN)/kineverse demo $(ARGS)
 
-test: $(VENV)/test.installed
+test: $(VENV)/test.installed $(ROS)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy --num-workers $(JOBS)
 	$(BIN)/lint-imports --no-logo
 	@# Tests start commands by the dozen: each would compile the package anew where Python is told to keep nothing.
-	$(BIN)/python -m compileall -q -j $(JOBS) src studies tests
+	$(BIN)/python -m compileall -q -j $(JOBS) src studies ros tests
 	@# To have the values in a failed assertion printed takes each worker 13 s: only what fails is run with it, again.
 	@# The tests of a file share what takes long to make, so that they stay in one process.
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder --assert=plain $(ARGS) || \
 	    { $(BIN)/python -m pytest -q --last-failed --last-failed-no-failures=none $(ARGS); exit 1; }
+
+ros: $(VENV)/ros.installed
 
 sanitize: $(VENV)/test.installed
 	$(BIN)/python tools/sanitize.py $(ARGS)
@@ -61,16 +68,25 @@ $(BIN)/python:
 	    echo "Kineverse needs Python 3.11 or newer, and $(PYTHON) is not: make PYTHON=/path/to/python"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-# The package and its studies go in last and as they lie here, so that an edit needs no second installation.
-$(VENV)/demo.installed: $(DEMO) pyproject.toml studies/pyproject.toml | $(BIN)/python
+# The package, its studies and its ROS nodes go in last and as they lie here, so that an edit needs no second installation.
+$(VENV)/demo.installed: $(DEMO) pyproject.toml studies/pyproject.toml ros/kineverse_ros/setup.py | $(BIN)/python
 	@echo "Installing into $(VENV); this takes a minute, once."
 	@$(INSTALL_FILES)
-	$(INSTALL) --no-build-isolation --editable . --editable studies
+	$(INSTALL) --no-build-isolation --editable . --editable studies --editable ros/kineverse_ros
 	@touch $@
 
 $(VENV)/test.installed: requirements/peers.txt requirements/test.txt $(VENV)/demo.installed | $(BIN)/python
 	@echo "Installing what the tests need into $(VENV); this takes a minute, once."
 	@$(INSTALL_FILES)
+	@touch $@
+
+# The wheels start each Python of their environment twice, so they have one of their own, with .venv behind it.
+$(VENV)/ros.installed: requirements/ros.txt tools/ros_environment.py $(VENV)/demo.installed | $(BIN)/python
+	@echo "Installing ROS 2 into $(VENV)/ros; this takes a minute, once."
+	@$(BIN)/python -m venv --without-pip --clear $(VENV)/ros
+	@$(BIN)/python -m pip --python $(VENV)/ros/bin/python install --quiet --no-input --disable-pip-version-check \
+	    --no-deps -r requirements/ros.txt
+	@$(VENV)/ros/bin/python tools/ros_environment.py $(BIN)/python
 	@touch $@
 
 $(VENV)/fuzz.installed: requirements/fuzz.txt $(VENV)/test.installed

@@ -1,0 +1,48 @@
+"""What is used of ROS 2, imported when it is used, and the qualities of service of its topics."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from kineverse.errors import MissingDependencyError
+
+_MESSAGES = {
+    "builtin_interfaces": ("Time",),
+    "geometry_msgs": ("PoseStamped", "Transform", "TransformStamped", "Twist"),
+    "sensor_msgs": ("JointState",),
+    "std_msgs": ("Float64MultiArray", "String"),
+    "tf2_msgs": ("TFMessage",),
+    "trajectory_msgs": ("JointTrajectory", "JointTrajectoryPoint"),
+    "visualization_msgs": ("Marker", "MarkerArray"),
+}
+
+
+@cache
+def import_ros() -> Any:
+    """Return ROS 2 as one namespace: ``rclpy``, the classes of messages by name, and qualities of service.
+
+    Without one, or with a part of one, that is a MissingDependencyError with what helps.
+    """
+    # The wheels send to the whole network unless told otherwise; a ROS that is sourced is set up by its user.
+    if "ROS_DISTRO" not in os.environ:
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    try:
+        rclpy = importlib.import_module("rclpy")
+        qos = importlib.import_module("rclpy.qos")
+        messages = {
+            name: getattr(importlib.import_module(f"{package}.msg"), name)
+            for package, names in _MESSAGES.items()
+            for name in names
+        }
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"ROS 2 cannot be imported ({error}). With an installed ROS 2, source it: "
+            "source /opt/ros/DISTRO/setup.bash, in an environment of the same Python. Without one, in a "
+            "checkout on Linux x86-64: make ros, then .venv/ros/bin/python -m kineverse ros ..."
+        ) from None
+    latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
+    return SimpleNamespace(rclpy=rclpy, LATCHED=latched, QUEUED=qos.QoSProfile(depth=100), **messages)
