@@ -95,6 +95,7 @@ def test_mechanism_limits_are_constraints(mechanism: Mechanism) -> None:
             assert not model.violations({**home, q.derivative(): slowest}) or mechanism.locks()
 
 
+@pytest.mark.sampled(2)
 @each
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.sampled(2)

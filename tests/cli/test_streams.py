@@ -100,6 +100,7 @@ def test_files_are_read_in_a_locale_without_utf_8(file: Path) -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("shell", "status", "says"),
     [

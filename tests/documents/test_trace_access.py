@@ -190,6 +190,7 @@ def test_accesses_that_decide_are_recorded(code: Code, changes: tuple[str, ...])
     assert any(outcomes)
 
 
+@pytest.mark.sampled(2)
 @of_changes
 @pytest.mark.parametrize("code", FOLLOWED.values(), ids=FOLLOWED)
 @pytest.mark.sampled(2)

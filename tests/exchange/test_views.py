@@ -37,6 +37,7 @@ def check_parts(model: kv.Model, frames: Sequence[str]) -> None:
         check_agreement(model, make_replica(views.add(Wish(tuple(frames)))), frames)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", gallery.names())
 def test_the_part_of_a_frame_agrees_with_the_scene(name: str) -> None:
     model = kv.load(f"articulations/{name}")

@@ -324,6 +324,7 @@ WRONG = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", WRONG)
 def test_coacd_failure_is_an_error_that_names_the_file(file, tmp_path, monkeypatch, capfd, name):
     body, message = WRONG[name]

@@ -44,6 +44,7 @@ def measured(a, b, poses):
     return narrow.distance(0, 1), *narrow.witness()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("one", "other"), PAIRS)
 @pytest.mark.sampled(2)
 def test_signed_distances_match_mujoco(one, other, shapes, mujoco_pairs):
@@ -290,6 +291,7 @@ def test_distances_tool_finds_no_errors(kind, case):
         assert count.apart + count.inside + count.unsolved > 0
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.compiler
 @pytest.mark.parametrize("case", ["any", "planar", "aligned"])
 @pytest.mark.parametrize("swapped", [False, True])

@@ -166,6 +166,7 @@ def test_session_ends_when_its_robot_stops_answering(fault, says):
     robot.blocked.set()
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
@@ -197,6 +198,7 @@ def test_a_pull_ends_with_what_is_wrong_with_the_readings(fault, says):
     robot.blocked.set()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("fault", "lasting", "watched"),
     [
@@ -221,6 +223,7 @@ def test_a_skill_goes_on_after_a_hiccup_and_catches_up_with_nothing(fault, lasti
     assert after < 1.2 * max(before, 0.2)  # the limit of the drawer
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("fault", ["nan poses", "not rigid", "unknown frames"])
 def test_poses_that_mean_nothing_are_left_out(fault):
     robot = make(fault, lasting=0.5)

@@ -134,6 +134,7 @@ def test_only_bases_that_turn_on_the_spot_drive():
     assert not make_drive(make_model(OmniBase(**names), ROOM)).is_possible
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("limits", [{"speed": 0.1}, {"turn": 0.2}, {"wheel_speed": 0.5}])
 def test_drives_keep_the_limits_of_speeds(limits):
     model = make_model(two_wheels(**limits), ROOM)

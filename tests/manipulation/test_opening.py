@@ -285,6 +285,7 @@ def test_a_way_is_made_back_where_it_leads_to_the_target(at_the_door):
         search.retrace(ended, search.find(state, grasps, 1.0, samples=1, accept=lambda found: False), 0.0)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("value", "target", "end"),
     [

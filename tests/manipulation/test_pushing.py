@@ -318,6 +318,7 @@ def test_push_counts_the_time_that_steps_really_last() -> None:
     assert metrics.overlap is None
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("fault", "seconds", "says"), READING_FAULTS)
 def test_push_waits_for_readings_and_says_which_have_ended(fault: str, seconds: float, says: str) -> None:
     world = KinematicWorld(room(), "robot", sensors=SENSORS)

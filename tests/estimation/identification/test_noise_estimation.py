@@ -163,6 +163,7 @@ def identify_online(parent, child, noise, outliers):
 LONG = ("outliers of both", "outliers among positions")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=pytest.mark.long if case in LONG else ()) for case in NOTHING]
 )

@@ -133,6 +133,7 @@ def exact_poses(kind: str, scale: float, far: float, count: int, seed: int) -> n
     return np.array(poses)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", ["rigid", "prismatic", "revolute", "screw", "spherical", "planar"])
 @pytest.mark.parametrize("scale", [1.0, 3000.0, pytest.param(1e5, marks=pytest.mark.long)])
 @pytest.mark.parametrize("count", [10, pytest.param(80, marks=pytest.mark.long)])

@@ -146,6 +146,7 @@ def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> No
     same(marginal_likelihood.continue_from(*arguments), solver.continue_from(*arguments), atol=0.02)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.compiler
 @pytest.mark.parametrize(
     ("family", "whole"), [("prismatic", True), ("revolute", True), ("spherical", True), ("revolute", False)]

@@ -26,6 +26,7 @@ def make_pinion(radius: float = 0.05) -> kv.Model:
 MODEL = make_pinion()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.compiler
 @pytest.mark.parametrize("is_compiled", [True, False])
 @pytest.mark.parametrize("process", ["position", "velocity"])
