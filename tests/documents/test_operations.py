@@ -227,14 +227,25 @@ def test_linked_operation_runs_again_when_what_it_read_changes() -> None:
 )
 @pytest.mark.sampled(4)
 def test_every_operation_of_the_library_is_made_again_from_kind_and_parameters(name: str) -> None:
-    model = kv.load(f"articulations/{name}", prefix="")
+    shipped = kv.load(f"articulations/{name}", prefix="")
+    # Fits of splines and loops have other last bits on other processors.
+    here = _made_again(shipped)
+    state = here.default_state()
+    assert here.history.tags == shipped.history.tags
+    for frame in here.frames:
+        np.testing.assert_allclose(here.fk(frame)(state), shipped.fk(frame)(state), rtol=0, atol=1e-9)
+    again = _made_again(kv.formats.from_bytes(kv.formats.to_bytes(here)))
+    assert kv.formats.document_hash(again) == kv.formats.document_hash(here)
+
+
+def _made_again(model: kv.Model) -> kv.Model:
     again = kv.Model()
     with again.edit() as edit:
         for tag in model.history.tags:
             operation = model.history.operation(tag)
             assert isinstance(operation, OpaqueOperation)
             edit.apply(find_class(operation.kind)(**operation.parameters), tag)
-    assert kv.formats.document_hash(again) == kv.formats.document_hash(model)
+    return again
 
 
 def test_no_blob_depends_on_a_folder() -> None:
