@@ -1,0 +1,131 @@
+"""Rights of those who come with a certificate: who sees, who edits, and below which names."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from kineverse.errors import FormatError, InvalidValueError, suggest
+
+from .address import check_server_name
+
+FILE_NAME: Final = "rights.toml"
+_ROLES: Final = {"see": (), "edit": ("",)}
+_ROLE: Final = "A right is 'see', 'edit', or a list of prefixes such as ['kitchen/'], below which one edits."
+
+
+@dataclass(frozen=True)
+class Right:
+    """Right to edit names that begin with one of some prefixes; everybody with a right sees everything.
+
+    The role *see* has no prefix, and *edit* the empty one. Any other ends with a slash.
+    """
+
+    prefixes: tuple[str, ...]
+
+    @property
+    def may_edit(self) -> bool:
+        """True if it allows any edit."""
+        return bool(self.prefixes)
+
+    @property
+    def may_edit_all(self) -> bool:
+        """True if it allows every edit, and all else that changes something, such as to publish state."""
+        return "" in self.prefixes
+
+    def covers(self, name: str) -> bool:
+        """Return whether it allows to edit a name."""
+        return name.startswith(self.prefixes)
+
+    def __str__(self) -> str:
+        if self.may_edit_all:
+            return "may edit everything"
+        return f"may edit below {' and '.join(self.prefixes)}" if self.prefixes else "may see, and not edit"
+
+
+EVERYTHING: Final = Right(_ROLES["edit"])
+
+
+@dataclass(frozen=True)
+class Rights:
+    """Rights of users by the name in their certificate, and the users for whom relays of sites speak."""
+
+    users: Mapping[str, Right] = field(default_factory=dict)
+    relays: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Rights:
+        """Read a file of rights; one that cannot be read, or has a wrong entry, is a FormatError."""
+        try:
+            content = tomllib.loads(Path(path).read_text("utf-8"))
+        except OSError as error:
+            raise FormatError(f"The rights in {path} cannot be read: {error.strerror}.") from None
+        except (ValueError, RecursionError) as error:  # of TOML, or of UTF-8
+            raise FormatError(f"{path} is not TOML: {error}.") from None
+        try:
+            for name in content:
+                if name not in ("users", "relays"):
+                    raise InvalidValueError(f"there is {name!r:.80}. The tables are [users] and [relays].")
+            users = {name: _as_right(name, right) for name, right in _items(content, "users")}
+            relays = {name: _as_users(name, given, users) for name, given in _items(content, "relays")}
+        except InvalidValueError as error:
+            raise FormatError(f"In {path}, {error}") from None
+        return cls(users, relays)
+
+
+def _items(content: Mapping[str, Any], table: str) -> Iterable[tuple[str, Any]]:
+    found = content.get(table, {})
+    if not isinstance(found, dict):
+        raise InvalidValueError(f"{table} is {found!r:.80}, and has to be a table, [{table}].")
+    for name in found:
+        try:
+            check_server_name(name, table.removesuffix("s"))  # it is a part of keys
+        except InvalidValueError as error:
+            raise InvalidValueError(f"[{table}] has a wrong entry: {error}") from None
+    return found.items()
+
+
+def _as_right(user: str, given: Any) -> Right:
+    if isinstance(given, str):
+        if given in _ROLES:
+            return Right(_ROLES[given])
+        raise InvalidValueError(f"the user {user!r} has the right {given!r:.80}, which there is not. {_ROLE}")
+    prefixes = _as_texts(f"the user {user!r}", given, _ROLE)
+    for prefix in prefixes:
+        if not prefix.endswith("/") or "//" in f"/{prefix}":
+            raise InvalidValueError(
+                f"the user {user!r} has the prefix {prefix!r:.80}. A prefix is the beginning of names, with "
+                "a slash at its end and none in front, such as 'kitchen/'."
+            )
+    if not prefixes:
+        raise InvalidValueError(f"the user {user!r} has an empty list. {_ROLE}")
+    return Right(prefixes)
+
+
+def _as_users(relay: str, given: Any, users: Mapping[str, Right]) -> tuple[str, ...]:
+    if relay in users:
+        raise InvalidValueError(
+            f"{relay!r} is a user and a relay. Give the relay another name, and a certificate of its own."
+        )
+    names = _as_texts(f"the relay {relay!r}", given, "It has a list of the users for whom it speaks.")
+    for name in names:
+        if name not in users:
+            raise InvalidValueError(
+                f"the relay {relay!r} speaks for {name!r:.80}, who is no user. "
+                f"{suggest(name, users, 'user')} Users stand in [users]."
+            )
+    return names
+
+
+def _as_texts(subject: str, given: Any, wanted: str) -> tuple[str, ...]:
+    """Return the texts in a list, each of which is there once."""
+    if not isinstance(given, list) or not all(isinstance(text, str) for text in given):
+        raise InvalidValueError(f"{subject} has {given!r:.80}. {wanted}")
+    for text in given:
+        if given.count(text) > 1:
+            raise InvalidValueError(f"{subject} has {text!r:.80} twice. Once is enough.")
+    return tuple(given)
