@@ -29,7 +29,11 @@ def read(tmp_path: Path, text: str) -> Rights:
 
 def test_rights_are_read_from_a_file(tmp_path: Path) -> None:
     rights = read(tmp_path, FILE)
-    users = {"alice": EVERYTHING, "bob": Right(()), "carol": Right(("kitchen/", "table/"))}
+    users = {
+        "alice": Right(("",), "alice"),
+        "bob": Right((), "bob"),
+        "carol": Right(("kitchen/", "table/"), "carol"),
+    }
     assert rights == Rights(users, {"hamburg": ("alice", "carol")})
     assert [right.may_edit for right in users.values()] == [True, False, True]
     assert [right.may_edit_all for right in users.values()] == [True, False, False]

@@ -20,12 +20,14 @@ _ROLE: Final = "A right is 'see', 'edit', or a list of prefixes such as ['kitche
 
 @dataclass(frozen=True)
 class Right:
-    """Right to edit names that begin with one of some prefixes; everybody with a right sees everything.
+    """Right of a user to edit names that begin with one of some prefixes, and to see everything.
 
     The role *see* has no prefix, and *edit* the empty one. Any other ends with a slash.
     """
 
     prefixes: tuple[str, ...]
+    user: str = ""
+    """Name of the user; empty for all who use the server's own computer as its user."""
 
     @property
     def may_edit(self) -> bool:
@@ -43,8 +45,9 @@ class Right:
 
     def __str__(self) -> str:
         if self.may_edit_all:
-            return "may edit everything"
-        return f"may edit below {' and '.join(self.prefixes)}" if self.prefixes else "may see, and not edit"
+            return f"{self.user} may edit everything"
+        what = f"edit below {' and '.join(self.prefixes)}" if self.prefixes else "see, and not edit"
+        return f"{self.user} may {what}"
 
 
 EVERYTHING: Final = Right(_ROLES["edit"])
@@ -92,7 +95,7 @@ def _items(content: Mapping[str, Any], table: str) -> Iterable[tuple[str, Any]]:
 def _as_right(user: str, given: Any) -> Right:
     if isinstance(given, str):
         if given in _ROLES:
-            return Right(_ROLES[given])
+            return Right(_ROLES[given], user)
         raise InvalidValueError(f"the user {user!r} has the right {given!r:.80}, which there is not. {_ROLE}")
     prefixes = _as_texts(f"the user {user!r}", given, _ROLE)
     for prefix in prefixes:
@@ -103,7 +106,7 @@ def _as_right(user: str, given: Any) -> Right:
             )
     if not prefixes:
         raise InvalidValueError(f"the user {user!r} has an empty list. {_ROLE}")
-    return Right(prefixes)
+    return Right(prefixes, user)
 
 
 def _as_users(relay: str, given: Any, users: Mapping[str, Right]) -> tuple[str, ...]:
