@@ -29,7 +29,7 @@ from kineverse.errors import (
 from kineverse.symbols import Symbol
 
 from . import protocol
-from .address import Address
+from .address import Address, list_endpoints
 from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
@@ -51,6 +51,8 @@ class Connection:
     ----------
     address
         Address of the server.
+    user
+        Name of the user in the certificate; empty on the server's computer.
     client
         Identity of this client, 32 hexadecimal digits.
     who
@@ -78,14 +80,28 @@ class Connection:
         self._numbers = count(1)
         self._told = -1
         self._changed = threading.Condition()
-        endpoint, secret = address.find()
-        try:
-            self.transport = Transport.connect(endpoint, secret)
-        except NoAnswerError:
-            raise OfflineError(
-                f"No model server answers at {endpoint}. Start it, or mend the address {str(address)!r}."
-            ) from None
+        self.user = ""
+        self.transport = self._connect()
         self._presence = self.transport.alive(self.key(f"client/{self.client}"))
+
+    def _connect(self) -> Transport:
+        endpoint, secret = self.address.find()
+        keys = None
+        if self.address.is_secured:
+            from .keys import Keys, explain_refusal  # for those who have no need of the package cryptography
+
+            keys = Keys.read()
+            self.user = keys.user
+        try:
+            return Transport.connect(endpoint, secret, keys=keys)
+        except NoAnswerError:
+            pass
+        if keys is None:
+            raise OfflineError(
+                f"No model server answers at {endpoint}. Start it, or mend the address {str(self.address)!r}."
+            )
+        reasons = "; ".join(explain_refusal(one, keys) for one in list_endpoints(endpoint))
+        raise OfflineError(f"There is no connection with {self.address}. {reasons}.")
 
     def close(self) -> None:
         """End the connection; the model can still be read. A second call has no effect."""
@@ -349,7 +365,11 @@ class Connection:
                 f"This takes a message of {len(data) / 1e6:.0f} MB, and the most is "
                 f"{protocol.MAX_BYTES / 1e6:.0f} MB. Split it into several edits."
             )
-        key, end = self.key("edit" if changes_model else "ask"), time.monotonic() + min(timeout, _ROUTING)
+        way = f"user/{self.user}/" if self.user else ""
+        key, end = (
+            self.key(way + ("edit" if changes_model else "ask")),
+            time.monotonic() + min(timeout, _ROUTING),
+        )
         while True:
             try:
                 return protocol.decode_answer(self.transport.ask(key, data, timeout))

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from msgspec import structs
@@ -27,13 +27,18 @@ from kineverse.model.edit import Edit
 from kineverse.model.model import Model, Snapshot
 
 from . import protocol
-from .address import Claim, check_endpoint
+from .access import make_grants
+from .address import Claim, check_endpoint, check_protected
 from .authority import Authority, Result
 from .connection import describe_client
 from .meshes import MAX_PART
+from .rights import FILE_NAME, Rights
 from .store import Store
 from .transport import Question, Questions, Transport
 from .views import MOST_MISSED, View, Views, Wish
+
+if TYPE_CHECKING:
+    from .keys import Keys
 
 _LOG = logging.getLogger(__name__)
 
@@ -59,6 +64,8 @@ def serve(
     store: str | os.PathLike[str] | None = None,
     listen: Iterable[str] = (),
     durable: bool = False,
+    keys: str | os.PathLike[str] | None = None,
+    insecure: bool = False,
 ) -> Server:
     """Serve a model to other processes, in threads of this one.
 
@@ -71,11 +78,17 @@ def serve(
     store
         SQLite file that keeps the model and all edits. Without one, they end with the server.
     listen
-        Further endpoints such as ``tcp/127.0.0.1:7410``. By default only processes of this user on this
+        Further endpoints: ``tls/HOST:PORT`` for users with a certificate, who may do what the rights say, or
+        ``tcp/127.0.0.1:PORT`` for everybody on this computer. By default only processes of this user on this
         computer are served.
     durable
         True to acknowledge an edit only when it survives a loss of power; otherwise it survives the end of
         the process at any time.
+    keys
+        Folder with the keys of the server and ``rights.toml``, for endpoints of TLS; ``kineverse keys`` makes
+        one.
+    insecure
+        True to listen at endpoints of TCP that other computers reach, for everybody.
 
     Returns
     -------
@@ -85,19 +98,22 @@ def serve(
     Raises
     ------
     InvalidValueError
-        For an invalid name or argument.
+        For an invalid name or argument, and for keys that are missing, expired, or can be read by others.
     DuplicateNameError
         If another server has the name.
     FormatError
-        For a model that cannot be loaded, or a store that is damaged, in use or of another version.
+        For a model or rights that cannot be loaded, or a store that is damaged, in use or of another version.
     MissingDependencyError
         Without the extra ``exchange``.
     """
     check_flag("durable", durable)
+    check_flag("insecure", insecure)
     if durable and store is None:
         raise InvalidValueError("Without a store= nothing is kept, so durable=True needs one.")
     given = as_entries("models=", models, (str, os.PathLike, Model), "models, or their files and names")
     endpoints = [check_endpoint(one) for one in as_entries("listen=", listen, str, "endpoints")]
+    check_protected(endpoints, keys, insecure)
+    found, rights = (None, Rights()) if keys is None else _read_keys(keys)
     path = None if store is None else Path(store)
     with ExitStack() as opened:
         kept = opened.enter_context(closing(Store(path, durable=durable)))
@@ -110,9 +126,18 @@ def serve(
         elif given:
             authority.fill(lambda edit: _include(edit, given), describe_client())
         kept.name = chosen
-        transport = Transport.serve([claim.endpoint, *endpoints], claim.secret)
+        grants = make_grants(chosen, rights)
+        transport = Transport.serve([claim.endpoint, *endpoints], claim.secret, keys=found, grants=grants)
         opened.callback(transport.close)
         return Server(chosen, authority, kept, transport, opened.pop_all())
+
+
+def _read_keys(folder: str | os.PathLike[str]) -> tuple[Keys, Rights]:
+    from .keys import Keys  # for those who have no need of the package cryptography
+
+    keys = Keys.read(folder)
+    keys.check_valid()
+    return keys, Rights.read(keys.folder / FILE_NAME)
 
 
 def _name_of(given: Sequence[Source]) -> str:

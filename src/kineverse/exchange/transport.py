@@ -16,14 +16,22 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar
 
 from kineverse._extras import install_command
 from kineverse.errors import InvalidValueError, MissingDependencyError, OfflineError
 
-from .address import check_endpoint
+from .address import check_endpoint, is_secured, list_endpoints
+
+if TYPE_CHECKING:
+    from .keys import Keys
+
+Use: TypeAlias = Literal["ask", "find", "answer", "read", "publish", "show", "watch"]
+"""What a client does with a key: ask questions, find who answers them, answer them; read and publish
+messages; show a sign of life, and watch those of others."""
 
 LEASE: Final = 1.0  # time after which a process that says nothing counts as gone [s]
 
@@ -38,6 +46,18 @@ Value = TypeVar("Value")
 
 class NoAnswerError(Exception):
     """Nobody is there, or has answered in time; or the transport is closed."""
+
+
+@dataclass(frozen=True)
+class Grant:
+    """Permission to use some keys, for those with certain names in their certificates.
+
+    Without names it is for everybody with a certificate of the authority.
+    """
+
+    use: Use
+    keys: tuple[str, ...]
+    names: tuple[str, ...] = ()
 
 
 class _Entrances:
@@ -212,8 +232,8 @@ class Token(_Owner):
 class Transport(_Owner):
     """Connection of this process to others, made by :meth:`serve` or :meth:`connect`.
 
-    Endpoints are ``unixsock-stream/PATH`` or ``tcp/HOST:PORT``. All methods may be called in any thread.
-    After :meth:`close` they raise :class:`NoAnswerError`, and publishing does nothing.
+    Endpoints are ``unixsock-stream/PATH``, ``tcp/HOST:PORT`` or ``tls/HOST:PORT``. All methods may be called
+    in any thread. After :meth:`close` they raise :class:`NoAnswerError`, and publishing does nothing.
     """
 
     def __init__(self, settings: dict[str, object]) -> None:
@@ -230,14 +250,35 @@ class Transport(_Owner):
         _call.transports.add(self)
 
     @classmethod
-    def serve(cls, endpoints: Sequence[str], secret: str = "") -> Transport:
+    def serve(
+        cls,
+        endpoints: Sequence[str],
+        secret: str = "",
+        *,
+        keys: Keys | None = None,
+        grants: Sequence[Grant] = (),
+        servers: Sequence[str] = (),
+        server: str = "",
+    ) -> Transport:
         """Listen at endpoints, for clients that know the secret if there is one.
 
-        An endpoint that is taken, or none to listen at, is an InvalidValueError.
+        At endpoints of TLS clients need a certificate of the authority in the folder of keys, and may do what
+        they are granted. All others may do everything. With ``servers`` it is a relay: it connects to them,
+        one after the other until one is there, and that may do everything if ``server`` is the name in its
+        certificate. An endpoint that is taken, or none to listen at, is an InvalidValueError.
         """
         for endpoint in endpoints:
             check_endpoint(endpoint)
         settings = {"mode": "router", "listen/endpoints": list(endpoints), "listen/exit_on_failure": True}
+        if servers:
+            settings |= {"connect/endpoints": list(servers), "connect/timeout_ms": -1, **_RETRY}
+            settings |= {"connect/exit_on_failure": False}
+        if keys is not None and any(map(is_secured, endpoints)):
+            trusted: list[dict[str, object]] = [{"link_protocols": ["unixsock-stream", "tcp"]}]
+            if server:
+                trusted.append({"cert_common_names": [server]})
+            settings |= _tls(keys, "listen", *["connect"] * bool(servers))
+            settings |= {"access_control": _access_control(trusted, grants)}
         with contextlib.ExitStack() as stack:
             if secret:
                 folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -256,20 +297,26 @@ class Transport(_Owner):
                 ) from None
 
     @classmethod
-    def connect(cls, endpoint: str, secret: str = "", timeout: float = 0.0) -> Transport:
+    def connect(
+        cls, endpoint: str, secret: str = "", timeout: float = 0.0, *, keys: Keys | None = None
+    ) -> Transport:
         """Connect to a server; a connection that is cut is made again as soon as there is a server.
 
-        If none is there after the timeout [s], or it wants another secret, that is a :class:`NoAnswerError`.
+        Two endpoints with a comma between them are tried in turn, also later; TLS needs a folder of keys. If
+        no server is there after the timeout [s], or it wants another secret or other keys, that is a
+        :class:`NoAnswerError`.
         """
         settings = {
             "mode": "client",
-            "connect/endpoints": [endpoint],
+            "connect/endpoints": list_endpoints(endpoint),
             "connect/exit_on_failure": True,
             "connect/timeout_ms": round(1e3 * timeout),
-            "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 2},
+            **_RETRY,
+            **_credentials(secret),
+            **({} if keys is None else _tls(keys, "connect")),
         }
         try:
-            return cls(settings | _credentials(secret))
+            return cls(settings)
         except _zenoh().ZError:
             raise NoAnswerError(f"No server answers at {endpoint}.") from None
 
@@ -356,6 +403,74 @@ _SETTINGS: Final[dict[str, object]] = {
     # An answer to one who reads nothing holds up the others no longer than he counts as there.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * LEASE),
 }
+_RETRY: Final[dict[str, object]] = {
+    "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 2},
+}
+
+# Messages of Zenoh that a client sends to this process (ingress) and gets from it (egress) for a use.
+_FLOWS: Final[Mapping[Use, Mapping[str, Sequence[str]]]] = {
+    "ask": {"ingress": ["query"], "egress": ["reply"]},
+    "find": {"egress": ["declare_queryable"]},
+    "answer": {"ingress": ["declare_queryable", "reply"], "egress": ["query"]},
+    "read": {"ingress": ["declare_subscriber"], "egress": ["put"]},
+    "publish": {"ingress": ["put"], "egress": ["declare_subscriber"]},
+    "show": {
+        "ingress": ["liveliness_token"],
+        "egress": ["declare_liveliness_subscriber", "liveliness_query"],
+    },
+    "watch": {
+        "ingress": ["declare_liveliness_subscriber", "liveliness_query"],
+        "egress": ["liveliness_token"],
+    },
+}
+
+
+def _tls(keys: Keys, *sides: str) -> dict[str, object]:
+    files = {"root_ca_certificate": str(keys.authority)}
+    for side in sides:
+        files |= {f"{side}_certificate": str(keys.certificate), f"{side}_private_key": str(keys.private_key)}
+    return {
+        "transport/link/tls": {
+            **files,
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+    }
+
+
+def _access_control(trusted: Sequence[dict[str, object]], grants: Sequence[Grant]) -> dict[str, object]:
+    """Return rules by which the trusted may do everything, others what is granted, and nothing else."""
+    everything = sorted({message for flows in _FLOWS.values() for some in flows.values() for message in some})
+    rules = [_rule("all", "ingress", everything, ["**"]), _rule("all", "egress", everything, ["**"])]
+    subjects = [{"id": f"trusted {number}", **subject} for number, subject in enumerate(trusted)]
+    policies = [{"rules": ["all ingress", "all egress"], "subjects": [one["id"] for one in subjects]}]
+    for number, grant in enumerate(grants):
+        subject = {"cert_common_names": [*grant.names]} if grant.names else {"link_protocols": ["tls"]}
+        subjects.append({"id": f"subject {number}", **subject})
+        granted = [
+            _rule(f"grant {number}", flow, messages, grant.keys)
+            for flow, messages in _FLOWS[grant.use].items()
+        ]
+        rules += granted
+        policies.append({"rules": [rule["id"] for rule in granted], "subjects": [f"subject {number}"]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> dict[str, object]:
+    return {
+        "id": f"{name} {flow}",
+        "permission": "allow",
+        "messages": [*messages],
+        "flows": [flow],
+        "key_exprs": [*keys],
+    }
 
 
 def _credentials(secret: str) -> dict[str, object]:

@@ -1,0 +1,363 @@
+"""Keys of servers, relays and users: certificates of one authority, by which each shows the others its name.
+
+A folder of keys has ``ca.pem``, the certificate of the authority, ``cert.pem``, that of the owner, and
+``key.pem``, which only the owner may read. The common name of a certificate is the name of a user,
+``relay NAME`` or ``model server``: names of users have no spaces, so nobody is taken for another kind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import re
+import secrets
+import socket
+import ssl
+import stat
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from kineverse._extras import install_command
+from kineverse.errors import DuplicateNameError, InvalidValueError, MissingDependencyError
+
+try:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+except ImportError:
+    raise MissingDependencyError(
+        f"Keys of model servers need the package cryptography: {install_command('exchange')}"
+    ) from None
+
+from .access import SERVER, relay_name
+from .address import check_server_name, split_endpoint
+
+AUTHORITY, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
+
+_HOST: Final = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(?:\.(?!-)[A-Za-z0-9-]{1,63})*")
+_AUTHORITY_DAYS: Final = 3650
+_EARLIER: Final = timedelta(hours=1)  # clocks of others may be late
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
+_SECONDS: Final = 2.0  # for a handshake that finds out why a connection was refused
+_ALERT_SECONDS: Final = 0.5  # a server that refuses a certificate says so after the handshake
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Keys of a server, a relay or a user, from :meth:`read`; ``name`` is that in the certificate."""
+
+    folder: Path
+    name: str
+    ends: datetime
+
+    @classmethod
+    def read(cls, folder: str | os.PathLike[str] | None = None) -> Keys:
+        """Return the keys in a folder: by default ``KINEVERSE_KEYS``, else that of the user's configuration.
+
+        If a file is missing, is none of its kind, does not belong to the others, or can be read by others
+        although it is private, that is an InvalidValueError.
+        """
+        path = _default_folder() if folder is None else Path(folder).expanduser().absolute()
+        missing = [name for name in (AUTHORITY, CERTIFICATE, KEY) if not (path / name).is_file()]
+        if missing:
+            raise InvalidValueError(
+                f"The keys in {path} are not complete: {' and '.join(missing)} missing. "
+                + (
+                    "Put those that you were given there, or name another folder in KINEVERSE_KEYS."
+                    if folder is None
+                    else "'kineverse keys' makes such folders."
+                )
+            )
+        check_private(path / KEY)
+        certificate = _load(path / CERTIFICATE, x509.load_pem_x509_certificate, "certificate")
+        _load(path / AUTHORITY, x509.load_pem_x509_certificate, "certificate")
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(path / CERTIFICATE, path / KEY, "")
+        except (ssl.SSLError, ValueError):
+            raise InvalidValueError(
+                f"{path / KEY} is not the key of {path / CERTIFICATE}. Copy both from one folder."
+            ) from None
+        names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+        return cls(path, str(names[0].value) if names else "", certificate.not_valid_after_utc)
+
+    @property
+    def authority(self) -> Path:
+        """File of the authority's certificate."""
+        return self.folder / AUTHORITY
+
+    @property
+    def certificate(self) -> Path:
+        """File of the owner's certificate."""
+        return self.folder / CERTIFICATE
+
+    @property
+    def private_key(self) -> Path:
+        """File of the owner's key."""
+        return self.folder / KEY
+
+    @property
+    def user(self) -> str:
+        """Name of the user; if these are the keys of a server or a relay, that is an InvalidValueError."""
+        try:
+            return check_server_name(self.name, "user")
+        except InvalidValueError:
+            raise InvalidValueError(
+                f"The keys in {self.folder} are those of {self.name!r}, which is no user. Name the folder of "
+                "a user in KINEVERSE_KEYS."
+            ) from None
+
+    def check_valid(self) -> None:
+        """Raise an InvalidValueError if the certificate is too old to listen with."""
+        if self.ends <= datetime.now(UTC):
+            raise InvalidValueError(
+                f"The certificate in {self.folder} expired on {self.ends:%Y-%m-%d}: "
+                "'kineverse keys --renew' makes another one."
+            )
+
+
+def check_private(path: Path) -> None:
+    """Raise an InvalidValueError if others can read a file, where that can be known."""
+    if hasattr(os, "geteuid") and path.stat().st_mode & _OTHERS:
+        raise InvalidValueError(
+            f"Others can read {path}, which is private (its mode is {path.stat().st_mode & 0o777:o}): "
+            f"chmod 600 mends that, and if somebody has read it, make new keys."
+        )
+
+
+# -- why a connection is refused -----------------------------------------------------------------------------
+
+_UNTRUSTED: Final = "its certificate is of another authority than {ca}: it is a foreign server"
+_REASONS: Final[dict[int, str]] = {  # codes of OpenSSL
+    9: "its certificate is not valid yet; look at the clocks of both computers",
+    10: "its certificate has expired: its owner has to renew it",
+    62: "its certificate is for another host than {host}: it is a foreign server, or the address is wrong",
+    64: "its certificate is for another host than {host}: it is a foreign server, or the address is wrong",
+}
+_ALERTS: Final[dict[str, str]] = {
+    "UNKNOWN_CA": "it does not know the authority of {cert}: those keys are for another server",
+    "CERTIFICATE_EXPIRED": "{cert} has expired: ask for new keys",
+    "CERTIFICATE_REQUIRED": "it wants a certificate",
+    "WRONG_VERSION_NUMBER": "what answers there does not speak TLS",
+}
+
+
+def explain_refusal(endpoint: str, keys: Keys) -> str:
+    """Return why the server at an endpoint refuses these keys, or they refuse it, as far as can be known.
+
+    That is found by a handshake, so it is about the present, and takes up to two seconds.
+    """
+    host, port = split_endpoint(endpoint)
+    context = ssl.create_default_context(cafile=keys.authority)
+    context.load_cert_chain(keys.certificate, keys.private_key)
+    reason = "it takes the keys, but is no model server, or busy"
+    try:
+        with (
+            socket.create_connection((host, port), _SECONDS) as plain,
+            context.wrap_socket(plain, server_hostname=host) as secured,
+        ):
+            secured.settimeout(_ALERT_SECONDS)
+            with contextlib.suppress(TimeoutError):
+                secured.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        reason = _REASONS.get(error.verify_code, _UNTRUSTED)
+    except ssl.SSLError as error:
+        alert = next((alert for alert in _ALERTS if alert in (error.reason or "")), "")
+        reason = _ALERTS.get(alert, f"the connection was refused ({error.reason})")
+    except (OSError, OverflowError) as error:
+        reason = f"nobody is there ({getattr(error, 'strerror', None) or error})"
+    return f"{endpoint}: {reason.format(host=host, ca=keys.authority, cert=keys.certificate)}"
+
+
+# -- making keys ---------------------------------------------------------------------------------------------
+
+
+def make_keys(
+    folder: str | os.PathLike[str],
+    *,
+    hosts: Sequence[str] = (),
+    users: Sequence[str] = (),
+    relays: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    days: float = 365.0,
+    renew: bool = False,
+) -> list[Path]:
+    """Make keys of an authority in a folder, which is made as well if it is not there; return their folders.
+
+    Parameters
+    ----------
+    folder
+        Folder with ``authority``, ``server``, ``users`` and ``relays``.
+    hosts
+        Names and IP addresses by which clients reach the server; none if it has its keys.
+    users
+        Names of users.
+    relays
+        Names of relays, with the names and IP addresses of their hosts.
+    days
+        Time for which the certificates are valid [days].
+    renew
+        Whether those who have keys get new ones; otherwise that is a DuplicateNameError.
+    """
+    root = Path(folder).expanduser().absolute()
+    wanted: dict[Path, tuple[str, Sequence[str]]] = {}
+    if hosts:
+        wanted[root / "server"] = SERVER, hosts
+    for name, places in relays.items():
+        wanted[root / "relays" / check_server_name(name, "relay")] = relay_name(name), places
+    for name in users:
+        wanted[root / "users" / check_server_name(name, "user")] = name, ()
+    for path, (name, places) in wanted.items():
+        if name not in users and not places:
+            raise InvalidValueError(f"{name!r} needs the names of its hosts, by which clients reach it.")
+        _alternatives(places)
+        if (path / KEY).exists() and not renew:
+            raise DuplicateNameError(f"{path} has keys already. --renew makes new ones in their place.")
+    authority = _Authority(root / "authority")
+    for path, (name, places) in wanted.items():
+        authority.issue(path, name, places, days)
+    return [*wanted]
+
+
+class _Authority:
+    """Authority in a folder, which is made if it is not there."""
+
+    def __init__(self, folder: Path) -> None:
+        if not (folder / AUTHORITY).exists():
+            self.key = _make_key()
+            name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Kineverse {secrets.token_hex(4)}")])
+            usage = dict.fromkeys(_USAGES, False) | {"key_cert_sign": True, "crl_sign": True}
+            builder = (
+                _builder(name, name, self.key.public_key(), _AUTHORITY_DAYS)
+                .add_extension(x509.BasicConstraints(True, 0), critical=True)
+                .add_extension(x509.KeyUsage(**usage), critical=True)
+            )
+            self.certificate = builder.sign(self.key, hashes.SHA256())
+            _write(folder, {AUTHORITY: self.certificate, KEY: self.key})
+            return
+        if not (folder / KEY).exists():
+            raise InvalidValueError(
+                f"{folder / KEY} is missing, so nothing can be signed. Put it back, or take a new folder."
+            )
+        check_private(folder / KEY)
+        self.certificate = _load(folder / AUTHORITY, x509.load_pem_x509_certificate, "certificate")
+        self.key = _load(
+            folder / KEY, lambda data: serialization.load_pem_private_key(data, None), "private key"
+        )
+
+    def issue(self, folder: Path, name: str, hosts: Sequence[str], days: float) -> None:
+        """Write the keys of an owner; one who has hosts can be a server, and all but the server a client."""
+        key = _make_key()
+        uses = [ExtendedKeyUsageOID.SERVER_AUTH] * bool(hosts)
+        uses += [ExtendedKeyUsageOID.CLIENT_AUTH] * (name != SERVER)
+        usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True}
+        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        builder = (
+            _builder(subject, self.certificate.subject, key.public_key(), days)
+            .add_extension(x509.BasicConstraints(False, None), critical=True)
+            .add_extension(x509.KeyUsage(**usage), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+            .add_extension(
+                x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), critical=False
+            )
+        )
+        if hosts:
+            builder = builder.add_extension(x509.SubjectAlternativeName(_alternatives(hosts)), critical=False)
+        certificate = builder.sign(self.key, hashes.SHA256())
+        _write(folder, {AUTHORITY: self.certificate, CERTIFICATE: certificate, KEY: key})
+
+
+_USAGES: Final = (
+    "digital_signature",
+    "content_commitment",
+    "key_encipherment",
+    "data_encipherment",
+    "key_agreement",
+    "key_cert_sign",
+    "crl_sign",
+    "encipher_only",
+    "decipher_only",
+)
+
+
+def _make_key() -> Any:
+    return ec.generate_private_key(ec.SECP256R1())
+
+
+def _builder(subject: Any, issuer: Any, key: Any, days: float) -> Any:
+    now = datetime.now(UTC)
+    end = now + timedelta(days=days)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(now, end) - _EARLIER)
+        .not_valid_after(end)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _alternatives(hosts: Sequence[str]) -> list[Any]:
+    found: list[x509.GeneralName] = []
+    for host in hosts:
+        try:
+            found.append(x509.IPAddress(ipaddress.ip_address(host.strip("[]"))))
+            continue
+        except ValueError:
+            if not _HOST.fullmatch(host) or len(host) > 253:
+                raise InvalidValueError(
+                    f"{host!r} is neither the name of a host nor an IP address."
+                ) from None
+        found.append(x509.DNSName(host))
+    return found
+
+
+def _write(folder: Path, files: dict[str, Any]) -> None:
+    """Write certificates and keys into a folder, each as a whole, for this user only."""
+    pem = serialization.Encoding.PEM
+    try:
+        folder.mkdir(0o700, parents=True, exist_ok=True)
+        for name, content in files.items():
+            if name == KEY:
+                data = content.private_bytes(
+                    pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+                )
+            else:
+                data = content.public_bytes(pem)
+            write_private(folder / name, data)
+    except OSError as error:
+        raise InvalidValueError(f"{folder} cannot be written: {error.strerror}.") from None
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that only this user can read, as a whole."""
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    try:
+        with open(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file:
+            file.write(data)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _load(path: Path, load: Any, what: str) -> Any:
+    try:
+        return load(path.read_bytes())
+    except OSError as error:
+        raise InvalidValueError(f"{path} cannot be read: {error.strerror}.") from None
+    except (ValueError, TypeError):
+        raise InvalidValueError(f"{path} is no {what} in PEM.") from None
+
+
+def _default_folder() -> Path:
+    chosen, configuration = os.environ.get("KINEVERSE_KEYS"), os.environ.get("XDG_CONFIG_HOME", "")
+    if chosen:
+        return Path(chosen).expanduser().absolute()
+    home = Path(configuration) if os.path.isabs(configuration) else Path("~/.config").expanduser()
+    return home / "kineverse" / "keys"
