@@ -209,7 +209,9 @@ Request: TypeAlias = (
 
 # -- answers -------------------------------------------------------------------------------------------------
 
-Reason: TypeAlias = Literal["conflict", "refused", "stale", "protocol", "malformed", "unknown", "failed"]
+Reason: TypeAlias = Literal[
+    "conflict", "refused", "forbidden", "stale", "protocol", "malformed", "unknown", "failed"
+]
 
 
 class Committed(_Message, frozen=True, tag="committed"):
@@ -223,8 +225,9 @@ class Refused(_Message, frozen=True, tag="refused"):
     """Nothing was done.
 
     Reasons: ``conflict`` with a commit after the base (tag, path, revision and who made it are named),
-    ``refused`` by the model, ``stale``: the server does not know the state of the client, which has to join
-    again, another ``protocol``, a ``malformed`` message, an ``unknown`` name, or the server has ``failed``.
+    ``refused`` by the model, ``forbidden`` by the right of the user (tag and path are named), ``stale``: the
+    server does not know the state of the client, which has to join again, another ``protocol``, a
+    ``malformed`` message, an ``unknown`` name, or the server has ``failed``.
     """
 
     reason: Reason

@@ -1,17 +1,25 @@
-"""Rights of those who come with a certificate: who sees, who edits, and below which names."""
+"""Rights of those who come with a certificate: who sees, who edits, and below which names.
+
+What counts are the names of what an edit itself writes, before and after it. A constraint is also about the
+coordinates that it restricts, a rate about those that it joins, and the record of an articulation about its
+frame and its coordinates.
+"""
 
 from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from kineverse.errors import FormatError, InvalidValueError, suggest
+from kineverse.model.operation import ARTICULATIONS, CONSTRAINTS, RATES, Cell
 
 from .address import check_server_name
+from .conflicts import RefusedError
+from .views import find_paths
 
 FILE_NAME: Final = "rights.toml"
 _ROLES: Final = {"see": (), "edit": ("",)}
@@ -132,3 +140,36 @@ def _as_texts(subject: str, given: Any, wanted: str) -> tuple[str, ...]:
         if given.count(text) > 1:
             raise InvalidValueError(f"{subject} has {text!r:.80} twice. Once is enough.")
     return tuple(given)
+
+
+# -- what an operation writes --------------------------------------------------------------------------------
+
+
+def find_forbidden(right: Right, tag: str, writes: Mapping[Cell, Any]) -> RefusedError | None:
+    """Return the error for an operation that writes what a right does not cover, or nothing at all."""
+    if right.may_edit_all:
+        return None
+    if not writes:
+        message = f"{right}, and {tag!r} writes nothing, so it is below no name."
+        return RefusedError("forbidden", message, tag)
+    for cell, value in writes.items():
+        path = "/".join(cell)
+        for name in _find_names(cell, value):
+            if not right.covers(name):
+                what = path if name == cell[1] else f"{path}, which is about {name}"
+                return RefusedError("forbidden", f"{right}, and {tag!r} writes {what}.", tag, path)
+    return None
+
+
+def _find_names(cell: Cell, value: Any) -> Iterator[str]:
+    """Yield the names that a written value decides about; of a coordinate, its path."""
+    kind, name = cell
+    if kind == RATES:
+        yield value[0].path
+    else:
+        yield name
+    if kind in (CONSTRAINTS, RATES):
+        yield from sorted(find_paths(kind, value))
+    elif kind == ARTICULATIONS:
+        yield value.child
+        yield from (symbol.path for symbol in (*value.coordinates, *value.speeds))
