@@ -12,6 +12,7 @@ from .rights import Rights
 from .transport import Grant, Use
 
 SERVER: Final = "model server"  # common name in the certificate of a server
+RELAY: Final = "relay"  # and that in front of the name of a relay
 
 SEE: Final[tuple[tuple[Use, str], ...]] = (
     ("find", "user/*/ask"),
@@ -42,7 +43,7 @@ ANYBODY: Final[tuple[tuple[Use, str], ...]] = (("watch", "alive/*"),)
 
 def relay_name(name: str) -> str:
     """Return the common name in the certificate of a relay; that of a user is the user's name."""
-    return f"relay {name}"
+    return f"{RELAY} {name}"
 
 
 def make_grants(name: str, rights: Rights) -> list[Grant]:

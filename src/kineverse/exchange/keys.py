@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import json
 import os
 import re
 import secrets
 import socket
 import ssl
 import stat
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -23,7 +24,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from kineverse._extras import install_command
-from kineverse.errors import DuplicateNameError, InvalidValueError, MissingDependencyError
+from kineverse.errors import DuplicateNameError, FormatError, InvalidValueError, MissingDependencyError
 
 try:
     from cryptography import x509
@@ -37,8 +38,15 @@ except ImportError:
 
 from .access import SERVER, relay_name
 from .address import check_server_name, split_endpoint
+from .rights import FILE_NAME, Right, Rights
 
 AUTHORITY, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
+_SERVER: Final = "server"
+_RIGHTS: Final = """\
+# Who may do what: "see", "edit", or a list of prefixes below which one edits, such as ["kitchen/"].
+# A server or relay reads this file when it starts.
+[users]
+"""
 
 _HOST: Final = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(?:\.(?!-)[A-Za-z0-9-]{1,63})*")
 _AUTHORITY_DAYS: Final = 3650
@@ -74,7 +82,7 @@ class Keys:
                     else "'kineverse keys' makes such folders."
                 )
             )
-        check_private(path / KEY)
+        _check_private(path / KEY)
         certificate = _load(path / CERTIFICATE, x509.load_pem_x509_certificate, "certificate")
         _load(path / AUTHORITY, x509.load_pem_x509_certificate, "certificate")
         try:
@@ -112,16 +120,35 @@ class Keys:
                 "a user in KINEVERSE_KEYS."
             ) from None
 
-    def check_valid(self) -> None:
-        """Raise an InvalidValueError if the certificate is too old to listen with."""
-        if self.ends <= datetime.now(UTC):
-            raise InvalidValueError(
-                f"The certificate in {self.folder} expired on {self.ends:%Y-%m-%d}: "
-                "'kineverse keys --renew' makes another one."
-            )
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """Names and addresses of the hosts that the certificate is for."""
+        certificate = _load(self.certificate, x509.load_pem_x509_certificate, "certificate")
+        with contextlib.suppress(x509.ExtensionNotFound, ValueError):
+            found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            return tuple(str(name.value) for name in found)
+        return ()
 
 
-def check_private(path: Path) -> None:
+def read_listening(folder: str | os.PathLike[str], owner: str) -> tuple[Keys, Rights]:
+    """Return the keys of a server or relay, and the rights beside them.
+
+    Keys of another owner, or that have expired, are an InvalidValueError, and wrong rights a FormatError.
+    """
+    keys = Keys.read(folder)
+    if not f"{keys.name} ".startswith(f"{owner} "):
+        raise InvalidValueError(
+            f"The keys in {keys.folder} are those of {keys.name!r}. Name the folder of the {owner}."
+        )
+    if keys.ends <= datetime.now(UTC):
+        raise InvalidValueError(
+            f"The certificate in {keys.folder} expired on {keys.ends:%Y-%m-%d}. 'kineverse keys' makes "
+            "another one with --renew."
+        )
+    return keys, Rights.read(keys.folder / FILE_NAME)
+
+
+def _check_private(path: Path) -> None:
     """Raise an InvalidValueError if others can read a file, where that can be known."""
     if hasattr(os, "geteuid") and path.stat().st_mode & _OTHERS:
         raise InvalidValueError(
@@ -169,6 +196,8 @@ def explain_refusal(endpoint: str, keys: Keys) -> str:
     except ssl.SSLError as error:
         alert = next((alert for alert in _ALERTS if alert in (error.reason or "")), "")
         reason = _ALERTS.get(alert, f"the connection was refused ({error.reason})")
+    except TimeoutError:
+        reason = f"nobody answers within {_SECONDS:g} s"
     except (OSError, OverflowError) as error:
         reason = f"nobody is there ({getattr(error, 'strerror', None) or error})"
     return f"{endpoint}: {reason.format(host=host, ca=keys.authority, cert=keys.certificate)}"
@@ -180,19 +209,21 @@ def explain_refusal(endpoint: str, keys: Keys) -> str:
 def make_keys(
     folder: str | os.PathLike[str],
     *,
-    hosts: Sequence[str] = (),
+    server: Sequence[str] = (),
     users: Sequence[str] = (),
     relays: Mapping[str, Sequence[str]] = MappingProxyType({}),
     days: float = 365.0,
     renew: bool = False,
 ) -> list[Path]:
-    """Make keys of an authority in a folder, which is made as well if it is not there; return their folders.
+    """Make keys of an authority in a folder, and return their folders.
+
+    New users may see, and new relays speak for all users; ``rights.toml`` in the server's folder says so.
 
     Parameters
     ----------
     folder
-        Folder with ``authority``, ``server``, ``users`` and ``relays``.
-    hosts
+        Folder with ``authority``, ``server``, ``users`` and ``relays``; what is not there is made.
+    server
         Names and IP addresses by which clients reach the server; none if it has its keys.
     users
         Names of users.
@@ -205,22 +236,77 @@ def make_keys(
     """
     root = Path(folder).expanduser().absolute()
     wanted: dict[Path, tuple[str, Sequence[str]]] = {}
-    if hosts:
-        wanted[root / "server"] = SERVER, hosts
+    if server:
+        wanted[root / _SERVER] = SERVER, server
+    elif not (root / _SERVER / FILE_NAME).exists():
+        raise InvalidValueError(f"{root} has no server yet. Name its hosts with server=, too.")
     for name, places in relays.items():
         wanted[root / "relays" / check_server_name(name, "relay")] = relay_name(name), places
+        if not places:
+            raise InvalidValueError(
+                f"The relay {name!r} needs the names of its hosts, by which clients reach it."
+            )
     for name in users:
         wanted[root / "users" / check_server_name(name, "user")] = name, ()
-    for path, (name, places) in wanted.items():
-        if name not in users and not places:
-            raise InvalidValueError(f"{name!r} needs the names of its hosts, by which clients reach it.")
+    if not wanted:
+        raise InvalidValueError("There is nobody to make keys for: name some with server=, user= or relay=.")
+    for path, (_, places) in wanted.items():
         _alternatives(places)
         if (path / KEY).exists() and not renew:
-            raise DuplicateNameError(f"{path} has keys already. --renew makes new ones in their place.")
+            raise DuplicateNameError(f"{path} has keys already. renew= makes new ones in their place.")
     authority = _Authority(root / "authority")
     for path, (name, places) in wanted.items():
         authority.issue(path, name, places, days)
+    _add_rights(root, users, relays)
     return [*wanted]
+
+
+def _add_rights(root: Path, users: Iterable[str], relays: Iterable[str]) -> None:
+    """Add those who are not in the server's rights, and write those of a relay, which are a part of them."""
+    path = root / _SERVER / FILE_NAME
+    text = path.read_text("utf-8") if path.exists() else _RIGHTS
+    there = Rights.read(path) if path.exists() else Rights()
+    new = [user for user in users if user not in there.users]
+    text = _add_lines(text, "users", [f'{_key(user)} = "see"' for user in new])
+    spoken = json.dumps([*there.users, *new])
+    lines = [f"{_key(relay)} = {spoken}" for relay in relays if relay not in there.relays]
+    rights = _write_rights(path, _add_lines(text, "relays", lines))
+    for relay in relays:
+        lines = [f"{_key(user)} = {_format(rights.users[user])}" for user in rights.relays[relay]]
+        _write_rights(root / "relays" / relay / FILE_NAME, _add_lines(_RIGHTS, "users", lines))
+
+
+def _add_lines(text: str, table: str, lines: Sequence[str]) -> str:
+    """Return a text in TOML with lines at the beginning of a table."""
+    if not lines:
+        return text
+    head = re.search(rf"^\[{table}\][ \t]*(?:#.*)?$", text, re.MULTILINE)
+    if head is None:
+        return "\n".join([text.rstrip("\n"), f"\n[{table}]", *lines, ""])
+    return "\n".join([text[: head.end()], *lines]) + text[head.end() :]
+
+
+def _key(name: str) -> str:
+    return json.dumps(name) if "." in name else name
+
+
+def _format(right: Right) -> str:
+    if right.may_edit_all:
+        return '"edit"'
+    return json.dumps(right.prefixes) if right.prefixes else '"see"'
+
+
+def _write_rights(path: Path, text: str) -> Rights:
+    part = path.with_name(f".{path.name}.new")
+    try:
+        _write_private(part, text.encode())
+        rights = Rights.read(part)
+        part.replace(path)
+    except FormatError as error:
+        raise InvalidValueError(f"Nobody can be added to {path}: write it by hand. {error}") from None
+    finally:
+        part.unlink(missing_ok=True)
+    return rights
 
 
 class _Authority:
@@ -243,7 +329,7 @@ class _Authority:
             raise InvalidValueError(
                 f"{folder / KEY} is missing, so nothing can be signed. Put it back, or take a new folder."
             )
-        check_private(folder / KEY)
+        _check_private(folder / KEY)
         self.certificate = _load(folder / AUTHORITY, x509.load_pem_x509_certificate, "certificate")
         self.key = _load(
             folder / KEY, lambda data: serialization.load_pem_private_key(data, None), "private key"
@@ -330,12 +416,12 @@ def _write(folder: Path, files: dict[str, Any]) -> None:
                 )
             else:
                 data = content.public_bytes(pem)
-            write_private(folder / name, data)
+            _write_private(folder / name, data)
     except OSError as error:
         raise InvalidValueError(f"{folder} cannot be written: {error.strerror}.") from None
 
 
-def write_private(path: Path, data: bytes) -> None:
+def _write_private(path: Path, data: bytes) -> None:
     """Write a file that only this user can read, as a whole."""
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:

@@ -27,12 +27,12 @@ from kineverse.model.edit import Edit
 from kineverse.model.model import Model, Snapshot
 
 from . import protocol
-from .access import make_grants
+from .access import SERVER, make_grants
 from .address import Claim, check_endpoint, check_protected
 from .authority import Authority, Result
 from .connection import describe_client
 from .meshes import MAX_PART
-from .rights import FILE_NAME, Rights
+from .rights import Rights
 from .store import Store
 from .transport import Question, Questions, Transport
 from .views import MOST_MISSED, View, Views, Wish
@@ -133,11 +133,9 @@ def serve(
 
 
 def _read_keys(folder: str | os.PathLike[str]) -> tuple[Keys, Rights]:
-    from .keys import Keys  # for those who have no need of the package cryptography
+    from .keys import read_listening  # for those who have no need of the package cryptography
 
-    keys = Keys.read(folder)
-    keys.check_valid()
-    return keys, Rights.read(keys.folder / FILE_NAME)
+    return read_listening(folder, SERVER)
 
 
 def _name_of(given: Sequence[Source]) -> str:
