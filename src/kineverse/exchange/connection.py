@@ -33,7 +33,7 @@ from .address import Address, list_endpoints
 from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
-from .transport import NoAnswerError, Transport, check_not_forked
+from .transport import LONGEST, SLOWEST, NoAnswerError, Transport, check_not_forked
 
 PATIENCE = 10.0  # time that an edit waits for a server that went away, before it is given up [s]
 _ASK_TIMEOUT = 5.0
@@ -145,7 +145,7 @@ class Connection:
                 size = MAX_PART
                 while size == MAX_PART:
                     asked = protocol.GetBackup(self.client, file.tell())
-                    size = file.write(self.ask(asked, protocol.FilePart, PATIENCE).data)
+                    size = file.write(self.ask(asked, protocol.FilePart, LONGEST).data)
                 file.flush()
                 os.fsync(file.fileno())
             with closing(Store(part)) as store:
@@ -261,11 +261,11 @@ class Connection:
 
     def join(self, wish: protocol.JoinRequest) -> protocol.Joined:
         """Join and return the model, or the part that is wished for."""
-        return self.ask(replace(wish, client=self.client, who=self.who), protocol.Joined)
+        return self.ask(replace(wish, client=self.client, who=self.who), protocol.Joined, LONGEST)
 
     def ask_missed(self, view: str) -> protocol.Missed | None:
         """Ask for the commits after the present revision; None if the server does not know this state."""
-        answer = self._ask(protocol.Since(self.client, self.who, view, *self.position), _ASK_TIMEOUT)
+        answer = self._ask(protocol.Since(self.client, self.who, view, *self.position), LONGEST)
         if isinstance(answer, protocol.Missed):
             return answer
         if isinstance(answer, protocol.Refused) and answer.reason == "stale":
@@ -275,7 +275,7 @@ class Connection:
     def fetch_part(self, sha256: str, offset: int) -> bytes | None:
         """Return a part of a file; None if the server does not have it."""
         try:
-            return self.ask(protocol.GetFile(sha256, offset), protocol.FilePart).data
+            return self.ask(protocol.GetFile(sha256, offset), protocol.FilePart, LONGEST).data
         except UnknownNameError:
             return None
 
@@ -370,9 +370,12 @@ class Connection:
             self.key(way + ("edit" if changes_model else "ask")),
             time.monotonic() + min(timeout, _ROUTING),
         )
+        # So that edits overtake what is long, on the slow connection of a site as well.
+        gives_way = not changes_model or len(data) > MAX_PART
         while True:
             try:
-                return protocol.decode_answer(self.transport.ask(key, data, timeout))
+                answer = self.transport.ask(key, data, timeout + len(data) / SLOWEST, gives_way=gives_way)
+                return protocol.decode_answer(answer)
             except NoAnswerError:
                 # For moments after a connection was made it is not known who answers.
                 if not self.is_online or time.monotonic() >= end:

@@ -26,7 +26,7 @@ from kineverse.model.operation import BODIES
 from .protocol import MeshContent
 from .store import Store
 
-MAX_PART = 1 << 24  # largest part of a file in one message [byte]
+MAX_PART = 1 << 20  # largest part of a file in one message [byte]
 
 
 class ServedFiles:

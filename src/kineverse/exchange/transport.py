@@ -34,11 +34,14 @@ Use: TypeAlias = Literal["ask", "find", "answer", "read", "publish", "show", "wa
 messages; show a sign of life, and watch those of others."""
 
 LEASE: Final = 1.0  # time after which a process that says nothing counts as gone [s]
+SLOWEST: Final = 16_384  # slowest connection that is borne [byte/s]
+LONGEST: Final = 60.0  # time that a message may take on a slow connection [s]
 
 _USER: Final = "kineverse"
 _MOST_QUESTIONS: Final = 10_000
 _END_SECONDS: Final = 0.6
 _OPEN_SECONDS: Final = 3.0  # for a server that is held up
+_LONG: Final = 65_536  # bytes of an answer that is not sent at once on any connection
 
 
 Value = TypeVar("Value")
@@ -185,7 +188,16 @@ class Question(_Owner):
         self.payload = b"" if payload is None else bytes(payload)
 
     def answer(self, payload: bytes) -> None:
-        """Send the answer; an asker who is gone gets none."""
+        """Send the answer; an asker who is gone gets none.
+
+        A long one takes a thread of its own: its asker may be behind a slow connection.
+        """
+        if len(payload) > _LONG:
+            threading.Thread(target=self._send, args=(payload,), name="kineverse-answer", daemon=True).start()
+        else:
+            self._send(payload)
+
+    def _send(self, payload: bytes) -> None:
         with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
             self._owned.reply(self._owned.key_expr, payload)
             self._owned.drop()  # else the asker waits for more
@@ -272,7 +284,7 @@ class Transport(_Owner):
         settings = {"mode": "router", "listen/endpoints": list(endpoints), "listen/exit_on_failure": True}
         if servers:
             settings |= {"connect/endpoints": list(servers), "connect/timeout_ms": -1, **_RETRY}
-            settings |= {"connect/exit_on_failure": False}
+            settings |= {"connect/exit_on_failure": False, **_NETWORK}
         if keys is not None and any(map(is_secured, endpoints)):
             trusted: list[dict[str, object]] = [{"link_protocols": ["unixsock-stream", "tcp"]}]
             if server:
@@ -312,6 +324,7 @@ class Transport(_Owner):
             "connect/exit_on_failure": True,
             "connect/timeout_ms": round(1e3 * timeout),
             **_RETRY,
+            **({} if endpoint.startswith("unixsock") else _NETWORK),
             **_credentials(secret),
             **({} if keys is None else _tls(keys, "connect")),
         }
@@ -320,11 +333,13 @@ class Transport(_Owner):
         except _zenoh().ZError:
             raise NoAnswerError(f"No server answers at {endpoint}.") from None
 
-    def ask(self, key: str, payload: bytes, timeout: float) -> bytes:
+    def ask(self, key: str, payload: bytes, timeout: float, *, gives_way: bool = False) -> bytes:
         """Return the answer to a question.
 
-        Raise a :class:`NoAnswerError` at once if nobody is there who answers; else after the timeout [s].
+        One that gives way lets other messages of the same connection overtake it and its answer. Raise a
+        :class:`NoAnswerError` at once if nobody is there who answers; else after the timeout [s].
         """
+        priorities = _zenoh().Priority
         channel: Any = _zenoh().handlers.FifoChannel(2)  # a ring would lose the answer at its end
         try:
             with _call:
@@ -336,6 +351,7 @@ class Transport(_Owner):
                     timeout=timeout,
                     consolidation=self._all,  # an answer is handed over when it comes, not when all have come
                     congestion_control=self._block,
+                    priority=priorities.DATA_LOW if gives_way else priorities.DATA,
                     cancellation_token=cancelled,
                 )
                 sample = replies.recv().ok
@@ -400,9 +416,11 @@ _SETTINGS: Final[dict[str, object]] = {
     "transport/shared_memory/enabled": False,  # files of it outlive a process that is killed
     "transport/link/tx/lease": round(1e3 * LEASE),
     "transport/link/tx/queue/size/data": 16,  # batches of 64 kB that wait for a reader before messages drop
-    # An answer to one who reads nothing holds up the others no longer than he counts as there.
-    "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * LEASE),
+    # Time that a message may take on a slow connection. That to one who reads nothing ends with the lease.
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * LONGEST),
 }
+# A batch has to arrive within the lease, as nothing else is a sign of life meanwhile.
+_NETWORK: Final[dict[str, object]] = {"transport/link/tx/batch_size": round(LEASE * SLOWEST)}
 _RETRY: Final[dict[str, object]] = {
     "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 2},
 }
