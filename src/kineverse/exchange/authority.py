@@ -118,7 +118,7 @@ class Authority:
             build(edit)
         entries = source.history.sequence
         net = NetChanges(tuple(PlacedEntry(entry, None, at_end=True) for entry in entries))
-        changes, files = protocol.encode_changes(net, entries), self.files.find(entries)
+        changes, files = protocol.encode_changes(net, entries), self.files.measure(entries)
         request = protocol.EditRequest("0" * 32, 0, who, 0, self.chain, changes, files=files)
         (result,) = self.process([request])
         if isinstance(result.answer, Refused):
@@ -326,7 +326,7 @@ class Authority:
                 who=request.who,
                 time=time.time(),
                 changes=protocol.encode_changes(net, history.sequence),
-                files=self.files.find(entries, getattr(request, "files", ())),
+                files=self.files.find(entries),
             )
             data = protocol.encode(commit)
             if len(data) > protocol.MAX_BYTES or len(entries) > protocol.MAX_OPERATIONS:
@@ -341,7 +341,7 @@ class Authority:
         files = commit.files
         put = [history.entries[entry.tag] for _, entry, _ in touched if entry is not None]
         if history.sequence is not sequence:  # all have new places
-            put, files = history.sequence, self.files.find(history.sequence, files)
+            put, files = history.sequence, self.files.find(history.sequence)
         self._batch.append(
             StoredCommit(
                 commit.revision,

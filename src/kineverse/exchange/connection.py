@@ -21,6 +21,7 @@ from msgspec.structs import replace
 from kineverse._checks import as_count, finite_number
 from kineverse.errors import (
     DuplicateNameError,
+    ForbiddenError,
     FormatError,
     InvalidValueError,
     OfflineError,
@@ -82,7 +83,8 @@ class Connection:
         self._changed = threading.Condition()
         self.user = ""
         self.transport = self._connect()
-        self._presence = self.transport.alive(self.key(f"client/{self.client}"))
+        self._identity = protocol.identify(self.user, self.client)  # to the server
+        self._presence = self.transport.alive(self.key(f"client/{self._identity}"))
 
     def _connect(self) -> Transport:
         endpoint, secret = self.address.find()
@@ -302,7 +304,7 @@ class Connection:
         self._take_sources(beat)
         if self.revision != self._told:
             self._told = self.revision
-            self.transport.publish(self.key("seen"), protocol.encode(protocol.Seen(self.client, self._told)))
+            self.transport.publish(self.key("seen"), protocol.encode(protocol.Seen(self._identity, self._told)))
 
     def wait_for(self, is_done: Callable[[], bool], timeout: float | None) -> bool:
         """Wait until something is so, which is looked at when the model or the connection changes."""
@@ -389,8 +391,8 @@ def refusal_error(answer: object, address: Address) -> Exception:
     """Return the error for an answer that is a refusal, or of another kind than was asked for."""
     if not isinstance(answer, protocol.Refused):
         return FormatError(f"{address} answered with a {type(answer).__name__}, which was not asked for.")
-    kind = UnknownNameError if answer.reason == "unknown" else FormatError
-    return kind(answer.message)
+    kinds: dict[str, type[Exception]] = {"unknown": UnknownNameError, "forbidden": ForbiddenError}
+    return kinds.get(answer.reason, FormatError)(answer.message)
 
 
 @cache

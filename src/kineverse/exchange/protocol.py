@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from kineverse.errors import FormatError
 from kineverse.formats import entry_to_bytes, operation_from_bytes
@@ -37,6 +38,7 @@ Link: TypeAlias = Annotated[bytes, Meta(max_length=32)]
 Sha256: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", max_length=64)]
 Tags: TypeAlias = Annotated[tuple[Name, ...], Meta(max_length=MAX_OPERATIONS)]
 
+_LONGEST_WHO: Final = 200  # letters of what the client of a user says of itself
 NO_CHAIN: Final = bytes(32)  # digest before the first commit
 
 
@@ -206,6 +208,23 @@ ChangeRequest: TypeAlias = EditRequest | UndoRequest
 Request: TypeAlias = (
     ChangeRequest | JoinRequest | Since | GetStatus | GetHistory | GetFile | GetBackup | Announce
 )
+
+
+def name_asker(request: Request, user: str) -> Request:
+    """Return a request under the identity and the name of a user, whatever it says of its sender."""
+    named: dict[str, str] = {}
+    if hasattr(request, "client"):
+        named["client"] = identify(user, request.client)
+    if hasattr(request, "who"):
+        said = "".join(filter(str.isprintable, request.who))
+        named["who"] = f"{user}, {said[:_LONGEST_WHO]}"
+    return replace(request, **named)
+
+
+def identify(user: str, client: str) -> str:
+    """Return the identity of a client: its own, or of a user's, one that no other user's client can have."""
+    return hashlib.sha256(f"{user}/{client}".encode()).hexdigest()[:32] if user else client
+
 
 # -- answers -------------------------------------------------------------------------------------------------
 

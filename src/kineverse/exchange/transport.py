@@ -184,7 +184,7 @@ class Question(_Owner):
 
     def __init__(self, query: Any) -> None:
         super().__init__(query)
-        payload = query.payload
+        payload, self.key = query.payload, str(query.key_expr)
         self.payload = b"" if payload is None else bytes(payload)
 
     def answer(self, payload: bytes) -> None:
