@@ -304,7 +304,9 @@ class Connection:
         self._take_sources(beat)
         if self.revision != self._told:
             self._told = self.revision
-            self.transport.publish(self.key("seen"), protocol.encode(protocol.Seen(self._identity, self._told)))
+            self.transport.publish(
+                self.key("seen"), protocol.encode(protocol.Seen(self._identity, self._told))
+            )
 
     def wait_for(self, is_done: Callable[[], bool], timeout: float | None) -> bool:
         """Wait until something is so, which is looked at when the model or the connection changes."""
