@@ -64,8 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
     made = make_keys(
         arguments.folder,
         server=arguments.server,
-        users=arguments.user,
-        relays=relays,
+        user=arguments.user,
+        relay=relays,
         days=days,
         renew=arguments.renew,
     )

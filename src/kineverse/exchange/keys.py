@@ -24,6 +24,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from kineverse._extras import install_command
+from kineverse.compilation.private_folder import NotPrivateError, PrivateFolder
 from kineverse.errors import DuplicateNameError, FormatError, InvalidValueError, MissingDependencyError
 
 try:
@@ -210,8 +211,8 @@ def make_keys(
     folder: str | os.PathLike[str],
     *,
     server: Sequence[str] = (),
-    users: Sequence[str] = (),
-    relays: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    user: Sequence[str] = (),
+    relay: Mapping[str, Sequence[str]] = MappingProxyType({}),
     days: float = 365.0,
     renew: bool = False,
 ) -> list[Path]:
@@ -225,9 +226,9 @@ def make_keys(
         Folder with ``authority``, ``server``, ``users`` and ``relays``; what is not there is made.
     server
         Names and IP addresses by which clients reach the server; none if it has its keys.
-    users
+    user
         Names of users.
-    relays
+    relay
         Names of relays, with the names and IP addresses of their hosts.
     days
         Time for which the certificates are valid [days].
@@ -240,13 +241,13 @@ def make_keys(
         wanted[root / _SERVER] = SERVER, server
     elif not (root / _SERVER / FILE_NAME).exists():
         raise InvalidValueError(f"{root} has no server yet. Name its hosts with server=, too.")
-    for name, places in relays.items():
+    for name, places in relay.items():
         wanted[root / "relays" / check_server_name(name, "relay")] = relay_name(name), places
         if not places:
             raise InvalidValueError(
                 f"The relay {name!r} needs the names of its hosts, by which clients reach it."
             )
-    for name in users:
+    for name in user:
         wanted[root / "users" / check_server_name(name, "user")] = name, ()
     if not wanted:
         raise InvalidValueError("There is nobody to make keys for: name some with server=, user= or relay=.")
@@ -255,9 +256,11 @@ def make_keys(
         if (path / KEY).exists() and not renew:
             raise DuplicateNameError(f"{path} has keys already. renew= makes new ones in their place.")
     authority = _Authority(root / "authority")
+    for path in wanted:
+        _make_folder(path)
+    _add_rights(root, user, relay)
     for path, (name, places) in wanted.items():
         authority.issue(path, name, places, days)
-    _add_rights(root, users, relays)
     return [*wanted]
 
 
@@ -407,8 +410,8 @@ def _alternatives(hosts: Sequence[str]) -> list[Any]:
 def _write(folder: Path, files: dict[str, Any]) -> None:
     """Write certificates and keys into a folder, each as a whole, for this user only."""
     pem = serialization.Encoding.PEM
+    _make_folder(folder)
     try:
-        folder.mkdir(0o700, parents=True, exist_ok=True)
         for name, content in files.items():
             if name == KEY:
                 data = content.private_bytes(
@@ -417,6 +420,15 @@ def _write(folder: Path, files: dict[str, Any]) -> None:
             else:
                 data = content.public_bytes(pem)
             _write_private(folder / name, data)
+    except OSError as error:
+        raise InvalidValueError(f"{folder} cannot be written: {error.strerror}.") from None
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        PrivateFolder(folder)
+    except NotPrivateError as error:
+        raise InvalidValueError(f"The folder {folder} {error}. Keys need one of their own.") from None
     except OSError as error:
         raise InvalidValueError(f"{folder} cannot be written: {error.strerror}.") from None
 

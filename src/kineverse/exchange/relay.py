@@ -44,7 +44,8 @@ class Relay(Closing):
     """
 
     def __init__(self, address: Address, listen: Sequence[str], keys: str | os.PathLike[str]) -> None:
-        if not address.is_secured or not all(is_secured(check_endpoint(one)) for one in listen):
+        secured = [is_secured(check_endpoint(one)) for one in listen]
+        if not address.is_secured or not secured or not all(secured):
             raise InvalidValueError(
                 "A relay connects to live:tls/HOST:PORT/NAME, and listens at tls/HOST:PORT."
             )
