@@ -383,10 +383,18 @@ class Connection:
             except NoAnswerError:
                 # For moments after a connection was made it is not known who answers.
                 if not self.is_online or time.monotonic() >= end:
-                    raise OfflineError(
-                        f"The server {self.address.name!r} does not answer. Look if it runs, by that name."
-                    ) from None
+                    raise OfflineError(self._explain_silence()) from None
                 time.sleep(_PAUSE)
+
+
+    def _explain_silence(self) -> str:
+        server = f"The server {self.address.name!r}"
+        if self.user and self.transport.is_alive(self.key("alive/*"), _ROUTING):
+            return (
+                f"{server} is there, and does not answer the user {self.user!r}: look if its rights name the "
+                "user, and those of a relay if there is one."
+            )
+        return f"{server} does not answer. Look if it runs, by that name."
 
 
 def refusal_error(answer: object, address: Address) -> Exception:

@@ -20,7 +20,7 @@ from .address import Address, check_endpoint, is_secured, list_endpoints
 from .keys import explain_refusal, read_listening
 from .transport import Transport
 
-_LONGEST_WAIT = 2.0  # time in which a server answers, or is away [s]
+_LONGEST_WAIT = 1.0  # time in which a server answers, or is away [s]
 
 
 class Relay(Closing):

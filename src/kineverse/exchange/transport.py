@@ -386,6 +386,17 @@ class Transport(_Owner):
         with self._declaring():
             return Token(self._owned[0].liveliness().declare_token(key))
 
+    def is_alive(self, key: str, timeout: float) -> bool:
+        """Return whether there is a sign of life of a key, in which ``*`` stands for any part."""
+        try:
+            with _call:
+                signs = self._owned[0].liveliness().get(key, timeout=timeout, handler=_ring(1))
+                found = signs.recv().ok is not None
+                del signs
+        except (NoAnswerError, self._error):
+            return False
+        return found
+
     def watch_alive(self, key: str) -> LifeSigns:
         """Return the signs of life of a key, in which ``*`` stands for any part between slashes."""
         with self._declaring():
