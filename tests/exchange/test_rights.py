@@ -1,4 +1,4 @@
-"""Rights of users: the file that has them, and what a server lets them do."""
+"""Rights of users: the file that has them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import pytest
 
 import kineverse as kv
 from kineverse.exchange.rights import EVERYTHING, Right, Rights
-
-# -- the file ------------------------------------------------------------------------------------------------
 
 FILE = """
 [users]

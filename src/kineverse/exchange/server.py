@@ -267,8 +267,8 @@ class Server(Closing):
         request = protocol.decode_request(question.payload)
         if question.key in (self._key("edit"), self._key("ask")):
             return request, EVERYTHING
-        user = question.key.removeprefix(self._key("user/")).rpartition("/")[0]
-        right = self._rights.users.get(user)
+        user, _, end = question.key.removeprefix(self._key("user/")).partition("/")
+        right = self._rights.users.get(user) if end in ("edit", "ask") else None
         if right is None:
             message = f"{user!r} is no user of {self.name!r}. Who runs the server enters users in its rights."
             raise RefusedError("forbidden", message, who=user)
