@@ -62,6 +62,11 @@ class Address:
                 f"{SCHEME}tcp/HOST:PORT/NAME or {SCHEME}unixsock-stream/PATH/NAME. Two places with a comma "
                 f"between them, {SCHEME}tls/HOST:PORT,tls/HOST:PORT/NAME, are tried in turn."
             )
+        if endpoint.startswith("tls/") and "[" in endpoint:  # Zenoh takes no such names of a server
+            raise FormatError(
+                f"{text!r} has an IPv6 address, and certificates are of names. Write the name of the "
+                "host, such as one in /etc/hosts."
+            )
         try:
             return cls(check_server_name(name), endpoint)
         except InvalidValueError as error:
