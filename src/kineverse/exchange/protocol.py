@@ -1,8 +1,9 @@
 """Messages between a model server and its clients, in msgpack; ``docs/protocol.md`` says what they mean.
 
 A message is the list of its fields. Operations are blobs, as in documents. A request goes to the key
-``kineverse/NAME/edit`` if it changes the model, else to ``kineverse/NAME/ask``; the answer is one message.
-Commits are published under ``kineverse/NAME/log``, and those that concern a part of the model under
+``kineverse/NAME/edit`` if it changes the model, else to ``kineverse/NAME/ask``; that of a user with a
+certificate to ``edit`` and ``ask`` below ``kineverse/NAME/user/USER``. The answer is one message. Commits are
+published under ``kineverse/NAME/log``, and those that concern a part of the model under
 ``kineverse/NAME/view/ID``.
 """
 
