@@ -157,6 +157,27 @@ def test_users_do_what_their_rights_say(site: Site, way: str, load: Callable[...
     here.close()
 
 
+def test_a_right_below_a_prefix_holds_nowhere_else(site: Site, load: Callable[..., Any]) -> None:
+    carol, here = load("carol", "direct"), kv.load("live:home")
+    with carol.edit() as edit:
+        edit.add_frame("kitchen/cup", "world", tag="cup")
+    assert here.wait(carol.version, LATE)
+    for act in (
+        lambda edit: edit.remove("joint hinge"),
+        lambda edit: edit.attach("door", "kitchen/cup", kv.translation(0, 0, 0)),
+        lambda edit: edit.constrain("kitchen/stop", 0, kv.position("hinge"), 0),
+        lambda edit: edit.replace("cup", kv.model.AddFrame("kitchen2/cup", kv.model.Frame("world", ()))),
+    ):
+        with pytest.raises(ForbiddenError, match="carol may edit below kitchen/, and"), carol.edit() as edit:
+            act(edit)
+    with pytest.raises(ForbiddenError):
+        carol.undo(1)
+    assert carol.version == here.version == site.server.revision
+    carol.undo(carol.version)
+    assert "kitchen/cup" not in carol.frames
+    here.close()
+
+
 def test_states_are_sent_by_those_who_may_edit_everything(
     way: str, load: Callable[..., Any], site: Site
 ) -> None:
