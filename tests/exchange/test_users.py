@@ -88,7 +88,7 @@ def test_who_edits_is_known_by_the_key_and_not_by_the_message(served: Server, as
     assert len(row.who) < 300
     (commit,) = served._store.last_commits(1, 100)
     kept = protocol.decode_commit(commit).client
-    assert kept == protocol.identify("carol", ME) != ME
+    assert kept == protocol.identity_of("carol", ME) != ME
     assert ask("user/carol/edit", draft(served, "pr2/x", 2, who="alice")).reason == "forbidden"
     wait_until(lambda: [one.who for one in ask("ask", protocol.GetStatus()).refusals] == ["carol, alice"])
 
@@ -137,7 +137,7 @@ def test_each_kind_of_request_asks_for_the_right(served: Server, ask: Ask, user:
     missed = ask(f"{me}/ask", protocol.Since(ME, "me", "", joined.revision, joined.chain))
     assert isinstance(missed, protocol.Missed)
     status = ask(f"{me}/ask", protocol.GetStatus())
-    assert [one.client for one in status.clients] == [protocol.identify(user, ME)]
+    assert [one.client for one in status.clients] == [protocol.identity_of(user, ME)]
     assert status.clients[0].who == f"{user}, me"
     assert isinstance(ask(f"{me}/ask", protocol.GetHistory()), protocol.CommitList)
     assert ask(f"{me}/ask", protocol.GetFile(64 * "0")).reason == "unknown"
@@ -172,7 +172,7 @@ def test_nobody_takes_the_place_of_anothers_client(served: Server, ask: Ask) -> 
     part = ask("user/alice/ask", join)
     assert isinstance(ask("user/alice/ask", BACKUP), protocol.FilePart)
     assert isinstance(ask("user/bob/ask", replace(join, frames=(), is_part=False)), protocol.Joined)
-    shown = protocol.identify("alice", ME)  # as the status names her client
+    shown = protocol.identity_of("alice", ME)  # as the status names her client
     assert (
         ask("user/bob/ask", protocol.Since(shown, "", part.view, part.revision, part.chain)).reason == "stale"
     )

@@ -83,7 +83,7 @@ class Connection:
         self._changed = threading.Condition()
         self.user = ""
         self.transport = self._connect()
-        self._identity = protocol.identify(self.user, self.client)  # to the server
+        self._identity = protocol.identity_of(self.user, self.client)  # to the server
         self._presence = self.transport.alive(self.key(f"client/{self._identity}"))
 
     def _connect(self) -> Transport:

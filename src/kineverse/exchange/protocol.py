@@ -215,14 +215,14 @@ def name_asker(request: Request, user: str) -> Request:
     """Return a request under the identity and the name of a user, whatever it says of its sender."""
     named: dict[str, str] = {}
     if hasattr(request, "client"):
-        named["client"] = identify(user, request.client)
+        named["client"] = identity_of(user, request.client)
     if hasattr(request, "who"):
         said = "".join(filter(str.isprintable, request.who))
         named["who"] = f"{user}, {said[:_LONGEST_WHO]}"
     return replace(request, **named)
 
 
-def identify(user: str, client: str) -> str:
+def identity_of(user: str, client: str) -> str:
     """Return the identity of a client: its own, or of a user's, one that no other user's client can have."""
     return hashlib.sha256(f"{user}/{client}".encode()).hexdigest()[:32] if user else client
 
