@@ -185,8 +185,10 @@ def main() -> None:
             for client in clients:
                 client.thread.join()
             tell(reply=[(client.outcomes, client.longest) for client in clients])
-        elif words[0] == "longest":
+        elif words[0] == "longest":  # since this was asked before
             tell(reply=[(client.outcomes, client.longest) for client in clients])
+            for client in clients:
+                client.longest = 0.0
         elif words[0] == "state":
             wanted = int(words[1])
             for client in clients:
