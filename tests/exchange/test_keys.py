@@ -208,7 +208,7 @@ def test_a_relay_wants_addresses_of_tls_and_keys_of_its_own(home: Path) -> None:
         (there, ["tls/127.0.0.1:1"], home / "server", "Name the folder of the relay"),
     ):
         with pytest.raises(InvalidValueError, match=message):
-            Relay(address, listen, folder)
+            Relay(str(address), listen=listen, keys=folder)
 
 
 def test_the_command_says_what_is_for_whom(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,7 @@ pytest.importorskip("zenoh")
 
 import kineverse as kv
 from kineverse.errors import ForbiddenError, OfflineError
-from kineverse.exchange import protocol
+from kineverse.exchange import protocol, transport
 from kineverse.exchange.address import Address
 from kineverse.exchange.connection import Connection
 from kineverse.exchange.keys import Keys, _Authority, make_keys
@@ -30,6 +30,8 @@ from kineverse.exchange.transport import NoAnswerError, Transport
 
 LATE = 10.0
 """Time after which a test fails [s]; what is awaited comes within milliseconds."""
+
+AS_ROUTER = {"mode": "router", "listen/endpoints": []}
 
 RIGHTS = """
 [users]
@@ -58,8 +60,11 @@ class Site(NamedTuple):
     def endpoint(self, way: str) -> str:
         return Address.parse(getattr(self, way)).endpoint
 
-    def attack(self, user: str, way: str) -> Transport:
-        return Transport.connect(self.endpoint(way), keys=Keys.read(self.keys / "users" / user))
+    def attack(self, user: str, way: str, **settings: object) -> Transport:
+        """Return a connection with the keys of a user, also as another kind of program than a client."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(transport, "_RETRY", transport._RETRY | settings)
+            return Transport.connect(self.endpoint(way), keys=Keys.read(self.keys / "users" / user))
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +89,7 @@ def site(keys: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]
         patch.setenv("KINEVERSE_RUNTIME_DIR", str(tmp_path_factory.mktemp("s", numbered=True)))
         with (
             serve(model, name="home", listen=endpoints[:1], keys=keys / "server") as server,
-            Relay(addresses[0], endpoints[1:], keys / "relays" / "site") as relay,
+            Relay(str(addresses[0]), listen=endpoints[1:], keys=keys / "relays" / "site") as relay,
         ):
             assert next(relay.watch())
             yield Site(keys, server, *map(str, addresses))
@@ -132,6 +137,22 @@ def until(holds: Callable[[], bool]) -> None:
 
 def key(end: str) -> str:
     return f"kineverse/home/{end}"
+
+
+def ask(asker: Transport, end: str) -> bytes:
+    """Return the answer to a question about the server, empty if nobody answers."""
+    try:
+        return asker.ask(key(end), protocol.encode(protocol.GetStatus()), LATE)
+    except NoAnswerError:
+        return b""
+
+
+def wait_to_be_known(attacker: Transport, user: str) -> None:
+    """Wait until what is sent would get to the server."""
+    if user == "dave":
+        until(lambda: attacker.is_alive(key("alive/*"), LATE))
+    else:
+        until(lambda: ask(attacker, f"user/{user}/ask") != b"")
 
 
 # -- what users do -------------------------------------------------------------------------------------------
@@ -303,8 +324,10 @@ def test_a_user_is_no_server(site: Site, monkeypatch: pytest.MonkeyPatch) -> Non
 # -- who is let in, and does what is not granted -------------------------------------------------------------
 
 
-@pytest.mark.parametrize("user", ["alice", "bob", "dave"])
-def test_questions_are_asked_under_the_own_name_alone(site: Site, way: str, user: str) -> None:
+@pytest.mark.parametrize(("user", "settings"), [("alice", {}), ("bob", {}), ("bob", AS_ROUTER), ("dave", {})])
+def test_questions_are_asked_under_the_own_name_alone(
+    site: Site, way: str, user: str, settings: dict[str, object]
+) -> None:
     other = "bob" if user == "alice" else "alice"
     question = protocol.encode(protocol.GetStatus())
     keys = [
@@ -315,18 +338,22 @@ def test_questions_are_asked_under_the_own_name_alone(site: Site, way: str, user
         ),
         *("edit", "ask", "user/**", "**", "*/ask", f"user/{user}/**"),
     ]
-    with closing(site.attack(user, way)) as attacker:
-        if user != "dave":
-            until(lambda: attacker.ask(key(f"user/{user}/ask"), question, LATE) != b"")
+    with closing(site.attack(user, way, **settings)) as attacker:
+        wait_to_be_known(attacker, user)
         for one in [*map(key, keys), "**", "kineverse/*/ask"]:
             with pytest.raises(NoAnswerError, match="Nobody answers"):
                 attacker.ask(one, question, LATE)
 
 
-@pytest.mark.parametrize("user", ["alice", "bob", "dave"])
-def test_only_the_server_publishes(site: Site, way: str, user: str, witness: Transport) -> None:
+@pytest.mark.parametrize(("user", "settings"), [("alice", {}), ("bob", {}), ("bob", AS_ROUTER), ("dave", {})])
+def test_only_the_server_publishes(
+    site: Site, way: str, user: str, settings: dict[str, object], witness: Transport
+) -> None:
     heard, alive = collect(witness.subscribe("**")), collect(witness.watch_alive("**"))
-    with closing(site.attack(user, way)) as attacker, closing(site.attack("alice", way)) as last:
+    with closing(site.attack(user, way, **settings)) as attacker, closing(site.attack("alice", way)) as last:
+        wait_to_be_known(attacker, user)
+        if user != "dave":
+            until(lambda: attacker.publish(key("seen"), b"first") or b"first" in heard)
         ends = ["log", "view/1", "beat", "alive/x", "user/alice/edit", "user/x", "x", "client/1"]
         ends += [] if user == "alice" else ["state/joints", "state/joints/layout"]
         ends += ["seen"] if user == "dave" else []
@@ -410,19 +437,13 @@ def test_states_and_their_layouts_are_not_forged(site: Site, way: str, witness: 
         answered = alice.answers(key("state/joints/layout"))
         threading.Thread(target=answer, args=(answered,), daemon=True).start()
 
-        def ask(asker: Transport) -> bytes:
-            try:
-                return asker.ask(key("state/joints/layout"), b"", LATE)
-            except NoAnswerError:
-                return b""
-
-        until(lambda: ask(witness) == b"true")
+        until(lambda: ask(witness, "state/joints/layout") == b"true")
         bob.publish(key("state/joints"), b"false")
         with pytest.raises(NoAnswerError):
             bob.ask(key("x"), b"", LATE)
         assert not stolen
         forged.close()  # else it would answer bob itself
-        until(lambda: ask(bob) == b"true")
+        until(lambda: ask(bob, "state/joints/layout") == b"true")
 
         def is_heard() -> bool:
             alice.publish(key("state/joints"), b"true")
@@ -455,7 +476,7 @@ def test_a_relay_waits_for_its_server_and_finds_it_again(
     def start() -> Server:
         return serve(name="home", listen=[server], keys=keys / "server", store=tmp_path / "home.db")
 
-    with Relay(Address("home", server), [relay], keys / "relays" / "site") as running:
+    with Relay(f"live:{server}/home", listen=[relay], keys=keys / "relays" / "site") as running:
         news = running.watch()
         assert not next(news)
         assert "nobody is there" in running.explain()

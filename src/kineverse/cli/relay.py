@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from kineverse.exchange.address import SCHEME, Address
+from kineverse.exchange.address import SCHEME
 
 from .arguments import require
 from .output import print_line
@@ -38,10 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Relay until interrupted."""
     require("kineverse relay", {"exchange": True})
-    address = Address.parse(arguments.server)
     from kineverse.exchange.relay import Relay  # for those who have no need of the package cryptography
 
-    with handle_interrupts(), Relay(address, arguments.listen, arguments.keys) as relay:
+    with handle_interrupts(), Relay(arguments.server, listen=arguments.listen, keys=arguments.keys) as relay:
+        address = relay.address
         users = ", ".join(relay.rights.users) or "nobody"
         print(
             f"{relay.keys.name} of {address.name}, for {users}   (Ctrl-C ends)",

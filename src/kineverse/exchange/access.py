@@ -1,4 +1,4 @@
-"""Who may use which keys of a model server through an endpoint of TLS; what is not here is refused there.
+"""Access to the keys of a model server through endpoints of TLS: what is not granted here is refused there.
 
 A user asks questions under keys of its own, so the server knows the asker by the key. Only the server itself
 publishes commits and signs of life, answers questions, and sees who is there.

@@ -14,7 +14,7 @@ from contextlib import closing, suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from msgspec.structs import replace
 
@@ -35,6 +35,9 @@ from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
 from .transport import LONGEST, SLOWEST, NoAnswerError, Transport, check_not_forked
+
+if TYPE_CHECKING:
+    from .keys import Keys
 
 PATIENCE = 10.0  # time that an edit waits for a server that went away, before it is given up [s]
 _ASK_TIMEOUT = 5.0
@@ -81,28 +84,29 @@ class Connection:
         self._numbers = count(1)
         self._told = -1
         self._changed = threading.Condition()
-        self.user = ""
+        self._keys: Keys | None = None
+        if address.is_secured:
+            from .keys import Keys  # for those who have no need of the package cryptography
+
+            self._keys = Keys.read()
+        self.user = "" if self._keys is None else self._keys.user
         self.transport = self._connect()
         self._identity = protocol.identity_of(self.user, self.client)  # to the server
         self._presence = self.transport.alive(self.key(f"client/{self._identity}"))
 
     def _connect(self) -> Transport:
         endpoint, secret = self.address.find()
-        keys = None
-        if self.address.is_secured:
-            from .keys import Keys, explain_refusal  # for those who have no need of the package cryptography
-
-            keys = Keys.read()
-            self.user = keys.user
         try:
-            return Transport.connect(endpoint, secret, keys=keys)
+            return Transport.connect(endpoint, secret, keys=self._keys)
         except NoAnswerError:
             pass
-        if keys is None:
+        if self._keys is None:
             raise OfflineError(
                 f"No model server answers at {endpoint}. Start it, or mend the address {str(self.address)!r}."
             )
-        reasons = "; ".join(explain_refusal(one, keys) for one in list_endpoints(endpoint))
+        from .keys import explain_refusal
+
+        reasons = "; ".join(explain_refusal(one, self._keys) for one in list_endpoints(endpoint))
         raise OfflineError(f"There is no connection with {self.address}. {reasons}.")
 
     def close(self) -> None:
@@ -257,6 +261,8 @@ class Connection:
         """Raise an OfflineError if the server is away."""
         self.check_open()
         if not self.is_online:
+            if self._keys is not None and self._keys.has_ended:
+                raise OfflineError(f"{self._keys.certificate} has expired: ask for new keys, and load again.")
             raise OfflineError(
                 f"The server of {self.address} is away. The model can be read, and edited when it is back."
             )
@@ -386,10 +392,9 @@ class Connection:
                     raise OfflineError(self._explain_silence()) from None
                 time.sleep(_PAUSE)
 
-
     def _explain_silence(self) -> str:
         server = f"The server {self.address.name!r}"
-        if self.user and self.transport.is_alive(self.key("alive/*"), _ROUTING):
+        if self.user and self.is_online and self.transport.is_alive(self.key("alive/*"), _ROUTING):
             return (
                 f"{server} is there, and does not answer the user {self.user!r}: look if its rights name the "
                 "user, and those of a relay if there is one."

@@ -122,6 +122,11 @@ class Keys:
             ) from None
 
     @property
+    def has_ended(self) -> bool:
+        """True if the certificate has expired."""
+        return self.ends <= datetime.now(UTC)
+
+    @property
     def hosts(self) -> tuple[str, ...]:
         """Names and addresses of the hosts that the certificate is for."""
         certificate = _load(self.certificate, x509.load_pem_x509_certificate, "certificate")
@@ -141,7 +146,7 @@ def read_listening(folder: str | os.PathLike[str], owner: str) -> tuple[Keys, Ri
         raise InvalidValueError(
             f"The keys in {keys.folder} are those of {keys.name!r}. Name the folder of the {owner}."
         )
-    if keys.ends <= datetime.now(UTC):
+    if keys.has_ended:
         raise InvalidValueError(
             f"The certificate in {keys.folder} expired on {keys.ends:%Y-%m-%d}. 'kineverse keys' makes "
             "another one with --renew."
@@ -184,6 +189,8 @@ def explain_refusal(endpoint: str, keys: Keys) -> str:
     context = ssl.create_default_context(cafile=keys.authority)
     context.load_cert_chain(keys.certificate, keys.private_key)
     reason = "it takes the keys, but is no model server, or busy"
+    if keys.has_ended:
+        reason = _ALERTS["CERTIFICATE_EXPIRED"]
     try:
         with (
             socket.create_connection((host, port), _SECONDS) as plain,
@@ -218,22 +225,11 @@ def make_keys(
 ) -> list[Path]:
     """Make keys of an authority in a folder, and return their folders.
 
-    New users may see, and new relays speak for all users; ``rights.toml`` in the server's folder says so.
-
-    Parameters
-    ----------
-    folder
-        Folder with ``authority``, ``server``, ``users`` and ``relays``; what is not there is made.
-    server
-        Names and IP addresses by which clients reach the server; none if it has its keys.
-    user
-        Names of users.
-    relay
-        Names of relays, with the names and IP addresses of their hosts.
-    days
-        Time for which the certificates are valid [days].
-    renew
-        Whether those who have keys get new ones; otherwise that is a DuplicateNameError.
+    The folder has ``authority``, ``server``, ``users`` and ``relays``; what is not there is made. The server,
+    which is named first of all, and the relays have names or IP addresses of hosts, by which clients reach
+    them. New users may see, and new relays speak for all users: that is in the server's ``rights.toml``.
+    The certificates are valid for a number of days. Those who have keys get new ones if that is said;
+    otherwise that is a DuplicateNameError.
     """
     root = Path(folder).expanduser().absolute()
     wanted: dict[Path, tuple[str, Sequence[str]]] = {}

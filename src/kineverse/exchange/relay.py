@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from threading import Thread
 
+from kineverse._checks import as_entries
 from kineverse._runtime import Closing
 from kineverse.errors import InvalidValueError
 
@@ -24,42 +25,50 @@ _LONGEST_WAIT = 1.0  # time in which a server answers, or is away [s]
 
 
 class Relay(Closing):
-    """Relay to a server, from the start until it is closed; it connects as soon as the server is there.
+    """Relay to a model server, which runs until it is closed. It connects as soon as the server is there.
 
     Parameters
     ----------
     address
-        Address of the server, of TLS.
+        Address of the server, ``live:tls/HOST:PORT/NAME``.
     listen
-        Endpoints of TLS.
+        Endpoints for clients, ``tls/HOST:PORT``.
     keys
-        Folder with the keys of the relay, and ``rights.toml`` about its users.
+        Folder with the keys of the relay, and ``rights.toml`` about its users; ``kineverse keys`` makes it.
+
+    Attributes
+    ----------
+    address, keys, rights
+        Address of the server, the relay's keys, and its rights.
 
     Raises
     ------
     InvalidValueError
         For keys or endpoints that cannot be used.
     FormatError
-        For rights that cannot be read.
+        For an address that is none, or rights that cannot be read.
+    MissingDependencyError
+        Without the extra ``exchange``.
     """
 
-    def __init__(self, address: Address, listen: Sequence[str], keys: str | os.PathLike[str]) -> None:
-        secured = [is_secured(check_endpoint(one)) for one in listen]
-        if not address.is_secured or not secured or not all(secured):
+    def __init__(self, address: str, *, listen: Iterable[str], keys: str | os.PathLike[str]) -> None:
+        self.address = Address.parse(address)
+        endpoints = as_entries("listen=", listen, str, "endpoints")
+        secured = [is_secured(check_endpoint(one)) for one in endpoints]
+        if not self.address.is_secured or not secured or not all(secured):
             raise InvalidValueError(
                 "A relay connects to live:tls/HOST:PORT/NAME, and listens at tls/HOST:PORT."
             )
-        self.address = address
         self.keys, self.rights = read_listening(keys, RELAY)
         self._transport = Transport.serve(
-            listen,
+            endpoints,
             keys=self.keys,
-            grants=make_grants(address.name, self.rights),
-            servers=list_endpoints(address.endpoint),
+            grants=make_grants(self.address.name, self.rights),
+            servers=list_endpoints(self.address.endpoint),
             server=SERVER,
         )
         self._signs: SimpleQueue[tuple[str, bool]] = SimpleQueue()
-        signs = self._transport.watch_alive(f"kineverse/{address.name}/alive/*")
+        signs = self._transport.watch_alive(f"kineverse/{self.address.name}/alive/*")
         Thread(
             target=lambda: deque(map(self._signs.put, signs), 0), name="kineverse-relay", daemon=True
         ).start()

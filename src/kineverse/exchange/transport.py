@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from .keys import Keys
 
 Use: TypeAlias = Literal["ask", "find", "answer", "read", "publish", "show", "watch"]
-"""What a client does with a key: ask questions, find who answers them, answer them; read and publish
-messages; show a sign of life, and watch those of others."""
+"""Uses of a key: to ask questions, find who answers them, and answer them; to read and to publish messages;
+to show a sign of life, and to watch those of others."""
 
 LEASE: Final = 1.0  # time after which a process that says nothing counts as gone [s]
 SLOWEST: Final = 16_384  # slowest connection that is borne [byte/s]
