@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from random import Random
 from typing import Any
 
 import msgspec
 import pytest
+from faults import edits
 from faults.edits import Capped, Twice
 from replicas import Act, Replica, content
 
 import kineverse as kv
+from hypothesis_profiles import attempts
 from kineverse.exchange import protocol
 from kineverse.exchange.authority import Authority
 from kineverse.exchange.protocol import Changes, Committed, Refused
-from kineverse.exchange.rights import EVERYTHING, Right
+from kineverse.exchange.rights import EVERYTHING, Right, find_forbidden
 from kineverse.exchange.store import Store
 from kineverse.model import Edit
 from kineverse.model.basic_operations import SetBody, SetData, SetHome
 from kineverse.model.body import Body
+from kineverse.model.history import History
 from kineverse.model.operation import Writes
 from kineverse.model.read_recorder import ReadRecorder
 
@@ -452,3 +457,43 @@ def test_undo_needs_the_right_for_what_it_restores(is_restarted: bool) -> None:
     assert ask(authority, carol.undo(3), EVERYTHING).revision == 8
     assert content(authority.model) != before
     check_forbidden(authority, carol.undo(8))
+
+
+# -- anything ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(attempts(8)))
+def test_no_edit_changes_an_operation_that_its_user_may_not_edit(seed: int) -> None:
+    random, authority = Random(seed), Authority(Store(None))
+    entries = edits.build().history.sequence
+
+    def fill(edit: Edit) -> None:
+        for entry in entries:
+            edit.apply(entry.operation, entry.tag)
+
+    def list_others(history: History) -> list[tuple[str, Any]]:
+        """Return what the user may not edit, in order; what is run again is the same operation."""
+        others = [one for one in history.sequence if find_forbidden(right, one.tag, one.writes)]
+        return [(one.tag, getattr(one.operation, "given", None)) for one in others]
+
+    def act(edit: Edit, tag: str) -> None:
+        edits.do_something(edit, random, tag)
+
+    authority.fill(fill, "me")
+    right, replica = Right(("part/", "more/"), "carol"), Replica(authority)
+    answers = set[tuple[bool, str]]()
+    for count in range(60):
+        try:
+            request: Any = replica.draft(partial(act, tag=f"{count}"))
+        except kv.KineverseError:  # refused by the client's own model
+            continue
+        if random.random() < 0.2:
+            request = replica.undo(random.randint(1, authority.revision))
+        is_limited = random.random() < 0.7
+        before = list_others(authority.model.history)
+        results = authority.process([request], [right if is_limited else EVERYTHING])
+        replica.follow(results)
+        answers.add((is_limited, getattr(results[0].answer, "reason", "")))
+        assert not is_limited or list_others(authority.model.history) == before
+    assert content(replica.model) == content(authority.model)
+    assert {(True, ""), (True, "forbidden"), (False, "")} <= answers
