@@ -14,6 +14,7 @@ pytest.importorskip("cryptography")
 pytest.importorskip("zenoh")
 
 from kineverse.cli import main
+from kineverse.cli.serve import list_addresses
 from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError
 from kineverse.exchange.access import RELAY, SERVER
 from kineverse.exchange.address import Address, check_protected
@@ -209,6 +210,17 @@ def test_a_relay_wants_addresses_of_tls_and_keys_of_its_own(home: Path) -> None:
     ):
         with pytest.raises(InvalidValueError, match=message):
             Relay(str(address), listen=listen, keys=folder)
+
+
+def test_addresses_for_clients_have_a_host_of_the_certificate(home: Path) -> None:
+    endpoints = ["tls/0.0.0.0:1", "tls/[::]:2", "tls/127.0.0.1:3", "unixsock-stream//x"]
+    assert list_addresses(endpoints, "home", str(home / "server")) == [
+        "live:tls/home.lan:1/home",
+        "live:tls/home.lan:2/home",
+        "live:tls/127.0.0.1:3/home",
+        "live:unixsock-stream//x/home",
+    ]
+    assert list_addresses(["tcp/0.0.0.0:1"], "home", None) == ["live:tcp/0.0.0.0:1/home"]
 
 
 def test_the_command_says_what_is_for_whom(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
