@@ -16,12 +16,14 @@ pytest.importorskip("zenoh")
 from kineverse.cli import main
 from kineverse.cli.serve import list_addresses
 from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError
-from kineverse.exchange.access import RELAY, SERVER
+from kineverse.exchange import keys
+from kineverse.exchange.access import RELAY
 from kineverse.exchange.address import Address, check_protected
 from kineverse.exchange.keys import Keys, make_keys, read_listening
 from kineverse.exchange.relay import Relay
 from kineverse.exchange.rights import Right, Rights
 from kineverse.exchange.server import serve
+from kineverse.exchange.transport import SERVER
 
 
 @pytest.fixture
@@ -97,13 +99,20 @@ def test_for_others_nothing_is_made(home: Path, given: dict[str, Any], message: 
     assert not [*home.glob("*/*/key.pem")][2:]
 
 
-def test_without_an_authority_or_a_server_nothing_is_made(home: Path, tmp_path: Path) -> None:
+def test_without_an_authority_or_a_server_nothing_is_made(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InvalidValueError, match="no server yet"):
         make_keys(tmp_path / "other", user=["alice"])
     assert not (tmp_path / "other").exists()
     (home / "authority" / "key.pem").unlink()
     with pytest.raises(InvalidValueError, match="nothing can be signed"):
         make_keys(home, user=["bob"])
+    with monkeypatch.context() as patch:
+        patch.setattr(keys, "_AUTHORITY_DAYS", -1)
+        make_keys(tmp_path / "old", server=["a"], days=-2)
+    with pytest.raises(InvalidValueError, match=r"authority in .* has expired"):
+        make_keys(tmp_path / "old", user=["bob"])
     (tmp_path / "file").touch()
     with pytest.raises(InvalidValueError, match="cannot be written"):
         make_keys(tmp_path / "file", server=["a"])
@@ -236,7 +245,7 @@ def test_the_command_says_what_is_for_whom(tmp_path: Path, capsys: pytest.Captur
         (["--user", "a/b"], "no name of a user"),
         (["--relay", "kiel"], "hosts"),
         (["--days", "0"], "--days"),
-        (["--days", "1e9"], "--days"),
+        (["--user", "eve", "--days", "1e9"], "--days is at most"),
         ([], "--server"),
     ):
         assert main(["keys", folder, *wrong]) == 2

@@ -26,7 +26,7 @@ from kineverse.exchange.connection import Connection
 from kineverse.exchange.keys import Keys, _Authority, make_keys
 from kineverse.exchange.relay import Relay
 from kineverse.exchange.server import Server, serve
-from kineverse.exchange.transport import NoAnswerError, Transport
+from kineverse.exchange.transport import Grant, NoAnswerError, Transport
 
 LATE = 10.0
 """Time after which a test fails [s]; what is awaited comes within milliseconds."""
@@ -319,6 +319,34 @@ def test_a_user_is_no_server(site: Site, monkeypatch: pytest.MonkeyPatch) -> Non
         pytest.raises(OfflineError),
     ):
         Connection(Address("home", endpoint))
+
+
+def test_a_server_by_another_name_is_not_listened_to(
+    keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh takes the certificates of public authorities, too; they are never those of a model server."""
+    with monkeypatch.context() as patch:
+        patch.setattr("kineverse.exchange.keys.SERVER", "localhost")
+        _Authority(keys / "authority").issue(tmp_path / "public", "localhost", ["localhost"], 1.0)
+    endpoint, heard = f"tls/localhost:{free_port()}", []
+    everybody = [Grant(use, ("**",), None) for use in transport._FLOWS]
+    users = Keys.read(keys / "users" / "alice")
+    with closing(Transport.serve([endpoint], keys=Keys.read(tmp_path / "public"), grants=everybody)) as false:
+        asked = [collect(false.answers(key(end))) for end in ("user/*/ask", "ask")]
+        token = false.alive(key("alive/x"))
+        news = Relay(
+            f"live:{endpoint}/home", listen=[f"tls/localhost:{free_port()}"], keys=keys / "relays/site"
+        )
+        with closing(Transport.connect(endpoint, keys=users)) as alice, news:
+            heard = collect(alice.subscribe("**"))
+            assert ask(alice, "user/alice/ask") == b""
+            assert not alice.is_alive(key("alive/*"), LATE)
+            false.publish(key("log"), b"false")
+            assert not next(news.watch())  # after a second
+            assert ask(alice, "user/alice/ask") == b""
+        token.close()
+    assert not heard
+    assert not any(asked)
 
 
 # -- who is let in, and does what is not granted -------------------------------------------------------------

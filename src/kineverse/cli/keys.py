@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 
 from kineverse._checks import as_positive
-from kineverse.errors import InvalidValueError
 
 from .arguments import print_notes, require
 from .output import format_table
@@ -23,9 +22,6 @@ examples:
   kineverse keys home-keys --user carol
   kineverse keys home-keys --relay hamburg relay.hamburg.example.org
   kineverse keys home-keys --user bob --renew"""
-
-MOST_DAYS = 3650
-"""Days for which an authority is valid."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,8 +52,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Make the keys, and print what goes where."""
     require("kineverse keys", {"exchange": True})
     days = as_positive(arguments.days, "--days")
-    if days > MOST_DAYS:
-        raise InvalidValueError(f"--days is at most {MOST_DAYS}, the time of the authority.")
     from kineverse.exchange.keys import make_keys  # for those who have no need of the package cryptography
 
     relays = {name: hosts for name, *hosts in arguments.relay}

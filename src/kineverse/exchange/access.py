@@ -11,8 +11,7 @@ from typing import Final
 from .rights import Rights
 from .transport import Grant, Use
 
-SERVER: Final = "model server"  # common name in the certificate of a server
-RELAY: Final = "relay"  # and that in front of the name of a relay
+RELAY: Final = "relay"  # in front of the name of a relay in its certificate
 
 SEE: Final[tuple[tuple[Use, str], ...]] = (
     ("find", "user/*/ask"),
@@ -52,16 +51,11 @@ def make_grants(name: str, rights: Rights) -> list[Grant]:
     who |= {relay_name(relay): users for relay, users in rights.relays.items() if users}
     may_edit = {user for user, right in rights.users.items() if right.may_edit_all}
     lists = (
-        (ANYBODY, ()),
+        (ANYBODY, None),
         (SEE, tuple(who)),
         (EDIT_ALL, tuple(one for one, users in who.items() if may_edit & {*users})),
     )
-    grants = [
-        Grant(use, (f"kineverse/{name}/{key}",), names)
-        for uses, names in lists
-        for use, key in uses
-        if names or uses is ANYBODY
-    ]
+    grants = [Grant(use, (f"kineverse/{name}/{key}",), names) for uses, names in lists for use, key in uses]
     for one, users in who.items():
         keys = tuple(f"kineverse/{name}/{key.format(user)}" for user in users for _, key in OWN)
         grants.append(Grant("ask", keys, (one,)))

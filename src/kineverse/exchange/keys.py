@@ -2,7 +2,8 @@
 
 A folder of keys has ``ca.pem``, the certificate of the authority, ``cert.pem``, that of the owner, and
 ``key.pem``, which only the owner may read. The common name of a certificate is the name of a user,
-``relay NAME`` or ``model server``: names of users have no spaces, so nobody is taken for another kind.
+``relay NAME`` or ``model server``: names of users have no spaces, so nobody is taken for another kind. To its
+clients, a relay is a model server, by ``server.pem``.
 """
 
 from __future__ import annotations
@@ -37,11 +38,12 @@ except ImportError:
         f"Keys of model servers need the package cryptography: {install_command('exchange')}"
     ) from None
 
-from .access import SERVER, relay_name
+from .access import relay_name
 from .address import check_server_name, split_endpoint
 from .rights import FILE_NAME, Right, Rights
+from .transport import SERVER
 
-AUTHORITY, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
+AUTHORITY, CERTIFICATE, LISTENING, KEY = "ca.pem", "cert.pem", "server.pem", "key.pem"
 _SERVER: Final = "server"
 _RIGHTS: Final = """\
 # Who may do what: "see", "edit", or a list of prefixes below which one edits, such as ["kitchen/"].
@@ -73,7 +75,7 @@ class Keys:
         although it is private, that is an InvalidValueError.
         """
         path = _default_folder() if folder is None else Path(folder).expanduser().absolute()
-        missing = [name for name in (AUTHORITY, CERTIFICATE, KEY) if not (path / name).is_file()]
+        missing = [name for name in (AUTHORITY, CERTIFICATE, KEY) if not os.path.isfile(path / name)]
         if missing:
             raise InvalidValueError(
                 f"The keys in {path} are not complete: {' and '.join(missing)} missing. "
@@ -88,6 +90,8 @@ class Keys:
         _load(path / AUTHORITY, x509.load_pem_x509_certificate, "certificate")
         try:
             ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(path / CERTIFICATE, path / KEY, "")
+        except PermissionError as error:
+            raise InvalidValueError(f"{path / KEY} cannot be read: {error.strerror}.") from None
         except (ssl.SSLError, ValueError):
             raise InvalidValueError(
                 f"{path / KEY} is not the key of {path / CERTIFICATE}. Copy both from one folder."
@@ -104,6 +108,12 @@ class Keys:
     def certificate(self) -> Path:
         """File of the owner's certificate."""
         return self.folder / CERTIFICATE
+
+    @property
+    def listening(self) -> Path:
+        """File of the certificate that clients are shown: the owner's, save for a relay."""
+        path = self.folder / LISTENING
+        return path if path.exists() else self.certificate
 
     @property
     def private_key(self) -> Path:
@@ -129,7 +139,7 @@ class Keys:
     @property
     def hosts(self) -> tuple[str, ...]:
         """Names and addresses of the hosts that the certificate is for."""
-        certificate = _load(self.certificate, x509.load_pem_x509_certificate, "certificate")
+        certificate = _load(self.listening, x509.load_pem_x509_certificate, "certificate")
         with contextlib.suppress(x509.ExtensionNotFound, ValueError):
             found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
             return tuple(str(name.value) for name in found)
@@ -167,6 +177,11 @@ def _check_private(path: Path) -> None:
 
 _UNTRUSTED: Final = "its certificate is of another authority than {ca}: it is a foreign server"
 _REASONS: Final[dict[int, str]] = {  # codes of OpenSSL
+    18: _UNTRUSTED,
+    19: _UNTRUSTED,
+    20: _UNTRUSTED,
+    21: _UNTRUSTED,
+    26: "its certificate is that of a user, and of no server",
     9: "its certificate is not valid yet; look at the clocks of both computers",
     10: "its certificate has expired: its owner has to renew it",
     62: "its certificate is for another host than {host}: it is a foreign server, or the address is wrong",
@@ -200,10 +215,10 @@ def explain_refusal(endpoint: str, keys: Keys) -> str:
             with contextlib.suppress(TimeoutError):
                 secured.recv(1)
     except ssl.SSLCertVerificationError as error:
-        reason = _REASONS.get(error.verify_code, _UNTRUSTED)
+        reason = _REASONS.get(error.verify_code, f"its certificate is not valid ({error.verify_message})")
     except ssl.SSLError as error:
         alert = next((alert for alert in _ALERTS if alert in (error.reason or "")), "")
-        reason = _ALERTS.get(alert, f"the connection was refused ({error.reason})")
+        reason = _ALERTS.get(alert, f"the connection was refused ({error.reason or error})")
     except TimeoutError:
         reason = f"nobody answers within {_SECONDS:g} s"
     except (OSError, OverflowError) as error:
@@ -231,6 +246,8 @@ def make_keys(
     The certificates are valid for a number of days. Those who have keys get new ones if that is said;
     otherwise that is a DuplicateNameError.
     """
+    if not days <= _AUTHORITY_DAYS:
+        raise InvalidValueError(f"days= is at most {_AUTHORITY_DAYS}, the time of an authority.")
     root = Path(folder).expanduser().absolute()
     wanted: dict[Path, tuple[str, Sequence[str]]] = {}
     if server:
@@ -263,8 +280,8 @@ def make_keys(
 def _add_rights(root: Path, users: Iterable[str], relays: Iterable[str]) -> None:
     """Add those who are not in the server's rights, and write those of a relay, which are a part of them."""
     path = root / _SERVER / FILE_NAME
-    text = path.read_text("utf-8") if path.exists() else _RIGHTS
     there = Rights.read(path) if path.exists() else Rights()
+    text = path.read_text("utf-8") if path.exists() else _RIGHTS
     new = [user for user in users if user not in there.users]
     text = _add_lines(text, "users", [f'{_key(user)} = "see"' for user in new])
     spoken = json.dumps([*there.users, *new])
@@ -317,12 +334,12 @@ class _Authority:
             name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Kineverse {secrets.token_hex(4)}")])
             usage = dict.fromkeys(_USAGES, False) | {"key_cert_sign": True, "crl_sign": True}
             builder = (
-                _builder(name, name, self.key.public_key(), _AUTHORITY_DAYS)
+                _builder(name, name, self.key.public_key(), datetime.now(UTC) + timedelta(_AUTHORITY_DAYS))
                 .add_extension(x509.BasicConstraints(True, 0), critical=True)
                 .add_extension(x509.KeyUsage(**usage), critical=True)
             )
             self.certificate = builder.sign(self.key, hashes.SHA256())
-            _write(folder, {AUTHORITY: self.certificate, KEY: self.key})
+            _write(folder, {KEY: self.key, AUTHORITY: self.certificate})
             return
         if not (folder / KEY).exists():
             raise InvalidValueError(
@@ -333,27 +350,37 @@ class _Authority:
         self.key = _load(
             folder / KEY, lambda data: serialization.load_pem_private_key(data, None), "private key"
         )
+        if self.certificate.not_valid_after_utc <= datetime.now(UTC):
+            raise InvalidValueError(f"The authority in {folder} has expired. Take a new folder.")
 
     def issue(self, folder: Path, name: str, hosts: Sequence[str], days: float) -> None:
-        """Write the keys of an owner; one who has hosts can be a server, and all but the server a client."""
+        """Write the keys of an owner: with hosts it can be a server, and with another name a client."""
         key = _make_key()
-        uses = [ExtendedKeyUsageOID.SERVER_AUTH] * bool(hosts)
-        uses += [ExtendedKeyUsageOID.CLIENT_AUTH] * (name != SERVER)
+        files = {KEY: key, AUTHORITY: self.certificate}
+        if hosts:
+            files[CERTIFICATE if name == SERVER else LISTENING] = self._sign(key, SERVER, hosts, days)
+        if name != SERVER:
+            files[CERTIFICATE] = self._sign(key, name, (), days)
+        _write(folder, files)
+
+    def _sign(self, key: Any, name: str, hosts: Sequence[str], days: float) -> x509.Certificate:
+        use = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
         usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True}
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        end = min(datetime.now(UTC) + timedelta(days), self.certificate.not_valid_after_utc)
         builder = (
-            _builder(subject, self.certificate.subject, key.public_key(), days)
+            _builder(subject, self.certificate.subject, key.public_key(), end)
             .add_extension(x509.BasicConstraints(False, None), critical=True)
             .add_extension(x509.KeyUsage(**usage), critical=True)
-            .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+            .add_extension(x509.ExtendedKeyUsage([use]), critical=False)
             .add_extension(
                 x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), critical=False
             )
         )
         if hosts:
             builder = builder.add_extension(x509.SubjectAlternativeName(_alternatives(hosts)), critical=False)
-        certificate = builder.sign(self.key, hashes.SHA256())
-        _write(folder, {AUTHORITY: self.certificate, CERTIFICATE: certificate, KEY: key})
+        certificate: x509.Certificate = builder.sign(self.key, hashes.SHA256())
+        return certificate
 
 
 _USAGES: Final = (
@@ -373,16 +400,14 @@ def _make_key() -> Any:
     return ec.generate_private_key(ec.SECP256R1())
 
 
-def _builder(subject: Any, issuer: Any, key: Any, days: float) -> Any:
-    now = datetime.now(UTC)
-    end = now + timedelta(days=days)
+def _builder(subject: Any, issuer: Any, key: Any, end: datetime) -> Any:
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(min(now, end) - _EARLIER)
+        .not_valid_before(min(datetime.now(UTC), end) - _EARLIER)
         .not_valid_after(end)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )

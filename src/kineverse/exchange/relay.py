@@ -16,7 +16,7 @@ from kineverse._checks import as_entries
 from kineverse._runtime import Closing
 from kineverse.errors import InvalidValueError
 
-from .access import RELAY, SERVER, make_grants
+from .access import RELAY, make_grants
 from .address import Address, check_endpoint, is_secured, list_endpoints
 from .keys import explain_refusal, read_listening
 from .transport import Transport
@@ -65,7 +65,6 @@ class Relay(Closing):
             keys=self.keys,
             grants=make_grants(self.address.name, self.rights),
             servers=list_endpoints(self.address.endpoint),
-            server=SERVER,
         )
         self._signs: SimpleQueue[tuple[str, bool]] = SimpleQueue()
         signs = self._transport.watch_alive(f"kineverse/{self.address.name}/alive/*")

@@ -27,7 +27,7 @@ from kineverse.model.edit import Edit
 from kineverse.model.model import Model, Snapshot
 
 from . import protocol
-from .access import SERVER, make_grants
+from .access import make_grants
 from .address import Claim, check_endpoint, check_protected
 from .authority import Authority, Result
 from .conflicts import RefusedError
@@ -36,7 +36,7 @@ from .meshes import MAX_PART
 from .rights import EVERYTHING, Right, Rights
 from .state import THROUGH_SERVER
 from .store import Store
-from .transport import Question, Questions, Transport
+from .transport import SERVER, Question, Questions, Transport
 from .views import MOST_MISSED, View, Views, Wish
 
 if TYPE_CHECKING:

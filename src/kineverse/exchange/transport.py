@@ -33,6 +33,7 @@ Use: TypeAlias = Literal["ask", "find", "answer", "read", "publish", "show", "wa
 """Uses of a key: to ask questions, find who answers them, and answer them; to read and to publish messages;
 to show a sign of life, and to watch those of others."""
 
+SERVER: Final = "model server"  # common name in the certificate that a server or relay listens with
 LEASE: Final = 1.0  # time after which a process that says nothing counts as gone [s]
 SLOWEST: Final = 16_384  # slowest connection that is borne [byte/s]
 LONGEST: Final = 60.0  # time that a message may take on a slow connection [s]
@@ -55,12 +56,12 @@ class NoAnswerError(Exception):
 class Grant:
     """Permission to use some keys, for those with certain names in their certificates.
 
-    Without names it is for everybody with a certificate of the authority.
+    If the names are None, it is for everybody with a certificate of the authority.
     """
 
     use: Use
     keys: tuple[str, ...]
-    names: tuple[str, ...] = ()
+    names: tuple[str, ...] | None
 
 
 class _Entrances:
@@ -270,14 +271,13 @@ class Transport(_Owner):
         keys: Keys | None = None,
         grants: Sequence[Grant] = (),
         servers: Sequence[str] = (),
-        server: str = "",
     ) -> Transport:
         """Listen at endpoints, for clients that know the secret if there is one.
 
         At endpoints of TLS clients need a certificate of the authority in the folder of keys, and may do what
-        they are granted. All others may do everything. With ``servers`` it is a relay: it connects to them,
-        one after the other until one is there, and that may do everything if ``server`` is the name in its
-        certificate. An endpoint that is taken, or none to listen at, is an InvalidValueError.
+        they are granted. All others may do everything. With ``servers`` it is a relay, with keys: it connects
+        to one of them as soon as it is there, which may do everything. An endpoint that is taken, or none to
+        listen at, is an InvalidValueError.
         """
         for endpoint in endpoints:
             check_endpoint(endpoint)
@@ -286,11 +286,10 @@ class Transport(_Owner):
             settings |= {"connect/endpoints": list(servers), "connect/timeout_ms": -1, **_RETRY}
             settings |= {"connect/exit_on_failure": False, **_NETWORK}
         if keys is not None and any(map(is_secured, endpoints)):
-            trusted: list[dict[str, object]] = [{"link_protocols": ["unixsock-stream", "tcp"]}]
-            if server:
-                trusted.append({"cert_common_names": [server]})
-            settings |= _tls(keys, "listen", *["connect"] * bool(servers))
-            settings |= {"access_control": _access_control(trusted, grants)}
+            trusted: dict[str, object] = (
+                _A_SERVER if servers else {"link_protocols": ["unixsock-stream", "tcp"]}
+            )
+            settings |= {**_tls(keys, listens=True), **_access_control(trusted, grants)}
         with contextlib.ExitStack() as stack:
             if secret:
                 folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -326,7 +325,8 @@ class Transport(_Owner):
             **_RETRY,
             **({} if endpoint.startswith("unixsock") else _NETWORK),
             **_credentials(secret),
-            **({} if keys is None else _tls(keys, "connect")),
+            # Zenoh takes certificates of public authorities as well, which are those of no model server.
+            **({} if keys is None else _tls(keys) | _access_control(_A_SERVER)),
         }
         try:
             return cls(settings)
@@ -436,6 +436,8 @@ _RETRY: Final[dict[str, object]] = {
     "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 2},
 }
 
+_A_SERVER: Final[dict[str, object]] = {"cert_common_names": [SERVER]}
+
 # Messages of Zenoh that a client sends to this process (ingress) and gets from it (egress) for a use.
 _FLOWS: Final[Mapping[Use, Mapping[str, Sequence[str]]]] = {
     "ask": {"ingress": ["query"], "egress": ["reply"]},
@@ -454,13 +456,13 @@ _FLOWS: Final[Mapping[Use, Mapping[str, Sequence[str]]]] = {
 }
 
 
-def _tls(keys: Keys, *sides: str) -> dict[str, object]:
-    files = {"root_ca_certificate": str(keys.authority)}
-    for side in sides:
-        files |= {f"{side}_certificate": str(keys.certificate), f"{side}_private_key": str(keys.private_key)}
+def _tls(keys: Keys, listens: bool = False) -> dict[str, object]:
+    own = {"connect": keys.certificate} | ({"listen": keys.listening} if listens else {})
     return {
         "transport/link/tls": {
-            **files,
+            "root_ca_certificate": str(keys.authority),
+            **{f"{side}_certificate": str(certificate) for side, certificate in own.items()},
+            **{f"{side}_private_key": str(keys.private_key) for side in own},
             "enable_mtls": True,
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
@@ -468,33 +470,40 @@ def _tls(keys: Keys, *sides: str) -> dict[str, object]:
     }
 
 
-def _access_control(trusted: Sequence[dict[str, object]], grants: Sequence[Grant]) -> dict[str, object]:
+def _access_control(trusted: dict[str, object], grants: Sequence[Grant] = ()) -> dict[str, object]:
     """Return rules by which the trusted may do everything, others what is granted, and nothing else."""
     everything = sorted({message for flows in _FLOWS.values() for some in flows.values() for message in some})
-    rules = [_rule("all", "ingress", everything, ["**"]), _rule("all", "egress", everything, ["**"])]
-    subjects = [{"id": f"trusted {number}", **subject} for number, subject in enumerate(trusted)]
-    policies = [{"rules": ["all ingress", "all egress"], "subjects": [one["id"] for one in subjects]}]
-    for number, grant in enumerate(grants):
-        subject = {"cert_common_names": [*grant.names]} if grant.names else {"link_protocols": ["tls"]}
-        subjects.append({"id": f"subject {number}", **subject})
-        granted = [
-            _rule(f"grant {number}", flow, messages, grant.keys)
-            for flow, messages in _FLOWS[grant.use].items()
-        ]
-        rules += granted
-        policies.append({"rules": [rule["id"] for rule in granted], "subjects": [f"subject {number}"]})
+    rules: list[dict[str, object]] = []
+    subjects: list[dict[str, object]] = []
+    policies: list[dict[str, object]] = []
+
+    def allow(subject: dict[str, object], flows: Mapping[str, Sequence[str]], keys: Sequence[str]) -> None:
+        name = f"grant {len(subjects)}"
+        granted = [_rule(f"{name} {flow}", flow, messages, keys) for flow, messages in flows.items()]
+        rules.extend(granted)
+        subjects.append({"id": name, **subject})
+        policies.append({"rules": [rule["id"] for rule in granted], "subjects": [name]})
+
+    allow(trusted, {"ingress": everything, "egress": everything}, ["**"])
+    for grant in grants:
+        if grant.names is None:
+            allow({"link_protocols": ["tls"]}, _FLOWS[grant.use], grant.keys)
+        elif grant.names:
+            allow({"cert_common_names": [*grant.names]}, _FLOWS[grant.use], grant.keys)
     return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": rules,
+            "subjects": subjects,
+            "policies": policies,
+        }
     }
 
 
 def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> dict[str, object]:
     return {
-        "id": f"{name} {flow}",
+        "id": name,
         "permission": "allow",
         "messages": [*messages],
         "flows": [flow],
