@@ -158,7 +158,9 @@ def wait_to_be_known(attacker: Transport, user: str) -> None:
 # -- what users do -------------------------------------------------------------------------------------------
 
 
-def test_users_do_what_their_rights_say(site: Site, way: str, load: Callable[..., Any]) -> None:
+def test_users_do_what_their_rights_say(
+    site: Site, way: str, load: Callable[..., Any], tmp_path: Path
+) -> None:
     alice, bob = load("alice", way), load("bob", way, frames=["door"])
     here = kv.load("live:home")
     before = alice.version
@@ -170,10 +172,17 @@ def test_users_do_what_their_rights_say(site: Site, way: str, load: Callable[...
     assert here.exchange.history(1)[0].who.startswith("alice, ")
     with pytest.raises(ForbiddenError, match="bob may see, and not edit"), bob.edit() as edit:
         edit.remove("joint hinge")
+    with pytest.raises(kv.errors.KineverseError, match="bob may see"):
+        bob.exchange.backup(tmp_path / "copy.db")
+    alice.exchange.backup(tmp_path / "copy.db")
+    alice.undo(alice.version)
     with here.edit() as edit:
-        edit.remove(f"frame door/{way}")
+        edit.add_frame(f"{way}", "world")
     assert alice.wait(here.version, LATE)
-    assert site.server.revision == before + 2
+    assert site.server.revision == before + 3
+    assert {*alice.frames} == {*here.frames}
+    names = {one.who.partition(", ")[0] for one in bob.exchange.status().clients}
+    assert {"alice", "bob"} <= names
     assert (alice.exchange.user, bob.exchange.user, here.exchange.user) == ("alice", "bob", "")
     here.close()
 
