@@ -360,27 +360,34 @@ class Authority:
     def _check_done(self, right: Right) -> None:
         """Refuse an edit that has done what a right does not cover, whatever it said.
 
-        What the user may edit has to stay so where it is run again, by this edit or by a later one of others:
-        an operation without a trace is then made from its parameters, which need not fit its writes.
+        What the user may edit has to stay so where it is run again, by this edit or by a later one of others.
         """
         if right.may_edit_all:
             return
-        history = self.model.history
-        for before, now, is_given in history.touched():
+        for before, now, is_given in self.model.history.touched():
             if not is_given and (before is None or find_forbidden(right, before.tag, before.writes)):
                 continue
             _check_right(right, (before, now))
-            operation = None if now is None else now.operation
-            if now is None or not isinstance(operation, OpaqueOperation) or operation.trace is not None:
-                continue
-            if now.reads.cells or now.reads.listings:
-                try:
-                    anew = operation.run_anew(history.reader_at(now.place, Reads()))
-                    writes = now.writes if anew is None else anew.writes()
-                except Exception as error:
-                    message = f"{now.tag!r} has other parameters than it was made from: {error}"
-                    raise RefusedError("refused", message, now.tag) from None
-                _check_right(right, (replace(now, writes=writes),))
+            if now is not None and (before is None or now.operation is not before.operation):
+                self._check_parameters(right, now)  # it is from the client, or from the store
+
+    def _check_parameters(self, right: Right, entry: HistoryEntry) -> None:
+        """Refuse an operation that would write elsewhere, or nothing, if it were made anew.
+
+        One without a trace is made from its parameters when it is run again, and these need not fit what it
+        says that it has written.
+        """
+        operation, reads = entry.operation, entry.reads
+        if not isinstance(operation, OpaqueOperation) or operation.trace is not None:
+            return
+        if reads.cells or reads.listings:
+            try:
+                anew = operation.run_anew(self.model.history.reader_at(entry.place, Reads()))
+                writes = entry.writes if anew is None else anew.writes()
+            except Exception as error:
+                message = f"{entry.tag!r} has other parameters than it was made from: {error}"
+                raise RefusedError("refused", message, entry.tag) from None
+            _check_right(right, (replace(entry, writes=writes),))
 
     def _find_replaced(self, tag: str) -> Replaced:
         history = self.model.history
