@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ pytest.importorskip("zenoh")
 
 from kineverse.cli import main
 from kineverse.cli.serve import list_addresses
-from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError
+from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError, MissingDependencyError
 from kineverse.exchange import keys
 from kineverse.exchange.access import RELAY
 from kineverse.exchange.address import Address, check_protected
@@ -219,6 +221,13 @@ def test_a_relay_wants_addresses_of_tls_and_keys_of_its_own(home: Path) -> None:
     ):
         with pytest.raises(InvalidValueError, match=message):
             Relay(str(address), listen=listen, keys=folder)
+
+
+def test_the_package_of_certificates_can_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    monkeypatch.delitem(sys.modules, "kineverse.exchange.keys")
+    with pytest.raises(MissingDependencyError, match="need the package cryptography"):
+        importlib.import_module("kineverse.exchange.keys")
 
 
 def test_addresses_for_clients_have_a_host_of_the_certificate(home: Path) -> None:
