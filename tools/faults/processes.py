@@ -33,6 +33,7 @@ class Process:
             encoding="utf-8",
             env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         )
+        self.id = self._process.pid
         self.told: list[dict[str, Any]] = []
         self._replies: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, daemon=True)
