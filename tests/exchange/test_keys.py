@@ -243,7 +243,19 @@ def test_addresses_for_clients_have_a_host_of_the_certificate(home: Path) -> Non
 
 def test_the_command_says_what_is_for_whom(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = str(tmp_path / "k")
-    words = ["keys", folder, "--server", "home.lan", "--user", "alice", "bob", "--relay", "hamburg", "h.lan"]
+    words = [
+        "keys",
+        folder,
+        "--server",
+        "home.lan",
+        "--user",
+        "alice",
+        "bob",
+        "bob",
+        "--relay",
+        "hamburg",
+        "h.lan",
+    ]
     assert main(words) == 0
     printed = capsys.readouterr()
     for name in ("authority", "server", "user alice", "user bob", "relay hamburg"):

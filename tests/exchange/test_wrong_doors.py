@@ -253,6 +253,9 @@ def foreign(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(ours / "cert.pem", folder / "users authority" / "ca.pem")
     _Authority(folder / "users authority").issue(folder / "signed by a user", "bob", (), 1.0)
     shutil.copy(ours / "ca.pem", folder / "signed by a user" / "ca.pem")
+    shutil.copytree(folder / "signed by a user", folder / "a chain")
+    with (folder / "a chain" / "cert.pem").open("a") as chain:
+        chain.write((ours / "cert.pem").read_text())
     shutil.copytree(site.keys / "server", folder / "of the server")
     return folder
 
@@ -266,7 +269,8 @@ def foreign(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ),
         ("foreign", "does not know the authority of .*cert.pem"),
         ("expired", "cert.pem has expired"),
-        ("signed by a user", "the connection was refused|does not know the authority"),
+        ("signed by a user", "does not know the authority of .*cert.pem"),
+        ("a chain", "the connection was refused"),
     ],
 )
 def test_wrong_keys_are_refused_with_a_reason(

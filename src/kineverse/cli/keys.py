@@ -54,7 +54,9 @@ def run(arguments: argparse.Namespace) -> int:
     days = as_positive(arguments.days, "--days")
     from kineverse.exchange.keys import make_keys  # for those who have no need of the package cryptography
 
-    relays = {name: hosts for name, *hosts in arguments.relay}
+    relays: dict[str, list[str]] = {}
+    for name, *hosts in arguments.relay:
+        relays.setdefault(name, []).extend(hosts)
     made = make_keys(
         arguments.folder,
         server=arguments.server,

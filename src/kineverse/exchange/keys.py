@@ -282,7 +282,7 @@ def _add_rights(root: Path, users: Iterable[str], relays: Iterable[str]) -> None
     path = root / _SERVER / FILE_NAME
     there = Rights.read(path) if path.exists() else Rights()
     text = path.read_text("utf-8") if path.exists() else _RIGHTS
-    new = [user for user in users if user not in there.users]
+    new = [user for user in dict.fromkeys(users) if user not in there.users]
     text = _add_lines(text, "users", [f'{_key(user)} = "see"' for user in new])
     spoken = json.dumps([*there.users, *new])
     lines = [f"{_key(relay)} = {spoken}" for relay in relays if relay not in there.relays]
