@@ -19,7 +19,7 @@ from kineverse.cli import main
 from kineverse.cli.serve import list_addresses
 from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError, MissingDependencyError
 from kineverse.exchange import keys
-from kineverse.exchange.access import RELAY
+from kineverse.exchange.access import RELAY, make_grants
 from kineverse.exchange.address import Address, check_protected
 from kineverse.exchange.keys import Keys, make_keys, read_listening
 from kineverse.exchange.relay import Relay
@@ -174,6 +174,24 @@ def test_keys_are_found_in_the_configuration(home: Path, monkeypatch: pytest.Mon
         Keys.read()
     shutil.copytree(home / "users" / "alice", home / "kineverse" / "keys")
     assert Keys.read().user == "alice"
+
+
+def test_a_relay_is_granted_what_its_users_may_together() -> None:
+    users = {"ann": Right((), "ann"), "ben": Right(("",), "ben"), "cleo": Right(("kitchen/",), "cleo")}
+    grants = make_grants("home", Rights(users, {"r": ("ann", "cleo"), "s": ("ann", "ben"), "none": ()}))
+
+    def granted(use: str, end: str) -> set[str]:
+        found = [grant for grant in grants if grant.use == use and f"kineverse/home/{end}" in grant.keys]
+        return {name for grant in found for name in grant.names or ("everybody",)}
+
+    assert granted("publish", "state/*") == granted("answer", "state/*/layout") == {"ben", "relay s"}
+    assert granted("read", "log") == {"ann", "ben", "cleo", "relay r", "relay s"}
+    assert granted("ask", "user/ann/edit") == {"ann", "relay r", "relay s"}
+    assert granted("ask", "user/cleo/ask") == {"cleo", "relay r"}
+    assert granted("watch", "alive/*") == {"everybody"}
+    assert {
+        end for end in ("edit", "ask", "log", "beat", "alive/*", "view/*") if granted("publish", end)
+    } == set()
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:1", "tcp/[::]:1", "tcp/home.lan:1", "tcp/192.0.2.1:1"])
