@@ -18,7 +18,9 @@ import pytest
 pytest.importorskip("zenoh")
 pytest.importorskip("cryptography")
 
+from faults.costs import write_on_paper
 from faults.edge import HOST, find_port
+from figures.pages import DOCS, find_blocks
 
 import kineverse as kv
 from kineverse.cli.command_line import make_parser
@@ -145,3 +147,8 @@ def wait_for(process: subprocess.Popen[str], beginning: str) -> None:
         if line.startswith(beginning):
             return
     pytest.fail("".join(told))
+
+
+def test_the_table_on_paper_follows_from_the_costs() -> None:
+    blocks = {block.name: block.tables[0] for block in find_blocks(DOCS / "deployment.md")}
+    assert write_on_paper(blocks["costs"].rows) == [*blocks["on-paper"].rows]

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,19 @@ def _cpu_time(process: int) -> float:
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(edits: int, clients: int, seconds: float) -> list[Row]:
-    """Return the rows of costs, by some edits before some clients, and in some seconds with few edits."""
+@dataclass(frozen=True)
+class Size:
+    """Size of the measurement: edits in a row, clients, seconds with few edits, and turns of all of that."""
+
+    edits: int
+    clients: int
+    seconds: float
+    turns: int = 4
+
+
+def measure(size: Size) -> list[Row]:
+    """Return the rows of costs."""
+    edits, clients = size.edits, size.clients
     with folder() as path, ExitStack() as running:
         home = Home(running, path, 1, secured=True)
         home.near.kill()
@@ -90,13 +102,13 @@ def measure(edits: int, clients: int, seconds: float) -> list[Row]:
         follower = start(
             running, "client", "followers", 1, 1, *[f"whole@{home.endpoint(others.port)}"] * clients
         )
-        direct = _split(editor, follower, others, [server], edits, seconds, alone[2]) / clients
+        direct = _split(editor, follower, others, [server], size) / clients
         follower.kill()
 
         port = find_port()
         relay = home.start_relay(site.port, port)
         follower = start(running, "client", "site", 1, 1, *[f"whole@{home.endpoint(port)}"] * clients)
-        relayed = _split(editor, follower, site, [server, relay.pid], edits, seconds, alone[2])
+        relayed = _split(editor, follower, site, [server, relay.pid], size)
         follower.kill()
 
         state = _measure_state(editor, own, home, others, edits)
@@ -104,8 +116,9 @@ def measure(edits: int, clients: int, seconds: float) -> list[Row]:
             with editor.edit() as edit:
                 edit.include(name)
         meter = Meter(others, server)
-        load("whole", home.endpoint(others.port)).close()
-        joined = meter.read(1)
+        for _ in range(clients):
+            load("whole", home.endpoint(others.port)).close()
+        joined = meter.read(clients)
     return [
         _row(EDIT, *alone),
         _row(CLIENT, None, *direct[1, 1:], relayed[1, 3] / clients),
@@ -117,31 +130,37 @@ def measure(edits: int, clients: int, seconds: float) -> list[Row]:
     ]
 
 
-def _split(
-    editor: LiveModel,
-    follower: Process,
-    proxy: Proxy,
-    processes: Sequence[int],
-    edits: int,
-    seconds: float,
-    alone: float,
-) -> Any:
+def _split(editor: LiveModel, follower: Process, proxy: Proxy, processes: Sequence[int], size: Size) -> Any:
     """Return costs of a second and of an edit, beside those of the server alone, by few edits and by many.
 
-    Columns are bytes up and down, and CPU times of processes, the first of which is the server.
+    Columns are bytes up and down, and CPU times of processes, the first of which is the server. The computer
+    does other things as well, so clients are cut off and let through in turn.
     """
-    totals, times = [], []
-    for number, pause in ((round(seconds / SELDOM), SELDOM), (edits, PAUSE)):
-        meter, begin = Meter(proxy, *processes), time.monotonic()
-        _edit(editor, number, follower, pause)
-        totals.append(meter.read(1))
-        totals[-1][2] -= number * alone
-        times.append((time.monotonic() - begin, number))
-    return np.linalg.solve(times, totals)
+    alone, few, many = (np.zeros(4 + len(processes)) for _ in range(3))
+    for _ in range(size.turns):
+        for total, number, pause in (
+            (alone, size.edits, PAUSE),
+            (few, size.seconds / SELDOM, SELDOM),
+            (many, size.edits, PAUSE),
+        ):
+            if total is alone:
+                proxy.cut("reset")
+            else:
+                proxy.heal()
+                follower.ask("follow", editor.version)
+            time.sleep(SELDOM)
+            meter, begin, made = Meter(proxy, *processes), time.monotonic(), round(number / size.turns)
+            _edit(editor, made, pause)
+            if total is not alone:
+                follower.ask("follow", editor.version)
+            total += [time.monotonic() - begin, made, *meter.read(1)]
+    for total in (few, many):
+        total[4] -= total[1] * alone[4] / alone[1]
+    return np.linalg.solve([few[:2], many[:2]], [few[2:], many[2:]])
 
 
-def _edit(editor: LiveModel, number: int, follower: Process | None = None, pause: float = PAUSE) -> None:
-    """Put a frame at another place, again and again, and wait until others have that.
+def _edit(editor: LiveModel, number: int, pause: float = PAUSE) -> None:
+    """Put a frame at another place, again and again.
 
     Others are in one process, and would ask for what they have no time to take.
     """
@@ -149,8 +168,6 @@ def _edit(editor: LiveModel, number: int, follower: Process | None = None, pause
         with editor.edit() as edit:
             count_on(edit)
         time.sleep(pause)
-    if follower is not None:
-        follower.ask("follow", editor.version)
 
 
 def _measure_state(
@@ -211,9 +228,9 @@ def _round(number: float) -> float:
     return float(f"{number:.2g}")
 
 
-def format_tables(edits: int, clients: int, seconds: float) -> str:
+def format_tables(size: Size) -> str:
     """Return both tables in Markdown."""
-    rows = measure(edits, clients, seconds)
+    rows = measure(size)
     tables = ("Costs", HEAD, rows), ("On paper", ON_PAPER_HEAD, write_on_paper(rows))
     return "\n".join(f"## {title}\n\n{Table(head, tuple(cells))}" for title, head, cells in tables)
 
@@ -229,4 +246,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> Iterator[str]:
     """Yield both tables."""
-    yield "\n" + format_tables(given.edits, given.clients, given.seconds)
+    yield "\n" + format_tables(Size(given.edits, given.clients, given.seconds))
