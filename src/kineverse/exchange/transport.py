@@ -42,7 +42,8 @@ _USER: Final = "kineverse"
 _MOST_QUESTIONS: Final = 10_000
 _END_SECONDS: Final = 0.6
 _OPEN_SECONDS: Final = 3.0  # for a server that is held up
-_LONG: Final = 65_536  # bytes of an answer that is not sent at once on any connection
+_PART: Final = 16_384  # most bytes of an answer that are sent in one message
+_MOST_PARTS: Final = 8_192
 
 
 Value = TypeVar("Value")
@@ -191,16 +192,19 @@ class Question(_Owner):
     def answer(self, payload: bytes) -> None:
         """Send the answer; an asker who is gone gets none.
 
-        A long one takes a thread of its own: its asker may be behind a slow connection.
+        A long one is sent in parts by a thread of its own: its asker may be behind a slow connection, and
+        Zenoh holds up others while it waits to send a message.
         """
-        if len(payload) > _LONG:
+        if len(payload) > _PART:
             threading.Thread(target=self._send, args=(payload,), name="kineverse-answer", daemon=True).start()
         else:
             self._send(payload)
 
     def _send(self, payload: bytes) -> None:
         with contextlib.suppress(NoAnswerError, _zenoh().ZError), _call:
-            self._owned.reply(self._owned.key_expr, payload)
+            size = str(len(payload)) if len(payload) > _PART else None
+            for start in range(0, max(1, len(payload)), _PART):
+                self._owned.reply(self._owned.key_expr, payload[start : start + _PART], attachment=size)
             self._owned.drop()  # else the asker waits for more
 
 
@@ -340,7 +344,7 @@ class Transport(_Owner):
         :class:`NoAnswerError` at once if nobody is there who answers; else after the timeout [s].
         """
         priorities = _zenoh().Priority
-        channel: Any = _zenoh().handlers.FifoChannel(2)  # a ring would lose the answer at its end
+        channel: Any = _zenoh().handlers.FifoChannel(_MOST_PARTS)  # a ring would lose the answer at its end
         try:
             with _call:
                 session, cancelled = self._owned
@@ -354,10 +358,9 @@ class Transport(_Owner):
                     priority=priorities.DATA_LOW if gives_way else priorities.DATA,
                     cancellation_token=cancelled,
                 )
-                sample = replies.recv().ok
-                answer = None if sample is None else bytes(sample.payload)
-                del replies, sample, session, cancelled
-        except self._error:
+                answer = _join(replies)
+                del replies, session, cancelled
+        except (self._error, ValueError):
             raise NoAnswerError(f"Nobody answers {key}.") from None
         if answer is None:
             raise NoAnswerError(f"No answer from {key} within {timeout:g} s.")
@@ -515,6 +518,18 @@ def _credentials(secret: str) -> dict[str, object]:
     if not secret:
         return {}
     return {"transport/auth/usrpwd/user": _USER, "transport/auth/usrpwd/password": secret}
+
+
+def _join(replies: Any) -> bytes | None:
+    """Return an answer from its parts, each of which comes with the size of all; None for an error."""
+    parts, size = list[bytes](), 0
+    while not parts or size > len(parts) * _PART:
+        sample = replies.recv().ok
+        if sample is None:
+            return None
+        size = 0 if sample.attachment is None else int(bytes(sample.attachment))
+        parts.append(bytes(sample.payload))
+    return b"".join(parts)
 
 
 def _ring(most: int) -> Any:
