@@ -149,4 +149,5 @@ def _socket() -> socket.socket:
     one = socket.socket()
     one.setblocking(False)
     one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _CHUNK)  # so that a sender feels a low rate
     return one
