@@ -36,20 +36,20 @@ def test_a_full_disk_refuses_edits_until_there_is_room() -> None:
 
 
 def test_random_edits_end_in_the_same_model_everywhere_whatever_the_clock() -> None:
-    found = faults.try_edits(300, 4, 1, "jump")
-    assert found["made"] > 100
+    found = faults.try_edits(200, 4, 1, "jump")
+    assert found["made"] > 60
     assert found["conflict"] > 5
 
 
 def test_nobody_is_held_up_by_a_process_that_stands_still() -> None:
-    found = faults.try_freezing(1.6, 1, most=BUSY)
+    found = faults.try_freezing(1.3, 1, most=BUSY)
     assert found["made"] > 10
 
 
 def test_nonsense_is_refused_and_harms_nobody() -> None:
-    found = faults.try_messages(2000, 200, 1, senders=1, most=BUSY)
-    assert found["malformed"] > 500
-    assert found["Committed"] > 20
+    found = faults.try_messages(1000, 100, 1, senders=1, most=BUSY)
+    assert found["malformed"] > 250
+    assert found["Committed"] > 10
     assert "failed" not in found
 
 
@@ -59,7 +59,7 @@ def test_nonsense_is_refused_and_harms_nobody() -> None:
 )
 def test_what_was_acknowledged_survives_partitions(route: str) -> None:
     """Both kinds of cuts; clients notice it, edit again, and have what was edited at the server's side."""
-    found = edge.try_partitions(2, 1.5, 1, route, most=BUSY)
+    found = edge.try_partitions(2, 1.2, 1, route, most=BUSY)
     assert found["edits meanwhile"] > 10
     assert found["made"] > found["edits meanwhile"]
 

@@ -108,7 +108,7 @@ def measure(size: Size) -> list[Row]:
         port = find_port()
         relay = home.start_relay(site.port, port)
         follower = start(running, "client", "site", 1, 1, *[f"whole@{home.endpoint(port)}"] * clients)
-        relayed = _split(editor, follower, site, [server, relay.pid], size)
+        relayed = _split(editor, follower, site, [server, relay.id], size)
         follower.kill()
 
         state = _measure_state(editor, own, home, others, edits)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import socket
-import subprocess
-import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -89,26 +87,10 @@ class Home:
         self.clients[client] = len(kinds)
         return client
 
-    def start_relay(self, server: int, port: int) -> subprocess.Popen[str]:
+    def start_relay(self, server: int, port: int) -> Process:
         """Start a relay between two ports, and return when it is connected."""
-        relay = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "kineverse", "relay", f"live:{self.endpoint(server)}/{NAME}"),
-                *("--listen", self.endpoint(port), "--keys", str(self._keys / "relays" / "site")),
-            ],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            encoding="utf-8",
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        )
-        self._running.callback(kill, relay)
-        assert relay.stdout is not None
-        told: list[str] = []
-        while not (told and told[-1].startswith("connected")):
-            told.append(relay.stdout.readline())
-            check(told[-1] != "", f"a relay has ended: {''.join(told)}")
-        return relay
+        address, keys = f"live:{self.endpoint(server)}/{NAME}", self._keys / "relays" / "site"
+        return start(self._running, "relayed", address, self.endpoint(port), keys)
 
     def check(self) -> int:
         """Let all pause, and check that all have what was acknowledged; return the revision."""
@@ -152,12 +134,6 @@ class Home:
         for how, times in self.longest.items():
             check(min(times) < most, f"an edit took {min(times):.2f} s or more whenever others had a {how}")
         return dict(found + stop(self.clients))
-
-
-def kill(process: subprocess.Popen[str]) -> None:
-    """Kill a process, and wait for its end."""
-    with process:  # which closes its pipe, and waits
-        process.kill()
 
 
 # -- partitions ----------------------------------------------------------------------------------------------
@@ -223,7 +199,7 @@ def try_relays(kills: int, seed: int, most: float = HELD_UP) -> dict[str, int]:
         for number in range(kills):
             wait_for_edits(home.near, one, both)
             since, killed = len(one.told), number % len(relays)
-            kill(relays[killed])
+            relays[killed].kill()
             begin = time.monotonic()
             wait_for_edits(both)
             _note(found, "edits by another relay after ms", begin)

@@ -24,10 +24,9 @@ from unittest.mock import patch
 PATIENCE = 60.0
 """Time after which a process that says nothing counts as a violation [s]."""
 
-
 # Processes are forked from one that has imported what takes a second of CPU time, and does nothing else.
 _context = multiprocessing.get_context("forkserver")
-_context.set_forkserver_preload(["zenoh", "faults.client", "faults.messages", "kineverse.exchange.server"])
+_context.set_forkserver_preload(["zenoh", "faults.messages", "faults.relayed", "kineverse.exchange.server"])
 
 
 class Process:
