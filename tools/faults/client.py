@@ -22,7 +22,7 @@ from .edits import PARTS, add_chain, add_constraints, count_on, do_something, re
 from .processes import commands, tell
 from .served import NAME
 
-PAUSE = 0.05
+PAUSE = 0.02
 """Longest time between two edits of one who edits until it is stopped [s]."""
 
 
