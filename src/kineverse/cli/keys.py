@@ -27,19 +27,12 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("folder", metavar="FOLDER", help="folder of the authority and of all keys")
-    for option, name, what in (
-        ("--server", "HOST", "names and IP addresses by which clients reach the server"),
-        ("--user", "NAME", "names of users"),
+    for option, name, action, what in (
+        ("--server", "HOST", "extend", "names and IP addresses by which clients reach the server"),
+        ("--user", "NAME", "extend", "names of users"),
+        ("--relay", ("NAME", "HOST"), "append", "name of a relay, and its hosts"),
     ):
-        parser.add_argument(option, metavar=name, nargs="+", action="extend", default=[], help=what)
-    parser.add_argument(
-        "--relay",
-        metavar=("NAME", "HOST"),
-        nargs="+",
-        action="append",
-        default=[],
-        help="name of a relay, and its hosts",
-    )
+        parser.add_argument(option, metavar=name, nargs="+", action=action, default=[], help=what)
     parser.add_argument(
         "--days", metavar="N", type=float, default=365.0, help="days for which the keys are valid (365)"
     )
@@ -77,5 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
             owner, where = "server", "kineverse serve ... --keys FOLDER"
         rows.append((owner, str(root / place), where))
     print(format_table(("keys of", "folder", "to be used as"), rows, "<<<"))
-    print_notes(["new users may see; who may edit is in rights.toml of the server, and of each relay"])
+    print_notes(
+        ["rights.toml of the server, and of each relay, says who may edit; they read it when they start"]
+    )
     return 0

@@ -49,12 +49,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "times",
     )
     parser.add_argument(
-        "--keys", metavar="FOLDER", help="keys of the server, from kineverse keys, for endpoints of TLS"
+        "--keys",
+        metavar="FOLDER",
+        help="folder with the keys of the server, which 'kineverse keys' makes, for tls/",
     )
     parser.add_argument(
         "--insecure",
         action="store_true",
-        help="listen at tcp/HOST:PORT for other computers, whoever uses them, without encryption",
+        help="allow tcp/HOST:PORT, where whoever reaches it may edit everything, without encryption",
     )
     parser.add_argument(
         "--durable",

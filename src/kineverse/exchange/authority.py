@@ -33,7 +33,7 @@ from . import protocol
 from .conflicts import KEPT, RefusedError, Revisions
 from .meshes import ServedFiles, put_contents
 from .protocol import CommitMessage, Committed, Published, Refused
-from .rights import EVERYTHING, Right, find_forbidden
+from .rights import EVERYTHING, Right, check_right, find_forbidden
 from .store import Replaced, Store, StoredCommit
 from .views import LOAD_THE_WHOLE, is_partial
 
@@ -230,7 +230,7 @@ class Authority:
         self._seconds["decode"] = perf_counter() - begin
         begin = perf_counter()
         own = _find_own(net)
-        _check_right(right, (*map(history.entries.get, own), *(placed.entry for placed in put)))
+        check_right(right, (*map(history.entries.get, own), *(placed.entry for placed in put)))
         if not is_newest:
             entries = [placed.entry for placed in put]
             self._revisions.check(request.base, entries, changes.moved, changes.removed, history)
@@ -367,7 +367,7 @@ class Authority:
         for before, now, is_given in self.model.history.touched():
             if not is_given and (before is None or find_forbidden(right, before.tag, before.writes)):
                 continue
-            _check_right(right, (before, now))
+            check_right(right, (before, now))
             if now is not None and (before is None or now.operation is not before.operation):
                 self._check_parameters(right, now)  # it is from the client, or from the store
 
@@ -387,7 +387,7 @@ class Authority:
             except Exception as error:
                 message = f"{entry.tag!r} has other parameters than it was made from: {error}"
                 raise RefusedError("refused", message, entry.tag) from None
-            _check_right(right, (replace(entry, writes=writes),))
+            check_right(right, (replace(entry, writes=writes),))
 
     def _find_replaced(self, tag: str) -> Replaced:
         history = self.model.history
@@ -408,7 +408,7 @@ class Authority:
             raise RefusedError("unknown", message)
         if revision in kept:
             commit = kept[revision]
-            _check_right(right, (entry for pair in commit.values() for entry in pair))
+            check_right(right, (entry for pair in commit.values() for entry in pair))
             return self._fold(request, right, lambda edit: self._take_back(edit, revision), commit)
         net = _find_inverse(self._store, self.model.history, revision)
         return self._fold(request, right, lambda edit: self._adopt(edit, net), _find_own(net))
@@ -491,14 +491,6 @@ def _choose_reruns(
 def _reads_any(entry: HistoryEntry, cells: set[tuple[str, str]]) -> bool:
     kinds = {kind for kind, _ in cells}
     return not (cells.isdisjoint(entry.reads.cells) and kinds.isdisjoint(entry.reads.listings))
-
-
-def _check_right(right: Right, entries: Iterable[HistoryEntry | None]) -> None:
-    """Raise a RefusedError if a right does not cover what some entries write."""
-    for entry in entries:
-        error = None if entry is None else find_forbidden(right, entry.tag, entry.writes)
-        if error is not None:
-            raise error
 
 
 def _find_own(changes: NetChanges) -> list[str]:

@@ -396,8 +396,8 @@ class Connection:
         server = f"The server {self.address.name!r}"
         if self.user and self.is_online and self.transport.is_alive(self.key("alive/*"), _ROUTING):
             return (
-                f"{server} is there, and does not answer the user {self.user!r}: look if its rights name the "
-                "user, and those of a relay if there is one."
+                f"{server} is there, and does not answer the user {self.user!r}: rights.toml of the server, "
+                "or of the relay, does not name this user, or has been changed since the start."
             )
         return f"{server} does not answer. Look if it runs, by that name."
 

@@ -82,7 +82,7 @@ class Keys:
                 + (
                     "Put those that you were given there, or name another folder in KINEVERSE_KEYS."
                     if folder is None
-                    else "'kineverse keys' makes such folders."
+                    else "'kineverse keys FOLDER' makes them, in FOLDER/server and FOLDER/relays/NAME."
                 )
             )
         _check_private(path / KEY)
@@ -176,16 +176,15 @@ def _check_private(path: Path) -> None:
 # -- why a connection is refused -----------------------------------------------------------------------------
 
 _UNTRUSTED: Final = "its certificate is of another authority than {ca}: it is a foreign server"
+_ELSEWHERE: Final = (
+    "its certificate is for another host than {host}: it is a foreign server, or the address is wrong"
+)
 _REASONS: Final[dict[int, str]] = {  # codes of OpenSSL
-    18: _UNTRUSTED,
-    19: _UNTRUSTED,
-    20: _UNTRUSTED,
-    21: _UNTRUSTED,
+    **dict.fromkeys((18, 19, 20, 21), _UNTRUSTED),
+    **dict.fromkeys((62, 64), _ELSEWHERE),
     26: "its certificate is that of a user, and of no server",
     9: "its certificate is not valid yet; look at the clocks of both computers",
     10: "its certificate has expired: its owner has to renew it",
-    62: "its certificate is for another host than {host}: it is a foreign server, or the address is wrong",
-    64: "its certificate is for another host than {host}: it is a foreign server, or the address is wrong",
 }
 _ALERTS: Final[dict[str, str]] = {
     "UNKNOWN_CA": "it does not know the authority of {cert}: those keys are for another server",

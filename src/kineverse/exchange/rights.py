@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from kineverse.errors import FormatError, InvalidValueError, suggest
+from kineverse.model.history import HistoryEntry
 from kineverse.model.operation import ARTICULATIONS, CONSTRAINTS, RATES, Cell
 
 from .address import check_server_name
@@ -143,6 +144,14 @@ def _as_texts(subject: str, given: Any, wanted: str) -> tuple[str, ...]:
 
 
 # -- what an operation writes --------------------------------------------------------------------------------
+
+
+def check_right(right: Right, entries: Iterable[HistoryEntry | None]) -> None:
+    """Raise a RefusedError if a right does not cover what some entries write."""
+    for entry in entries:
+        error = None if entry is None else find_forbidden(right, entry.tag, entry.writes)
+        if error is not None:
+            raise error
 
 
 def find_forbidden(right: Right, tag: str, writes: Mapping[Cell, Any]) -> RefusedError | None:

@@ -191,11 +191,9 @@ class Server(Closing):
         self._lock = threading.RLock()  # of the model, the views and the lists above
         self._editing = threading.Lock()  # edits are made, published and answered in turn
         self._closed = threading.Event()
-        edits, user_edits = transport.answers(self._key("edit")), transport.answers(self._key("user/*/edit"))
-        questions, user_questions = (
-            transport.answers(self._key("ask")),
-            transport.answers(self._key("user/*/ask")),
-        )
+        ways = ("", "user/*/")  # of this computer, and of users with a certificate
+        edits, user_edits = (transport.answers(self._key(f"{way}edit")) for way in ways)
+        questions, user_questions = (transport.answers(self._key(f"{way}ask")) for way in ways)
         presence = transport.watch_alive(self._key("client/*"))
         seen = transport.subscribe(self._key("seen"))
         # Last, for those who wait for a server to ask it.
@@ -273,16 +271,12 @@ class Server(Closing):
             message = f"{user!r} is no user of {self.name!r}. Who runs the server enters users in its rights."
             raise RefusedError("forbidden", message, who=user)
         request = protocol.name_asker(request, user)
-        match request:
-            case protocol.EditRequest() | protocol.UndoRequest():
-                lacks = "" if right.may_edit else "edit"
-            case protocol.GetBackup() | protocol.Announce():
-                lacks = "" if right.may_edit_all else "edit everything"
-            case _:
-                lacks = ""
-        if lacks:
-            message = f"{right}, and this takes the right to {lacks}."
-            raise RefusedError("forbidden", message, who=getattr(request, "who", user))
+        if isinstance(request, protocol.ChangeRequest) and not right.may_edit:
+            raise RefusedError("forbidden", f"{right}.", who=request.who)
+        if isinstance(request, protocol.GetBackup | protocol.Announce) and not right.may_edit_all:
+            raise RefusedError(
+                "forbidden", f"{right}, and this takes the right to edit everything.", who=user
+            )
         if isinstance(request, protocol.Announce) and request.endpoint not in ("", THROUGH_SERVER):
             raise FormatError(f"A source of another computer sends through the server: {THROUGH_SERVER!r}.")
         return request, right
@@ -299,7 +293,7 @@ class Server(Closing):
             for request in waiting:
                 try:
                     asked, right = self._admit(request)
-                    if not isinstance(asked, (protocol.EditRequest, protocol.UndoRequest)):
+                    if not isinstance(asked, protocol.ChangeRequest):
                         raise FormatError("This is no edit, and is asked under another key.")
                 except FormatError as error:
                     self._refuse(request, "malformed", error)
