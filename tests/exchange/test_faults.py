@@ -47,9 +47,9 @@ def test_nobody_is_held_up_by_a_process_that_stands_still() -> None:
 
 
 def test_nonsense_is_refused_and_harms_nobody() -> None:
-    found = faults.try_messages(1000, 100, 1, senders=1, most=BUSY)
-    assert found["malformed"] > 250
-    assert found["Committed"] > 10
+    found = faults.try_messages(700, 100, 1, senders=1, most=BUSY)
+    assert found["malformed"] > 150
+    assert found["Committed"] > 5
     assert "failed" not in found
 
 
