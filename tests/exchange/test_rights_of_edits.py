@@ -462,6 +462,17 @@ def test_undo_needs_the_right_for_what_it_restores(is_restarted: bool) -> None:
 # -- anything ------------------------------------------------------------------------------------------------
 
 
+def lie(request: protocol.EditRequest, random: Random, history: History) -> protocol.EditRequest:
+    """Return a request that says another thing about an operation than it does."""
+    field = random.choice(("replaced", "rerun", "moved", "removed"))
+    said = [*getattr(request.changes, field)]
+    if said and random.random() < 0.5:
+        said.pop(random.randrange(len(said)))
+    else:
+        said.append(random.choice([*history.tags, *map(protocol.tag_of, request.changes.put)]))
+    return with_changes(request, **{field: tuple(said)})
+
+
 @pytest.mark.parametrize("seed", range(attempts(8)))
 def test_no_edit_changes_an_operation_that_its_user_may_not_edit(seed: int) -> None:
     random, authority = Random(seed), Authority(Store(None))
@@ -490,6 +501,8 @@ def test_no_edit_changes_an_operation_that_its_user_may_not_edit(seed: int) -> N
         if random.random() < 0.2:
             request = replica.undo(random.randint(1, authority.revision))
         is_limited = random.random() < 0.7
+        if is_limited and isinstance(request, protocol.EditRequest) and random.random() < 0.3:
+            request = lie(request, random, authority.model.history)
         before = list_others(authority.model.history)
         results = authority.process([request], [right if is_limited else EVERYTHING])
         replica.follow(results)
