@@ -16,6 +16,7 @@ __all__ = [
     "DuplicateNameError",
     "EditError",
     "ExpressionError",
+    "ForbiddenError",
     "FormatError",
     "InfeasibleError",
     "InvalidValueError",
@@ -124,6 +125,10 @@ class ConflictError(EditError):
         super().__init__(message)
         self.tags, self.paths = tuple(tags), tuple(paths)
         self.revision, self.who = revision, who
+
+
+class ForbiddenError(EditError):
+    """The right of this user does not allow it, and nothing was done; the message says what it allows."""
 
 
 class OfflineError(KineverseError, ConnectionError):

@@ -24,7 +24,16 @@ from kineverse.exchange.address import (
 
 NAMES = st.text("aZ09_.-", min_size=1, max_size=60).filter(lambda name: name[0] not in ".-")
 ENDPOINTS = st.sampled_from(
-    ["", "tcp/127.0.0.1:7410", "tcp/[::1]:1", "tcp/home.lan:80", "unixsock-stream//run/a b/x.sock"]
+    [
+        "",
+        "tcp/127.0.0.1:7410",
+        "tcp/[::1]:1",
+        "tcp/home.lan:80",
+        "tls/a:1",
+        "tls/a:1,tls/b:2",
+        "tcp/a:1,tcp/b:1",
+        "unixsock-stream//run/a b/x.sock",
+    ]
 )
 
 SERVER = """
@@ -66,12 +75,21 @@ def test_addresses_are_read_as_they_are_written(name: str, endpoint: str) -> Non
         "live:tcp/a:b/home",
         "live:tcp/a:1?x/home",
         "live:udp/a:1/home",
+        "live:tls/a:1,tcp/b:1/home",
+        "live:tls/a:1,tls/b:1,tls/c:1/home",
+        "live:tls/a:1,/home",
+        "live:tls/a,b:1/home",
         "live:unixsock-stream//x.sock/",
     ],
 )
 def test_what_is_no_address_is_refused(text: str) -> None:
     with pytest.raises(FormatError, match="is no address of a model server"):
         Address.parse(text)
+
+
+def test_an_address_of_tls_has_the_name_of_its_host() -> None:
+    with pytest.raises(FormatError, match="IPv6"):
+        Address.parse("live:tls/[::1]:1/home")
 
 
 @given(st.text(max_size=70))

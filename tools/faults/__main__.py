@@ -9,9 +9,9 @@ import argparse
 import sys
 import time
 
-from . import server, store
+from . import costs, edge, server, store
 
-TARGETS = {"store": store, "server": server}
+TARGETS = {"store": store, "server": server, "edge": edge, "costs": costs}
 """Modules with ``add_arguments`` and ``run``, and a docstring that says what must hold."""
 
 

@@ -27,20 +27,25 @@ PAUSE = 0.02
 
 
 class Client:
-    """Live model, and the thread that edits it: a number of random edits, 0: chains, or -1: for ever."""
+    """Live model, and the thread that edits it: a number of random edits, 0: chains, or -1: for ever.
 
-    def __init__(self, name: str, kind: str, seed: str, edits: int) -> None:
+    What it loads is one of the kinds, or ``KIND@ENDPOINT``.
+    """
+
+    def __init__(self, name: str, what: str, seed: str, edits: int) -> None:
         self.name, self.edits = name, edits
-        self.kind = kind
+        self.kind, _, endpoint = what.partition("@")
+        kind = self.kind
         self.add = add_constraints if kind == "1" else add_chain
         self.unknown, self.committed, self.longest = 0, 0, 0.0
         self.random = Random(seed)
-        self.model = load(kind)
-        self.stopped = threading.Event()
+        self.model = load(kind, endpoint)
+        self.stopped, self.turn = threading.Event(), threading.Lock()
         self.outcomes: dict[str, int] = {}
         self._record()
         work = self._make_chains if not edits else self._make_anything
         self.thread = threading.Thread(target=self._work, args=(work,), daemon=True)
+        threading.Thread(target=self._watch, daemon=True).start()
 
     def _record(self) -> None:
         """Tell what is asked for and answered, before those who wait for the answer see it."""
@@ -67,6 +72,14 @@ class Client:
             return answer
 
         connection.ask_edit = ask_edit  # type: ignore[method-assign]
+
+    def _watch(self) -> None:
+        """Tell when the server goes away and is back."""
+        connection = self.model.exchange
+        while True:
+            is_online = connection.is_online
+            connection.wait_for(lambda: connection.is_online != is_online, None)  # noqa: B023
+            tell(client=self.name, online=not is_online, at=time.monotonic())
 
     def _work(self, work: Callable[[], None]) -> None:
         try:
@@ -97,24 +110,33 @@ class Client:
         """Count on, add and remove chains until it is stopped."""
         model, mine, number = self.model, list[str](), 0
         while not self.stopped.wait(self.random.uniform(0, PAUSE)):
-            if self.random.random() < 0.3 and not self.model._wish.is_part:
-                outcome = self._try(lambda: model.transact(count_on, attempts=3))
-                tell(counted=outcome)
-            elif len(mine) > 10 or (mine and self.random.random() < 0.3):
-                name = mine.pop(self.random.randrange(len(mine)))
-                outcome = self._try(lambda name=name: self._edit(lambda edit: remove_chain(edit, name)))  # type: ignore
-                tell(chain=name, removed=outcome)
-            else:
-                number += 1
-                name = f"part/{self.name}/{number}"
-                outcome = self._try(lambda name=name: self._edit(lambda edit: self.add(edit, name)))  # type: ignore
-                tell(chain=name, added=outcome)
-                if outcome == "made" and model.exchange.is_online:
-                    if f"{name}/2" not in model.history.tags:
-                        raise AssertionError(f"{name} was acknowledged, and is not in the model")
-                    mine.append(name)
-            if outcome == "refused":
-                raise AssertionError("an edit was refused that could be made")
+            with self.turn:
+                if self.random.random() < 0.3 and not self.model._wish.is_part:
+                    outcome = self._try(lambda: model.transact(count_on, attempts=3))
+                    tell(counted=outcome)
+                elif len(mine) > 10 or (mine and self.random.random() < 0.3):
+                    name = mine.pop(self.random.randrange(len(mine)))
+                    outcome = self._try(lambda name=name: self._edit(lambda edit: remove_chain(edit, name)))  # type: ignore
+                    tell(chain=name, removed=outcome)
+                else:
+                    number += 1
+                    name = f"part/{self.name}/{number}"
+                    outcome = self._try(lambda name=name: self._edit(lambda edit: self.add(edit, name)))  # type: ignore
+                    tell(chain=name, added=outcome)
+                    if outcome == "made" and model.exchange.is_online:
+                        if f"{name}/2" not in model.history.tags:
+                            raise AssertionError(f"{name} was acknowledged, and is not in the model")
+                        mine.append(name)
+                if outcome == "refused":
+                    raise AssertionError("an edit was refused that could be made")
+
+    def refuses(self) -> bool:
+        """Return whether an edit is an error at once, as the server is away."""
+        try:
+            with self.model.edit():
+                return False
+        except OfflineError:
+            return True
 
     def _edit(self, act: Callable[[kv.model.Edit], None]) -> None:
         with self.model.edit() as edit:
@@ -137,9 +159,10 @@ class Client:
             self._try(lambda act=act: self._edit(act))  # type: ignore[misc]
 
 
-def load(kind: str) -> LiveModel:
+def load(kind: str, endpoint: str = "") -> LiveModel:
     """Load the whole model, or one of the parts."""
-    model = kv.load(f"live:{NAME}", frames=None if kind == "whole" else [PARTS[int(kind)]])
+    address = f"live:{endpoint}/{NAME}" if endpoint else f"live:{NAME}"
+    model = kv.load(address, frames=None if kind == "whole" else [PARTS[int(kind)]])
     assert isinstance(model, LiveModel)
     return model
 
@@ -162,16 +185,33 @@ def main() -> None:
             for client in clients:
                 client.thread.join()
             tell(reply=[(client.outcomes, client.longest) for client in clients])
-        elif words[0] == "longest":
+        elif words[0] == "longest":  # since this was asked before
             tell(reply=[(client.outcomes, client.longest) for client in clients])
+            for client in clients:
+                client.longest = 0.0
         elif words[0] == "state":
             wanted = int(words[1])
             for client in clients:
                 if not client.model.wait(wanted, 20.0):
                     tell(violation=f"{client.name} is at {client.model.version} and not at {wanted}")
             tell(reply=[(client.kind, document_hash(client.model)) for client in clients])
+        elif words[0] == "pause":  # after the edits that are under way
+            for client in clients:
+                client.turn.acquire()
+            tell(reply="ready")
+        elif words[0] == "resume":
+            for client in clients:
+                client.turn.release()
+            tell(reply="ready")
+        elif words[0] == "follow":
+            for client in clients:
+                if not client.model.wait(int(words[1]), 20.0):
+                    tell(violation=f"{client.name} is at {client.model.version} and not at {words[1]}")
+            tell(reply=time.monotonic())
         elif words[0] == "online":
             tell(reply=any(client.model.exchange.is_online for client in clients))
+        elif words[0] == "refuses":
+            tell(reply=[client.refuses() for client in clients])
         elif words[0] == "read":
             tell(reply=[len(client.model.frames) for client in clients])
         elif words[0] == "hook":  # one that takes long

@@ -136,9 +136,9 @@ class Sender:
         for model in models:
             ask = model.exchange.transport.ask
 
-            def record(key: str, payload: bytes, timeout: float, ask: Any = ask) -> bytes:
+            def record(key: str, payload: bytes, *options: Any, ask: Any = ask, **named: Any) -> bytes:
                 self.requests.append((key.rpartition("/")[2], payload))
-                return ask(key, payload, timeout)  # type: ignore[no-any-return]
+                return ask(key, payload, *options, **named)  # type: ignore[no-any-return]
 
             model.exchange.transport.ask = record  # type: ignore[method-assign]
         for number in range(LEARNED):

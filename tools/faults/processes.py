@@ -2,45 +2,62 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import multiprocessing
 import os
 import queue
+import random
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing.connection import Connection
+from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 PATIENCE = 60.0
 """Time after which a process that says nothing counts as a violation [s]."""
+
+# Processes are forked from one that has imported what takes a second of CPU time, and does nothing else.
+_context = multiprocessing.get_context("forkserver")
+_context.set_forkserver_preload(["zenoh", "faults.messages", "faults.relayed", "kineverse.exchange.server"])
 
 
 class Process:
     """Process of a module of this package; what it has told is kept, also after its end."""
 
     def __init__(self, module: str, *arguments: object) -> None:
-        self.what = f"{module} {' '.join(map(str, arguments))}"
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", f"faults.{module}", *map(str, arguments)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        )
+        words = [*map(str, arguments)]
+        self.what = f"{module} {' '.join(words)}"
+        with patch.dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path)):
+            ensure_running()
+            stdin, stdout = os.pipe(), os.pipe()
+            ends = Connection(stdin[0], writable=False), Connection(stdout[1], readable=False)
+            self._stdin, self._stdout = (
+                os.fdopen(stdin[1], "w", encoding="utf-8"),
+                os.fdopen(stdout[0], encoding="utf-8"),
+            )
+            self._process = _context.Process(
+                target=_run, args=(module, words, dict(os.environ), *ends), daemon=True
+            )
+            self._process.start()
+        for end in ends:
+            end.close()
+        assert self._process.pid is not None
+        self.id = self._process.pid
         self.told: list[dict[str, Any]] = []
         self._replies: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
+        for line in self._stdout:
             with suppress(ValueError):  # the last line of one that was killed
                 told = json.loads(line)
                 if "reply" in told:
@@ -57,7 +74,8 @@ class Process:
             raise AssertionError(f"{self.what}: no reply within {timeout:g} s") from None
         self.check()
         if told is None:
-            raise AssertionError(f"{self.what}: has ended, with status {self._process.wait()}")
+            self._process.join()
+            raise AssertionError(f"{self.what}: has ended, with status {self._process.exitcode}")
         return told["reply"]
 
     def ask(self, *words: object, timeout: float = PATIENCE) -> Any:
@@ -66,10 +84,9 @@ class Process:
         return self.wait_for_reply(timeout)
 
     def tell(self, *words: object) -> None:
-        assert self._process.stdin is not None
         with suppress(BrokenPipeError):
-            self._process.stdin.write(f"{' '.join(map(str, words))}\n")
-            self._process.stdin.flush()
+            self._stdin.write(f"{' '.join(map(str, words))}\n")
+            self._stdin.flush()
 
     def check(self) -> None:
         """Raise what the process has found wrong."""
@@ -84,22 +101,33 @@ class Process:
     def close(self) -> None:
         """Let the process end by itself."""
         self.tell("end")
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(5)
+        self._process.join(5)
         self.kill()
 
     def _end(self) -> None:
-        self._process.wait()
+        self._process.join()
         self._reader.join()
-        for stream in (self._process.stdin, self._process.stdout):
+        for stream in (self._stdin, self._stdout):
             with suppress(BrokenPipeError):
-                stream.close()  # type: ignore[union-attr]
+                stream.close()
 
     def freeze(self) -> None:
-        os.kill(self._process.pid, signal.SIGSTOP)
+        os.kill(self.id, signal.SIGSTOP)
 
     def thaw(self) -> None:
-        os.kill(self._process.pid, signal.SIGCONT)
+        os.kill(self.id, signal.SIGCONT)
+
+
+def _run(
+    module: str, arguments: list[str], environment: dict[str, str], stdin: Connection, stdout: Connection
+) -> None:
+    os.environ.clear()
+    os.environ.update(environment)
+    random.seed()
+    sys.argv = [module, *arguments]
+    sys.stdin = os.fdopen(stdin.fileno(), encoding="utf-8", closefd=False)
+    sys.stdout = os.fdopen(stdout.fileno(), "w", encoding="utf-8", closefd=False)
+    importlib.import_module(f"faults.{module}").main()
 
 
 def start(running: ExitStack, module: str, *arguments: object) -> Process:

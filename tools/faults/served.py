@@ -42,6 +42,10 @@ def set_limit(size: int) -> None:
 
 def main() -> None:
     path, how = Path(sys.argv[1]), sys.argv[2:]
+    keys, listen = (
+        [word.removeprefix(f"{option}=") for word in how if word.startswith(f"{option}=")]
+        for option in ("keys", "listen")
+    )
     if "jump" in how:
         jump(1)
     if "late" in how:
@@ -49,7 +53,7 @@ def main() -> None:
     from kineverse.exchange.server import serve
     from kineverse.formats import document_hash
 
-    with serve(store=path, name=NAME) as server:
+    with serve(store=path, name=NAME, listen=listen, keys=keys[0] if keys else None) as server:
         threading.Thread(target=server.run, daemon=True).start()  # as the command does
         tell(reply="ready")
         for words in commands():

@@ -182,12 +182,12 @@ def try_kills(rounds: int, seed: int, processes: int = 3) -> dict[str, int]:
                 server.kill()
                 killed = time.monotonic()
                 server = start(running, "served", store, ("late", "")[number % 2])
-                _wait_for_edits(*clients, all_of_them=False)
+                wait_for_edits(*clients, all_of_them=False)
                 found["longest ms"] = max(found["longest ms"], round(1e3 * (time.monotonic() - killed)))
                 found["servers"] += 1
-            _wait_for_edits(*clients)
-            _check_presence(len(clients) * len(KINDS))
-            found += _stop(clients)
+            wait_for_edits(*clients)
+            check_presence(len(clients) * len(KINDS))
+            found += stop(clients)
             end = check_replicas(server, clients)
             server.kill()
             check(
@@ -203,12 +203,12 @@ def _start_client(running: ExitStack, seed: str, number: int) -> Process:
     return start(running, "client", f"p{number}", seed, 0, *KINDS)
 
 
-def _has_edited(client: Process, since: int) -> bool:
+def has_edited(client: Process, since: int) -> bool:
     client.check()
     return any("number" in told for told in client.told[since:])
 
 
-def _check_presence(wanted: int) -> None:
+def check_presence(wanted: int) -> None:
     """Check that a server knows the clients that are there, and no others."""
     model = load("whole")
     try:
@@ -254,7 +254,7 @@ def try_messages(
         )
         found["longest of others ms"] = round(1e3 * longest)
         check_replicas(server, [client, follower])
-        _check_presence(1 + len(KINDS))
+        check_presence(1 + len(KINDS))
         busy = start(running, "client", "r", f"{seed}", -1, *KINDS)
         for enemy in enemies:
             enemy.tell("publish", publications // senders)
@@ -279,16 +279,16 @@ def try_full_disks(rounds: int, seed: int) -> dict[str, int]:
         make_store(store)
         server = start(running, "served", store)
         client = _start_client(running, f"{seed}", 0)
-        _wait_for_edits(client)
+        wait_for_edits(client)
         for _ in range(rounds):
             server.ask("room", random.uniform(0, 1.1))
             begin = len(client.told)
             wait_until(
-                lambda begin=begin: "failed" in _outcomes(client, begin), LONG, "an edit that is refused"
+                lambda begin=begin: "failed" in outcomes_of(client, begin), LONG, "an edit that is refused"
             )
             server.ask("any-room")
-            _wait_for_edits(client)
-        found = Counter(_outcomes(client, 0))
+            wait_for_edits(client)
+        found = Counter(outcomes_of(client, 0))
         client.ask("stop")
         end = check_replicas(server, [client])
         server.close()
@@ -296,17 +296,17 @@ def try_full_disks(rounds: int, seed: int) -> dict[str, int]:
     return dict(found)
 
 
-def _outcomes(client: Process, since: int) -> list[str]:
+def outcomes_of(client: Process, since: int) -> list[str]:
     client.check()
     names = ("added", "removed", "counted")
     return [told[name] for told in client.told[since:] for name in names if name in told]
 
 
-def _wait_for_edits(*clients: Process, all_of_them: bool = True) -> None:
+def wait_for_edits(*clients: Process, all_of_them: bool = True) -> None:
     """Wait until the clients, or one of them, have got an edit made from now on."""
     since = [len(client.told) for client in clients]
     enough = all if all_of_them else any
-    wait_until(lambda: enough(map(_has_edited, clients, since)), LONG, f"an edit of {clients[0].what}")
+    wait_until(lambda: enough(map(has_edited, clients, since)), LONG, f"an edit of {clients[0].what}")
 
 
 def try_damages(count: int, seed: int) -> dict[str, int]:
@@ -345,7 +345,7 @@ def try_damages(count: int, seed: int) -> dict[str, int]:
     return dict(found)
 
 
-def _stop(clients: Iterable[Process]) -> Counter[str]:
+def stop(clients: Iterable[Process]) -> Counter[str]:
     """Let clients stop, after the edits that they have to make, and return how these ended."""
     found: Counter[str] = Counter()
     for client in clients:
@@ -395,8 +395,8 @@ def try_edits(edits: int, clients: int, seed: int, how: str = "") -> dict[str, i
         ]
         for process in processes:
             process.wait_for_reply()
-        found = _stop(processes)
-        _check_presence(clients)
+        found = stop(processes)
+        check_presence(clients)
         end = check_replicas(server, processes)
         server.close()
         check(check_store(store, processes) == end, "the store has another model")
@@ -414,14 +414,14 @@ def try_freezing(seconds: float, seed: int, most: float = HELD_UP) -> dict[str, 
         clients = [_start_client(running, f"{seed}", k) for k in range(2)]
         frozen, other = clients
         frozen.ask("hook", 0.3)
-        _wait_for_edits(*clients)
+        wait_for_edits(*clients)
         frozen.freeze()
         time.sleep(seconds)
         ((_, longest), *_) = other.ask("longest")
         frozen.thaw()
         found["longest of others ms"] = round(1e3 * longest)
         check(longest < most, f"while a client stood still, an edit of another took {longest:.2f} s")
-        _wait_for_edits(*clients)
+        wait_for_edits(*clients)
         server.freeze()
         begin_time = time.monotonic()
         wait_until(lambda: not other.ask("online"), LONG, "a client that notices a frozen server")
@@ -429,8 +429,8 @@ def try_freezing(seconds: float, seed: int, most: float = HELD_UP) -> dict[str, 
         check(min(other.ask("read")) > 0, "there is nothing to read")
         time.sleep(max(0.0, seconds - (time.monotonic() - begin_time)))
         server.thaw()
-        _wait_for_edits(*clients)
-        found.update(_stop(clients))
+        wait_for_edits(*clients)
+        found.update(stop(clients))
         end = check_replicas(server, clients)
         server.close()
         check(check_store(store, clients) == end, "the store has another model")
@@ -458,19 +458,19 @@ def run(given: argparse.Namespace) -> Iterator[str]:
     if given.rounds:
         try_twice()
         yield "a second server of a store and one of a name: refused"
-        yield f"{10 * given.rounds} damaged stores: {_say(try_damages(10 * given.rounds, seed))}"
-        yield f"{given.rounds} full disks: {_say(try_full_disks(given.rounds, seed))}"
-        yield f"a client and a server that stand still: {_say(try_freezing(3.0, seed))}"
+        yield f"{10 * given.rounds} damaged stores: {say(try_damages(10 * given.rounds, seed))}"
+        yield f"{given.rounds} full disks: {say(try_full_disks(given.rounds, seed))}"
+        yield f"a client and a server that stand still: {say(try_freezing(3.0, seed))}"
     if given.kills:
-        yield f"{given.kills} killed servers: {_say(try_kills(given.kills, seed))}"
+        yield f"{given.kills} killed servers: {say(try_kills(given.kills, seed))}"
     if given.edits:
         few = given.edits // 10
-        yield f"{few} edits and a clock that jumps: {_say(try_edits(few, 8, seed, 'jump'))}"
-        yield f"{given.edits} edits by 8 clients: {_say(try_edits(given.edits, 8, seed))}"
+        yield f"{few} edits and a clock that jumps: {say(try_edits(few, 8, seed, 'jump'))}"
+        yield f"{given.edits} edits by 8 clients: {say(try_edits(given.edits, 8, seed))}"
     if given.messages:
         found = try_messages(given.messages, given.messages // 50, seed)
-        yield f"{given.messages} messages, and {given.messages // 50} to clients: {_say(found)}"
+        yield f"{given.messages} messages, and {given.messages // 50} to clients: {say(found)}"
 
 
-def _say(found: dict[str, int]) -> str:
+def say(found: dict[str, int]) -> str:
     return ", ".join(f"{name} {number}" for name, number in sorted(found.items()))

@@ -409,5 +409,30 @@ BENCH = tuple(
     if name not in _LEFT_OUT
 )
 
-DOCUMENTED = (*FIG4, *STURM, *STREAM, *JOINTS, *MANIPULATION, *LOCKBOX, *BENCH)
+_BYTES = ByRow("message", {"a second": Unchecked("few seconds say little"), "": Mean(0.1, 4)})
+_COSTS = "make faults ARGS=costs"
+
+DEPLOYMENT = (
+    DocumentedTable(
+        "costs",
+        "deployment.md",
+        _COSTS,
+        "Costs",
+        {"message": KEY, "up [B]": _BYTES, "down [B]": _BYTES, "server [µs]": TIME, "relay [µs]": TIME},
+        short_forms.costs_of_messages,
+    ),
+    DocumentedTable(
+        "on-paper",
+        "deployment.md",
+        _COSTS,
+        "On paper",
+        {
+            **dict.fromkeys(("sites", "clients", "edits/s", "way"), KEY),
+            **dict.fromkeys(("server's CPU [%]", "server sends [Mbit/s]", "site gets [Mbit/s]"), FOLLOWS),
+        },
+        short_forms.costs_of_messages,
+    ),
+)
+
+DOCUMENTED = (*FIG4, *STURM, *STREAM, *JOINTS, *MANIPULATION, *LOCKBOX, *BENCH, *DEPLOYMENT)
 """All tables, in the order of the pages."""

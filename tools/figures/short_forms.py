@@ -209,3 +209,11 @@ def lockbox() -> Tables:
 def has_data(folder: str) -> bool:
     """Return whether there is a folder of other people's data."""
     return (DATA / folder).exists()
+
+
+@cache
+def costs_of_messages() -> Tables:
+    """Count few messages to two clients."""
+    from faults.costs import Size, format_tables
+
+    return list(find_titled_tables(format_tables(Size(edits=10, clients=2, seconds=1.0, turns=1))))

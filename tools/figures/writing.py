@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterable
 
 from .documented import DocumentedTable
-from .pages import DOCS, Table, find_titled_tables, write_block
+from .pages import DOCS, ROOT, Table, find_titled_tables, write_block
 from .short_forms import DATA
 
 
@@ -25,11 +25,15 @@ def write_tables(chosen: Iterable[DocumentedTable]) -> None:
 
 
 def run_command(command: str, needs_data: bool) -> str:
-    """Return what a command prints with ``--markdown``.
+    """Return what a command prints with ``--markdown``, or a target of make without.
 
-    It runs in the folder of other people's data, or in an empty one: some experiments take what they find.
+    A command runs in the folder of other people's data, or in an empty one: some experiments take what they
+    find.
     """
-    words = [sys.executable, "-m", *shlex.split(command), "--markdown"]
+    words = shlex.split(command)
+    if words[0] == "make":
+        return subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True, cwd=ROOT).stdout
+    words = [sys.executable, "-m", *words, "--markdown"]
     with tempfile.TemporaryDirectory() as empty:
         folder = DATA if needs_data else empty
         return subprocess.run(

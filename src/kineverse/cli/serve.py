@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 from kineverse.errors import InvalidValueError
+from kineverse.exchange.address import Address, split_endpoint
 from kineverse.formats.reader_warnings import collect_warnings
 
 from .arguments import print_notes, require
@@ -13,7 +15,8 @@ from .pages import handle_interrupts
 
 HELP = """\
 Other processes load the model by its address, edit it, and see each other's edits at once. It is served until
-Ctrl-C, to processes of this user on this computer; with --listen also to others, who need no password.
+Ctrl-C, to processes of this user on this computer. With --listen tls/HOST:PORT and --keys it is served to
+other computers, for users with a certificate; rights.toml in the folder of keys says what they may do.
 
 With --store, the model and all of its edits are kept in a file, and served from there the next time. A MODEL
 is read into an empty store only. Without --store, edits end with the server.
@@ -23,7 +26,9 @@ examples:
   kineverse serve kitchen pr2 --name home --store home.db
   kineverse serve --store home.db                     again, as it was
   kineverse serve --name empty
-  kineverse serve kitchen --listen tcp/127.0.0.1:7410"""
+  kineverse serve kitchen --listen tcp/127.0.0.1:7410         for everybody on this computer
+  kineverse keys home-keys --server home.example.org --user alice
+  kineverse serve kitchen --listen tls/0.0.0.0:7410 --keys home-keys/server"""
 
 SHOWN = 10  # number of reader warnings printed without --all
 
@@ -40,7 +45,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         action="append",
         default=[],
-        help="also listen at tcp/HOST:PORT or unixsock-stream/PATH; may be given several times",
+        help="also listen at tls/HOST:PORT, tcp/127.0.0.1:PORT or unixsock-stream/PATH; may be given several "
+        "times",
+    )
+    parser.add_argument(
+        "--keys",
+        metavar="FOLDER",
+        help="folder with the keys of the server, which 'kineverse keys' makes, for tls/",
+    )
+    parser.add_argument(
+        "--insecure",
+        action="store_true",
+        help="allow tcp/HOST:PORT, where whoever reaches it may edit everything, without encryption",
     )
     parser.add_argument(
         "--durable",
@@ -64,6 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
             store=arguments.store,
             listen=arguments.listen,
             durable=arguments.durable,
+            keys=arguments.keys,
+            insecure=arguments.insecure,
         )
     with handle_interrupts(), server:
         model = server.snapshot()
@@ -72,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"  {server.address}",
             f'  model = kv.load("{server.address}")',
             f"  kineverse view {server.address}",
-            *(f"  live:{endpoint}/{server.name}" for endpoint in arguments.listen),
+            *(f"  {address}" for address in list_addresses(arguments.listen, server.name, arguments.keys)),
         ]
         if remarks:
             shown = truncate_lines([f"  {text}" for text in remarks], None if arguments.all else SHOWN, "  ")
@@ -80,7 +98,29 @@ def run(arguments: argparse.Namespace) -> int:
         notes = [] if arguments.store else ["edits end with this server; --store FILE keeps them"]
         if any(endpoint.startswith("tcp/") for endpoint in arguments.listen):
             notes.append("whoever reaches the port can read and edit the model, without a password")
+        if arguments.keys:
+            notes.append(
+                "users need the keys that 'kineverse keys' has made for them; KINEVERSE_KEYS is their folder"
+            )
         print_notes(notes)
         print("\n".join(lines), flush=True)
         server.run()
     return 0
+
+
+def list_addresses(endpoints: Sequence[str], name: str, keys: str | None) -> list[str]:
+    """Return addresses for clients; a host of the certificate stands for all addresses of this computer."""
+    hosts: Sequence[str] = ()
+    if keys is not None:
+        from kineverse.exchange.keys import Keys  # for those who have no need of the package cryptography
+
+        hosts = Keys.read(keys).hosts
+    result = []
+    for endpoint in endpoints:
+        kind = endpoint.partition("/")[0]
+        if kind != "unixsock-stream" and hosts:
+            host, port = split_endpoint(endpoint)
+            if host in ("0.0.0.0", "::"):
+                endpoint = f"{kind}/{f'[{hosts[0]}]' if ':' in hosts[0] else hosts[0]}:{port}"
+        result.append(str(Address(name, endpoint)))
+    return result

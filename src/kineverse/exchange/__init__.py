@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from .address import list_servers as list_servers
     from .client import LiveModel as LiveModel
     from .connection import Connection as Connection
+    from .relay import Relay as Relay
     from .server import Server as Server, serve as serve
     from .state import StatePublisher as StatePublisher, StateReader as StateReader
 

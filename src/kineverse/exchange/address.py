@@ -9,6 +9,7 @@ server.
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import json
 import os
 import re
@@ -17,6 +18,7 @@ import socket
 import stat
 import tempfile
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -33,7 +35,9 @@ SCHEME: Final = "live:"
 UNIX_SOCKETS: Final = hasattr(socket, "AF_UNIX") and hasattr(os, "geteuid")
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,59}")
-_ENDPOINT: Final = re.compile(r"unixsock-stream/[^?#]+|tcp/(?:[^/\s?#:]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}")
+_PLACE: Final = r"/(?:[^/\s?#:,]+|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}"
+_ENDPOINT: Final = re.compile(rf"unixsock-stream/[^?#]+|(?:tcp|tls){_PLACE}")
+_ENDPOINTS: Final = re.compile(rf"{_ENDPOINT.pattern}|tcp{_PLACE},tcp{_PLACE}|tls{_PLACE},tls{_PLACE}")
 _LONGEST_SOCKET: Final = 103  # bytes of the path; systems allow 103 or 107
 _FILES: Final = (".sock", ".sock.lock", ".json")  # the second is Zenoh's
 _LOOK_SECONDS: Final = 0.1
@@ -42,20 +46,26 @@ _OPEN: Final = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC
 
 @dataclass(frozen=True)
 class Address:
-    """Address of a model server: ``live:NAME``, or ``live:ENDPOINT/NAME``."""
+    """Address of a model server: ``live:NAME``, ``live:ENDPOINT/NAME`` or ``live:ENDPOINT,ENDPOINT/NAME``."""
 
     name: str
     endpoint: str = ""
-    """``tcp/HOST:PORT`` or ``unixsock-stream/PATH``; empty for a server of this user."""
+    """``tls/HOST:PORT`` or ``tcp/HOST:PORT``, or two of them, or ``unixsock-stream/PATH``; else empty."""
 
     @classmethod
     def parse(cls, text: str) -> Address:
         """Return the address that a text is; if it is none, that is a FormatError."""
         endpoint, _, name = text.removeprefix(SCHEME).rpartition("/")
-        if not text.startswith(SCHEME) or (endpoint and not _ENDPOINT.fullmatch(endpoint)):
+        if not text.startswith(SCHEME) or (endpoint and not _ENDPOINTS.fullmatch(endpoint)):
             raise FormatError(
-                f"{text!r} is no address of a model server. It is {SCHEME}NAME, "
-                f"{SCHEME}tcp/HOST:PORT/NAME or {SCHEME}unixsock-stream/PATH/NAME."
+                f"{text!r} is no address of a model server. It is {SCHEME}NAME, {SCHEME}tls/HOST:PORT/NAME, "
+                f"{SCHEME}tcp/HOST:PORT/NAME or {SCHEME}unixsock-stream/PATH/NAME. Two places with a comma "
+                f"between them, {SCHEME}tls/HOST:PORT,tls/HOST:PORT/NAME, are tried in turn."
+            )
+        if endpoint.startswith("tls/") and "[" in endpoint:  # Zenoh takes no such names of a server
+            raise FormatError(
+                f"{text!r} has an IPv6 address, and certificates are of names. Write the name of the "
+                "host, such as one in /etc/hosts."
             )
         try:
             return cls(check_server_name(name), endpoint)
@@ -64,6 +74,11 @@ class Address:
 
     def __str__(self) -> str:
         return f"{SCHEME}{self.endpoint}/{self.name}" if self.endpoint else SCHEME + self.name
+
+    @property
+    def is_secured(self) -> bool:
+        """True if the server is reached by TLS, so that keys are needed."""
+        return is_secured(self.endpoint)
 
     def find(self) -> tuple[str, str]:
         """Return where the server listens, and the secret that it wants, empty for none.
@@ -147,9 +162,58 @@ def check_endpoint(endpoint: str) -> str:
     """Return an endpoint if it has the form of one, else raise an InvalidValueError."""
     if not _ENDPOINT.fullmatch(endpoint):
         raise InvalidValueError(
-            f"{endpoint!r} is nothing to listen at: that is tcp/HOST:PORT or unixsock-stream/PATH."
+            f"{endpoint!r} is nothing to listen at: that is tls/HOST:PORT, tcp/HOST:PORT or "
+            "unixsock-stream/PATH."
         )
     return endpoint
+
+
+def check_protected(endpoints: Iterable[str], keys: object, insecure: bool) -> None:
+    """Raise an InvalidValueError unless endpoints for other computers are those of TLS, and have keys."""
+    given = [*endpoints]
+    secured = [one for one in given if is_secured(one)]
+    reached = [one for one in given if is_open_to_others(one)]
+    if reached and not insecure:
+        raise InvalidValueError(
+            f"Whoever reaches {reached[0]} from another computer could read and edit everything. Listen at "
+            f"{reached[0].replace('tcp', 'tls', 1)} with keys=, which 'kineverse keys' makes, or say so "
+            "with insecure=."
+        )
+    if secured and keys is None:
+        raise InvalidValueError(
+            f"{secured[0]} needs keys=, a folder with the keys of the server: 'kineverse keys' makes one."
+        )
+    if secured and not UNIX_SOCKETS:
+        raise InvalidValueError(f"{secured[0]} needs a system with Unix sockets.")
+    if keys is not None and not secured:
+        raise InvalidValueError("keys= are for an endpoint of TLS: add tls/HOST:PORT to listen=.")
+
+
+def is_secured(endpoint: str) -> bool:
+    """Return True for an endpoint of TLS."""
+    return endpoint.startswith("tls/")
+
+
+def is_open_to_others(endpoint: str) -> bool:
+    """Return True if other computers can reach an endpoint, and nothing protects it."""
+    if not endpoint.startswith("tcp/"):
+        return False
+    host, _ = split_endpoint(endpoint)
+    try:
+        return not ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host != "localhost"
+
+
+def list_endpoints(text: str) -> list[str]:
+    """Return the endpoints in an address, each of its own."""
+    return [text] if text.startswith("unixsock-stream/") else text.split(",")
+
+
+def split_endpoint(endpoint: str) -> tuple[str, int]:
+    """Return host, without brackets, and port of an endpoint of TCP or TLS."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    return host.strip("[]"), int(port)
 
 
 def list_servers() -> list[str]:
@@ -278,8 +342,7 @@ def _discard(folder: Path, stem: str) -> None:
 
 
 def _is_open(endpoint: str) -> bool:
-    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-    with contextlib.suppress(OSError, ValueError):
-        socket.create_connection((host, int(port)), _LOOK_SECONDS).close()
+    with contextlib.suppress(OSError, ValueError, OverflowError):
+        socket.create_connection(split_endpoint(endpoint), _LOOK_SECONDS).close()
         return True
     return False

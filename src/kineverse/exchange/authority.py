@@ -15,6 +15,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import repeat
 from operator import attrgetter
 from time import perf_counter
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -26,12 +27,13 @@ from kineverse.formats.document import OpaqueOperation
 from kineverse.model import Diff, Edit, Model, NetChanges, PlacedEntry
 from kineverse.model.history import History, HistoryEntry
 from kineverse.model.operation import Cell
-from kineverse.model.read_recorder import ABSENT, Read, differs
+from kineverse.model.read_recorder import ABSENT, Read, Reads, differs
 
 from . import protocol
 from .conflicts import KEPT, RefusedError, Revisions
 from .meshes import ServedFiles, put_contents
 from .protocol import CommitMessage, Committed, Published, Refused
+from .rights import EVERYTHING, Right, check_right, find_forbidden
 from .store import Replaced, Store, StoredCommit
 from .views import LOAD_THE_WHOLE, is_partial
 
@@ -116,7 +118,7 @@ class Authority:
             build(edit)
         entries = source.history.sequence
         net = NetChanges(tuple(PlacedEntry(entry, None, at_end=True) for entry in entries))
-        changes, files = protocol.encode_changes(net, entries), self.files.find(entries)
+        changes, files = protocol.encode_changes(net, entries), self.files.measure(entries)
         request = protocol.EditRequest("0" * 32, 0, who, 0, self.chain, changes, files=files)
         (result,) = self.process([request])
         if isinstance(result.answer, Refused):
@@ -127,18 +129,21 @@ class Authority:
 
     # -- requests ------------------------------------------------------------------------------------------
 
-    def process(self, requests: Sequence[protocol.ChangeRequest]) -> list[Result]:
+    def process(
+        self, requests: Sequence[protocol.ChangeRequest], rights: Iterable[Right] = repeat(EVERYTHING)
+    ) -> list[Result]:
         """Make edits, store their commits in one transaction, and return the results in order.
 
-        An edit is made whole or not at all, and others are made if one is refused. If the store fails, all of
-        them are refused, and the model is what the store has, under a new epoch.
+        Each has the right of its user. An edit is made whole or not at all, and others are made if one is
+        refused. If the store fails, all of them are refused, and the model is what the store has, under a new
+        epoch.
         """
         new: list[tuple[str, int]] = []
         results = []
         try:
             if self._is_lost:
                 self._recover()
-            for request in requests:
+            for request, right in zip(requests, rights, strict=False):
                 key = request.client, request.number
                 answer = self._find_answer(key)
                 if answer is not None:
@@ -146,7 +151,7 @@ class Authority:
                     continue
                 if isinstance(request, protocol.UndoRequest):
                     self._persist()  # it may need all commits of the store
-                results.append(self._answer(request))
+                results.append(self._answer(request, right))
                 self._answers[key] = results[-1].answer
                 if len(self._answers) > ANSWERS:
                     self._answers.popitem(last=False)
@@ -194,41 +199,44 @@ class Authority:
         stored = self._store.find_answer(*key)
         return None if stored is None else Committed(*stored)
 
-    def _answer(self, request: protocol.ChangeRequest) -> Result:
+    def _answer(self, request: protocol.ChangeRequest, right: Right) -> Result:
         revision = self.revision
         self._seconds = dict[str, float]()
         try:
             with no_collection():
-                commit = (
-                    self._undo(request) if isinstance(request, protocol.UndoRequest) else self._make(request)
-                )
+                if isinstance(request, protocol.UndoRequest):
+                    commit = self._undo(request, right)
+                else:
+                    commit = self._make(request, right)
         except Exception as error:
             if self.revision > revision:  # what was made is not stored
                 raise
             return Result(_as_answer(error, request.who), seconds=self._seconds)
         return Result(Committed(self.revision, self.chain), commit, self._seconds)
 
-    def _make(self, request: protocol.EditRequest) -> MadeCommit | None:
+    def _make(self, request: protocol.EditRequest, right: Right) -> MadeCommit | None:
         begin = perf_counter()
         self._check_base(request)
         changes, history = request.changes, self.model.history
         put = _decode(request)
         # What the client has run again on the present model is taken, so that loops are not closed once more.
-        # What it has run again on an older one is run here.
+        # What it has run again on an older one, or without a right to edit it, is run here.
         is_newest = request.base == self.revision
-        taken = _choose_reruns(put, changes, history) if is_newest else set[str]()
+        taken = _choose_reruns(put, changes, history, right) if is_newest else set[str]()
         dropped = {placed.entry.tag for placed in put}.intersection(changes.rerun) - taken
         put = tuple(placed for placed in put if placed.entry.tag not in dropped)
         rerun = tuple(tag for tag in changes.rerun if tag not in dropped)
         net = NetChanges(put, changes.replaced, rerun, changes.moved, changes.removed)
         self._seconds["decode"] = perf_counter() - begin
         begin = perf_counter()
+        own = _find_own(net)
+        check_right(right, (*map(history.entries.get, own), *(placed.entry for placed in put)))
         if not is_newest:
             entries = [placed.entry for placed in put]
             self._revisions.check(request.base, entries, changes.moved, changes.removed, history)
         self._check_tags(net, request.base)
         self._seconds["check"] = perf_counter() - begin
-        return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net))
+        return self._fold(request, right, lambda edit: self._adopt(edit, net), own)
 
     def _check_base(self, request: protocol.EditRequest) -> None:
         base, now = request.base, self.revision
@@ -287,7 +295,11 @@ class Authority:
                 now.blob = given.blob
 
     def _fold(
-        self, request: protocol.ChangeRequest, act: Callable[[Edit], None], own: Iterable[str]
+        self,
+        request: protocol.ChangeRequest,
+        right: Right,
+        act: Callable[[Edit], None],
+        own: Iterable[str],
     ) -> MadeCommit | None:
         """Make an edit, and a commit of it to be stored and published; None if it does nothing.
 
@@ -300,6 +312,7 @@ class Authority:
         with self.model.edit() as edit:
             act(edit)
             net = edit.net()
+            self._check_done(right)
             self._seconds["fold"] = perf_counter() - begin
             if net.is_empty:
                 return None
@@ -313,7 +326,7 @@ class Authority:
                 who=request.who,
                 time=time.time(),
                 changes=protocol.encode_changes(net, history.sequence),
-                files=self.files.find(entries, getattr(request, "files", ())),
+                files=self.files.find(entries),
             )
             data = protocol.encode(commit)
             if len(data) > protocol.MAX_BYTES or len(entries) > protocol.MAX_OPERATIONS:
@@ -328,7 +341,7 @@ class Authority:
         files = commit.files
         put = [history.entries[entry.tag] for _, entry, _ in touched if entry is not None]
         if history.sequence is not sequence:  # all have new places
-            put, files = history.sequence, self.files.find(history.sequence, files)
+            put, files = history.sequence, self.files.find(history.sequence)
         self._batch.append(
             StoredCommit(
                 commit.revision,
@@ -344,6 +357,38 @@ class Authority:
         )
         return MadeCommit(commit, Published(self.epoch, self.chain, data), self._diffs.pop())
 
+    def _check_done(self, right: Right) -> None:
+        """Refuse an edit that has done what a right does not cover, whatever it said.
+
+        What the user may edit has to stay so where it is run again, by this edit or by a later one of others.
+        """
+        if right.may_edit_all:
+            return
+        for before, now, is_given in self.model.history.touched():
+            if not is_given and (before is None or find_forbidden(right, before.tag, before.writes)):
+                continue
+            check_right(right, (before, now))
+            if now is not None and (before is None or now.operation is not before.operation):
+                self._check_parameters(right, now)  # it is from the client, or from the store
+
+    def _check_parameters(self, right: Right, entry: HistoryEntry) -> None:
+        """Refuse an operation that would write elsewhere, or nothing, if it were made anew.
+
+        One without a trace is made from its parameters when it is run again, and these need not fit what it
+        says that it has written.
+        """
+        operation, reads = entry.operation, entry.reads
+        if not isinstance(operation, OpaqueOperation) or operation.trace is not None:
+            return
+        if reads.cells or reads.listings:
+            try:
+                anew = operation.run_anew(self.model.history.reader_at(entry.place, Reads()))
+                writes = entry.writes if anew is None else anew.writes()
+            except Exception as error:
+                message = f"{entry.tag!r} has other parameters than it was made from: {error}"
+                raise RefusedError("refused", message, entry.tag) from None
+            check_right(right, (replace(entry, writes=writes),))
+
     def _find_replaced(self, tag: str) -> Replaced:
         history = self.model.history
         entry = history.entries.get(tag)
@@ -355,16 +400,18 @@ class Authority:
 
     # -- undo ----------------------------------------------------------------------------------------------
 
-    def _undo(self, request: protocol.UndoRequest) -> MadeCommit | None:
+    def _undo(self, request: protocol.UndoRequest, right: Right) -> MadeCommit | None:
         """Take back a commit: by the model if it has it, else by what the store has kept of it."""
         revision, kept = request.revision, self.model.history.commits
         if not 0 < revision <= self.revision:
             message = f"There is no revision {revision}; the model is at revision {self.revision}."
             raise RefusedError("unknown", message)
         if revision in kept:
-            return self._fold(request, lambda edit: self._take_back(edit, revision), kept[revision])
+            commit = kept[revision]
+            check_right(right, (entry for pair in commit.values() for entry in pair))
+            return self._fold(request, right, lambda edit: self._take_back(edit, revision), commit)
         net = _find_inverse(self._store, self.model.history, revision)
-        return self._fold(request, lambda edit: self._adopt(edit, net), _find_own(net))
+        return self._fold(request, right, lambda edit: self._adopt(edit, net), _find_own(net))
 
     def _take_back(self, edit: Edit, revision: int) -> None:
         try:
@@ -407,10 +454,13 @@ def _unlinked(placed: PlacedEntry) -> PlacedEntry:
     return replace(placed, entry=other)
 
 
-def _choose_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, history: History) -> set[str]:
+def _choose_reruns(
+    put: Sequence[PlacedEntry], changes: protocol.Changes, history: History, right: Right
+) -> set[str]:
     """Return the tags of operations that a client has run again, because they read what the edit changes.
 
-    The others may only be as they were: read what was there for a while within the edit.
+    The others may only be as they were: read what was there for a while within the edit. Those that the user
+    has no right to edit are left out.
     """
     again, taken = {*changes.rerun}, set[str]()
     tags = {*changes.removed, *(placed.entry.tag for placed in put)} - again
@@ -433,7 +483,8 @@ def _choose_reruns(put: Sequence[PlacedEntry], changes: protocol.Changes, histor
             message = f"The operation {entry.tag!r} is not one that the edit leads to be run again."
             raise RefusedError("refused", message, entry.tag)
         changed |= old.writes.keys() | entry.writes.keys()
-        taken.add(entry.tag)
+        if not any(find_forbidden(right, entry.tag, writes) for writes in (old.writes, entry.writes)):
+            taken.add(entry.tag)
     return taken
 
 

@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
 from kineverse._runtime import Closing
 from kineverse._version import __version__
-from kineverse.errors import ConflictError, EditError, OfflineError
+from kineverse.errors import ConflictError, EditError, ForbiddenError, OfflineError
 from kineverse.formats import entries_from_bytes
 from kineverse.formats.resources import add_resolver, remove_resolver
 from kineverse.model.changes import find_moved_tags
@@ -130,6 +130,8 @@ class LiveModel(Model, Closing):
         ConflictError
             If another edit was first: the error names tags, paths, revision and who. Nothing has happened;
             :meth:`transact` tries again.
+        ForbiddenError
+            If it writes what this user may not edit; it is an EditError.
         EditError
             If the model refuses the edit, as for any model, or the part does not have what the edit needs.
         OfflineError
@@ -280,7 +282,8 @@ class LiveModel(Model, Closing):
             if answer.reason in ("conflict", "stale"):
                 named = (filter(None, [answer.tag]), filter(None, [answer.path]))
                 raise ConflictError(answer.message, *named, answer.revision, answer.who)
-            raise EditError(answer.message)
+            kind = ForbiddenError if answer.reason == "forbidden" else EditError
+            raise kind(answer.message)
         connection = self.exchange
         first = 0.0 if self._wish.is_part else _OWN_COMMIT  # a part may have nothing of it
         while not connection.wait_for(lambda: connection.revision >= answer.revision, first):

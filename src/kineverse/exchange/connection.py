@@ -14,13 +14,14 @@ from contextlib import closing, suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from msgspec.structs import replace
 
 from kineverse._checks import as_count, finite_number
 from kineverse.errors import (
     DuplicateNameError,
+    ForbiddenError,
     FormatError,
     InvalidValueError,
     OfflineError,
@@ -29,11 +30,14 @@ from kineverse.errors import (
 from kineverse.symbols import Symbol
 
 from . import protocol
-from .address import Address
+from .address import Address, list_endpoints
 from .meshes import MAX_PART
 from .state import StatePublisher, StateReader
 from .store import Store
-from .transport import NoAnswerError, Transport, check_not_forked
+from .transport import LONGEST, SLOWEST, NoAnswerError, Transport, check_not_forked
+
+if TYPE_CHECKING:
+    from .keys import Keys
 
 PATIENCE = 10.0  # time that an edit waits for a server that went away, before it is given up [s]
 _ASK_TIMEOUT = 5.0
@@ -51,6 +55,8 @@ class Connection:
     ----------
     address
         Address of the server.
+    user
+        Name of the user in the certificate; empty on the server's computer.
     client
         Identity of this client, 32 hexadecimal digits.
     who
@@ -78,14 +84,30 @@ class Connection:
         self._numbers = count(1)
         self._told = -1
         self._changed = threading.Condition()
-        endpoint, secret = address.find()
+        self._keys: Keys | None = None
+        if address.is_secured:
+            from .keys import Keys  # for those who have no need of the package cryptography
+
+            self._keys = Keys.read()
+        self.user = "" if self._keys is None else self._keys.user
+        self.transport = self._connect()
+        self._identity = protocol.identity_of(self.user, self.client)  # to the server
+        self._presence = self.transport.alive(self.key(f"client/{self._identity}"))
+
+    def _connect(self) -> Transport:
+        endpoint, secret = self.address.find()
         try:
-            self.transport = Transport.connect(endpoint, secret)
+            return Transport.connect(endpoint, secret, keys=self._keys)
         except NoAnswerError:
+            pass
+        if self._keys is None:
             raise OfflineError(
-                f"No model server answers at {endpoint}. Start it, or mend the address {str(address)!r}."
-            ) from None
-        self._presence = self.transport.alive(self.key(f"client/{self.client}"))
+                f"No model server answers at {endpoint}. Start it, or mend the address {str(self.address)!r}."
+            )
+        from .keys import explain_refusal
+
+        reasons = "; ".join(explain_refusal(one, self._keys) for one in list_endpoints(endpoint))
+        raise OfflineError(f"There is no connection with {self.address}. {reasons}.")
 
     def close(self) -> None:
         """End the connection; the model can still be read. A second call has no effect."""
@@ -129,7 +151,7 @@ class Connection:
                 size = MAX_PART
                 while size == MAX_PART:
                     asked = protocol.GetBackup(self.client, file.tell())
-                    size = file.write(self.ask(asked, protocol.FilePart, PATIENCE).data)
+                    size = file.write(self.ask(asked, protocol.FilePart, LONGEST).data)
                 file.flush()
                 os.fsync(file.fileno())
             with closing(Store(part)) as store:
@@ -239,17 +261,19 @@ class Connection:
         """Raise an OfflineError if the server is away."""
         self.check_open()
         if not self.is_online:
+            if self._keys is not None and self._keys.has_ended:
+                raise OfflineError(f"{self._keys.certificate} has expired: ask for new keys, and load again.")
             raise OfflineError(
                 f"The server of {self.address} is away. The model can be read, and edited when it is back."
             )
 
     def join(self, wish: protocol.JoinRequest) -> protocol.Joined:
         """Join and return the model, or the part that is wished for."""
-        return self.ask(replace(wish, client=self.client, who=self.who), protocol.Joined)
+        return self.ask(replace(wish, client=self.client, who=self.who), protocol.Joined, LONGEST)
 
     def ask_missed(self, view: str) -> protocol.Missed | None:
         """Ask for the commits after the present revision; None if the server does not know this state."""
-        answer = self._ask(protocol.Since(self.client, self.who, view, *self.position), _ASK_TIMEOUT)
+        answer = self._ask(protocol.Since(self.client, self.who, view, *self.position), LONGEST)
         if isinstance(answer, protocol.Missed):
             return answer
         if isinstance(answer, protocol.Refused) and answer.reason == "stale":
@@ -259,7 +283,7 @@ class Connection:
     def fetch_part(self, sha256: str, offset: int) -> bytes | None:
         """Return a part of a file; None if the server does not have it."""
         try:
-            return self.ask(protocol.GetFile(sha256, offset), protocol.FilePart).data
+            return self.ask(protocol.GetFile(sha256, offset), protocol.FilePart, LONGEST).data
         except UnknownNameError:
             return None
 
@@ -286,7 +310,9 @@ class Connection:
         self._take_sources(beat)
         if self.revision != self._told:
             self._told = self.revision
-            self.transport.publish(self.key("seen"), protocol.encode(protocol.Seen(self.client, self._told)))
+            self.transport.publish(
+                self.key("seen"), protocol.encode(protocol.Seen(self._identity, self._told))
+            )
 
     def wait_for(self, is_done: Callable[[], bool], timeout: float | None) -> bool:
         """Wait until something is so, which is looked at when the model or the connection changes."""
@@ -349,25 +375,39 @@ class Connection:
                 f"This takes a message of {len(data) / 1e6:.0f} MB, and the most is "
                 f"{protocol.MAX_BYTES / 1e6:.0f} MB. Split it into several edits."
             )
-        key, end = self.key("edit" if changes_model else "ask"), time.monotonic() + min(timeout, _ROUTING)
+        way = f"user/{self.user}/" if self.user else ""
+        key, end = (
+            self.key(way + ("edit" if changes_model else "ask")),
+            time.monotonic() + min(timeout, _ROUTING),
+        )
+        # So that edits overtake what is long, on the slow connection of a site as well.
+        gives_way = not changes_model or len(data) > MAX_PART
         while True:
             try:
-                return protocol.decode_answer(self.transport.ask(key, data, timeout))
+                answer = self.transport.ask(key, data, timeout + len(data) / SLOWEST, gives_way=gives_way)
+                return protocol.decode_answer(answer)
             except NoAnswerError:
                 # For moments after a connection was made it is not known who answers.
                 if not self.is_online or time.monotonic() >= end:
-                    raise OfflineError(
-                        f"The server {self.address.name!r} does not answer. Look if it runs, by that name."
-                    ) from None
+                    raise OfflineError(self._explain_silence()) from None
                 time.sleep(_PAUSE)
+
+    def _explain_silence(self) -> str:
+        server = f"The server {self.address.name!r}"
+        if self.user and self.is_online and self.transport.is_alive(self.key("alive/*"), _ROUTING):
+            return (
+                f"{server} is there, and does not answer the user {self.user!r}: rights.toml of the server, "
+                "or of the relay, does not name this user, or has been changed since the start."
+            )
+        return f"{server} does not answer. Look if it runs, by that name."
 
 
 def refusal_error(answer: object, address: Address) -> Exception:
     """Return the error for an answer that is a refusal, or of another kind than was asked for."""
     if not isinstance(answer, protocol.Refused):
         return FormatError(f"{address} answered with a {type(answer).__name__}, which was not asked for.")
-    kind = UnknownNameError if answer.reason == "unknown" else FormatError
-    return kind(answer.message)
+    kinds: dict[str, type[Exception]] = {"unknown": UnknownNameError, "forbidden": ForbiddenError}
+    return kinds.get(answer.reason, FormatError)(answer.message)
 
 
 @cache

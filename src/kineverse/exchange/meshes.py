@@ -26,7 +26,7 @@ from kineverse.model.operation import BODIES
 from .protocol import MeshContent
 from .store import Store
 
-MAX_PART = 1 << 24  # largest part of a file in one message [byte]
+MAX_PART = 1 << 20  # largest part of a file in one message [byte]
 
 
 class ServedFiles:
@@ -35,23 +35,26 @@ class ServedFiles:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._paths = store.paths()
+        self._checked: dict[str, tuple[int, ...]] = {}  # state of a file in which it had its digest
 
-    def find(
-        self, entries: Iterable[HistoryEntry], named: Iterable[MeshContent] = ()
-    ) -> tuple[MeshContent, ...]:
-        """Return the digests of meshes whose files are here: found on disk, or named and known already."""
-        by_place = {(file.tag, file.index): (file.sha256, file.size) for file in named}
+    def measure(self, entries: Iterable[HistoryEntry]) -> tuple[MeshContent, ...]:
+        """Look for the files of meshes on disk, serve them from now on, and return their digests.
+
+        The entries are those of models that the server is started with: an edit never makes it open a file.
+        """
         result = []
         for tag, index, mesh in _meshes(entries):
-            known = by_place.get((tag, index)) or mesh.content
-            if known is None:
-                known = measure_content(mesh)
-                if known is not None and known[0] not in self._paths:
+            known = measure_content(mesh) if mesh.content is None else None
+            if known is not None:
+                result.append(MeshContent(tag, index, *known))
+                if known[0] not in self._paths:
                     self._paths[known[0]] = os.fspath(locate_mesh(mesh))
                     self._store.add_path(known[0], self._paths[known[0]])
-            if known is not None and known[0] in self._paths:
-                result.append(MeshContent(tag, index, *known))
         return tuple(result)
+
+    def find(self, entries: Iterable[HistoryEntry]) -> tuple[MeshContent, ...]:
+        """Return the digests of the meshes whose files are served."""
+        return tuple(file for file in find_known_files(entries) if file.sha256 in self._paths)
 
     def read(self, sha256: str, offset: int) -> bytes | None:
         """Return a part of a file; None if there is none with this digest any more."""
@@ -60,8 +63,12 @@ class ServedFiles:
             return None
         try:
             with open(path, "rb") as file:
-                if not offset and hashlib.file_digest(file, "sha256").hexdigest() != sha256:
-                    return None
+                status = os.fstat(file.fileno())
+                state = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+                if self._checked.get(sha256) != state:
+                    if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
+                        return None
+                    self._checked[sha256] = state
                 file.seek(offset)
                 return file.read(MAX_PART)
         except (OSError, OverflowError):

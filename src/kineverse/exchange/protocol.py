@@ -1,8 +1,9 @@
 """Messages between a model server and its clients, in msgpack; ``docs/protocol.md`` says what they mean.
 
 A message is the list of its fields. Operations are blobs, as in documents. A request goes to the key
-``kineverse/NAME/edit`` if it changes the model, else to ``kineverse/NAME/ask``; the answer is one message.
-Commits are published under ``kineverse/NAME/log``, and those that concern a part of the model under
+``kineverse/NAME/edit`` if it changes the model, else to ``kineverse/NAME/ask``; that of a user with a
+certificate to ``edit`` and ``ask`` below ``kineverse/NAME/user/USER``. The answer is one message. Commits are
+published under ``kineverse/NAME/log``, and those that concern a part of the model under
 ``kineverse/NAME/view/ID``.
 """
 
@@ -14,6 +15,7 @@ from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from kineverse.errors import FormatError
 from kineverse.formats import entry_to_bytes, operation_from_bytes
@@ -37,6 +39,7 @@ Link: TypeAlias = Annotated[bytes, Meta(max_length=32)]
 Sha256: TypeAlias = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", max_length=64)]
 Tags: TypeAlias = Annotated[tuple[Name, ...], Meta(max_length=MAX_OPERATIONS)]
 
+_LONGEST_WHO: Final = 200  # letters of what the client of a user says of itself
 NO_CHAIN: Final = bytes(32)  # digest before the first commit
 
 
@@ -207,9 +210,28 @@ Request: TypeAlias = (
     ChangeRequest | JoinRequest | Since | GetStatus | GetHistory | GetFile | GetBackup | Announce
 )
 
+
+def name_asker(request: Request, user: str) -> Request:
+    """Return a request under the identity and the name of a user, whatever it says of its sender."""
+    named: dict[str, str] = {}
+    if hasattr(request, "client"):
+        named["client"] = identity_of(user, request.client)
+    if hasattr(request, "who"):
+        said = "".join(filter(str.isprintable, request.who))
+        named["who"] = f"{user}, {said[:_LONGEST_WHO]}"
+    return replace(request, **named)
+
+
+def identity_of(user: str, client: str) -> str:
+    """Return the identity of a client: its own, or of a user's, one that no other user's client can have."""
+    return hashlib.sha256(f"{user}/{client}".encode()).hexdigest()[:32] if user else client
+
+
 # -- answers -------------------------------------------------------------------------------------------------
 
-Reason: TypeAlias = Literal["conflict", "refused", "stale", "protocol", "malformed", "unknown", "failed"]
+Reason: TypeAlias = Literal[
+    "conflict", "refused", "forbidden", "stale", "protocol", "malformed", "unknown", "failed"
+]
 
 
 class Committed(_Message, frozen=True, tag="committed"):
@@ -223,8 +245,9 @@ class Refused(_Message, frozen=True, tag="refused"):
     """Nothing was done.
 
     Reasons: ``conflict`` with a commit after the base (tag, path, revision and who made it are named),
-    ``refused`` by the model, ``stale``: the server does not know the state of the client, which has to join
-    again, another ``protocol``, a ``malformed`` message, an ``unknown`` name, or the server has ``failed``.
+    ``refused`` by the model, ``forbidden`` by the right of the user (tag and path are named), ``stale``: the
+    server does not know the state of the client, which has to join again, another ``protocol``, a
+    ``malformed`` message, an ``unknown`` name, or the server has ``failed``.
     """
 
     reason: Reason

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from msgspec import structs
@@ -27,13 +27,20 @@ from kineverse.model.edit import Edit
 from kineverse.model.model import Model, Snapshot
 
 from . import protocol
-from .address import Claim, check_endpoint
+from .access import make_grants
+from .address import Claim, check_endpoint, check_protected
 from .authority import Authority, Result
+from .conflicts import RefusedError
 from .connection import describe_client
 from .meshes import MAX_PART
+from .rights import EVERYTHING, Right, Rights
+from .state import THROUGH_SERVER
 from .store import Store
-from .transport import Question, Questions, Transport
+from .transport import SERVER, Question, Questions, Transport
 from .views import MOST_MISSED, View, Views, Wish
+
+if TYPE_CHECKING:
+    from .keys import Keys
 
 _LOG = logging.getLogger(__name__)
 
@@ -59,6 +66,8 @@ def serve(
     store: str | os.PathLike[str] | None = None,
     listen: Iterable[str] = (),
     durable: bool = False,
+    keys: str | os.PathLike[str] | None = None,
+    insecure: bool = False,
 ) -> Server:
     """Serve a model to other processes, in threads of this one.
 
@@ -71,11 +80,17 @@ def serve(
     store
         SQLite file that keeps the model and all edits. Without one, they end with the server.
     listen
-        Further endpoints such as ``tcp/127.0.0.1:7410``. By default only processes of this user on this
+        Further endpoints: ``tls/HOST:PORT`` for users with a certificate, who may do what the rights say, or
+        ``tcp/127.0.0.1:PORT`` for everybody on this computer. By default only processes of this user on this
         computer are served.
     durable
         True to acknowledge an edit only when it survives a loss of power; otherwise it survives the end of
         the process at any time.
+    keys
+        Folder with the keys of the server and ``rights.toml``, for endpoints of TLS; ``kineverse keys`` makes
+        one.
+    insecure
+        True to listen at endpoints of TCP that other computers reach, for everybody.
 
     Returns
     -------
@@ -85,19 +100,22 @@ def serve(
     Raises
     ------
     InvalidValueError
-        For an invalid name or argument.
+        For an invalid name or argument, and for keys that are missing, expired, or can be read by others.
     DuplicateNameError
         If another server has the name.
     FormatError
-        For a model that cannot be loaded, or a store that is damaged, in use or of another version.
+        For a model or rights that cannot be loaded, or a store that is damaged, in use or of another version.
     MissingDependencyError
         Without the extra ``exchange``.
     """
     check_flag("durable", durable)
+    check_flag("insecure", insecure)
     if durable and store is None:
         raise InvalidValueError("Without a store= nothing is kept, so durable=True needs one.")
     given = as_entries("models=", models, (str, os.PathLike, Model), "models, or their files and names")
     endpoints = [check_endpoint(one) for one in as_entries("listen=", listen, str, "endpoints")]
+    check_protected(endpoints, keys, insecure)
+    found, rights = (None, Rights()) if keys is None else _read_keys(keys)
     path = None if store is None else Path(store)
     with ExitStack() as opened:
         kept = opened.enter_context(closing(Store(path, durable=durable)))
@@ -110,9 +128,16 @@ def serve(
         elif given:
             authority.fill(lambda edit: _include(edit, given), describe_client())
         kept.name = chosen
-        transport = Transport.serve([claim.endpoint, *endpoints], claim.secret)
+        grants = make_grants(chosen, rights)
+        transport = Transport.serve([claim.endpoint, *endpoints], claim.secret, keys=found, grants=grants)
         opened.callback(transport.close)
-        return Server(chosen, authority, kept, transport, opened.pop_all())
+        return Server(chosen, authority, kept, transport, opened.pop_all(), rights)
+
+
+def _read_keys(folder: str | os.PathLike[str]) -> tuple[Keys, Rights]:
+    from .keys import read_listening  # for those who have no need of the package cryptography
+
+    return read_listening(folder, SERVER)
 
 
 def _name_of(given: Sequence[Source]) -> str:
@@ -142,9 +167,15 @@ class Server(Closing):
     """
 
     def __init__(
-        self, name: str, authority: Authority, store: Store, transport: Transport, opened: ExitStack
+        self,
+        name: str,
+        authority: Authority,
+        store: Store,
+        transport: Transport,
+        opened: ExitStack,
+        rights: Rights,
     ) -> None:
-        self.name = name
+        self.name, self._rights = name, rights
         self._authority, self._store, self._transport, self._opened = authority, store, transport, opened
         self._since = time.time()
         self._views = Views(authority.model)
@@ -158,15 +189,20 @@ class Server(Closing):
         self._accepted: deque[float] = deque(maxlen=100_000)
         self._edits = 0
         self._lock = threading.RLock()  # of the model, the views and the lists above
+        self._editing = threading.Lock()  # edits are made, published and answered in turn
         self._closed = threading.Event()
-        edits, questions = transport.answers(self._key("edit")), transport.answers(self._key("ask"))
+        ways = ("", "user/*/")  # of this computer, and of users with a certificate
+        edits, user_edits = (transport.answers(self._key(f"{way}edit")) for way in ways)
+        questions, user_questions = (transport.answers(self._key(f"{way}ask")) for way in ways)
         presence = transport.watch_alive(self._key("client/*"))
         seen = transport.subscribe(self._key("seen"))
         # Last, for those who wait for a server to ask it.
         self._token = transport.alive(self._key(f"alive/{authority.epoch}"))
         for task, work in (
             ("edits", lambda: self._take_edits(edits)),
+            ("user-edits", lambda: self._take_edits(user_edits)),
             ("questions", lambda: self._answer_questions(questions)),
+            ("user-questions", lambda: self._answer_questions(user_questions)),
             ("presence", lambda: self._watch_clients(presence)),
             ("seen", lambda: self._note_seen(seen)),
             ("beat", self._beat),
@@ -217,6 +253,34 @@ class Server(Closing):
                     self._drop_backup(client)
                 self._opened.close()
 
+    # -- rights --------------------------------------------------------------------------------------------
+
+    def _admit(self, question: Question) -> tuple[protocol.Request, Right]:
+        """Return what is asked, under the identity of who asks, and the right of that user.
+
+        The user is a part of the key, which access control gives to the certificate with that name alone.
+        Clients of this computer ask under keys without a user. A request that the right does not cover is a
+        RefusedError; what an edit may change is known once it is made.
+        """
+        request = protocol.decode_request(question.payload)
+        if question.key in (self._key("edit"), self._key("ask")):
+            return request, EVERYTHING
+        user, _, end = question.key.removeprefix(self._key("user/")).partition("/")
+        right = self._rights.users.get(user) if end in ("edit", "ask") else None
+        if right is None:
+            message = f"{user!r} is no user of {self.name!r}. Who runs the server enters users in its rights."
+            raise RefusedError("forbidden", message, who=user)
+        request = protocol.name_asker(request, user)
+        if isinstance(request, protocol.ChangeRequest) and not right.may_edit:
+            raise RefusedError("forbidden", f"{right}.", who=request.who)
+        if isinstance(request, protocol.GetBackup | protocol.Announce) and not right.may_edit_all:
+            raise RefusedError(
+                "forbidden", f"{right}, and this takes the right to edit everything.", who=user
+            )
+        if isinstance(request, protocol.Announce) and request.endpoint not in ("", THROUGH_SERVER):
+            raise FormatError(f"A source of another computer sends through the server: {THROUGH_SERVER!r}.")
+        return request, right
+
     # -- edits ---------------------------------------------------------------------------------------------
 
     def _take_edits(self, requests: Questions) -> None:
@@ -225,26 +289,37 @@ class Server(Closing):
             if not waiting:
                 return  # the transport is closed
             begin = time.perf_counter()
-            edits, given = [], []
+            edits, rights, given = [], [], []
             for request in waiting:
                 try:
-                    decoded = protocol.decode_request(request.payload)
-                    if not isinstance(decoded, (protocol.EditRequest, protocol.UndoRequest)):
+                    asked, right = self._admit(request)
+                    if not isinstance(asked, protocol.ChangeRequest):
                         raise FormatError("This is no edit, and is asked under another key.")
                 except FormatError as error:
                     self._refuse(request, "malformed", error)
                     continue
-                edits.append(decoded)
+                except RefusedError as error:
+                    request.answer(protocol.encode(error.answer))
+                    self._note_refusal(error.answer.who, error.answer)
+                    continue
+                edits.append(asked)
+                rights.append(right)
                 given.append(request)
             self._note_time("receive", begin)
             if edits:
-                self._process(edits, given)
+                with self._editing:
+                    self._process(edits, rights, given)
 
-    def _process(self, edits: Sequence[protocol.ChangeRequest], requests: Sequence[Question]) -> None:
+    def _process(
+        self,
+        edits: Sequence[protocol.ChangeRequest],
+        rights: Sequence[Right],
+        requests: Sequence[Question],
+    ) -> None:
         epoch = self._authority.epoch
         try:
             with self._lock:
-                results = self._authority.process(edits)
+                results = self._authority.process(edits, rights)
                 if self._authority.epoch != epoch:
                     self._begin_again()
                 for_parts = self._follow_views(results)
@@ -295,16 +370,19 @@ class Server(Closing):
         return commits
 
     def _note(self, edit: protocol.ChangeRequest, result: Result) -> None:
-        now = time.time()
         with self._lock:
             for stage, seconds in result.seconds.items():
                 self._times[stage].append(seconds)
             if isinstance(result.answer, protocol.Refused):
-                self._refusals.append(protocol.Refusal(now, edit.who, result.answer.message))
-                _LOG.info("Refused an edit of %s: %s", edit.who, result.answer.message)
+                self._note_refusal(edit.who, result.answer)
             elif result.commit is not None:
                 self._edits += 1
                 self._accepted.append(time.monotonic())
+
+    def _note_refusal(self, who: str, answer: protocol.Refused) -> None:
+        with self._lock:
+            self._refusals.append(protocol.Refusal(time.time(), who, answer.message))
+        _LOG.info("Refused an edit of %s: %s", who, answer.message)
 
     def _note_time(self, stage: str, begin: float) -> None:
         self._times[stage].append(time.perf_counter() - begin)
@@ -317,7 +395,9 @@ class Server(Closing):
     def _answer_questions(self, requests: Questions) -> None:
         for request in requests:
             try:
-                answer = self._answer(protocol.decode_request(request.payload))
+                answer = self._answer(self._admit(request)[0])
+            except RefusedError as error:
+                request.answer(protocol.encode(error.answer))
             except UnknownNameError as error:
                 self._refuse(request, "unknown", error)
             except KineverseError as error:

@@ -155,10 +155,7 @@ class Coupling:
         value = self._history.head[cell[0]][cell[1]]
         known = self._paths.get(cell)
         if known is None or known[0] is not value:
-            found = _paths_of(find_expressions(cell[0], value))
-            if cell[0] == RATES and not isinstance(value[1], Expression):
-                found |= {speed.path for speed, _ in value[1]}
-            known = self._paths[cell] = value, found
+            known = self._paths[cell] = value, find_paths(cell[0], value)
         return known[1]
 
     def close(self, wish: Wish) -> tuple[dict[Cell, None], set[Key]]:
@@ -226,6 +223,14 @@ class Coupling:
 
     def _find(self, what: str, name: str) -> Iterable[str]:
         return self._groups.get((what, name), ())
+
+
+def find_paths(kind: str, value: Any) -> frozenset[str]:
+    """Return the coordinates in a written value, and the speeds of a rate."""
+    found = _paths_of(find_expressions(kind, value))
+    if kind == RATES and not isinstance(value[1], Expression):
+        found |= {speed.path for speed, _ in value[1]}
+    return found
 
 
 def _paths_of(expressions: Iterable[Expression]) -> frozenset[str]:

@@ -113,7 +113,7 @@ def _time(one: Benchmark, samples: dict[str, tuple[Callable[[], float], float]])
 def _edits(one: Benchmark, scene: ProcessGroup) -> None:
     """Measure the time to a subscriber beside the relay, and the CPU time of the server."""
     place = f"unixsock-stream/{scene.folder}/relay.sock"
-    server, _ = scene.serve(), scene.start(programs.Relay, place)
+    server, _ = scene.serve(), scene.start(programs.EchoServer, place)
     editor, follower = scene.start(programs.Editor, place), scene.start(programs.Subscriber, place)
 
     def edit(since: int, kind: str) -> float:

@@ -69,7 +69,7 @@ class ServerProgram(Remote):
         return self.seconds, time.process_time()
 
 
-class Relay(Remote):
+class EchoServer(Remote):
     """Server that publishes what it is asked."""
 
     def __init__(self, endpoint: str) -> None:

@@ -90,9 +90,9 @@ class OpaqueOperation(Operation):
             except KineverseError as problem:
                 error = problem
         else:
-            again = self._made_again()
+            again = self.run_anew(model)
             if again is not None:
-                return again.apply(scope)
+                return again
         kind = UnknownNameError if isinstance(error, UnknownNameError) else ModelError
         is_below = self.given and self.scope
         hint = f" Its parameters say from what, in names that lack '{self.scope}'." if is_below else ""
@@ -101,6 +101,11 @@ class OpaqueOperation(Operation):
             "document, without its code; in the same edit, remove it, or replace it by "
             f"a new {self.kind}(...).{hint}"
         ) from None
+
+    def run_anew(self, model: ReadRecorder) -> Writes | None:
+        """Return the writes of the operation of the library that it was; None if it was none."""
+        again = self._made_again()
+        return None if again is None else again.apply(self._in_scope(model))
 
     def see(self, model: ReadRecorder) -> SeenValues:
         """Return what a model has of what the original read."""
