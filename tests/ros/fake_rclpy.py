@@ -56,10 +56,12 @@ Pose = _message("geometry_msgs", "Pose", position=Point(), orientation=Quaternio
 ColorRGBA = _message("std_msgs", "ColorRGBA", r=0.0, g=0.0, b=0.0, a=0.0)
 MESSAGES = (
     Time,
+    Point,
     Transform,
     TransformStamped,
     _message("geometry_msgs", "PoseStamped", header=Header(), pose=Pose()),
     _message("geometry_msgs", "Twist", linear=Vector3(), angular=Vector3()),
+    _message("rcl_interfaces", "ParameterDescriptor", description=""),
     _message("sensor_msgs", "JointState", header=Header(), name=[], position=[], velocity=[], effort=[]),
     _message("std_msgs", "Float64MultiArray", data=[]),
     _message("std_msgs", "String", data=""),
@@ -106,14 +108,16 @@ class FakeRos(SimpleNamespace):
         super().__init__(
             **{kind.__name__: kind for kind in MESSAGES},
             LATCHED=SimpleNamespace(depth=1, latched=True),
+            STATIC=SimpleNamespace(depth=100, latched=True),
             QUEUED=SimpleNamespace(depth=100, latched=False),
+            STEADY=None,
         )
         self.parameters = dict(parameters or {})
         self.nanoseconds = round(start * SECOND)
         self.nodes: list[FakeNode] = []
         self.topics: dict[str, SimpleNamespace] = {}
         self.gids = count(1)
-        self.rclpy = SimpleNamespace(create_node=lambda name: FakeNode(self, name))
+        self.rclpy = SimpleNamespace(create_node=lambda name, **options: FakeNode(self, name))
 
     def topic(self, name: str) -> SimpleNamespace:
         found = SimpleNamespace(publishers=[], subscriptions=[])
@@ -167,7 +171,8 @@ class FakeSubscription:
     def __init__(self, node: FakeNode, kind: Any, topic: str, callback: Callable[..., Any]) -> None:
         self.node, self.kind, self.topic_name, self.callback = node, kind, f"/{topic.lstrip('/')}", callback
         self.queue: list[Any] = []
-        self._with_info = len(inspect.signature(callback).parameters) == 2
+        needed = [p for p in inspect.signature(callback).parameters.values() if p.default is p.empty]
+        self._with_info = len(needed) == 2
         node.ros.topic(topic).subscriptions.append(self)
         for publisher in node.ros.topic(topic).publishers:
             for message in publisher.kept:
@@ -190,6 +195,7 @@ class FakeNode:
     def __init__(self, ros: FakeRos, name: str) -> None:
         self.ros, self.name = ros, name
         self.timers: list[SimpleNamespace] = []
+        self.parameters = {key: SimpleNamespace(value=value) for key, value in ros.parameters.items()}
         self.logged: list[tuple[str, str]] = []
         ros.nodes.append(self)
 
@@ -204,8 +210,17 @@ class FakeNode:
     def get_clock(self) -> SimpleNamespace:
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.ros.nanoseconds))
 
-    def declare_parameter(self, name: str, value: Any) -> SimpleNamespace:
-        return SimpleNamespace(value=self.ros.parameters.get(name, value))
+    def declare_parameter(self, name: str, value: Any, descriptor: Any = None) -> SimpleNamespace:
+        return self.parameters.setdefault(name, SimpleNamespace(value=value))
+
+    def has_parameter(self, name: str) -> bool:
+        return name in self.parameters
+
+    def get_parameter(self, name: str) -> SimpleNamespace:
+        return self.parameters[name]
+
+    def get_parameters_by_prefix(self, prefix: str) -> dict[str, SimpleNamespace]:
+        return dict(self.parameters)
 
     def resolve_topic_name(self, topic: str) -> str:
         return f"/{topic.lstrip('/')}"
@@ -218,7 +233,7 @@ class FakeNode:
     ) -> FakeSubscription:
         return FakeSubscription(self, kind, topic, callback)
 
-    def create_timer(self, period: float, callback: Callable[[], Any]) -> SimpleNamespace:
+    def create_timer(self, period: float, callback: Callable[[], Any], clock: None = None) -> SimpleNamespace:
         step = round(period * SECOND)
         timer = SimpleNamespace(due=self.ros.nanoseconds + step, period=step, callback=callback)
         self.timers.append(timer)

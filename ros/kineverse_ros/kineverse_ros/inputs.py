@@ -17,7 +17,7 @@ MOST_AHEAD, MOST_BEHIND = SECOND // 2, SECOND
 """How far a stamp may be from the present of the clock."""
 
 _SILENCE = SECOND  # after which another source may have a joint
-_PATIENCE = 3 * SECOND  # until a topic that nobody serves is named
+_PATIENCE = 3  # seconds until a topic that nobody serves is named
 
 
 class Complaints:
@@ -109,9 +109,14 @@ class JointStateFilter:
     """
 
     def __init__(self, names: NameMap, wanted: Collection[str], complaints: Complaints) -> None:
-        self._names, self._wanted, self._complaints = names, frozenset(wanted), complaints
+        self.follow(names, wanted)
+        self._complaints = complaints
         self._stamps = StampCheck(complaints)
         self._owners: dict[str, tuple[str, int]] = {}  # source of a joint, and when it was last heard
+
+    def follow(self, names: NameMap, wanted: Collection[str]) -> None:
+        """Take over the joints of an edited model."""
+        self._names, self._wanted = names, frozenset(wanted)
 
     def accept(
         self,
@@ -206,14 +211,16 @@ class Topics:
         Node of rclpy.
     now
         Function that returns the time [ns].
+    clock
+        Clock of rclpy that goes on where the time stands still, as it does without a simulator.
     """
 
-    def __init__(self, node: Any, complaints: Complaints, now: Callable[[], int]) -> None:
+    def __init__(self, node: Any, complaints: Complaints, now: Callable[[], int], clock: Any = None) -> None:
         self._node, self._complaints, self._now = node, complaints, now
-        self._wanted: dict[str, tuple[str, int]] = {}  # type of the messages, and since when they are awaited
+        self._wanted: dict[str, tuple[str, int]] = {}  # type of the messages, and how long they are awaited
         self._sources: dict[tuple[str, bytes], str] = {}
         self._subscriptions: list[Any] = []
-        node.create_timer(1.0, self.check)
+        node.create_timer(1.0, self.check, clock=clock)
 
     def subscribe(self, kind: Any, topic: str, callback: Callable[[Any, str], object], quality: Any) -> None:
         """Have a function called with each message of a topic, and its source."""
@@ -223,7 +230,7 @@ class Topics:
 
         self._subscriptions.append(self._node.create_subscription(kind, topic, receive, quality))
         package = kind.__module__.partition(".")[0]
-        self._wanted[topic] = f"{package}/msg/{kind.__name__}", self._now()
+        self._wanted[topic] = f"{package}/msg/{kind.__name__}", 0
 
     def close(self) -> None:
         """End all subscriptions."""
@@ -232,20 +239,19 @@ class Topics:
         self._subscriptions, self._wanted = [], {}
 
     def check(self) -> None:
-        """Say which topics nobody serves, or with messages of another type."""
-        now = self._now()
-        for topic, (kind, since) in self._wanted.items():
-            others = []
-            for info in self._node.get_publishers_info_by_topic(topic):
-                if info.topic_type == kind:
-                    self._wanted[topic] = kind, now
-                else:
-                    others.append(f"{_name(info)} ({info.topic_type})")
+        """Say which topics nobody serves, or with messages of another type; called each second."""
+        if self._now() == 0:
+            self._complaints.add_once("The time is 0: use_sim_time is set, and nobody serves /clock.")
+        for topic, (kind, waited) in self._wanted.items():
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            others = [f"{_name(one)} ({one.topic_type})" for one in publishers if one.topic_type != kind]
+            waited = 0 if len(publishers) > len(others) else waited + 1
+            self._wanted[topic] = kind, waited
             name = self._node.resolve_topic_name(topic)
             if others:
                 text = f"{name} has {kind} here, and messages of another type by {list_some(others, 3)}."
                 self._complaints.add_once(text)
-            elif abs(now - since) >= _PATIENCE:
+            elif waited >= _PATIENCE:
                 self._complaints.add_once(f"Nobody serves {name} ({kind}).")
 
     def _source(self, topic: str, info: Any) -> str:

@@ -1,0 +1,148 @@
+"""What a model says at a state: poses of its frames in their parents, and positions of all joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import accumulate
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse import compile as compile_expressions
+from kineverse.errors import NoSolutionError
+from kineverse.expressions import Expression, array, total_derivative
+from kineverse.lie import Array, to_quaternion
+from kineverse.model.frame import WORLD
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+from .names import covers
+
+
+class ModelOutput:
+    """Poses and joints of a model as one compiled function of its coordinates.
+
+    Frames that no coordinate moves in their parent are static. Joints are the free coordinates, those that
+    closed loops determine, and articulations that follow others, such as mimic joints and gears.
+
+    Parameters
+    ----------
+    model
+        The model. Later edits of it have no effect.
+    omitted
+        Names of frames that are left to somebody else; one that ends in a slash stands for all below it.
+
+    Attributes
+    ----------
+    coordinates
+        Names of the free coordinates, in the order of the input vectors.
+    joints
+        Names of all joints.
+    moving
+        Names of frames that move in their parents.
+    parents
+        Parent of each frame.
+    static
+        Poses (4, 4) in the parents of the other frames.
+    positions, velocities
+        Of the joints, in their order; a velocity is NaN if it is not known.
+    translations, rotations
+        Poses of the moving frames in their parents, (n, 3) [m] and (n, 4), unit quaternions x y z w.
+    problem
+        Why some have none at the last values; empty if all have.
+
+    Raises
+    ------
+    InvalidValueError
+        If a parameter has no value.
+    """
+
+    def __init__(self, model: ModelView, omitted: Iterable[str] = ()) -> None:
+        left_out = tuple(omitted)
+        self.parents = {
+            name: frame.parent
+            for name, frame in model.frames.items()
+            if name != WORLD and not any(covers(key, name) for key in left_out)
+        }
+        start = model.default_state()
+        coordinates = model.degrees_of_freedom
+        self.coordinates = tuple(map(str, coordinates))
+        self.start = np.array([start[symbol] for symbol in coordinates])
+        parameters = [symbol for symbol in model.symbols if not symbol.has_derivative]
+        poses = {name: model.fk(name, parent) for name, parent in self.parents.items()}
+        moved_by = {
+            name: [self.coordinates.index(str(s)) for s in pose.symbols if s.has_derivative]
+            for name, pose in poses.items()
+        }
+        self.moving = tuple(name for name, indices in moved_by.items() if indices)
+        followers = _find_followers(model)
+        self.joints = (*self.coordinates, *followers)
+        rates = [total_derivative(follower) for follower in followers.values()]
+        outputs = [
+            array([poses[name] for name in self.moving]),
+            array(list(followers.values())),
+            array([rate if _is_known(rate, coordinates) else float("nan") for rate in rates]),
+        ]
+        inputs = [*coordinates, *(symbol.derivative() for symbol in coordinates), *parameters]
+        self._evaluator = compile_expressions(outputs, inputs).bind()
+        self._evaluator.input[2 * len(coordinates) :] = [start[symbol] for symbol in parameters]
+        self.static = {
+            name: pose({s: start[s] for s in pose.symbols})
+            for name, pose in poses.items()
+            if not moved_by[name]
+        }
+        self._movers = np.array([i for name in self.moving for i in moved_by[name]], dtype=np.intp)
+        sizes = [len(moved_by[name]) for name in self.moving]
+        self._starts = np.array([0, *accumulate(sizes)][: len(sizes)], dtype=np.intp)
+        self.problem = ""
+        self.positions, self.velocities = np.zeros(len(self.joints)), np.zeros(len(self.joints))
+        self.translations, self.rotations = np.zeros((len(sizes), 3)), np.zeros((len(sizes), 4))
+
+    def evaluate(self, values: Array, speeds: Array) -> npt.NDArray[np.bool_]:
+        """Compute all for values of the coordinates and their speeds, NaN where they are not known (n,).
+
+        Returns
+        -------
+        numpy.ndarray of bool (n,)
+            Which of the moving frames have a pose: none has one where a loop cannot be closed. The others
+            keep the one before.
+        """
+        count = len(values)
+        self._evaluator.input[:count], self._evaluator.input[count : 2 * count] = values, speeds
+        self.problem = ""
+        try:
+            self._evaluator()
+        except NoSolutionError as error:  # what belongs to the loop is NaN, the rest is there
+            self.problem = str(error)
+        poses, positions, velocities = self._evaluator.outputs
+        self.positions[:count], self.positions[count:] = values, positions.ravel()
+        self.velocities[:count], self.velocities[count:] = speeds, velocities.ravel()
+        poses = poses.reshape(-1, 4, 4)  # of none, too
+        is_placed = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+        rotations = to_quaternion(np.where(is_placed[:, None, None], poses, np.eye(4))[:, :3, :3])
+        rotations *= np.where(np.sum(rotations * self.rotations, axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+        self.translations[is_placed] = poses[is_placed, :3, 3]
+        self.rotations[is_placed] = rotations[is_placed]
+        return is_placed
+
+    def newest(self, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return the newest stamp of the coordinates that move each of the moving frames."""
+        if not len(self._starts):
+            return stamps[:0]
+        newest: npt.NDArray[np.int64] = np.maximum.reduceat(stamps[self._movers], self._starts)
+        return newest
+
+
+def _find_followers(model: ModelView) -> dict[str, Expression]:
+    """Return the positions of joints that are no free coordinates, by name."""
+    names = set(map(str, model.degrees_of_freedom))
+    found = {str(symbol): expression for symbol, expression in model.rates.dependent.items()}
+    for name, record in model.articulations.items():
+        if record.follows is not None and name not in names:
+            found.setdefault(name, model.rates.resolve(record.follows))
+    return found
+
+
+def _is_known(rate: Expression, coordinates: tuple[Symbol, ...]) -> bool:
+    """Return True for a rate that is a function of the coordinates and their own speeds."""
+    return {symbol.position for symbol in rate.symbols if symbol.has_derivative} <= set(coordinates)
