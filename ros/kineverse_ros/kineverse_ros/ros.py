@@ -36,6 +36,7 @@ def import_ros() -> Any:
         qos = importlib.import_module("rclpy.qos")
         clock = importlib.import_module("rclpy.clock")
         executors = importlib.import_module("rclpy.executors")
+        serialization = importlib.import_module("rclpy.serialization")
         signals = importlib.import_module("rclpy.signals")
         messages = {
             name: getattr(importlib.import_module(f"{package}.msg"), name)
@@ -58,6 +59,7 @@ def import_ros() -> Any:
         NO_SIGNALS=signals.SignalHandlerOptions.NO,
         QUEUED=queued,
         STATIC=static,
+        serialize=serialization.serialize_message,
         STEADY=clock.Clock(clock_type=clock.ClockType.STEADY_TIME),
         **messages,
     )
