@@ -263,7 +263,9 @@ class RobotNode:
         if wiring.odometry is not None and self._base is None:
             fixed, moving = wiring.odometry
             self._complaints.add("base", f"TF has no way from '{fixed}' to '{moving}'.", present)
-        topics = [topic for topic in wiring.poses.values() if not self._node.count_publishers(topic)]
+        topics = [
+            topic for topic in wiring.poses.values() if not self._node.get_publishers_info_by_topic(topic)
+        ]
         if topics:
             names = [self._node.resolve_topic_name(topic) for topic in topics]
             self._complaints.add_once(f"Nobody serves the poses {list_some(names, 3)}.")

@@ -114,7 +114,11 @@ class RosRobot:
         self._tick = -math.inf
         self._begin = now()
         self._link, end = Link.pair()
-        self._process = _start_node(end)
+        try:
+            self._process = _start_node(end)
+        except BaseException:
+            self._link.close()
+            raise
         self._link.send(Start(wiring))
         self._reader = threading.Thread(target=self._listen, daemon=True, name="robot node")
         self._reader.start()
@@ -408,20 +412,19 @@ def _to_pose(numbers: tuple[float, ...]) -> Array:
 
 def _start_node(end: Any) -> subprocess.Popen[bytes]:
     """Start the robot node by this Python if it has ROS 2, else by the one that is named."""
-    python = sys.executable
-    if not _has_ros():
-        named = os.environ.get(PYTHON)
-        if not named:
+    named = os.environ.get(PYTHON)
+    python = sys.executable if _has_ros() else named
+    with end:
+        if not python:
             raise MissingDependencyError(
                 "This Python has no ROS 2 (rclpy). With an installed ROS 2, source it: source "
                 "/opt/ros/DISTRO/setup.bash, in an environment of the same Python; or name a Python that has "
                 f"it and kineverse: {PYTHON}=.venv/ros/bin/python, which make ros makes in a checkout."
             )
-        python = named
-    try:
-        return start_process("node", end, python)
-    except OSError as error:
-        raise MissingDependencyError(f"{PYTHON}={python} cannot be started: {error.strerror}.") from None
+        try:
+            return start_process("node", end, python)
+        except OSError as error:
+            raise MissingDependencyError(f"{PYTHON}={python} cannot be started: {error.strerror}.") from None
 
 
 @cache

@@ -27,9 +27,9 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import KinematicWorld, Observation, Robot, Sensors, SimulatedWorld
 
 from .inputs import SECOND, Complaints
-from .robot_node import nanoseconds
 from .robot_settings import RobotConnection, RobotSettings, connect_names, read_settings
 from .ros import import_ros
+from .transforms import make_transform, nanoseconds
 
 _PERIOD = 0.01  # time between two joint states [s]
 _LONGEST = 0.05  # longest step: a world that is slower than that per step is slower than real time [s]
@@ -146,13 +146,14 @@ class SimulatedRobot:
     def publish(self) -> None:
         """Publish what the robot says now."""
         seen = self._world.observe()
-        stamp = self._node.get_clock().now().to_msg()
+        now = self._now()
+        stamp = self._ros.Time(sec=now // SECOND, nanosec=now % SECOND)
         transforms = []
         if self._names.wiring.odometry is not None:
             fixed, moving = self._names.wiring.odometry
             place = self._place(np.array([seen.joints[s] for s in self._place.inputs]))
-            transforms.append(self._make_transform(stamp, fixed, moving, place))
-        transforms += self._publish_poses(seen, stamp)
+            transforms.append(make_transform(self._ros, (fixed, moving), now, _to_numbers(place)))
+        transforms += self._publish_poses(seen, now, stamp)
         if transforms and self._transforms is not None:
             self._transforms.publish(self._ros.TFMessage(transforms=transforms))
         joints = self._ros.JointState(name=self._joint_names)
@@ -160,7 +161,7 @@ class SimulatedRobot:
         joints.position = [seen.joints[s] for s in self._read]
         self._joints.publish(joints)
 
-    def _publish_poses(self, seen: Observation, stamp: Any) -> list[Any]:
+    def _publish_poses(self, seen: Observation, now: int, stamp: Any) -> list[Any]:
         """Publish poses that are seen on their topics, and return those that belong into TF."""
         transforms, world = [], self._frames[WORLD]
         for frame, pose in seen.poses.items():
@@ -169,22 +170,17 @@ class SimulatedRobot:
                     continue  # a message takes longer than the look
                 message = self._ros.PoseStamped()
                 message.header.stamp, message.header.frame_id = stamp, world
-                _fill(message.pose.position, message.pose.orientation, pose)
+                place, turn = message.pose.position, message.pose.orientation
+                place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = _to_numbers(pose)
                 self._poses[frame].publish(message)
             elif frame in self._seen_in_tf:
-                transforms.append(self._make_transform(stamp, world, self._seen_in_tf[frame], pose))
+                name = self._seen_in_tf[frame]
+                transforms.append(make_transform(self._ros, (world, name), now, _to_numbers(pose)))
         return transforms
 
-    def _make_transform(self, stamp: Any, parent: str, child: str, pose: Array) -> Any:
-        message = self._ros.TransformStamped(child_frame_id=child)
-        message.header.stamp, message.header.frame_id = stamp, parent
-        _fill(message.transform.translation, message.transform.rotation, pose)
-        return message
 
-
-def _fill(position: Any, rotation: Any, pose: Array) -> None:
-    position.x, position.y, position.z = pose[:3, 3].tolist()
-    rotation.x, rotation.y, rotation.z, rotation.w = to_quaternion(pose[:3, :3]).tolist()
+def _to_numbers(pose: Array) -> tuple[float, ...]:
+    return (*pose[:3, 3].tolist(), *to_quaternion(pose[:3, :3]).tolist())
 
 
 def make_world(
