@@ -111,6 +111,7 @@ class FakeRos(SimpleNamespace):
             STATIC=SimpleNamespace(depth=100, latched=True),
             QUEUED=SimpleNamespace(depth=100, latched=False),
             STEADY=None,
+            serialize=lambda message: None,
         )
         self.parameters = dict(parameters or {})
         self.nanoseconds = round(start * SECOND)
@@ -236,6 +237,7 @@ class FakeNode:
     def create_timer(self, period: float, callback: Callable[[], Any], clock: None = None) -> SimpleNamespace:
         step = round(period * SECOND)
         timer = SimpleNamespace(due=self.ros.nanoseconds + step, period=step, callback=callback)
+        timer.reset = lambda: setattr(timer, "due", self.ros.nanoseconds + step)
         self.timers.append(timer)
         return timer
 

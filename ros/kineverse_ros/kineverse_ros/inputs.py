@@ -202,8 +202,8 @@ class JointStateFilter:
 class Topics:
     """Subscriptions of a node, whose callbacks are told the source of each message.
 
-    A source is a node and its topic, as in ``/joint_states of /driver``. A topic that nobody serves, and one
-    that is served with messages of another type, is said once.
+    A source is a node and its topic, as in ``/joint_states of /driver``. A topic that nobody serves, one that
+    is served with messages of another type, and messages that were lost are said.
 
     Parameters
     ----------
@@ -213,28 +213,45 @@ class Topics:
         Function that returns the time [ns].
     clock
         Clock of rclpy that goes on where the time stands still, as it does without a simulator.
+
+    Attributes
+    ----------
+    received, lost
+        Number of messages by source; ROS before kilted does not tell what was lost.
     """
 
     def __init__(self, node: Any, complaints: Complaints, now: Callable[[], int], clock: Any = None) -> None:
         self._node, self._complaints, self._now = node, complaints, now
         self._wanted: dict[str, tuple[str, int]] = {}  # type of the messages, and how long they are awaited
+        self.received, self.lost = Counter[str](), Counter[str]()
         self._sources: dict[tuple[str, bytes], str] = {}
-        self._subscriptions: list[Any] = []
+        self._numbers: dict[str, int] = {}  # of the last message of each source
+        self._subscriptions: list[tuple[Any, Any, Callable[[Any, Any], None]]] = []
         node.create_timer(1.0, self.check, clock=clock)
 
     def subscribe(self, kind: Any, topic: str, callback: Callable[[Any, str], object], quality: Any) -> None:
         """Have a function called with each message of a topic, and its source."""
 
         def receive(message: Any, info: Any) -> None:
-            callback(message, self._source(topic, info))
+            source = self._source(topic, info)
+            self._count(source, info)
+            callback(message, source)
 
-        self._subscriptions.append(self._node.create_subscription(kind, topic, receive, quality))
+        subscription = self._node.create_subscription(kind, topic, receive, quality)
+        self._subscriptions.append((subscription, kind, receive))
         package = kind.__module__.partition(".")[0]
         self._wanted[topic] = f"{package}/msg/{kind.__name__}", 0
 
+    def drain(self) -> None:
+        """Take all messages that have come, without an executor."""
+        for subscription, kind, receive in self._subscriptions:
+            with subscription.handle:
+                while (taken := subscription.handle.take_message(kind, False)) is not None:
+                    receive(*taken)
+
     def close(self) -> None:
         """End all subscriptions."""
-        for subscription in self._subscriptions:
+        for subscription, _, _ in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions, self._wanted = [], {}
 
@@ -253,6 +270,18 @@ class Topics:
                 self._complaints.add_once(text)
             elif waited >= _PATIENCE:
                 self._complaints.add_once(f"Nobody serves {name} ({kind}).")
+
+    def _count(self, source: str, info: Any) -> None:
+        self.received[source] += 1
+        number = info.get("publication_sequence_number") if isinstance(info, dict) else None
+        if number is None:
+            return
+        lost = number - self._numbers.get(source, number - 1) - 1
+        self._numbers[source] = number
+        if lost > 0:
+            self.lost[source] += lost
+            text = f"Messages of {source} were lost, {self.lost[source]} so far."
+            self._complaints.add(f"lost {source}", text, self._now())
 
     def _source(self, topic: str, info: Any) -> str:
         """Return a name of the publisher of a message, another one for each."""

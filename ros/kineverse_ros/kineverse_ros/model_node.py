@@ -6,10 +6,13 @@ describe. A live model is followed through its edits.
 
 from __future__ import annotations
 
+import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +41,7 @@ from .model_settings import ModelSettings, Value, declare_settings
 from .names import NameMap, covers
 from .ros import import_ros
 from .tracking import PoseInputs, PoseTracking
+from .transforms import TransformPublisher, make_transform, nanoseconds
 
 if TYPE_CHECKING:
     from kineverse.exchange import Connection, StatePublisher, StateReader
@@ -48,6 +52,7 @@ JOINT_STATES, ALL_JOINT_STATES = "joint_states", "joint_states/all"
 DESCRIPTION, DOCUMENT, MARKERS = "robot_description", "kineverse_document", "visualization_marker_array"
 
 _FRESH = SECOND  # age up to which a reading is said again with others
+_SPIN = 0.1  # time between two looks at what is not read in each period, such as services [s]
 _IDLE = 4.0  # time without another look at an edited model, in times of what the last one took
 
 
@@ -75,7 +80,6 @@ class _Tables:
             NameMap(names, settings.frame_names, settings.frame_prefix),
             NameMap(joints, settings.joint_names),
         )
-
 
     @property
     def shown(self) -> frozenset[str]:
@@ -123,6 +127,11 @@ class ModelNode:
     model
         The model. A live one is followed.
 
+    Attributes
+    ----------
+    inputs
+        Subscriptions, with the numbers of messages that came in and were lost.
+
     Raises
     ------
     UnknownNameError, DuplicateNameError, InvalidValueError
@@ -131,8 +140,9 @@ class ModelNode:
 
     def __init__(self, ros: Any, node: Any, model: kv.Model, settings: ModelSettings) -> None:
         self._ros, self._node, self._model, self._settings = ros, node, model, settings
+        self._last_now = self._sent_joints = 0
         self._complaints = Complaints(node.get_logger().warning)
-        self._topics = Topics(node, self._complaints, self._now, ros.STEADY)
+        self.inputs = Topics(node, self._complaints, self._now, ros.STEADY)
         self._connection: Connection | None = getattr(model, "exchange", None)
         self._version, self._look = model.version, 0.0
         self._tables = _Tables.build(model.copy(), settings)
@@ -141,15 +151,17 @@ class ModelNode:
             raise InvalidValueError(
                 "There is nothing to publish: the model has no frames, or all are omitted."
             )
+        if settings.share and self._connection is None:
+            raise InvalidValueError("share is for a live model: there is no server to give readings to.")
         self._values = CoordinateValues(output)
         self._filter = JointStateFilter(self._tables.joints, output.coordinates, self._complaints)
         self._tracking = PoseTracking(self._tables.model, settings.deviations)
         self._poses = PoseInputs(
-            ros, self._topics, settings.observed, self._complaints, self._now, self._observe
+            ros, self.inputs, settings.observed, self._complaints, self._now, self._observe
         )
         self._poses.follow(self._tables.frames, (WORLD, *self._tables.model.frames), output.parents)
         for topic in settings.sources:
-            self._topics.subscribe(ros.JointState, topic, self._hear, ros.QUEUED)
+            self.inputs.subscribe(ros.JointState, topic, self._hear, ros.QUEUED)
         self.joint_topic = ALL_JOINT_STATES if JOINT_STATES in settings.sources else JOINT_STATES
         self._tf = node.create_publisher(ros.TFMessage, "/tf", ros.QUEUED)
         self._joint_states = node.create_publisher(ros.JointState, self.joint_topic, ros.QUEUED)
@@ -162,11 +174,9 @@ class ModelNode:
             if self._connection is None
             else _ServerState(self._connection, settings.share, self._tables.joints)
         )
-        self._last_now = self._sent_joints = 0
         self._describing: threading.Thread | None = None
         self._described: _Tables | None = None
         self._publish_tables()
-        node.create_timer(1.0 / settings.rate, self._tick)
 
     @property
     def summary(self) -> str:
@@ -202,10 +212,18 @@ class ModelNode:
     # -- what comes in -------------------------------------------------------------------------------------
 
     def _now(self) -> int:
-        return int(self._node.get_clock().now().nanoseconds)
+        """Return the time [ns]; begin anew if the clock was set back."""
+        now = int(self._node.get_clock().now().nanoseconds)
+        if now < self._last_now:
+            self._sent_joints = 0
+            self._values.stamps = np.minimum(self._values.stamps, 1)  # read, and older than all that comes
+            self._sent[:] = 1
+            self._tracking.forget()
+        self._last_now = now
+        return now
 
     def _hear(self, message: Any, source: str) -> None:
-        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+        stamp = nanoseconds(message.header.stamp)
         readings = self._filter.accept(
             source, stamp, message.name, message.position, message.velocity, self._now()
         )
@@ -234,27 +252,18 @@ class ModelNode:
 
     # -- what goes out -------------------------------------------------------------------------------------
 
-    def _tick(self) -> None:
+    def tick(self) -> None:
+        """Publish what is new; called in each period."""
         now = self._now()
         if now == 0:
             return
-        if now < self._last_now:
-            self._forget_times(now)
-        self._last_now = now
         self._follow_model()
         self._read_server(now)
         self._publish_state(now)
 
-    def _forget_times(self, now: int) -> None:
-        """Begin anew, since the clock was set back."""
-        self._sent_joints = 0
-        self._values.stamps = np.minimum(self._values.stamps, 1)  # read, and older than all that comes
-        self._sent[:] = 1
-        self._tracking.forget()
-
     def _publish_state(self, now: int) -> None:
         output, values = self._tables.output, self._values
-        newest = output.newest(values.stamps)
+        newest = output.movers.newest(values.stamps)
         # What nobody reads stands at home, at the present.
         stamps = np.where(newest == 0, now, newest)
         due = stamps > self._sent
@@ -264,28 +273,12 @@ class ModelNode:
         is_placed = output.evaluate(values.values, values.speeds)
         if output.problem:
             self._complaints.add("loop", output.problem, now)
-        due &= is_placed
-        self._publish_transforms(due, stamps)
+        places = np.flatnonzero(due & is_placed)
+        poses = np.hstack([output.translations[places], output.rotations[places]])
+        self._transforms.publish(places, stamps[places], poses)
+        self._sent[places] = stamps[places]
         if joint_stamp is not None:
             self._publish_joints(joint_stamp, now)
-
-    def _publish_transforms(self, due: npt.NDArray[np.bool_], stamps: Stamps) -> None:
-        output = self._tables.output
-        places = np.flatnonzero(due)
-        if not len(places):
-            return
-        times: dict[int, Any] = {}
-        moved = []
-        numbers = np.hstack([output.translations[places], output.rotations[places]]).tolist()
-        for place, stamp, pose in zip(places.tolist(), stamps[places].tolist(), numbers, strict=True):
-            message = self._transforms[place]
-            if stamp not in times:
-                times[stamp] = self._time(stamp)
-            message.header.stamp = times[stamp]
-            _fill(message.transform, pose)
-            moved.append(message)
-        self._sent[places] = stamps[places]
-        self._tf.publish(self._ros.TFMessage(transforms=moved))
 
     def _find_joint_stamp(self, now: int) -> int | None:
         """Return the stamp of joint states if there is something new to say."""
@@ -297,17 +290,17 @@ class ModelNode:
 
     def _publish_joints(self, stamp: int, now: int) -> None:
         """Publish all joints but those whose source is silent, and those of loops that are not closed."""
-        output, values = self._tables.output, self._values
-        stale = (values.stamps > 0) & (now - values.stamps > _FRESH)
-        is_left_out = np.zeros(len(output.joints), dtype=bool)
-        is_left_out[: len(stale)] = stale
-        kept = np.flatnonzero(~is_left_out & np.isfinite(output.positions))
-        message = self._joint_message
+        output, values, message = self._tables.output, self._values, self._joint_message
+        is_kept = np.isfinite(output.positions)
+        stamps = output.joint_movers.newest(values.stamps)
+        is_kept &= (stamps == 0) | (now - stamps <= _FRESH)
+        kept = np.flatnonzero(is_kept)
+        velocities = output.velocities[kept]
         message.header.stamp = self._time(stamp)
         message.name = [self._joint_names[place] for place in kept.tolist()]
-        message.position = output.positions[kept].tolist()
-        velocities = output.velocities[kept]
-        message.velocity = velocities.tolist() if np.isfinite(velocities).all() else []
+        message.position = array("d", output.positions[kept].tobytes())
+        is_moving = bool(np.isfinite(velocities).all())
+        message.velocity = array("d", velocities.tobytes() if is_moving else b"")
         self._sent_joints = stamp
         self._joint_states.publish(message)
 
@@ -341,25 +334,21 @@ class ModelNode:
     def _publish_tables(self) -> None:
         """Publish what is static, and prepare messages of what moves."""
         tables, ros = self._tables, self._ros
-        output = tables.output
+        output, frames = tables.output, tables.frames
         self._sent: Stamps = np.zeros(len(output.moving), dtype=np.int64)
-        self._transforms = [self._make_transform(tables, name) for name in output.moving]
+        names = {
+            child: (frames.to_ros(parent), frames.to_ros(child)) for child, parent in output.parents.items()
+        }
+        self._transforms = TransformPublisher(ros, self._tf, [names[child] for child in output.moving])
         self._joint_names = [tables.joints.to_ros(name) for name in output.joints]
         self._joint_message = ros.JointState()
-        static = []
-        for name, pose in output.static.items():
-            message = self._make_transform(tables, name)
-            message.header.stamp = self._time(self._now())
-            _fill(message.transform, [*pose[:3, 3].tolist(), *to_quaternion(pose[:3, :3]).tolist()])
-            static.append(message)
+        now, static = self._now(), []
+        for child, pose in output.static.items():
+            numbers = [*pose[:3, 3].tolist(), *to_quaternion(pose[:3, :3]).tolist()]
+            static.append(make_transform(ros, names[child], now, numbers))
         self._static_tf.publish(ros.TFMessage(transforms=static))
-        self._markers.publish(make_markers(ros, tables.model, tables.frames, tables.shown))
+        self._markers.publish(make_markers(ros, tables.model, frames, tables.shown))
         self._describe_anew()
-
-    def _make_transform(self, tables: _Tables, name: str) -> Any:
-        message = self._ros.TransformStamped(child_frame_id=tables.frames.to_ros(name))
-        message.header.frame_id = tables.frames.to_ros(tables.output.parents[name])
-        return message
 
     def _describe_anew(self) -> None:
         """Have a thread publish URDF and document of the newest tables, which takes long for large models."""
@@ -425,11 +414,6 @@ class _ServerState:
             self._publisher = None
 
 
-def _fill(transform: Any, numbers: Sequence[float]) -> None:
-    place, turn = transform.translation, transform.rotation
-    place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = numbers
-
-
 def load_model(sources: Sequence[str]) -> kv.Model:
     """Load a model, or several into one; a live one stays connected.
 
@@ -474,12 +458,41 @@ def run_model_node(
         settings = declare_settings(ros, node, given)
         model_node = ModelNode(ros, node, load_model(settings.model), settings)
         started(model_node)
-        executor = ros.Executor()
-        executor.add_node(node)
-        while ros.rclpy.ok():
-            executor.spin_once(timeout_sec=1.0)
+        _spin(ros, node, model_node, settings.rate)
     finally:
         ros.rclpy.try_shutdown()
+
+
+def _spin(ros: Any, node: Any, model_node: ModelNode, rate: float) -> None:
+    """Run until a signal: an executor would take a millisecond for each message."""
+    executor = ros.Executor()
+    executor.add_node(node)
+    is_simulated = bool(node.get_parameter("use_sim_time").value)
+    due = spin_due = time.monotonic()
+    with _ending_signals() as is_over:
+        while not is_over():
+            model_node.inputs.drain()
+            model_node.tick()
+            if is_simulated or due >= spin_due:  # /clock is read by the executor
+                executor.spin_once(timeout_sec=0.0)
+                spin_due = due + _SPIN
+            due = max(due + 1.0 / rate, time.monotonic())
+            time.sleep(max(due - time.monotonic(), 0.0))
+
+
+@contextmanager
+def _ending_signals() -> Iterator[Callable[[], bool]]:
+    """Have Ctrl-C and SIGTERM make a function true, as exceptions do not pass through C code of rclpy."""
+    arrived: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: arrived.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield lambda: bool(arrived)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def main() -> int:

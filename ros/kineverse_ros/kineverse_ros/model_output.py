@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from itertools import accumulate
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +43,8 @@ class ModelOutput:
         Parent of each frame.
     static
         Poses (4, 4) in the parents of the other frames.
+    movers, joint_movers
+        Which coordinates move the moving frames, and the joints.
     positions, velocities
         Of the joints, in their order; a velocity is NaN if it is not known.
     translations, rotations
@@ -91,12 +92,14 @@ class ModelOutput:
             for name, pose in poses.items()
             if not moved_by[name]
         }
-        self._movers = np.array([i for name in self.moving for i in moved_by[name]], dtype=np.intp)
-        sizes = [len(moved_by[name]) for name in self.moving]
-        self._starts = np.array([0, *accumulate(sizes)][: len(sizes)], dtype=np.intp)
+        self.movers = _Movers([moved_by[name] for name in self.moving])
+        places = {name: [place] for place, name in enumerate(self.coordinates)}
+        followed = [[places[str(s)][0] for s in e.symbols if s.has_derivative] for e in followers.values()]
+        self.joint_movers = _Movers([*places.values(), *followed])
         self.problem = ""
         self.positions, self.velocities = np.zeros(len(self.joints)), np.zeros(len(self.joints))
-        self.translations, self.rotations = np.zeros((len(sizes), 3)), np.zeros((len(sizes), 4))
+        count = len(self.moving)
+        self.translations, self.rotations = np.zeros((count, 3)), np.zeros((count, 4))
 
     def evaluate(self, values: Array, speeds: Array) -> npt.NDArray[np.bool_]:
         """Compute all for values of the coordinates and their speeds, NaN where they are not known (n,).
@@ -119,17 +122,29 @@ class ModelOutput:
         self.velocities[:count], self.velocities[count:] = speeds, velocities.ravel()
         poses = poses.reshape(-1, 4, 4)  # of none, too
         is_placed = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-        rotations = to_quaternion(np.where(is_placed[:, None, None], poses, np.eye(4))[:, :3, :3])
-        rotations *= np.where(np.sum(rotations * self.rotations, axis=1, keepdims=True) < 0.0, -1.0, 1.0)
-        self.translations[is_placed] = poses[is_placed, :3, 3]
-        self.rotations[is_placed] = rotations[is_placed]
+        placed = poses[is_placed]
+        rotations = to_quaternion(placed[:, :3, :3])
+        is_opposite = np.einsum("ij,ij->i", rotations, self.rotations[is_placed]) < 0.0
+        rotations[is_opposite] *= -1.0
+        self.translations[is_placed], self.rotations[is_placed] = placed[:, :3, 3], rotations
         return is_placed
 
+
+class _Movers:
+    """Which coordinates move each of some things."""
+
+    def __init__(self, indices: Sequence[Sequence[int]]) -> None:
+        # A thing that nothing moves has the one after the last, which is never read.
+        listed = [list(some) or [-1] for some in indices]
+        self._indices = np.array([index for some in listed for index in some], dtype=np.intp)
+        self._starts = np.cumsum([0, *map(len, listed)])[: len(listed)]
+
     def newest(self, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the newest stamp of the coordinates that move each of the moving frames."""
+        """Return the newest of the stamps of the coordinates that move each; 0 where none does."""
         if not len(self._starts):
-            return stamps[:0]
-        newest: npt.NDArray[np.int64] = np.maximum.reduceat(stamps[self._movers], self._starts)
+            return np.zeros(0, dtype=np.int64)
+        extended = np.append(stamps, 0)
+        newest: npt.NDArray[np.int64] = np.maximum.reduceat(extended[self._indices], self._starts)
         return newest
 
 

@@ -63,3 +63,4 @@ def import_ros() -> Any:
         STEADY=clock.Clock(clock_type=clock.ClockType.STEADY_TIME),
         **messages,
     )
+
