@@ -28,7 +28,7 @@ from .manipulate_skills import (
     make_scene,
 )
 from .output import format_table, join_lines, name_options, show_activity
-from .outside_robot import OutsideRobot, check_world, is_outside
+from .outside_robot import OutsideRobot, check_world, is_outside, refuse_start
 from .pages import (
     add_page_options,
     check_picture_path,
@@ -283,7 +283,9 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
         "recording": arguments.record is not None,
         "view": arguments.view,
     }
-    check_world(arguments)
+    check_world(arguments.world, ("kinematic", "mujoco"))
+    if is_outside(arguments.world):
+        refuse_start(arguments)
     # A push takes what stands in its way into account without a planner.
     require(f"kineverse {skill}", extras, compiler=skill != "push")
     if not arguments.seconds > 0 or math.isinf(arguments.seconds):

@@ -26,11 +26,11 @@ from .output import join_lines
 
 if TYPE_CHECKING:
     from kineverse.manipulation import Belief
+    from kineverse.planning.trajectories.trajectory import Trajectory
 
 ENTRY_POINTS = "kineverse.robots"
 """Group of entry points by which other distributions connect robots; each names a :class:`Connect`."""
 
-_SIMULATED = ("kinematic", "mujoco")
 _OUTSIDE = "ros"
 _LOOKING, _STEP = 5.0, 0.05  # longest time until an object is seen, and time between two looks [s]
 _SETTLING = 0.5  # time in which the estimate of an object at rest settles [s]
@@ -40,6 +40,9 @@ class ConnectedRobot(RobotInterface, AbstractContextManager["ConnectedRobot"], P
     """Robot outside of this process, until its context is left."""
 
     observed: Sequence[str]  # frames whose poses come with its readings
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """Follow a path, and return at its end; a SimulationError if it is given up."""
 
 
 class Connect(Protocol):
@@ -56,16 +59,18 @@ def is_outside(world: str) -> bool:
     return world.partition(":")[0] == _OUTSIDE
 
 
-def check_world(arguments: argparse.Namespace) -> None:
-    """Check ``--world``, and options of which a robot outside knows nothing."""
-    name, colon, file = arguments.world.partition(":")
-    if arguments.world not in _SIMULATED and (name != _OUTSIDE or bool(colon) != bool(file)):
+def check_world(world: str, simulated: Sequence[str] = ()) -> None:
+    """Check ``--world``: one of some simulated ones, or a robot outside."""
+    name, colon, file = world.partition(":")
+    if world not in simulated and (name != _OUTSIDE or bool(colon) != bool(file)):
         raise UnknownNameError(
-            f"--world {arguments.world}: there is no such world. There are {', '.join(_SIMULATED)}, and "
-            f"{_OUTSIDE}, also with a file of settings: {_OUTSIDE}:robot.toml."
+            f"--world {world}: there is no such world. There is {', '.join([*simulated, _OUTSIDE])}, also with "
+            f"a file of settings: {_OUTSIDE}:robot.toml."
         )
-    if name != _OUTSIDE:
-        return
+
+
+def refuse_start(arguments: argparse.Namespace) -> None:
+    """Refuse options of which a robot outside knows nothing."""
     for option, given, why in (
         ("--from", arguments.start, "the robot sees where the object is"),
         ("--set", arguments.assignments, "the robot begins where it is, and so does all else"),
