@@ -109,11 +109,6 @@ class CoordinateValues:
                 self.values[place], self.stamps[place] = value, readings.stamp
                 self.speeds[place] = readings.velocities.get(name, np.nan)
 
-    @property
-    def read(self) -> dict[str, float]:
-        """Values by name of what was read."""
-        return {name: float(self.values[i]) for name, i in self.places.items() if self.stamps[i]}
-
 
 class ModelNode:
     """Node of one model.
@@ -154,6 +149,7 @@ class ModelNode:
         if settings.share and self._connection is None:
             raise InvalidValueError("share is for a live model: there is no server to give readings to.")
         self._values = CoordinateValues(output)
+        self._measured: set[str] = set()  # coordinates that were read, and are not to be estimated from poses
         self._filter = JointStateFilter(self._tables.joints, output.coordinates, self._complaints)
         self._tracking = PoseTracking(self._tables.model, settings.deviations)
         self._poses = PoseInputs(
@@ -227,14 +223,18 @@ class ModelNode:
         readings = self._filter.accept(
             source, stamp, message.name, message.position, message.velocity, self._now()
         )
-        self._take(readings)
+        if readings is not None:
+            self._measured.update(readings.positions)
+            self._take(readings)
 
     def _observe(self, frame: str, reference: str, pose: Array, stamp: int) -> None:
-        self._take(self._tracking.observe(frame, reference, pose, stamp, self._values.read))
+        places, values = self._values.places, self._values.values
+        measured = {name: float(values[places[name]]) for name in self._measured & places.keys()}
+        readings = self._tracking.observe(frame, reference, pose, stamp, measured)
+        if readings is not None:
+            self._take(readings)
 
-    def _take(self, readings: Readings | None) -> None:
-        if readings is None:
-            return
+    def _take(self, readings: Readings) -> None:
         self._values.take(readings)
         if self._exchange is not None:
             self._exchange.share(readings)
@@ -248,6 +248,7 @@ class ModelNode:
                 source, now if uses_own_time else stamp, names, positions, velocities, now
             )
             if found is not None:
+                self._measured.update(found.positions)
                 self._values.take(found)
 
     # -- what goes out -------------------------------------------------------------------------------------
@@ -284,9 +285,9 @@ class ModelNode:
         """Return the stamp of joint states if there is something new to say."""
         stamps = self._values.stamps
         newest = int(stamps.max(initial=0))
-        if now - newest > _FRESH:
-            newest = now if (stamps == 0).any() or not len(stamps) else 0
-        return newest if newest > self._sent_joints else None
+        if newest > self._sent_joints and now - newest <= _FRESH:
+            return newest
+        return now if now > self._sent_joints and not stamps.all() else None
 
     def _publish_joints(self, stamp: int, now: int) -> None:
         """Publish all joints but those whose source is silent, and those of loops that are not closed."""

@@ -52,14 +52,14 @@ class PoseTracking:
                 self._tracker = None
 
     def observe(
-        self, frame: str, reference: str, pose: Array, stamp: int, read: Mapping[str, float]
+        self, frame: str, reference: str, pose: Array, stamp: int, measured: Mapping[str, float]
     ) -> Readings | None:
-        """Return what a pose of a frame in another one tells, with values of what is read elsewhere.
+        """Return what a pose of a frame in another one tells, with values of what is measured elsewhere.
 
-        None if all that moves the frame is read.
+        None if that is all that moves the frame.
         """
         moved_by = set(map(str, self._model.symbols_of(frame, reference)))
-        inputs = self._inputs | (moved_by & read.keys())
+        inputs = self._inputs | (moved_by & measured.keys())
         if moved_by <= inputs:
             return None
         if self._tracker is None or self._references.get(frame) != reference or inputs != self._inputs:
@@ -74,7 +74,7 @@ class PoseTracking:
                 inputs=sorted(inputs),
                 lag=_LAG,
             )
-        values = {name: read[name] for name in inputs}
+        values = {name: measured[name] for name in inputs}
         estimate = self._tracker.update({frame: pose}, at=stamp / SECOND, inputs=values)
         found = {str(symbol): estimate.state[symbol] for symbol in self._tracker.symbols}
         return Readings(stamp, {name: value for name, value in found.items() if name in moved_by}, {})
