@@ -11,11 +11,11 @@ import time
 import numpy as np
 import pytest
 from fake_rclpy import SECOND
-from kineverse.model.basic_operations import SetBody
 from model_bench import Bench, assert_tf_is_fk
 
 import kineverse as kv
 from kineverse.lie import translation
+from kineverse.model.basic_operations import SetBody
 
 LONG = 20.0  # longest time that anything is waited for [s]
 HINGE = "revolute/door"
