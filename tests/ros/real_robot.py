@@ -137,7 +137,7 @@ def cut_all(rounds: int) -> dict[str, Any]:
         note("skill killed", skill.kill)
     finally:
         robot.end()
-    return {"times": times, "said": said[1::2]}
+    return {"times": times, "said": [line.strip() for line in said[1::2]]}
 
 
 def open_object(model: str, name: str, coordinate: str, words: list[str]) -> dict[str, Any]:

@@ -135,12 +135,12 @@ class Link:
 
     def receive(self, timeout: float | None = None) -> Any:
         """Return the next message, or None after a time [s]; an EOFError if the other end is gone."""
-        ready, _, _ = select.select([self._socket], [], [], timeout)
-        if not ready:
-            return None
         try:
+            ready, _, _ = select.select([self._socket], [], [], timeout)
+            if not ready:
+                return None
             data = self._socket.recv(_LARGEST)
-        except OSError:
+        except (OSError, ValueError):  # this end was closed meanwhile
             data = b""
         if not data:
             raise EOFError

@@ -36,6 +36,14 @@ from .transforms import TransformTree, nanoseconds, to_matrix, to_numbers
 _NEWEST = 10  # depth of queues: of a few publishers, and no more, since what is old is of no use
 _BEAT = 0.02  # time between two signs of life, and between two zeros [s]
 _ZEROS = 5  # how often a stop is said, since a message may be lost
+_PROGRAM = f"""\
+import sys
+try:
+    from {__name__} import main
+except ImportError as error:
+    sys.exit(f"kineverse: the robot node cannot be imported by {{sys.executable}}: {{error}}.")
+main()
+"""
 _HOLDING = 0.1  # time in which a joint that followed a path comes to rest [s]
 
 
@@ -254,15 +262,15 @@ class RobotNode:
 
     def _name_missing(self) -> None:
         """Say what has never been read."""
-        wiring, present = self._wiring, self._ros_now()
+        wiring = self._wiring
         missing = [self._joints.to_ros(name) for name in wiring.read if name not in self._positions]
         if missing:
             topic = self._node.resolve_topic_name(wiring.joint_states)
             text = f"No position of {list_some(missing, 3)} has come on {topic}."
-            self._complaints.add("joints", text, present)
+            self._complaints.add_once(text)
         if wiring.odometry is not None and self._base is None:
             fixed, moving = wiring.odometry
-            self._complaints.add("base", f"TF has no way from '{fixed}' to '{moving}'.", present)
+            self._complaints.add_once(f"TF has no way from '{fixed}' to '{moving}'.")
         topics = [
             topic for topic in wiring.poses.values() if not self._node.get_publishers_info_by_topic(topic)
         ]
@@ -373,9 +381,9 @@ def guard_robot(commands: Commands, link: Link, timeout: float) -> None:
             last = msgspec.structs.replace(last, moves=False)
 
 
-def main(words: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Run the node, or its guard, at the end of a link whose file descriptor is named."""
-    role, descriptor = sys.argv[1:] if words is None else words
+    role, descriptor = sys.argv[1:]
     link = Link(socket.socket(fileno=int(descriptor)))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the skill ends first, and says what is next
     with suppress(OSError, AttributeError):  # where a user may: a busy machine does not make the robot stop
@@ -432,12 +440,8 @@ def start_process(role: str, end: socket.socket, python: str) -> subprocess.Pope
     if python != sys.executable:  # wheels of ROS set these for the Python that they are installed in
         for name in ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH"):
             environment.pop(name, None)
-    words = [python, "-m", __spec__.name if __name__ == "__main__" else __name__, role, str(end.fileno())]
     with end:
+        words = [python, "-c", _PROGRAM, role, str(end.fileno())]
         return subprocess.Popen(
             words, pass_fds=[end.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
         )
-
-
-if __name__ == "__main__":
-    main()

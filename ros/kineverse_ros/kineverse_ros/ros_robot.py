@@ -47,6 +47,7 @@ _LATER = 0.01  # how much older than the readings a picture is, so that all of i
 _PICTURE = 0.002  # difference of times of poses in a picture [s]
 _NOTES = 8  # number of sentences that are kept
 _STEP = 0.02  # time between two looks at a path [s]
+_ENDED = "The robot node has ended, and the robot was stopped."
 _LAG = 0.5  # time by which a robot may be late on its path [s]
 _ARRIVAL = 2.0  # time in which it has to be at the end of its path [s]
 
@@ -139,7 +140,7 @@ class RosRobot:
 
     def close(self) -> None:
         """Stop the robot, and end its node."""
-        self._link.send(End())
+        self._link.send(End(), wait=self.timeout)
         try:
             self._process.wait(2.0)
         except subprocess.TimeoutExpired:
@@ -364,7 +365,7 @@ class RosRobot:
                     self._lock.notify_all()
         except EOFError:
             with self._lock:
-                self._ended = self._ended or "The robot node has ended, and the robot was stopped."
+                self._ended = self._ended or _ENDED
                 self._lock.notify_all()
 
     def _take(self, message: Readings) -> None:
@@ -383,7 +384,8 @@ class RosRobot:
             self._ended = message.text
         elif message.text not in self._notes:
             self._notes.append(message.text)
-        logger.warning(message.text)
+        if self._history:  # before, the error has them
+            logger.warning(message.text)
 
     def _check(self) -> None:
         if self._ended:
@@ -398,6 +400,10 @@ class RosRobot:
         with self._lock:
             self._lock.wait_for(lambda: bool(self._ended or not self._begins), _START)
             self._lock.wait_for(lambda: bool(self._ended or self._history), _WAIT)
+            if self._ended == _ENDED and self._begins:
+                raise MissingDependencyError(
+                    "The robot node has ended at once. Its Python needs ROS 2, kineverse and kineverse_ros."
+                )
             if self._ended:
                 raise OfflineError(self._ended)
             if not self._history:
