@@ -1,4 +1,4 @@
-"""What is said once of a model, and again after edits: the URDF of it, and markers of its shapes."""
+"""URDF and markers of a model, which are said once, and again after edits."""
 
 from __future__ import annotations
 

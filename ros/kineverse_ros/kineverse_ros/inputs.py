@@ -14,7 +14,7 @@ from .names import NameMap
 SECOND = 1_000_000_000  # [ns]; times are integers, since a double of today's seconds has steps of 200 ns
 
 MOST_AHEAD, MOST_BEHIND = SECOND // 2, SECOND
-"""How far a stamp may be from the present of the clock."""
+"""Largest distances of a stamp from the present of the clock, ahead and behind."""
 
 _SILENCE = SECOND  # after which another source may have a joint
 _PATIENCE = 3  # seconds until a topic that nobody serves is named

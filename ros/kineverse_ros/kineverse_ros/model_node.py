@@ -58,7 +58,7 @@ _IDLE = 4.0  # time without another look at an edited model, in times of what th
 
 @dataclass
 class _Tables:
-    """What follows from one version of a model."""
+    """Output and names of one version of a model."""
 
     model: kv.Model
     output: ModelOutput
@@ -176,7 +176,7 @@ class ModelNode:
 
     @property
     def summary(self) -> str:
-        """What is published, in a line."""
+        """Line about the frames and joints that are published."""
         output = self._tables.output
         parts = (
             (len(output.moving), "moving frame"),

@@ -1,4 +1,4 @@
-"""What a model says at a state: poses of its frames in their parents, and positions of all joints."""
+"""Output of a model at a state: poses of its frames in their parents, and positions of all joints."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class ModelOutput:
 
 
 class _Movers:
-    """Which coordinates move each of some things."""
+    """Coordinates that move each of some things."""
 
     def __init__(self, indices: Sequence[Sequence[int]]) -> None:
         # A thing that nothing moves has the one after the last, which is never read.

@@ -1,4 +1,4 @@
-"""What is used of ROS 2, imported when it is used, and the qualities of service of its topics."""
+"""ROS 2, imported when it is used, and the qualities of service of its topics."""
 
 from __future__ import annotations
 
