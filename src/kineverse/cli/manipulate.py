@@ -350,7 +350,9 @@ def _act(run: _Run, watchers: list[Callable[[SkillStep], object]], record: str |
             watchers.append(recorder)
 
         def look(step: SkillStep) -> None:
-            run.believed = step.state
+            # The model of a skill that learns a joint has other coordinates.
+            known = {s: v for s, v in step.state.items() if s in run.believed}
+            run.believed = run.believed.updated(known)
             for watch in watchers:
                 watch(step)
 
@@ -428,8 +430,10 @@ class _PhaseLines:
     def __call__(self, session: SkillStep) -> None:
         if session.phase != self._phase:
             self._phase, scene = session.phase, self._run.scene
-            value = f"{self._run.state[scene.coordinate]:.3f} {scene.unit}".rstrip()
-            print(f"{session.time:7.2f} s  {self._phase:<12}  {value}", file=sys.stderr, flush=True)
+            state = session.state if self._run.world is None else self._run.world.state
+            value = state.given(scene.coordinate)  # None for a joint that is being learned
+            text = "" if value is None else f"{value:.3f} {scene.unit}".rstrip()
+            print(f"{session.time:7.2f} s  {self._phase:<12}  {text}".rstrip(), file=sys.stderr, flush=True)
 
 
 def _report_outcome(run: _Run, outcome: JudgedOutcome) -> None:

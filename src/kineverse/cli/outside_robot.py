@@ -46,7 +46,7 @@ class ConnectedRobot(RobotInterface, AbstractContextManager["ConnectedRobot"], P
 
 
 class Connect(Protocol):
-    """What an entry point names."""
+    """Function that an entry point names."""
 
     def __call__(
         self, model: ModelView, robot: Robot, settings: str | None, *, observed: Sequence[str]
@@ -63,9 +63,10 @@ def check_world(world: str, simulated: Sequence[str] = ()) -> None:
     """Check ``--world``: one of some simulated ones, or a robot outside."""
     name, colon, file = world.partition(":")
     if world not in simulated and (name != _OUTSIDE or bool(colon) != bool(file)):
+        known = ", ".join([*simulated, _OUTSIDE])
         raise UnknownNameError(
-            f"--world {world}: there is no such world. There is {', '.join([*simulated, _OUTSIDE])}, also with "
-            f"a file of settings: {_OUTSIDE}:robot.toml."
+            f"--world {world}: there is no such world. There is {known}, also with a file of settings: "
+            f"{_OUTSIDE}:robot.toml."
         )
 
 
@@ -100,15 +101,10 @@ def connect_robot(world: str, robot: Robot, observed: Sequence[str]) -> Connecte
 
 
 class OutsideRobot(AbstractContextManager["OutsideRobot"]):
-    """Robot outside of this process, with a belief from what it sees.
+    """Robot outside of this process, with a belief from what it sees."""
 
-    Attributes
-    ----------
-    interface
-        The robot.
-    belief
-        Source of the state.
-    """
+    interface: ConnectedRobot
+    belief: Belief  # source of the state
 
     def __init__(self, world: str, robot: Robot, coordinate: Symbol, *, whole: bool) -> None:
         """Connect the robot; by default it observes the object, or with ``whole`` what carries it as well."""
@@ -128,7 +124,7 @@ class OutsideRobot(AbstractContextManager["OutsideRobot"]):
                     f"poses of a frame that it moves: {list_some(wanted, 3) or 'the model has none'}."
                 )
             sensors = replace(USUAL, marked=tuple(self.interface.observed))
-            self.belief: Belief = TrackedBelief(model, robot, sensors)
+            self.belief = TrackedBelief(model, robot, sensors)
             self._stack = self._stack.pop_all()
 
     def __exit__(self, *_: object) -> None:
