@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
+from pathlib import Path
 from time import monotonic
 
 import numpy as np
@@ -331,6 +333,15 @@ def test_settings_name_topics_joints_and_frames(tmp_path):
     assert "door" not in wiring.frames  # whose place no readings say
     assert wiring.timeout == 0.05
     assert names.frame_in_base[0, 3] == 0.1
+
+
+def test_the_settings_on_the_page_can_be_read(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "ros.md").read_text()
+    (block,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    path = tmp_path / "robot.toml"
+    path.write_text(block)
+    settings = read_settings(path)
+    assert {name for name in settings.__struct_fields__ if not getattr(settings, name)} == set()
 
 
 @pytest.mark.parametrize(
