@@ -40,9 +40,10 @@ def measure(seconds: float) -> dict[str, Any]:
         assert child.stdout.readline().strip() == STARTED
         listener = Listener(ros, load_model(MODELS))
         listener.speak_for(2.0)
-        before, start = cpu_seconds(child.pid), time.monotonic()
+        heard, before, start = listener.heard, cpu_seconds(child.pid), time.monotonic()
         listener.speak_for(seconds)
-        share = (cpu_seconds(child.pid) - before) / (time.monotonic() - start)
+        took = time.monotonic() - start
+        share, rate = (cpu_seconds(child.pid) - before) / took, (listener.heard - heard) / took
         child.send_signal(signal.SIGINT)
         counted = json.loads(child.stdout.read())
     finally:
@@ -53,7 +54,7 @@ def measure(seconds: float) -> dict[str, Any]:
         "core": share,
         "transforms": len(listener.compared),
         "difference": max(listener.compared),
-        "heard": listener.heard,
+        "rate": rate,
         **counted,
     }
 
@@ -155,10 +156,11 @@ def main() -> None:
     if arguments.json:
         print(json.dumps(result))
         return
-    print(f"{' + '.join(MODELS)} at {RATE:g} Hz for {result['seconds']:g} s")
+    print(
+        f"{' + '.join(MODELS)} at {RATE:g} Hz for {result['seconds']:g} s; {result['rate']:.0f} Hz were reached"
+    )
     print(f"  {100 * result['core']:.1f} % of a core")
     print(f"  {result['transforms']} transforms, at most {result['difference']:.1e} from fk")
-    print(f"  {result['heard']} joint states of all joints heard")
     print(f"  {result['received']} joint states of the robot received since the first, {result['lost']} lost")
 
 

@@ -36,7 +36,7 @@ from kineverse.model.frame import WORLD
 
 from .description import describe, make_markers
 from .inputs import SECOND, Complaints, JointStateFilter, Readings, Topics
-from .model_output import ModelOutput
+from .model_output import ModelOutput, Stamps
 from .model_settings import ModelSettings, Value, declare_settings
 from .names import NameMap, covers
 from .ros import import_ros
@@ -45,8 +45,6 @@ from .transforms import TransformPublisher, make_transform, nanoseconds
 
 if TYPE_CHECKING:
     from kineverse.exchange import Connection, StatePublisher, StateReader
-
-Stamps = npt.NDArray[np.int64]
 
 JOINT_STATES, ALL_JOINT_STATES = "joint_states", "joint_states/all"
 DESCRIPTION, DOCUMENT, MARKERS = "robot_description", "kineverse_document", "visualization_marker_array"
@@ -264,7 +262,7 @@ class ModelNode:
 
     def _publish_state(self, now: int) -> None:
         output, values = self._tables.output, self._values
-        newest = output.movers.newest(values.stamps)
+        newest, of_joints = output.newest(values.stamps)
         # What nobody reads stands at home, at the present.
         stamps = np.where(newest == 0, now, newest)
         due = stamps > self._sent
@@ -275,11 +273,12 @@ class ModelNode:
         if output.problem:
             self._complaints.add("loop", output.problem, now)
         places = np.flatnonzero(due & is_placed)
-        poses = np.hstack([output.translations[places], output.rotations[places]])
-        self._transforms.publish(places, stamps[places], poses)
+        self._transforms.publish(places, stamps[places], output.poses[places])
         self._sent[places] = stamps[places]
         if joint_stamp is not None:
-            self._publish_joints(joint_stamp, now)
+            # Without those whose source is silent, and those of loops that are not closed.
+            is_said = ((of_joints == 0) | (of_joints >= now - _FRESH)) & np.isfinite(output.positions)
+            self._publish_joints(joint_stamp, np.flatnonzero(is_said))
 
     def _find_joint_stamp(self, now: int) -> int | None:
         """Return the stamp of joint states if there is something new to say."""
@@ -289,18 +288,13 @@ class ModelNode:
             return newest
         return now if now > self._sent_joints and not stamps.all() else None
 
-    def _publish_joints(self, stamp: int, now: int) -> None:
-        """Publish all joints but those whose source is silent, and those of loops that are not closed."""
-        output, values, message = self._tables.output, self._values, self._joint_message
-        is_kept = np.isfinite(output.positions)
-        stamps = output.joint_movers.newest(values.stamps)
-        is_kept &= (stamps == 0) | (now - stamps <= _FRESH)
-        kept = np.flatnonzero(is_kept)
-        velocities = output.velocities[kept]
-        message.header.stamp = self._time(stamp)
-        message.name = [self._joint_names[place] for place in kept.tolist()]
-        message.position = array("d", output.positions[kept].tobytes())
+    def _publish_joints(self, stamp: int, places: npt.NDArray[np.intp]) -> None:
+        output, message = self._tables.output, self._joint_message
+        velocities = output.velocities[places]
         is_moving = bool(np.isfinite(velocities).all())
+        message.header.stamp = self._time(stamp)
+        message.name = [self._joint_names[place] for place in places.tolist()]
+        message.position = array("d", output.positions[places].tobytes())
         message.velocity = array("d", velocities.tobytes() if is_moving else b"")
         self._sent_joints = stamp
         self._joint_states.publish(message)

@@ -106,37 +106,38 @@ class TransformPublisher:
 
 
 class _PackedTransforms(NamedTuple):
-    """Serialised transforms, and where their stamps (n, 8) and poses (n, 56) are in the bytes."""
+    """Serialised transforms, and where their stamps (n, 2) and poses (n, 7) are in the bytes.
 
-    data: npt.NDArray[np.uint8]
-    stamps: npt.NDArray[np.intp]
-    poses: npt.NDArray[np.intp]
+    Stamps are seconds and nanoseconds. Numbers are aligned from the end of a header of four bytes on.
+    """
+
+    data: npt.NDArray[np.uint8]  # with a gap at its end, and four bytes before it
+    size: int
+    stamps: npt.NDArray[np.intp]  # in units of four bytes
+    poses: npt.NDArray[np.intp]  # in units of eight bytes
 
     @classmethod
     def find(cls, data: bytes, stamps: npt.NDArray[np.int64], poses: Array) -> _PackedTransforms | None:
-        """Look for stamps and poses; None if one is not found."""
-        starts = [
-            [data.find(row.tobytes()) for row in _stamp_bytes(stamps)],
-            [data.find(row.tobytes()) for row in poses],
-        ]
-        if min(map(min, starts)) < 0:
-            return None
-        places = [
-            np.array(start)[:, None] + np.arange(size) for start, size in zip(starts, (8, 56), strict=True)
-        ]
-        return cls(np.frombuffer(bytearray(data), dtype=np.uint8), *places)
+        """Look for stamps and poses; None if one is not found, or lies across."""
+        padded = bytes(4) + data + bytes(-(len(data) + 4) % 8)
+        places = []
+        for rows in (_split(stamps), poses):
+            starts, unit = [padded.find(row.tobytes()) for row in rows], rows.itemsize
+            if min(starts) < 0 or any(start % unit for start in starts):
+                return None
+            places.append(np.array(starts)[:, None] // unit + np.arange(rows.shape[1]))
+        return cls(np.frombuffer(bytearray(padded), dtype=np.uint8), len(data), *places)
 
     def fill(self, stamps: npt.NDArray[np.int64], poses: Array) -> bytes:
         """Return the bytes with other stamps [ns] and poses."""
-        self.data[self.stamps] = _stamp_bytes(stamps)
-        self.data[self.poses] = np.ascontiguousarray(poses).view(np.uint8)
-        return self.data.tobytes()
+        self.data.view(np.uint32)[self.stamps] = _split(stamps)
+        self.data.view(np.float64)[self.poses] = poses
+        return self.data[4 : 4 + self.size].tobytes()
 
 
-def _stamp_bytes(stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    """Return seconds and nanoseconds as bytes (n, 8)."""
-    parts = np.stack(np.divmod(stamps, SECOND), axis=1).astype(np.uint32)
-    return parts.view(np.uint8)
+def _split(stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
+    """Return seconds and nanoseconds (n, 2)."""
+    return np.stack(np.divmod(stamps, SECOND), axis=1).astype(np.uint32)
 
 
 def make_transform(ros: Any, frames: tuple[str, str], stamp: int, pose: Sequence[float]) -> Any:
