@@ -157,7 +157,7 @@ def main() -> None:
         print(json.dumps(result))
         return
     print(
-        f"{' + '.join(MODELS)} at {RATE:g} Hz for {result['seconds']:g} s; {result['rate']:.0f} Hz were reached"
+        f"{' + '.join(MODELS)} at {RATE:g} Hz ({result['rate']:.0f} were reached) for {result['seconds']:g} s"
     )
     print(f"  {100 * result['core']:.1f} % of a core")
     print(f"  {result['transforms']} transforms, at most {result['difference']:.1e} from fk")
