@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from time import monotonic
 from typing import Any
 
@@ -51,6 +52,11 @@ class Robot:
     """The robot, which notes the largest speed of each command when it arrives."""
 
     def __init__(self, world: SimulatedWorld, words: list[str]) -> None:
+        self.skill = subprocess.Popen(
+            [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        with suppress(OSError, AttributeError):  # after the skill, so that only the robot is always in time
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
         ros = import_ros()
         ros.rclpy.init()
         node = ros.rclpy.create_node("robot")
@@ -67,9 +73,6 @@ class Robot:
         self.executor = ros.rclpy.executors.SingleThreadedExecutor()
         self.executor.add_node(node)
         self.last = self.due = monotonic()
-        self.skill = subprocess.Popen(
-            [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
         self.lines: dict[str, list[str]] = {"stdout": [], "stderr": []}
         for name, lines in self.lines.items():
             threading.Thread(target=lines.extend, args=(getattr(self.skill, name),), daemon=True).start()

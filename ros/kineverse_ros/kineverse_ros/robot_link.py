@@ -36,6 +36,7 @@ class Wiring(msgspec.Struct, frozen=True, array_like=True):
     poses: dict[str, str]  # topics of PoseStamped by frame of the model
     transforms: dict[str, str]  # observed frames of the model by name in TF
     timeout: float
+    use_sim_time: bool
 
 
 class Start(msgspec.Struct, frozen=True, array_like=True, tag=True):

@@ -34,6 +34,7 @@ from .ros import import_ros
 from .transforms import TransformTree, nanoseconds, to_matrix, to_numbers
 
 _NEWEST = 10  # depth of queues: of a few publishers, and no more, since what is old is of no use
+_POLL, _SPIN = 0.003, 0.2  # times between two looks for messages, and for timers [s]
 _BEAT = 0.02  # time between two signs of life, and between two zeros [s]
 _ZEROS = 5  # how often a stop is said, since a message may be lost
 _PROGRAM = f"""\
@@ -133,8 +134,8 @@ class Commands:
 class RobotNode:
     """Node between a skill and a robot.
 
-    What the robot reports is heard in the thread of the executor. What the skill commands, and the watch on
-    both, is the business of the thread that calls :meth:`take` and :meth:`watch`.
+    What the robot reports is heard in the thread that calls :meth:`hear`. What the skill commands, and the
+    watch on both, is the business of the one that calls :meth:`take` and :meth:`watch`.
 
     Parameters
     ----------
@@ -171,17 +172,26 @@ class RobotNode:
         self._base_stamp: int | None = None
         self._following: tuple[str, ...] = ()  # joints that follow a path
         self._zeros, self._due, self._beaten = 0, 0.0, -math.inf
-        topics = Topics(node, self._complaints, self._ros_now)
+        # What nobody serves of the others, this node says in words of its own, or it is no matter.
+        topics, quiet = (
+            Topics(node, complaints, self._ros_now, ros.STEADY)
+            for complaints in (self._complaints, Complaints(lambda text: None))
+        )
+        self._topics = topics, quiet
         if wiring.read:
             topics.subscribe(ros.JointState, wiring.joint_states, self._hear_joints, _NEWEST)
         for frame, topic in wiring.poses.items():
-            node.create_subscription(ros.PoseStamped, topic, partial(self._hear_pose, frame, topic), _NEWEST)
+            quiet.subscribe(ros.PoseStamped, topic, partial(self._hear_pose, frame), _NEWEST)
         for topic, quality, static in (("/tf", _NEWEST, False), ("/tf_static", ros.STATIC, True)):
-            hear = partial(self._hear_transforms, static)
-            node.create_subscription(ros.TFMessage, topic, hear, quality)
-        node.create_timer(1.0, self._name_missing)
+            quiet.subscribe(ros.TFMessage, topic, partial(self._hear_transforms, static), quality)
+        node.create_timer(1.0, self._name_missing, clock=ros.STEADY)
 
     # -- what the robot reports ------------------------------------------------------------------------------
+
+    def hear(self) -> None:
+        """Take what the robot has reported since the last call."""
+        for topics in self._topics:
+            topics.drain()
 
     def _ros_now(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)
@@ -199,7 +209,7 @@ class RobotNode:
             self._positions |= {name: (value, time) for name, value in found.positions.items()}
             self._report()
 
-    def _hear_transforms(self, static: bool, message: Any) -> None:
+    def _hear_transforms(self, static: bool, message: Any, source: str) -> None:
         for one in message.transforms:
             self._tree.put(one, static)
             frame = self._wiring.transforms.get(one.child_frame_id)
@@ -221,9 +231,9 @@ class RobotNode:
             if not self._wiring.read:
                 self._report()
 
-    def _hear_pose(self, frame: str, topic: str, message: Any) -> None:
+    def _hear_pose(self, frame: str, message: Any, source: str) -> None:
         numbers = to_numbers(message.pose.position, message.pose.orientation)
-        self._see(frame, self._node.resolve_topic_name(topic), message.header, numbers)
+        self._see(frame, source, message.header, numbers)
 
     def _see(self, frame: str, source: str, header: Any, numbers: tuple[float, ...]) -> None:
         """Take an observed pose of a frame of the model."""
@@ -400,7 +410,7 @@ def main() -> None:
 def run_guard(link: Link, wiring: Wiring) -> None:
     """Guard a robot until the end of its node."""
     ros = import_ros()
-    ros.rclpy.init(args=[], signal_handler_options=ros.rclpy.signals.SignalHandlerOptions.NO)
+    ros.rclpy.init(args=[], signal_handler_options=ros.NO_SIGNALS)
     commands = Commands(ros, ros.rclpy.create_node("kineverse_robot_guard"), wiring)
     link.send(Beat(now(), False))
     guard_robot(commands, link, wiring.timeout)
@@ -413,14 +423,15 @@ def run_node(link: Link, wiring: Wiring) -> None:
     guard = start_process("guard", other, sys.executable)
     own.send(Start(wiring))
     ros = import_ros()
-    ros.rclpy.init(args=[], signal_handler_options=ros.rclpy.signals.SignalHandlerOptions.NO)
+    words = ["--ros-args", "-p", f"use_sim_time:={str(wiring.use_sim_time).lower()}"]
+    ros.rclpy.init(args=words, signal_handler_options=ros.NO_SIGNALS)
     node = ros.rclpy.create_node("kineverse_robot")
     robot = RobotNode(ros, node, wiring, link.send, own.send)
     own.receive()  # the guard is there
     link.send(Beat(now(), False))
-    executor = ros.rclpy.executors.SingleThreadedExecutor()
+    executor = ros.Executor()
     executor.add_node(node)
-    over = threading.Event()
+    over, due = threading.Event(), 0.0
 
     def serve() -> None:
         serve_skill(robot, link, own)
@@ -428,8 +439,12 @@ def run_node(link: Link, wiring: Wiring) -> None:
         over.set()
 
     threading.Thread(target=serve, daemon=True, name="skill").start()
-    while not over.is_set():
-        executor.spin_once(timeout_sec=_BEAT)
+    # An executor takes a millisecond for each message, so it is there for timers and /clock alone.
+    while not over.wait(_POLL):
+        robot.hear()
+        if wiring.use_sim_time or now() >= due:
+            executor.spin_once(timeout_sec=0.0)
+            due = now() + _SPIN
     ros.rclpy.shutdown()
     guard.wait()
 

@@ -56,6 +56,7 @@ class RobotSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     trajectory: str = "joint_trajectory_controller/joint_trajectory"
     observed: dict[str, str] | None = None  # topics of poses by frame of the model, or tf: and a frame in TF
     timeout: float = TIMEOUT
+    use_sim_time: bool = False  # whether stamps are those of a simulator, /clock
 
 
 def read_settings(path: str | os.PathLike[str]) -> RobotSettings:
@@ -161,6 +162,7 @@ def connect_names(robot: Robot, settings: RobotSettings, marked: Iterable[str]) 
         poses,
         transforms,
         settings.timeout,
+        settings.use_sim_time,
     )
     return RobotConnection(wiring, base_speeds, frame, frame_in_base, tuple(controllers.values()), joints)
 

@@ -227,7 +227,7 @@ def simulate_robot(
     given = RobotSettings() if settings is None else read_settings(settings)
     names = connect_names(simulated.robot, given, simulated.robot.markers)
     ros = import_ros()
-    ros.rclpy.init(args=[], signal_handler_options=ros.rclpy.signals.SignalHandlerOptions.NO)
+    ros.rclpy.init(args=[], signal_handler_options=ros.NO_SIGNALS)
     node = ros.rclpy.create_node("simulated_robot")
     simulation = SimulatedRobot(ros, node, simulated, names)
     wiring = names.wiring
@@ -243,7 +243,7 @@ def simulate_robot(
 
 def run_in_real_time(ros: Any, node: Any, simulation: SimulatedRobot) -> None:
     """Let a simulated robot move by the clock, until something is raised."""
-    executor = ros.rclpy.executors.SingleThreadedExecutor()
+    executor = ros.Executor()
     executor.add_node(node)
     last = due = monotonic()
     while True:
