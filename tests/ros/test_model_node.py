@@ -53,7 +53,7 @@ def test_robot_and_furniture_have_names_of_their_own():
     assert_tf_is_fk(bench, {"cam/cam": 0.2, "prismatic/drawer": 0.1}, names, "a/map")
     assert bench.joints[-1].name == ["cam", "slide", "valve"]
     assert bench.warnings == [
-        "/joint_states of /other has 'caster_rotation_joint', which is no joint of the model."
+        "/joint_states of /other has names that are no joints of the model: caster_rotation_joint."
     ]
     joints = ET.fromstring(bench.latest["robot_description"].data).iter("joint")
     assert {"cam", "slide"} <= {one.attrib["name"] for one in joints}
@@ -86,7 +86,7 @@ def test_stamps_are_those_of_readings_and_the_present_where_nothing_is_read():
         ({"cam/cam": math.nan}, 0.0, "no numbers: cam/cam"),
         ({"cam/cam": 0.5}, 5.0, "5 s old"),
         ({"cam/cam": 0.5}, -5.0, "5 s ahead of the clock"),
-        ({"unknown": 0.5}, 0.0, "'unknown', which is no joint"),
+        ({"unknown": 0.5}, 0.0, "no joints of the model: unknown"),
     ],
 )
 def test_bad_joint_states_move_nothing_and_are_named_once_a_second(positions, ago, complaint):

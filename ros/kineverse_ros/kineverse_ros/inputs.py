@@ -33,13 +33,15 @@ class Complaints:
         self._say = say
         self._next: dict[str, float] = {}
 
-    def add(self, kind: str, text: str, now: int, pause: float = SECOND) -> None:
-        """Say a text unless one of its kind was said less than a pause ago [ns]."""
+    def add(self, kind: str, text: str, now: int) -> bool:
+        """Say a text unless one of its kind was said less than a second ago [ns]; return True if it was."""
         after = self._next.get(kind)
         # Where the clock was set back, a time that is far ahead is one from before.
-        if after is None or now >= after or now < after - pause:
-            self._next[kind] = now + pause
+        is_said = after is None or now >= after or now < after - SECOND
+        if is_said:
+            self._next[kind] = now + SECOND
             self._say(text)
+        return is_said
 
     def add_once(self, text: str) -> None:
         """Say a text unless it was said before."""
@@ -112,6 +114,7 @@ class JointStateFilter:
         self.follow(names, wanted)
         self._complaints = complaints
         self._stamps = StampCheck(complaints)
+        self._unknown: set[str] = set()  # names that were said to be no joints
         self._owners: dict[str, tuple[str, int]] = {}  # source of a joint, and when it was last heard
 
     def follow(self, names: NameMap, wanted: Collection[str]) -> None:
@@ -137,10 +140,12 @@ class JointStateFilter:
         found: dict[str, float] = {}
         speeds: dict[str, float] = {}
         bad: list[str] = []
+        unknown: list[str] = []
         for index, name in enumerate(names):
             joint = self._names.to_model(name)
             if joint is None:
-                self._complaints.add_once(f"{source} has '{name}', which is no joint of the model.")
+                if name not in self._unknown:
+                    unknown.append(name)
             elif joint in self._wanted and self._is_from(source, joint, now):
                 value = positions[index]
                 if not math.isfinite(value):
@@ -155,6 +160,10 @@ class JointStateFilter:
                 joint = self._names.to_model(name) or ""
                 found.pop(joint, None)
                 speeds.pop(joint, None)
+        if unknown:
+            text = f"{source} has names that are no joints of the model: {list_some(unknown, 4)}."
+            if self._complaints.add(f"unknown {source}", text, now):
+                self._unknown.update(unknown)
         if bad:
             text = f"{source} has positions that are no numbers: {list_some(bad, 4)}. They are not used."
             self._complaints.add(f"values {source}", text, now)
@@ -248,12 +257,6 @@ class Topics:
             with subscription.handle:
                 while (taken := subscription.handle.take_message(kind, False)) is not None:
                     receive(*taken)
-
-    def close(self) -> None:
-        """End all subscriptions."""
-        for subscription, _, _ in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions, self._wanted = [], {}
 
     def check(self) -> None:
         """Say which topics nobody serves, or with messages of another type; called each second."""
