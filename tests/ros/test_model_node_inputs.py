@@ -156,6 +156,11 @@ def test_a_live_model_is_followed_through_edits_and_the_end_of_its_server(serve_
 
         until(bench, is_exchanged)
         assert_tf_is_fk(bench, {HINGE: 0.4, "drawer": 0.25}, {"cam/cam": "nocke"})
+        for _ in range(60):  # what is read no longer is shared no longer
+            bench.say_values({"cam/cam": 0.1})
+            bench.ros.advance(0.02)
+        (shared,) = [one for one in other.exchange.status().sources if one.source == "ros"]
+        assert shared.coordinates == ("cam/cam",)
         server.send_signal(signal.SIGKILL)
         server.wait()
         until(bench, lambda: not model.exchange.is_online)
@@ -168,6 +173,7 @@ def test_a_live_model_is_followed_through_edits_and_the_end_of_its_server(serve_
             edit.remove("joint drawer")
         until(bench, lambda: "drawer" not in {marker.ns for marker in bench.latest["markers"].markers})
         bench.transforms.clear()
+        bench.say_values({"cam/cam": 0.2})
         until(bench, lambda: {one.child_frame_id for one in bench.transforms} >= {"nocke"})
         assert "drawer" not in {one.child_frame_id for one in bench.transforms}
         assert any("no joints of the model: nonsense" in text for text in bench.warnings)

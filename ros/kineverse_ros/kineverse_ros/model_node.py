@@ -22,7 +22,6 @@ import numpy.typing as npt
 import kineverse as kv
 from kineverse.cli.output import format_count, join_lines
 from kineverse.errors import (
-    FormatError,
     InvalidValueError,
     KineverseError,
     OfflineError,
@@ -93,9 +92,11 @@ class CoordinateValues:
         self.places = {name: place for place, name in enumerate(output.coordinates)}
         self.values, self.speeds = output.start.copy(), np.full(count, np.nan)
         self.stamps: Stamps = np.zeros(count, dtype=np.int64)
-        for name, place in before.places.items() if before is not None else ():
-            if before is not None and before.stamps[place] and name in self.places:
-                own = self.places[name]
+        if before is None:
+            return
+        for name, own in self.places.items():
+            place = before.places.get(name)
+            if place is not None and before.stamps[place]:
                 self.values[own], self.speeds[own] = before.values[place], before.speeds[place]
                 self.stamps[own] = before.stamps[place]
 
@@ -136,15 +137,15 @@ class ModelNode:
         self._last_now = self._sent_joints = 0
         self._complaints = Complaints(node.get_logger().warning)
         self.inputs = Topics(node, self._complaints, self._now, ros.STEADY)
-        self._connection: Connection | None = getattr(model, "exchange", None)
+        connection: Connection | None = getattr(model, "exchange", None)
         self._version, self._look = model.version, 0.0
         self._tables = _Tables.build(model.copy(), settings)
         output = self._tables.output
-        if not output.parents and self._connection is None:
+        if not output.parents and connection is None:
             raise InvalidValueError(
                 "There is nothing to publish: the model has no frames, or all are omitted."
             )
-        if settings.share and self._connection is None:
+        if settings.share and connection is None:
             raise InvalidValueError("share is for a live model: there is no server to give readings to.")
         self._values = CoordinateValues(output)
         self._measured: set[str] = set()  # coordinates that were read, and are not to be estimated from poses
@@ -163,11 +164,9 @@ class ModelNode:
         self._description = node.create_publisher(ros.String, DESCRIPTION, ros.LATCHED)
         self._document = node.create_publisher(ros.String, DOCUMENT, ros.LATCHED)
         self._markers = node.create_publisher(ros.MarkerArray, MARKERS, ros.LATCHED)
-        self._exchange = (
-            None
-            if self._connection is None
-            else _ServerState(self._connection, settings.share, self._tables.joints)
-        )
+        self._exchange: _ServerState | None = None
+        if connection is not None:
+            self._exchange = _ServerState(connection, settings.share, self._tables.joints)
         self._describing: threading.Thread | None = None
         self._described: _Tables | None = None
         self._publish_tables()
@@ -359,7 +358,7 @@ class ModelNode:
         self._document.publish(self._ros.String(data=to_json(tables.model)))
         try:
             text, remarks = describe(tables.model, tables.frames, tables.joints, tables.shown)
-        except FormatError as error:
+        except KineverseError as error:
             self._complaints.add_once(f"There is no {DESCRIPTION}. {error}")
             return
         if remarks:
@@ -375,7 +374,7 @@ class _ServerState:
         self._connection, self._own = connection, share
         self._reader: StateReader = connection.reader()
         self._seen: dict[str, int] = {}
-        self._shared: dict[str, float] = {}
+        self._shared: dict[str, tuple[float, int]] = {}  # values and stamps
         self._publisher: StatePublisher | None = connection.publisher(share, ()) if share else None
 
     def read(self) -> Iterable[tuple[str, int, list[str], list[float], list[float]]]:
@@ -396,17 +395,20 @@ class _ServerState:
             yield f"source '{source.source}' of the server", stamp, names, [*positions.values()], speeds
 
     def share(self, readings: Readings) -> None:
-        """Give readings to the server, with all that was read before."""
+        """Give readings to the server, with the others of the last second."""
         if self._publisher is None:
             return
-        before = len(self._shared)
-        self._shared.update(readings.positions)
+        fresh = {name: item for name, item in self._shared.items() if item[1] >= readings.stamp - _FRESH}
+        fresh |= {name: (value, readings.stamp) for name, value in readings.positions.items()}
         try:
-            if len(self._shared) > before:
-                self._publisher.set_coordinates(self._shared)
-            self._publisher.put([*self._shared.values()], readings.stamp / SECOND)
+            if fresh.keys() != self._shared.keys():
+                self._publisher.set_coordinates(fresh)
+            else:
+                fresh = {name: fresh[name] for name in self._shared}  # in the order of the source
+            self._publisher.put([value for value, _ in fresh.values()], readings.stamp / SECOND)
         except OfflineError:
             self._publisher = None
+        self._shared = fresh
 
 
 def load_model(sources: Sequence[str]) -> kv.Model:
@@ -454,6 +456,7 @@ def run_model_node(
         model_node = ModelNode(ros, node, load_model(settings.model), settings)
         started(model_node)
         _spin(ros, node, model_node, settings.rate)
+        model_node.join()
     finally:
         ros.rclpy.try_shutdown()
 
