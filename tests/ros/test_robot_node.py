@@ -11,7 +11,7 @@ from fake_rclpy import SECOND, FakeRos
 from robots import connect, load_robot
 
 from kineverse_ros.robot_link import Beat, End, Follow, Link, Note, Readings, Speeds, Start, now
-from kineverse_ros.robot_node import Commands, RobotNode, guard_robot
+from kineverse_ros.robot_node import Commands, RobotNode, guard_robot, serve_skill
 from kineverse_ros.transforms import make_transform
 
 POSE = (1.0, 2.0, 0.0, 0.0, 0.0, math.sin(0.25), math.cos(0.25))
@@ -298,7 +298,10 @@ def test_the_guard_stops_the_robot_of_a_node_that_is_gone(end):
     guard.start()
     link.send(Beat(now(), False, moves=end != "at rest"))
     if end == "stopped":
-        guard.join(0.2)
+        deadline = now() + 5.0
+        while len(arrived) < 5 and now() < deadline:
+            ros.deliver()
+        guard.join(0.1)
         ros.deliver()
         assert len(arrived) == 5
     elif end == "good-bye":
@@ -329,3 +332,28 @@ def test_messages_survive_the_link_and_a_full_one_drops_them():
         end.receive(1.0)
     assert not end.send(End())
     end.close()
+
+
+@pytest.mark.parametrize("gone", ["skill", "guard"])
+def test_the_robot_stands_when_the_skill_or_the_guard_is_gone(gone):
+    ros, arrived = FakeRos(), []
+    ros.rclpy.create_node("robot").create_subscription(ros.Twist, "cmd_vel", arrived.append, 1)
+    (skill, node_end), (guard, guard_end) = Link.pair(), Link.pair()
+    near, far = Link(node_end), Link(guard_end)
+    wiring = connect(load_robot()).wiring
+    node = RobotNode(ros, ros.rclpy.create_node("node"), wiring, near.send, guard.send)
+    node.watchdog.read = now() + 100.0
+    skill.send(Speeds(now(), now(), (0.1, 0.0, 0.0), ((0.0, 0.0),)))
+    thread = threading.Thread(target=serve_skill, args=(node, near, guard))
+    thread.start()
+    assert far.receive(5.0).moves
+    (skill if gone == "skill" else far).close()
+    thread.join(5.0)
+    ros.deliver()
+    assert not thread.is_alive()
+    assert arrived[0].linear.x == 0.1
+    assert {message.linear.x for message in arrived[1:]} == {0.0}
+    if gone == "guard":
+        assert skill.receive(1.0) == Note("The guard of the robot node has ended.", fatal=True)
+    for link in (skill, near, guard, far):
+        link.close()

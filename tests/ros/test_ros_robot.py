@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import re
 import threading
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 
+import msgspec
 import numpy as np
 import pytest
 from fake_rclpy import FakeRos
@@ -21,14 +23,14 @@ from kineverse.errors import (
     OfflineError,
     SimulationError,
 )
-from kineverse.manipulation import SkillRun
+from kineverse.manipulation import SkillError, SkillRun
 from kineverse.manipulation.session import EncoderBelief, Session
 from kineverse.planning.trajectories.trajectory import Trajectory
 from kineverse.worlds import KinematicWorld
 from kineverse_ros import ros_robot
 from kineverse_ros.robot_link import Beat, End, Follow, Link, Note, Pose, Readings, Speeds, now
 from kineverse_ros.robot_node import RobotNode
-from kineverse_ros.robot_settings import BaseSettings, read_settings
+from kineverse_ros.robot_settings import BaseSettings, connect_names, read_settings
 from kineverse_ros.ros_robot import RosRobot
 from kineverse_ros.simulated_robot import SimulatedRobot
 
@@ -113,10 +115,17 @@ class Simulated(Far):
         self.last = time
 
 
+def connect_patiently(*arguments):
+    """Return names whose robot is not said to be silent when this computer is busy."""
+    names = connect_names(*arguments)
+    return replace(names, wiring=msgspec.structs.replace(names.wiring, timeout=5.0))
+
+
 @pytest.fixture
 def started(monkeypatch):
     """Have robots begin with an end of this kind, and return the robot and the end."""
     opened = []
+    monkeypatch.setattr(ros_robot, "connect_names", connect_patiently)
 
     def start(kind, *, omni=True, **settings):
         ends = []
@@ -135,14 +144,15 @@ def started(monkeypatch):
 def test_wheels_drive_the_base_at_the_pace_of_the_steps(started):
     robot, far = started(Simulated, omni=False)
     wheels = ["bot/base/left_wheel:velocity", "bot/base/right_wheel:velocity"]
-    begin = monotonic()
-    for _ in range(20):
+    begin, steps = monotonic(), 0
+    while steps < 20 or far.world.state["bot/base/x"] < 0.04:
         robot.apply(dict.fromkeys(wheels, 2.0) | {"bot/pan:velocity": 0.5}, 0.02, stamp=robot.observe().stamp)
-    assert monotonic() - begin == pytest.approx(0.4, abs=0.05)
+        steps += 1
+        assert monotonic() - begin < 20.0
+    assert monotonic() - begin >= 0.02 * steps - 0.001
+    robot.apply({}, 0.1)
     joints = {str(s): v for s, v in robot.observe().joints.items()}
     state = far.world.state
-    assert far.world.time > 0.3
-    assert state["bot/base/x"] > 0.04
     assert state["bot/base/x"] == pytest.approx(0.1 * 2.0 * state["bot/pan"] / 0.5, rel=0.1)
     assert joints["bot/base/x"] == pytest.approx(state["bot/base/x"], abs=0.01)
     assert joints["bot/base/y"] == pytest.approx(0.0, abs=1e-9)
@@ -154,10 +164,9 @@ def test_a_session_moves_it_and_ends_with_a_reason_if_its_node_does(started):
     run = SkillRun(session, None, 10.0)
 
     def skill() -> str:
-        for k in range(100):
+        for _ in range(1000):
             session.act({"bot/lift:velocity": 0.3})
-            if k == 10:
-                assert session.state["bot/lift"] > 0.02
+            if session.state["bot/lift"] > 0.02:
                 far.over.set()
         return "never"
 
@@ -165,6 +174,43 @@ def test_a_session_moves_it_and_ends_with_a_reason_if_its_node_does(started):
     assert not outcome
     assert outcome.reason == "The robot node has ended, and the robot was stopped."
     assert session.broken
+
+
+def test_a_skill_that_hears_nothing_from_the_robot_ends_with_a_reason(started):
+    robot, far = started(Scripted)
+    session = Session(robot, belief=EncoderBelief(robot.model, robot.robot), patience=0.1)
+    far.until = 0.0
+    with pytest.raises(SkillError, match=r"The robot 'ros' was observed last at .* has waited for"):
+        for _ in range(100):
+            session.act({"bot/lift:velocity": 0.3})
+    assert session.fault
+
+
+def test_a_simulated_robot_refuses_what_is_no_command():
+    ros, model = FakeRos(), load_robot()
+    node, other = ros.rclpy.create_node("robot"), ros.rclpy.create_node("other")
+    world = KinematicWorld(model, "bot")
+    robot = SimulatedRobot(ros, node, world, connect(model, observed={"door": "tf:tag"}))
+    heard = []
+    other.create_subscription(ros.TFMessage, "/tf", heard.append, ros.QUEUED)
+    twist = ros.Twist()
+    twist.linear.x = math.nan
+    path = ros.JointTrajectory(joint_names=["nothing"], points=[ros.JointTrajectoryPoint(positions=[1.0])])
+    for topic, message in (
+        ("cmd_vel", twist),
+        ("velocity_controller/commands", ros.Float64MultiArray(data=[1.0])),
+        ("velocity_controller/commands", ros.Float64MultiArray(data=[1.0, math.inf])),
+        ("joint_trajectory_controller/joint_trajectory", path),
+    ):
+        other.create_publisher(type(message), topic, 1).publish(message)
+    ros.deliver()
+    start = world.state
+    robot.step(0.1)
+    ros.deliver()
+    assert dict(world.state) == dict(start)
+    assert [text.partition(" ")[0] for _, text in node.logged] == ["A", "velocity_controller/commands", "A"]
+    (message,) = heard
+    assert [one.child_frame_id for one in message.transforms] == ["base_link", "tag"]
 
 
 def test_poses_are_placed_where_the_camera_was_when_it_saw_them(started):
@@ -199,9 +245,11 @@ def test_the_heading_goes_on_beyond_a_half_turn(started):
 def test_fingers_and_stale_speeds_are_as_the_interface_says(started):
     robot, far = started(Scripted)
     robot.apply({"bot/pan:velocity": 0.5}, 0.01, stamp=robot.time)
-    robot.apply({"bot/pan:velocity": 0.5}, 0.01, stamp=robot.time - 1.0)
+    robot.apply({"bot/pan:velocity": 0.5}, 0.01, stamp=robot.time - 9.0)
     robot.apply({}, 0.01)
-    sent = [message.controllers for message in far.heard if isinstance(message, Speeds)]
+    deadline, sent = monotonic() + 5.0, []
+    while len(sent) < 3 and monotonic() < deadline:
+        sent = [message.controllers for message in far.heard if isinstance(message, Speeds)]
     assert sent == [((0.0, 0.5),), ((0.0, 0.0),), ((0.0, 0.0),)]
     with pytest.raises(InvalidValueError, match="finite"):
         robot.apply({"bot/pan:velocity": math.nan}, 0.01)
@@ -226,6 +274,7 @@ def test_a_path_is_followed_to_its_end(started):
 def test_a_path_is_given_up(started, why, monkeypatch):
     robot, far = started(Scripted)
     monkeypatch.setattr(ros_robot, "_LAG", 0.05)
+    robot.timeout = 0.08 if why == "silent" else robot.timeout
     monkeypatch.setattr(ros_robot, "_ARRIVAL", 0.05)
     path = make_path(robot.model, 0.2, 0.6) if why == "leaves" else make_path(robot.model, 0.2, 0.25)
 
