@@ -274,6 +274,29 @@ def test_a_path_is_given_up_when_the_skill_says_so(bench):
     assert [path.points[0].positions for path in bench.paths] == [[0.2], [0.1]]
 
 
+@pytest.mark.parametrize(
+    ("joints", "times", "positions", "velocities"),
+    [
+        (("pan",), (1.0,), ((math.nan,),), ((0.0,),)),
+        (("pan",), (1.0,), ((0.2,),), ((math.inf,),)),
+        (("pan",), (1.0,), ((0.2, 0.3),), ((0.0,),)),
+        (("pan",), (1.0, 2.0), ((0.2,),), ((0.0,),)),
+        (("nothing",), (1.0,), ((0.2,),), ((0.0,),)),
+    ],
+)
+def test_bad_paths_are_never_forwarded(bench, joints, times, positions, velocities):
+    bench.node.take(Follow(bench.now(), bench.now(), joints, times, positions, velocities))
+    bench.ros.deliver()
+    assert not bench.paths
+    assert "A command is refused" in bench.notes[0]
+
+
+def test_a_bad_command_gives_up_a_path(bench):
+    bench.node.take(Follow(bench.now(), bench.now(), ("pan",), (1.0,), ((0.2,),), ((0.0,),)))
+    bench.command((math.nan, 0.0, 0.0))
+    assert [path.points[0].positions for path in bench.paths] == [[0.2], [0.1]]
+
+
 def test_the_guard_is_told_of_motion_alone(bench):
     bench.command()
     assert bench.beats[-1].moves

@@ -408,6 +408,8 @@ def test_the_settings_on_the_page_can_be_read(tmp_path):
         ("[joints]\n'bot/pan' = 'lift'", "would both be 'lift'"),
         ("[base]\nframe = 'column'", "no frame of that name that stands still on its base"),
         ("[base]\njoints = ['x', 'y']", "has 2 names; the base of 'bot' has the coordinates"),
+        ("joint_states = 'joint states'", "'joint states' is no name of a topic"),
+        ("[controllers]\n'2nd' = ['lift', 'pan']", "'2nd/commands' is no name of a topic"),
         ("[observed]\nnowhere = 'x'", "there is no frame 'nowhere'"),
         ("[observed]\ndoor = 'tf:a'\nwall = 'tf:a'", "'a' in TF stands for 'door' and for 'wall'"),
     ],

@@ -16,6 +16,7 @@ import socket
 import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -35,6 +36,7 @@ from .transforms import TransformTree, nanoseconds, to_matrix, to_numbers
 
 _NEWEST = 10  # depth of queues: of a few publishers, and no more, since what is old is of no use
 _POLL, _SPIN = 0.003, 0.2  # times between two looks for messages, and for timers [s]
+_MOST_POSES = 1000  # that wait for readings
 _BEAT = 0.02  # time between two signs of life, and between two zeros [s]
 _ZEROS = 5  # how often a stop is said, since a message may be lost
 _PROGRAM = f"""\
@@ -166,7 +168,7 @@ class RobotNode:
         self._joints = NameMap(wiring.joints, wiring.joint_rules)
         self._filter = JointStateFilter(self._joints, wiring.read, self._complaints)
         self._stamps = StampCheck(self._complaints)
-        self._tree, self._poses = TransformTree(), list[Pose]()
+        self._tree, self._poses = TransformTree(), deque[Pose](maxlen=_MOST_POSES)
         self._positions: dict[str, tuple[float, float]] = {}  # with their times
         self._base: tuple[tuple[float, ...], float] | None = None
         self._base_stamp: int | None = None
@@ -266,7 +268,8 @@ class RobotNode:
         read = [positions[name] for name in wiring.read]
         times = [time for _, time in read] + ([] if self._base is None else [self._base[1]])
         stamp = self.watchdog.read = min(times)
-        poses, self._poses = tuple(self._poses), []
+        poses = tuple(self._poses)
+        self._poses.clear()
         base = None if self._base is None else self._base[0]
         self._tell(Readings(stamp, tuple(value for value, _ in read), base, poses))
 
@@ -298,20 +301,30 @@ class RobotNode:
             if self._following and not message.follows:
                 self.stop()
             return
-        # Readings that are too old do not make a skill silent.
-        watchdog.heard, self._following = message.sent, ()
+        watchdog.heard = message.sent  # readings that are too old do not make a skill silent
         if why := watchdog.explain(time, min(message.sent, message.stamp)):
             self.stop(f"A command is refused. {why}")
-        elif isinstance(message, Follow):
-            self._following, watchdog.moves = message.joints, True
-            self.commands.follow(message.joints, message.times, message.positions, message.velocities)
-        elif not self.commands.fit(message):
+        elif not (self._fits(message) if isinstance(message, Follow) else self.commands.fit(message)):
             self.stop("A command is refused. It has numbers that are not finite, or too few or many of them.")
+        elif isinstance(message, Follow):
+            self._following, watchdog.moves, self._zeros = message.joints, True, 0
+            self.commands.follow(message.joints, message.times, message.positions, message.velocities)
         else:
+            self._following, self._zeros = (), 0
             self.commands.move(message.base, message.controllers)
             watchdog.moves = any(message.base) or any(map(any, message.controllers))
-            self._zeros = 0
         self._live(time)
+
+    def _fits(self, path: Follow) -> bool:
+        """Return whether a path has finite numbers for joints that are read."""
+        known = {self._joints.to_ros(name) for name in self._wiring.read}
+        rows = [*path.positions, *path.velocities]
+        return (
+            known.issuperset(path.joints)
+            and len(path.positions) == len(path.velocities) == len(path.times)
+            and all(len(row) == len(path.joints) for row in rows)
+            and all(math.isfinite(value) for row in (path.times, *rows) for value in row)
+        )
 
     def stop(self, why: str = "") -> None:
         """Stop the robot, and say why."""

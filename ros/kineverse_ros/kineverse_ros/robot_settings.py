@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -34,6 +35,8 @@ TIMEOUT = 0.08
 
 _BASES = ("base_footprint", "base_link")  # frames whose speed a Twist says, by custom
 _TF = "tf:"
+_NO_TOPIC = re.compile(r"[^A-Za-z0-9_/]|(?<=/)(?=\d)")  # what a name of a topic lacks, in one of a frame
+_TOPIC = re.compile(r"[~/]?([A-Za-z_]\w*/)*[A-Za-z_]\w*", re.ASCII)
 
 
 class BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -164,6 +167,8 @@ def connect_names(robot: Robot, settings: RobotSettings, marked: Iterable[str]) 
         settings.timeout,
         settings.use_sim_time,
     )
+    topics = [own.command, *(topic for topic, _ in wiring.controllers), *poses.values()]
+    _check_topics([settings.joint_states, settings.trajectory, *topics])
     return RobotConnection(wiring, base_speeds, frame, frame_in_base, tuple(controllers.values()), joints)
 
 
@@ -238,7 +243,7 @@ def _find_observed(
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Return topics of poses by frame of the model, and frames of the model by observed frame in TF."""
     if given is None:
-        return {name: f"poses/{name}" for name in marked}, {}
+        given = {name: _NO_TOPIC.sub("_", f"poses/{name}") for name in marked}
     frames = robot.model.frames
     for name in given:
         if name not in frames:
@@ -255,3 +260,12 @@ def _find_observed(
                 )
             transforms[seen] = name
     return {name: topic for name, topic in given.items() if not topic.startswith(_TF)}, transforms
+
+
+def _check_topics(topics: Iterable[str]) -> None:
+    for topic in topics:
+        if _TOPIC.fullmatch(topic) is None:
+            raise InvalidValueError(
+                f"'{topic}' is no name of a topic in ROS: words of letters, digits and _, with slashes "
+                "between them."
+            )

@@ -12,10 +12,12 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from functools import cache
 from importlib.util import find_spec
+from types import NoneType
 from typing import Any
 
 import numpy as np
 
+from kineverse._checks import as_entries, as_positive
 from kineverse.compilation import compile
 from kineverse.errors import (
     InvalidValueError,
@@ -96,9 +98,13 @@ class RosRobot:
         observed: Iterable[str] | None = None,
     ) -> None:
         self.model, self.robot = model, Robot.of(model, robot)
+        if not isinstance(settings, (RobotSettings, str, os.PathLike, NoneType)):
+            raise InvalidValueError(f"settings= is the path of a file, not {settings!r:.60}.")
         if not isinstance(settings, RobotSettings):
             settings = RobotSettings() if settings is None else read_settings(settings)
-        marked = self.robot.markers if observed is None else tuple(observed)
+        marked = self.robot.markers
+        if observed is not None:
+            marked = as_entries("observed=", observed, str, "names of frames")
         self._names = connect_names(self.robot, settings, marked)
         wiring = self._names.wiring
         self.observed = (*wiring.poses, *wiring.transforms.values())
@@ -233,12 +239,14 @@ class RosRobot:
         SimulationError
             If it is given up.
         """
+        as_positive(tolerance, "tolerance=", "distance")
         columns = self._find_columns(trajectory.symbols)
         with self._lock:
             self._check()
             stamp, values = self._history[-1]
         off = np.abs(values[columns] - trajectory.positions[0])
-        if (worst := int(off.argmax())) >= 0 and off[worst] > tolerance:
+        if off.max(initial=0.0) > tolerance:
+            worst = int(off.argmax())
             raise InvalidValueError(
                 f"The path begins {off[worst]:.3g} from where '{trajectory.symbols[worst]}' is now."
             )
@@ -274,13 +282,13 @@ class RosRobot:
                 raise SimulationError(f"The robot's readings are {now() - stamp:.2f} s old on its path.")
             if report is not None:
                 report(passed)
-            end = np.abs(values[columns] - trajectory.positions[-1]).max()
+            end = np.abs(values[columns] - trajectory.positions[-1]).max(initial=0.0)
             if passed >= trajectory.duration and end <= 0.1 * tolerance:
                 return
             if passed >= trajectory.duration + _ARRIVAL:
                 raise SimulationError(f"The robot is still {end:.3g} (rad, m) from the end of its path.")
             near = trajectory.positions_at(np.linspace(max(passed - _LAG, 0.0), max(passed, 0.0), 26))
-            off = np.abs(near - values[columns]).max(axis=1).min()
+            off = np.abs(near - values[columns]).max(axis=1, initial=0.0).min()
             if off > tolerance:
                 raise SimulationError(f"The robot has left its path by {off:.3g} (rad, m).")
 
