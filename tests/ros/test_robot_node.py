@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 
+import msgspec
 import numpy as np
 import pytest
 from fake_rclpy import SECOND, FakeRos
@@ -363,7 +364,7 @@ def test_the_robot_stands_when_the_skill_or_the_guard_is_gone(gone):
     ros.rclpy.create_node("robot").create_subscription(ros.Twist, "cmd_vel", arrived.append, 1)
     (skill, node_end), (guard, guard_end) = Link.pair(), Link.pair()
     near, far = Link(node_end), Link(guard_end)
-    wiring = connect(load_robot()).wiring
+    wiring = msgspec.structs.replace(connect(load_robot()).wiring, timeout=5.0)
     node = RobotNode(ros, ros.rclpy.create_node("node"), wiring, near.send, guard.send)
     node.watchdog.read = now() + 100.0
     skill.send(Speeds(now(), now(), (0.1, 0.0, 0.0), ((0.0, 0.0),)))
