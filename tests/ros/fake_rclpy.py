@@ -155,10 +155,12 @@ class FakePublisher:
         self.node_name, self.node_namespace = node.name, "/"
         self.topic_type = f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
         self.kept: list[Any] = []
+        self.count = 0
         node.ros.topic(topic).publishers.append(self)
 
     def publish(self, message: Any) -> None:
         assert type(message) is self.kind, f"{self.topic_name} has {self.kind.__name__}, not {message!r}"
+        self.count += 1
         if getattr(self.quality, "latched", False):
             self.kept = [copy.deepcopy(message)]
         for subscription in self.node.ros.topic(self.topic_name).subscriptions:
@@ -181,7 +183,10 @@ class FakeSubscription:
 
     def put(self, publisher: FakePublisher, message: Any) -> None:
         if publisher.kind is self.kind:  # as in ROS, others are never received
-            info = {"publisher_gid": {"data": bytes(publisher.endpoint_gid)}}
+            info = {
+                "publisher_gid": {"data": bytes(publisher.endpoint_gid)},
+                "publication_sequence_number": publisher.count,
+            }
             self.queue.append((copy.deepcopy(message), info))
 
     def take(self) -> None:

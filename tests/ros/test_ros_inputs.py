@@ -114,3 +114,21 @@ def test_topics_tell_sources_apart_and_name_what_nobody_serves():
         "Nobody serves /nobody (geometry_msgs/msg/PoseStamped).",
     ]
     assert ros.Time() == Time()
+
+
+def test_messages_that_are_lost_are_counted_and_named():
+    ros = FakeRos()
+    node, driver = ros.rclpy.create_node("listener"), ros.rclpy.create_node("driver")
+    said = []
+    topics = Topics(node, Complaints(said.append), lambda: ros.nanoseconds)
+    publisher = driver.create_publisher(ros.String, "words", ros.QUEUED)
+    publisher.publish(ros.String())  # before there is a subscription
+    topics.subscribe(ros.String, "words", lambda message, source: None, ros.QUEUED)
+    for number in range(10):
+        publisher.publish(ros.String())
+        if number in (4, 5):
+            ros.topic("words").subscriptions[0].queue.clear()
+        ros.advance(0.01)
+    assert topics.received == {"/words of /driver": 8}
+    assert topics.lost == {"/words of /driver": 2}
+    assert said == ["Messages of /words of /driver were lost, 2 so far."]

@@ -276,8 +276,8 @@ class Topics:
 
     def _count(self, source: str, info: Any) -> None:
         self.received[source] += 1
-        number = info.get("publication_sequence_number") if isinstance(info, dict) else None
-        if number is None:
+        number = info.get("publication_sequence_number")
+        if number is None or "publisher_gid" not in info:  # it counts for each publisher
             return
         lost = number - self._numbers.get(source, number - 1) - 1
         self._numbers[source] = number

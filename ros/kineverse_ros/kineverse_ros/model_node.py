@@ -49,7 +49,7 @@ JOINT_STATES, ALL_JOINT_STATES = "joint_states", "joint_states/all"
 DESCRIPTION, DOCUMENT, MARKERS = "robot_description", "kineverse_document", "visualization_marker_array"
 
 _FRESH = SECOND  # age up to which a reading is said again with others
-_SPIN = 0.1  # time between two looks at what is not read in each period, such as services [s]
+_SPIN = 0.2  # time between two looks at what is not read in each period, such as services [s]
 _IDLE = 4.0  # time without another look at an edited model, in times of what the last one took
 
 
