@@ -1,13 +1,15 @@
 """What holds for every test: where models are found, a cache of its own, and what is skipped where.
 
 A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
-the system's Chromium. Without one it is skipped, or with ``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that
-needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. A test of zig as
-compiler runs if ziglang is installed, or if ``KINEVERSE_TEST_ZIG`` is a folder that holds it. A test that reads
-data of other people asks for the fixture ``published``, a function from a path below ``KINEVERSE_TEST_DATA``, which
-gives it the marker ``data``; without the data it is skipped. The summary has a line for each cause. What is
-slow for what it checks carries the marker ``long``: it runs with ``--long``, or if it is asked for by its name.
-So do most cases of a test with the marker ``sampled(n)``, all but every n-th.
+the system's Chromium. Without one it is skipped, or with ``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test of
+real ROS 2 carries the marker ``ros`` and asks for the fixture ``ros_python``, the Python that ``make ros``
+makes; ``KINEVERSE_REQUIRE_ROS=1`` likewise. A test that needs compiled code carries the marker ``compiler``;
+without a C compiler it is skipped as well. A test of zig as compiler runs if ziglang is installed, or if
+``KINEVERSE_TEST_ZIG`` is a folder that holds it. A test that reads data of other people asks for the fixture
+``published``, a function from a path below ``KINEVERSE_TEST_DATA``, which gives it the marker ``data``; without
+the data it is skipped. The summary has a line for each cause. What is slow for what it checks carries the
+marker ``long``: it runs with ``--long``, or if it is asked for by its name. So do most cases of a test with the
+marker ``sampled(n)``, all but every n-th.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from native_libraries import compile_native_libraries
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "examples"))  # living_kitchen
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+ROS_PYTHON = Path(sys.prefix, "ros", "bin", "python")  # of wheels, with the packages of this environment
 
 # No test depends on the load of the machine.
 settings.register_profile(
@@ -127,14 +130,25 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip, or fail, what needs a browser or a compiler where there is none."""
+    """Skip, or fail, what needs a browser, ROS or a compiler where there is none."""
     if item.get_closest_marker("browser") and _browser() is None:
-        message = f"{item.name} needs a Chromium, and there is none: install the package 'chromium'."
-        if os.environ.get("KINEVERSE_REQUIRE_BROWSER"):
-            pytest.fail(message, pytrace=False)
-        pytest.skip(message)
+        _leave_out(
+            f"{item.name} needs a Chromium, and there is none: install the package 'chromium'.", "BROWSER"
+        )
+    if item.get_closest_marker("ros") and not ROS_PYTHON.is_file():
+        _leave_out(
+            f"{item.name} needs ROS 2, and there is none: make ros, with the packages 'cmake' and 'g++'.",
+            "ROS",
+        )
     if item.get_closest_marker("compiler") and not _has_compiler():
         pytest.skip(f"{item.name} needs a C compiler, and there is none: install the package 'gcc'.")
+
+
+def _leave_out(message: str, what: str) -> None:
+    """Skip a test, or fail where what it needs is required."""
+    if os.environ.get(f"KINEVERSE_REQUIRE_{what}"):
+        pytest.fail(message, pytrace=False)
+    pytest.skip(message)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -152,6 +166,7 @@ def _cause(report: pytest.TestReport) -> str:
         return f"what they read is not ours; {published_data.VARIABLE} names its folder, see tests/DATA.md"
     for marker, cause in (
         ("browser", "there is no Chromium; install the package 'chromium'"),
+        ("ros", "there is no ROS 2; on Linux x86-64: make ros, with the packages 'cmake' and 'g++'"),
         ("compiler", "there is no C compiler; install the package 'gcc'"),
     ):
         if marker in report.keywords and "and there is none" in why:
@@ -176,6 +191,17 @@ def chromium() -> str:
     if path is None:
         pytest.skip("There is no Chromium: install the package 'chromium'.")
     return path
+
+
+@pytest.fixture
+def ros_python(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Python with ROS 2, for programs that start in this test: in a domain of this process, on this computer."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_LOG_DIR", os.path.join(os.environ["KINEVERSE_CACHE_DIR"], "ros_logs"))
+    # The wheels start Python anew, unless they find in the environment that they have.
+    monkeypatch.delenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", raising=False)
+    return str(ROS_PYTHON)
 
 
 @pytest.fixture

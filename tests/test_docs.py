@@ -52,7 +52,7 @@ def test_the_index_names_every_page(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_names_of_the_library_on_pages_exist(page: Path) -> None:
     text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    names = set(re.findall(r"`(?:kineverse|kv)((?:\.\w+)+)", text)) - {".commands", ".NAME"}
+    names = set(re.findall(r"`(?:kineverse|kv)((?:\.\w+)+)", text)) - {".commands", ".robots", ".NAME"}
     assert {name for name in names if not _exists(f"kineverse{name}")} == set()
 
 

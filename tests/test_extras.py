@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from kineverse import _extras
-from kineverse._extras import DISTRIBUTION, install_command, install_studies, requirements
+from kineverse._extras import DISTRIBUTION, install_command, install_distribution, requirements
 from kineverse._version import __version__
 
 ROOT = Path(__file__).parents[1]
@@ -75,14 +75,15 @@ def test_requirements_keep_other_markers():
     ]
 
 
-def test_install_command_of_the_studies(tmp_path, monkeypatch):
+def test_install_command_of_distributions_beside_the_package(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
-    assert install_studies().endswith(" install -e ./studies")
-    assert install_studies("peers").endswith(" install -e './studies[peers]'")
+    assert install_distribution(_extras.STUDIES).endswith(" install -e ./studies")
+    assert install_distribution(_extras.ROS).endswith(" install -e ./ros/kineverse_ros")
+    assert install_distribution(_extras.STUDIES, "peers").endswith(" install -e './studies[peers]'")
     monkeypatch.chdir(tmp_path)
-    assert install_studies() == f"{pip()} install -e {ROOT / 'studies'}"
+    assert install_distribution(_extras.STUDIES) == f"{pip()} install -e {ROOT / 'studies'}"
     monkeypatch.setattr(_extras, "__file__", str(tmp_path / "a" / "kineverse" / "_extras.py"))
-    assert install_studies("peers") == f"{pip()} install 'kineverse-studies[peers]'"
+    assert install_distribution(_extras.STUDIES, "peers") == f"{pip()} install 'kineverse-studies[peers]'"
 
 
 def test_install_command_without_metadata_asks_for_a_checkout(tmp_path, monkeypatch):

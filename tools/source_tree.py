@@ -11,6 +11,7 @@ import textwrap
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+ROS = ROOT / "ros" / "kineverse_ros" / "kineverse_ros"
 PAGE = ROOT / "docs" / "architecture.md"
 BLOCK = re.compile(r"(?<=## Source tree\n\n```text\n).*?(?=```\n)", re.DOTALL)
 WIDTH = 118
@@ -18,7 +19,7 @@ WIDTH = 118
 
 def tree() -> str:
     """Return one paragraph for each folder: its name, its subject, and its modules or files of C."""
-    return _draw(ROOT / "src" / "kineverse") + _draw(ROOT / "studies" / "kineverse_studies")
+    return _draw(ROOT / "src" / "kineverse") + _draw(ROOT / "studies" / "kineverse_studies") + _draw(ROS)
 
 
 def _draw(source: Path) -> str:

@@ -27,5 +27,6 @@ setup(
     entry_points={
         "console_scripts": [f"model_node = {NAME}.model_node:main"],
         "kineverse.commands": [f"ros = {NAME}.command"],
+        "kineverse.robots": [f"ros = {NAME}.ros_robot:RosRobot"],
     },
 )

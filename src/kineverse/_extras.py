@@ -11,7 +11,10 @@ from pathlib import Path
 
 DISTRIBUTION = "kineverse-articulation"
 
-STUDIES = "kineverse-studies"  # distribution with benchmarks and experiments, studies/ in a checkout
+STUDIES, ROS = "kineverse-studies", "kineverse_ros"
+"""Distributions beside the package: benchmarks and experiments, and nodes of ROS 2."""
+
+_FOLDERS = {STUDIES: "studies", ROS: "ros/kineverse_ros"}  # where they are in a checkout
 
 _EXTRA = re.compile(r"""(?:\s*and\s*)?extra\s*==\s*["'](?P<name>[^"']+)["']""")
 
@@ -33,13 +36,13 @@ def install_command(*extras: str) -> str:
     return f"{_pip()} install {' '.join(map(shlex.quote, wanted))}"
 
 
-def install_studies(*extras: str) -> str:
-    """Return the command that installs the benchmarks and experiments, with some of their extras."""
+def install_distribution(name: str, *extras: str) -> str:
+    """Return the command that installs a distribution beside the package, with some of its extras."""
     extra = f"[{','.join(extras)}]" if extras else ""
     here = checkout(Path(__file__))
-    if here is None or not (here / "studies").is_dir():
-        return f"{_pip()} install {shlex.quote(STUDIES + extra)}"
-    folder = _relative_to_cwd(here / "studies")
+    if here is None or not (here / _FOLDERS[name]).is_dir():
+        return f"{_pip()} install {shlex.quote(name + extra)}"
+    folder = _relative_to_cwd(here / _FOLDERS[name])
     return f"{_pip()} install -e {shlex.quote((folder if os.path.isabs(folder) else f'./{folder}') + extra)}"
 
 

@@ -109,11 +109,12 @@ def test_entry_points_are_looked_up_for_unknown_names_and_for_help_only(run, mon
     assert looked_up == ["kineverse.commands"] * 2
 
 
-@pytest.mark.parametrize("words", [["bench"], ["bench", "--json"], ["reproduce", "fig4"]])
-def test_command_of_studies_that_are_not_installed_says_how(run, without_added_commands, words):
+@pytest.mark.parametrize("words", [["bench"], ["bench", "--json"], ["reproduce", "fig4"], ["ros", "kitchen"]])
+def test_command_of_a_distribution_that_is_not_installed_says_how(run, without_added_commands, words):
     status, out, err = run(*words)
     assert (status, out, err.count("\n")) == (2, "", 1)
-    assert f"'kineverse {words[0]}' is a command of kineverse-studies, which is not installed: " in err
+    distribution = "kineverse_ros" if words[0] == "ros" else "kineverse-studies"
+    assert f"'kineverse {words[0]}' is a command of {distribution}, which is not installed: " in err
     assert " install " in err
     assert run("bnech")[2].count("'bench'") == 1
     assert "bench" in run("--help")[1]
@@ -121,7 +122,7 @@ def test_command_of_studies_that_are_not_installed_says_how(run, without_added_c
 
 def test_studies_are_found_where_they_are_installed():
     added = find_added_commands()
-    assert {"bench", "reproduce"} <= added.keys()
+    assert {"bench", "reproduce", "ros"} <= added.keys()
     assert not added.keys() & COMMANDS.keys()
     assert load_command("bench").HELP.startswith("measure")
 

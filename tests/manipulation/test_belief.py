@@ -8,7 +8,7 @@ from cupboards import box
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError
 from kineverse.manipulation import Session, TrackedBelief
 from kineverse.state import State
-from kineverse.worlds import Robot, Sensors
+from kineverse.worlds import Observation, Robot, Sensors
 from kineverse.worlds.sensor_sampler import SensorSampler
 from robot_interface_proxy import InterfaceOnly
 
@@ -108,6 +108,30 @@ def test_planned_speeds_bridge_delay_and_slow_pictures(model):
             note=lambda state, world=world, errors=errors: errors.append(state["door"] - world.truth["door"]),
         )  # fmt: skip
         assert np.abs(errors[30:]).max() < 0.006  # it moves by 0.08 between two pictures
+
+
+def test_pictures_may_be_older_than_the_encoders(model):
+    """Cameras are slow; the poses say of when they are."""
+
+    class Slow(Told):
+        def reset(self, values):
+            super().reset(values)
+            self.past = [(self.time, super().observe().poses)]
+
+        def observe(self):
+            now = super().observe()
+            self.past.append((self.time, now.poses))
+            seen, poses = self.past[max(len(self.past) - 5, 0)]  # of 80 ms before
+            return Observation(now.stamp, now.joints, poses, seen=seen)
+
+    sensors = Sensors.parse("0.5mm,0.1deg,50Hz")
+    world, belief = Slow(model, sensors, door=0.1), TrackedBelief(model, "rover", sensors)
+    errors = []
+    run(
+        world, belief, 100, planned={"door:velocity": 0.4}, really={"door:velocity": 0.4},
+        note=lambda state: errors.append(state["door"] - world.truth["door"]),
+    )  # fmt: skip
+    assert np.abs(errors[30:]).max() < 0.006  # it moves by 0.03 meanwhile
 
 
 def test_joints_are_predicted_over_the_delay(model):

@@ -36,7 +36,7 @@ class NameMap:
         unused = set(rules)
         known = list(names)
         for name in known:
-            key = max((key for key in rules if _covers(key, name)), key=len, default=None)
+            key = max((key for key in rules if covers(key, name)), key=len, default=None)
             unused.discard(key or "")
             other = prefix + (name if key is None else rules[key] + name[len(key) :])
             if not other or other.startswith("/"):
@@ -58,10 +58,15 @@ class NameMap:
         """Return the name in ROS of a name of the model."""
         return self._to_ros[name]
 
+    def translate(self, name: str) -> str:
+        """Return the name in ROS of a name of the model, and any other name as it is."""
+        return self._to_ros.get(name, name)
+
     def to_model(self, name: str) -> str | None:
         """Return the name in the model of a name of ROS; None for one of something else."""
         return self._to_model.get(name)
 
 
-def _covers(key: str, name: str) -> bool:
+def covers(key: str, name: str) -> bool:
+    """Return True if a key names something: by its name, or with a slash at the end by what it is below."""
     return name == key or (key.endswith("/") and name.startswith(key))

@@ -1,4 +1,4 @@
-"""What is used of ROS 2, imported when it is used, and the qualities of service of its topics."""
+"""ROS 2, imported when it is used, and the qualities of service of its topics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from kineverse.errors import MissingDependencyError
 
 _MESSAGES = {
     "builtin_interfaces": ("Time",),
-    "geometry_msgs": ("PoseStamped", "Transform", "TransformStamped", "Twist"),
+    "geometry_msgs": ("Point", "PoseStamped", "Transform", "TransformStamped", "Twist"),
+    "rcl_interfaces": ("ParameterDescriptor",),
     "sensor_msgs": ("JointState",),
     "std_msgs": ("Float64MultiArray", "String"),
     "tf2_msgs": ("TFMessage",),
@@ -33,6 +34,10 @@ def import_ros() -> Any:
     try:
         rclpy = importlib.import_module("rclpy")
         qos = importlib.import_module("rclpy.qos")
+        clock = importlib.import_module("rclpy.clock")
+        executors = importlib.import_module("rclpy.executors")
+        serialization = importlib.import_module("rclpy.serialization")
+        signals = importlib.import_module("rclpy.signals")
         messages = {
             name: getattr(importlib.import_module(f"{package}.msg"), name)
             for package, names in _MESSAGES.items()
@@ -45,4 +50,17 @@ def import_ros() -> Any:
             "checkout on Linux x86-64: make ros, then .venv/ros/bin/python -m kineverse ros ..."
         ) from None
     latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
-    return SimpleNamespace(rclpy=rclpy, LATCHED=latched, QUEUED=qos.QoSProfile(depth=100), **messages)
+    static = qos.QoSProfile(depth=100, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)  # of many publishers
+    queued = qos.QoSProfile(depth=100)
+    return SimpleNamespace(
+        rclpy=rclpy,
+        Executor=executors.SingleThreadedExecutor,
+        LATCHED=latched,
+        NO_SIGNALS=signals.SignalHandlerOptions.NO,
+        QUEUED=queued,
+        STATIC=static,
+        serialize=serialization.serialize_message,
+        STEADY=clock.Clock(clock_type=clock.ClockType.STEADY_TIME),
+        **messages,
+    )
+

@@ -15,7 +15,7 @@ from traceback import walk_tb
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, cast
 
-from kineverse._extras import STUDIES, install_command, install_studies
+from kineverse._extras import ROS, STUDIES, install_command, install_distribution
 from kineverse._version import __version__
 from kineverse.errors import FormatError, KineverseError, MissingDependencyError, UnknownNameError, suggest
 
@@ -77,8 +77,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
 ENTRY_POINTS = "kineverse.commands"
 """Group of entry points by which other distributions add commands; each names a :class:`CommandModule`."""
 
-STUDY_COMMANDS = ("bench", "reproduce")
-"""Commands of the distribution of studies, which need not be installed."""
+BESIDE: Mapping[str, str] = MappingProxyType({"bench": STUDIES, "reproduce": STUDIES, "ros": ROS})
+"""Commands of distributions beside this one, which need not be installed."""
 
 ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 """Exit statuses: the request failed; Ctrl-C; the output pipe was closed (128 and the signal's number)."""
@@ -236,9 +236,10 @@ def load_command(name: str) -> CommandModule:
         return cast(CommandModule, getattr(found, attribute) if attribute else found)
     added = find_added_commands()
     if name not in added:
-        if name in STUDY_COMMANDS:
+        if name in BESIDE:
             raise MissingDependencyError(
-                f"'kineverse {name}' is a command of {STUDIES}, which is not installed: {install_studies()}"
+                f"'kineverse {name}' is a command of {BESIDE[name]}, which is not installed: "
+                f"{install_distribution(BESIDE[name])}"
             )
         raise UnknownNameError(f"There is no command {name!r}. {_suggest_command(name, added)}")
     point = added[name]
@@ -322,7 +323,9 @@ def _list_summaries() -> dict[str, str]:
     for name, point in find_added_commands().items():
         found[name] = f"command of {point.dist.name if point.dist else point.value}"
     return found | {
-        name: f"command of {STUDIES}, which is not installed" for name in STUDY_COMMANDS if name not in found
+        name: f"command of {distribution}, which is not installed"
+        for name, distribution in BESIDE.items()
+        if name not in found
     }
 
 
@@ -331,7 +334,7 @@ def _suggest_command(name: str, added: Iterable[str]) -> str:
 
     if name in shipped_models() or os.path.exists(name):
         return f"It is a model or file: 'kineverse info {name}' says what it consists of."
-    known = dict.fromkeys([*COMMANDS, *added, *STUDY_COMMANDS])
+    known = dict.fromkeys([*COMMANDS, *added, *BESIDE])
     return f"{suggest(name, known, 'command')} 'kineverse --help' says what each does."
 
 

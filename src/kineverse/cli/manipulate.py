@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -28,6 +28,7 @@ from .manipulate_skills import (
     make_scene,
 )
 from .output import format_table, join_lines, name_options, show_activity
+from .outside_robot import OutsideRobot, check_world, is_outside, refuse_start
 from .pages import (
     add_page_options,
     check_picture_path,
@@ -41,7 +42,9 @@ from .pages import (
 if TYPE_CHECKING:
     from kineverse.manipulation import Belief, JudgedOutcome
     from kineverse.manipulation.swept_volume import Obstacle
-    from kineverse.worlds import SimulatedWorld
+    from kineverse.state import State
+    from kineverse.symbols import Symbol
+    from kineverse.worlds import Robot, RobotInterface, SimulatedWorld
     from kineverse.worlds.robot_interface import SkillStep
 
 DONE, NOT_DONE = 0, 1
@@ -49,7 +52,8 @@ DONE, NOT_DONE = 0, 1
 _COMMON = """
 MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places it, and
 ROBOT@X,Y,Z,ANGLE one that is bolted to something. The world gets the speeds of the robot alone, and judges by
-its own truth: kinematic (the default), or mujoco with contacts, forces and friction. Nothing is moved where
+its own truth: kinematic (the default), or mujoco with contacts, forces and friction. With --world ros it is a
+robot behind topics of ROS 2, which begins where it is; the result is what it believes. Nothing is moved where
 something is in the way of the object. The exit status is 0 if it is done and nothing went through anything, 1
 if not, 2 if the request is wrong. This needs the extras 'control' and 'geometry', the other world 'mjcf',
 --record 'recording', and opening and closing a C compiler.
@@ -132,7 +136,11 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
         "--what", metavar="COORDINATE", required=True, action=_Once, help="coordinate of the object"
     )
     parser.add_argument(
-        "--world", choices=("kinematic", "mujoco"), default="kinematic", help="the world (kinematic)"
+        "--world",
+        metavar="WORLD",
+        default="kinematic",
+        help="kinematic (the default), mujoco, or ros: a robot behind topics of ROS 2; ros:FILE names its "
+        "settings (.toml)",
     )
     parser.add_argument("--from", metavar="VALUE", dest="start", help="value at the start (0.3, 30deg, 12cm)")
     parser.add_argument("--to", metavar="VALUE", help="wanted value")
@@ -183,27 +191,86 @@ def _run(arguments: argparse.Namespace, skill: str) -> int:
 
     _check(arguments, skill)
     request_planner()
+    if is_outside(arguments.world):
+        return _run_outside(arguments, skill)
     with show_activity(f"reading {arguments.model} and {arguments.robot}"):
         scene = make_scene(arguments, skill)
+    _print_violations(scene)
+    with show_activity("preparing the world"):
+        world = _make_world(arguments, scene)
+    belief: Belief = TrueBelief(world)
+    if arguments.noise is not None:
+        belief = _track(scene, Sensors.parse(arguments.noise))
+    return _run_in(arguments, skill, scene, world, world, belief)
+
+
+def _run_outside(arguments: argparse.Namespace, skill: str) -> int:
+    """Run the skill with a robot outside of this process."""
+    with ExitStack() as stack:
+        outside: OutsideRobot | None = None
+
+        def look(robot: Robot, coordinate: Symbol) -> State:
+            nonlocal outside
+            outside = stack.enter_context(
+                OutsideRobot(arguments.world, robot, coordinate, whole=arguments.unknown)
+            )
+            return outside.look()
+
+        with show_activity(f"reading {arguments.model} and looking at {arguments.robot}"):
+            scene = make_scene(arguments, skill, look)
+        assert outside is not None
+        _print_violations(scene)
+        return _run_in(arguments, skill, scene, outside.interface, None, outside.belief)
+
+
+def _print_violations(scene: ManipulationScene) -> None:
     print_notes(
         f"{violation.name} is violated at the start: {format_number(violation.value)} is not in "
         f"[{format_number(violation.lower)}, {format_number(violation.upper)}]"
         for violation in scene.model.violations(scene.start)[:3]
     )
-    with show_activity("preparing the world"):
-        world = _make_world(arguments, scene)
+
+
+def _run_in(
+    arguments: argparse.Namespace,
+    skill: str,
+    scene: ManipulationScene,
+    interface: RobotInterface,
+    world: SimulatedWorld | None,
+    belief: Belief,
+) -> int:
+    """Run the skill with a robot, in a simulated world if it is in one, and return the status."""
     if arguments.verbose:
-        print_notes(world.remarks)
+        print_notes(interface.remarks)
+    run = _Run(arguments, skill, scene, interface, world, belief, scene.start)
     outcome = None
     with ExitStack() as stack:
         if arguments.view:
-            outcome = _view(arguments, skill, scene, world, stack)
+            outcome = _view(run, stack)
         else:
-            outcome = _act(arguments, skill, scene, world, [], arguments.record)
-            _report_outcome(arguments, skill, scene, world, outcome)
+            outcome = _act(run, [], arguments.record)
+            _report_outcome(run, outcome)
     if outcome is None:
         raise KeyboardInterrupt  # before there was a result
     return DONE if outcome else NOT_DONE
+
+
+@dataclass
+class _Run:
+    """Run of a skill with a robot."""
+
+    arguments: argparse.Namespace
+    skill: str
+    scene: ManipulationScene
+    interface: RobotInterface
+    world: SimulatedWorld | None  # the world if it is a simulated one
+    belief: Belief
+    believed: State  # the latest
+
+    @property
+    def state(self) -> State:
+        """The present state: the true one, else the believed one."""
+        return self.believed if self.world is None else self.world.state
 
 
 def _check(arguments: argparse.Namespace, skill: str) -> None:
@@ -216,6 +283,9 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
         "recording": arguments.record is not None,
         "view": arguments.view,
     }
+    check_world(arguments.world, ("kinematic", "mujoco"))
+    if is_outside(arguments.world):
+        refuse_start(arguments)
     # A push takes what stands in its way into account without a planner.
     require(f"kineverse {skill}", extras, compiler=skill != "push")
     if not arguments.seconds > 0 or math.isinf(arguments.seconds):
@@ -249,45 +319,44 @@ def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> Simu
     return world
 
 
-def _act(
-    arguments: argparse.Namespace,
-    skill: str,
-    scene: ManipulationScene,
-    world: SimulatedWorld,
-    watchers: list[Callable[[SkillStep], object]],
-    record: str | None,
-) -> JudgedOutcome:
-    belief: Belief = TrueBelief(world)
-    with ExitStack() as stack:
-        watchers = [_PhaseLines(scene, world), *watchers]
-        if arguments.noise is not None:
-            from kineverse.manipulation import TrackedBelief  # for start-up time
+def _track(scene: ManipulationScene, sensors: Sensors) -> Belief:
+    """Return a belief from noisy sensors, and print what is to be known of it."""
+    from kineverse.manipulation import TrackedBelief  # for start-up time
 
-            tracked = TrackedBelief(scene.model, scene.robot, Sensors.parse(arguments.noise))
-            print_notes(tracked.remarks)
-            if tracked.sensors.position > 0.0 and tracked.sensors.orientation == 0.0:
-                print_notes(["orientations are seen exactly; 0.5deg in --noise gives them noise, too"])
-            belief = tracked
+    tracked = TrackedBelief(scene.model, scene.robot, sensors)
+    print_notes(tracked.remarks)
+    if tracked.sensors.position > 0.0 and tracked.sensors.orientation == 0.0:
+        print_notes(["orientations are seen exactly; 0.5deg in --noise gives them noise, too"])
+    return tracked
+
+
+def _act(run: _Run, watchers: list[Callable[[SkillStep], object]], record: str | None) -> JudgedOutcome:
+    arguments, skill, scene = run.arguments, run.skill, run.scene
+    with ExitStack() as stack:
+        watchers = [_PhaseLines(run), *watchers]
         recorder = None
         if record is not None:
             about = {
                 "skill": skill,
                 "robot": scene.robot.name,
                 "what": str(scene.coordinate),
-                "world": world.name,
+                "world": run.interface.name,
             }
             if arguments.noise is not None:
                 about["noise"] = arguments.noise
             from kineverse.worlds import Recorder  # for start-up time
 
-            recorder = stack.enter_context(Recorder(record, scene.model, about, world=world))
+            recorder = stack.enter_context(Recorder(record, scene.model, about, world=run.world))
             watchers.append(recorder)
 
         def look(step: SkillStep) -> None:
+            # The model of a skill that learns a joint has other coordinates.
+            known = {s: v for s, v in step.state.items() if s in run.believed}
+            run.believed = run.believed.updated(known)
             for watch in watchers:
                 watch(step)
 
-        trial = SkillTrial(arguments, scene, world, belief, look)
+        trial = SkillTrial(arguments, scene, run.interface, run.world, run.belief, look)
         there = abs(scene.start[scene.coordinate] - scene.target) <= scene.tolerance
         if scene.fixed and (not there or (skill == "open" and arguments.to is None)):
             outcome = trial.skip(False, scene.fixed)
@@ -314,13 +383,7 @@ def _find_obstacle(scene: ManipulationScene) -> Obstacle | None:
     return find_obstacle(scene.model, scene.coordinate, scene.start, scene.target, robot=scene.robot)
 
 
-def _view(
-    arguments: argparse.Namespace,
-    skill: str,
-    scene: ManipulationScene,
-    world: SimulatedWorld,
-    stack: ExitStack,
-) -> JudgedOutcome | None:
+def _view(run: _Run, stack: ExitStack) -> JudgedOutcome | None:
     """Run the skill on a page, then play it there until Ctrl-C; return None if it was interrupted before."""
     from kineverse.view.page import read_title  # for start-up time
     from kineverse.view.run_overlay import LiveRun, play_recording  # for start-up time
@@ -328,6 +391,7 @@ def _view(
     from kineverse.worlds import read_run_recording  # for start-up time
     from kineverse.worlds.recorder import import_mcap  # for start-up time
 
+    arguments, scene = run.arguments, run.scene
     record = arguments.record
     if record is None:
         try:
@@ -340,15 +404,16 @@ def _view(
     outcome = None
     with (
         handle_interrupts(),
-        Viewer(scene.model, world.state, label=label, **page_options(arguments)) as page,
+        Viewer(scene.model, run.state, label=label, **page_options(arguments)) as page,
     ):
         print_mesh_problems(page.problems)
         with redirect_stdout(sys.stderr if arguments.json else sys.stdout):
             print_address(page, browser=not arguments.no_browser)
-        live = LiveRun(page, world)
-        outcome = _act(arguments, skill, scene, world, [live], record)
+        # A robot outside keeps time itself.
+        live = LiveRun(page, run.world, speed=0.0 if run.world is None else 1.0)
+        outcome = _act(run, [live], record)
         live.remove()
-        _report_outcome(arguments, skill, scene, world, outcome)
+        _report_outcome(run, outcome)
         sys.stdout.flush()
         if record is not None and outcome.steps:
             play_recording(page, read_run_recording(record), loop=True)
@@ -359,28 +424,25 @@ def _view(
 class _PhaseLines:
     """Lines on standard error, one for each phase that begins."""
 
-    def __init__(self, scene: ManipulationScene, world: SimulatedWorld) -> None:
-        self._scene, self._world, self._phase = scene, world, ""
+    def __init__(self, run: _Run) -> None:
+        self._run, self._phase = run, ""
 
     def __call__(self, session: SkillStep) -> None:
         if session.phase != self._phase:
-            self._phase, scene = session.phase, self._scene
-            value = f"{self._world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()
-            print(f"{session.time:7.2f} s  {self._phase:<12}  {value}", file=sys.stderr, flush=True)
+            self._phase, scene = session.phase, self._run.scene
+            state = session.state if self._run.world is None else self._run.world.state
+            value = state.given(scene.coordinate)  # None for a joint that is being learned
+            text = "" if value is None else f"{value:.3f} {scene.unit}".rstrip()
+            print(f"{session.time:7.2f} s  {self._phase:<12}  {text}".rstrip(), file=sys.stderr, flush=True)
 
 
-def _report_outcome(
-    arguments: argparse.Namespace,
-    skill: str,
-    scene: ManipulationScene,
-    world: SimulatedWorld,
-    outcome: JudgedOutcome,
-) -> None:
+def _report_outcome(run: _Run, outcome: JudgedOutcome) -> None:
     """Print the result of a skill, and write a picture if wanted."""
+    arguments, scene = run.arguments, run.scene
     if arguments.picture is not None:
         from kineverse.view import save_picture  # for start-up time
 
-        save_picture(arguments.picture, scene.model, {str(s): v for s, v in world.state.items()})
+        save_picture(arguments.picture, scene.model, {str(s): v for s, v in run.state.items()})
         print_mesh_problems(list_mesh_problems(scene.model))
         print(f"picture: {arguments.picture}", file=sys.stderr)
     if arguments.json:
@@ -392,14 +454,14 @@ def _report_outcome(
             "world": outcome.world,
             "seconds": outcome.seconds,
             "steps": outcome.steps,
-            "skill": skill,
+            "skill": run.skill,
             "robot": scene.robot.name,
             "what": str(scene.coordinate),
             "start": scene.start[scene.coordinate],
             "target": None if arguments.unknown and arguments.to is None else scene.target,
             "hand": None if scene.gripper is None else scene.gripper.hand,
             "measures": outcome.measures,
-            "remarks": world.remarks,
+            "remarks": run.interface.remarks,
         }
         print(json.dumps(_plain(answer), allow_nan=False))
         return
@@ -408,7 +470,7 @@ def _report_outcome(
         verdict = f"not done, at {at}. {outcome.reason}"
     else:
         state = "shut" if is_shut(scene) else "done"
-        verdict = f"{state} at {at}, after {format_number(outcome.seconds, 4)} s in the {world.name} world"
+        verdict = f"{state} at {at}, after {format_number(outcome.seconds, 4)} s {_name_world(run)}"
     print(f"{scene.coordinate}: {name_options(join_lines(verdict), arguments)}")
     if "family" in outcome.measures:
         if outcome:
@@ -423,6 +485,12 @@ def _report_outcome(
         print(format_table(("measure", "value"), rows))
     if arguments.record is not None:
         print(f"recording: {arguments.record}")
+
+
+def _name_world(run: _Run) -> str:
+    if run.world is None:
+        return "as the robot believes"
+    return f"in the {run.world.name} world"
 
 
 def _describe_joint(measures: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from time import perf_counter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -17,12 +17,13 @@ from kineverse.geometry.exclusions import remove_unusable_shapes
 from kineverse.grasping import Gripper, Handle, find_handle
 from kineverse.manipulation import JudgedOutcome, PlacedRobot, Robot, Session, judge_outcome, place_robot
 from kineverse.manipulation.articulated_objects import find_shut_value
+from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.skill_run import choose_tolerance, explain_fixed
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.view.sliders import infer_units
-from kineverse.worlds import RunMetrics, SimulatedWorld
+from kineverse.worlds import RobotInterface, RunMetrics, SimulatedWorld
 
 from .arguments import check_unit, load_model, parse_assignments, parse_value, print_notes
 from .output import join_lines, print_line, show_activity
@@ -60,8 +61,15 @@ class ManipulationScene:
     tolerance: float  # distance from the target within which the object is there [m], [rad]
 
 
-def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
-    """Load the model, put the robot into it, and return everything before a skill begins."""
+def make_scene(
+    arguments: argparse.Namespace,
+    skill: str,
+    look: Callable[[Robot, Symbol], State] | None = None,
+) -> ManipulationScene:
+    """Load the model, put the robot into it, and return everything before a skill begins.
+
+    A robot outside of this process is looked at, with the coordinate of the object: it says how all begins.
+    """
     begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
     source, place = parse_robot(arguments.robot)
     model = load_model(arguments, arguments.model)
@@ -89,6 +97,10 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         check_unit(option, text, coordinate, unit)
     shut = find_shut_value(model, coordinate)
     lower, upper = model.limits(coordinate)
+    if look is not None:
+        _check_standing(robot, placed)
+        default = look(robot, coordinate)
+        begin = default[coordinate]
     if begin is None:
         begin = default[coordinate] if skill == "open" else _open_from(shut, lower, upper)
     if end is None:
@@ -96,12 +108,15 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     if not math.isfinite(end):
         raise InvalidValueError(f"'{coordinate}' has no limit at which it is open; say how far: --to VALUE.")
     fixed = explain_fixed(model, coordinate, default.updated({coordinate: begin}))
-    _check_limits(model, "--from", coordinate, begin)
     if not fixed:  # that it is fixed is the result
         _check_limits(model, "--to", coordinate, end)
-    state = placed.start_state(model).updated(others).updated({coordinate: begin})
-    if skill != "push":  # pushes search a place for the whole push
-        state = _find_free_start(model, placed, state)
+    if look is not None:
+        state = default
+    else:
+        _check_limits(model, "--from", coordinate, begin)
+        state = placed.start_state(model).updated(others).updated({coordinate: begin})
+        if skill != "push":  # pushes search a place for the whole push
+            state = _find_free_start(model, placed, state)
     gripper, why, pusher = _find_pusher(robot, arguments.hand, skill)
     return ManipulationScene(
         model,
@@ -113,10 +128,16 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         gripper,
         why,
         pusher,
-        place is not None,
+        place is not None or look is not None,
         fixed,
         choose_tolerance(model, coordinate, state, end),
     )
+
+
+def _check_standing(robot: Robot, placed: PlacedRobot) -> None:
+    """Check that nobody says where a robot stands that says so itself."""
+    if robot.base is not None and placed.place:
+        raise InvalidValueError("--robot ROBOT@X,Y,ANGLE: a robot with a base says itself where it stands.")
 
 
 def _parse_other_positions(
@@ -216,24 +237,28 @@ class _SearchLines:
 
 
 class SkillTrial:
-    """Trial of a skill in a world: it is measured in the true states, and its outcome is judged by them."""
+    """Trial of a skill in a world: it is measured in the true states, and its outcome is judged by them.
+
+    Without a world, what a robot does is measured by nobody, and done is what the skill claims.
+    """
 
     def __init__(
         self,
         arguments: argparse.Namespace,
         scene: ManipulationScene,
-        world: SimulatedWorld,
+        interface: RobotInterface,
+        world: SimulatedWorld | None,
         belief: Belief,
         look: Callable[[SkillStep], None],
     ) -> None:
-        self._arguments, self._scene, self._world = arguments, scene, world
+        self._arguments, self._scene, self._interface, self._world = arguments, scene, interface, world
         self._belief, self._look = belief, look
 
     def skip(
         self, done: bool, reason: str, measures: Mapping[str, Any] = MappingProxyType({})
     ) -> JudgedOutcome:
         """Return the outcome of what was not begun."""
-        value, name = self._world.state[self._scene.coordinate], self._world.name
+        value, name = self._scene.start[self._scene.coordinate], self._interface.name
         return JudgedOutcome(done, value, join_lines(reason), name, 0.0, 0, measures, done)
 
     def grasp(self) -> JudgedOutcome:
@@ -246,7 +271,7 @@ class SkillTrial:
         from kineverse.manipulation.opening.grasped_opening import open_object  # for start-up time
 
         coordinate, target = self._scene.coordinate, self._scene.target
-        metrics = RunMetrics(self._world, coordinate, gripper=gripper, handle=handle.frame)
+        metrics = self._measure(gripper=gripper, handle=handle.frame)
         outcome = open_object(
             self._open_session_at_handle(metrics, gripper, handle),
             coordinate,
@@ -256,7 +281,18 @@ class SkillTrial:
             seconds=self._arguments.seconds,
             seed=self._arguments.seed,
         )
-        return judge_outcome(outcome, metrics)
+        return self._judge(outcome, metrics)
+
+    def _measure(self, **options: Any) -> RunMetrics | None:
+        return None if self._world is None else RunMetrics(self._world, self._scene.coordinate, **options)
+
+    @staticmethod
+    def _judge(outcome: Outcome, metrics: RunMetrics | None) -> JudgedOutcome:
+        if metrics is not None:
+            return judge_outcome(outcome, metrics)
+        return JudgedOutcome(
+            **{one.name: getattr(outcome, one.name) for one in fields(outcome)}, claimed=outcome.done
+        )
 
     def open_as_unknown(self) -> JudgedOutcome:
         """Open the object as if its joint was unknown."""
@@ -279,9 +315,7 @@ class SkillTrial:
         if part is None:
             raise InvalidValueError(f"--unknown: no joint moves '{coordinate}', so no part belongs to it.")
         far = None if arguments.to is None else abs(self._scene.target - start[coordinate])
-        metrics = RunMetrics(
-            self._world,
-            coordinate,
+        metrics = self._measure(
             gripper=gripper,
             handle=handle.frame,
             part=part,
@@ -299,7 +333,7 @@ class SkillTrial:
             way=OPEN_WAY if far is None else far,
             turn=OPEN_TURN if far is None else far,
         )
-        judged = judge_outcome(outcome, metrics)
+        judged = self._judge(outcome, metrics)
         there = abs(judged.value - start[coordinate])
         if judged and far is not None and there < (1.0 - _SHORT) * far:
             reason = f"{judged.reason} That is {there:.3g}, and not {far:.3g}, from where it began."
@@ -318,14 +352,15 @@ class SkillTrial:
         from kineverse.manipulation.pushing.push_skill import push  # for start-up time
 
         arguments, scene, world = self._arguments, self._scene, self._world
+        coordinate = scene.coordinate
         if not scene.pusher:
             return self.skip(False, scene.why)
         with show_activity("building the controller"):
             pushing = Pushing(
-                scene.model, scene.robot, scene.coordinate, scene.pusher, scene.start, target=scene.target
+                scene.model, scene.robot, coordinate, scene.pusher, scene.start, target=scene.target
             )
         placed, nowhere = 0, None
-        if not scene.stays:
+        if world is not None and not scene.stays:
             steps = round(arguments.seconds / 0.02)
             problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
             if problem:
@@ -345,28 +380,33 @@ class SkillTrial:
                 else:
                     nowhere = found
 
-        metrics = RunMetrics(world, scene.coordinate)
+        metrics = self._measure()
         session = self._open_session(metrics)
-        outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
-        judged = judge_outcome(outcome, metrics)
+        outcome = push(session, coordinate, seconds=arguments.seconds, pushing=pushing)
+        judged = self._judge(outcome, metrics)
         measures = {**judged.measures, "placed": placed}
         if judged or nowhere is None:
             return replace(judged, measures=measures)
         reason = f"{judged.reason} Another place of the robot: {nowhere.why}"
         return replace(judged, reason=reason, measures={**measures, "failure": nowhere.failure})
 
-    def _open_session(self, metrics: RunMetrics) -> Session:
+    def _open_session(self, metrics: RunMetrics | None) -> Session:
         def look(session: Session) -> None:
-            metrics(session)
+            if metrics is not None:
+                metrics(session)
             self._look(session)
 
-        return Session(self._world, belief=self._belief, on_step=look, on_search=_SearchLines())
+        return Session(self._interface, belief=self._belief, on_step=look, on_search=_SearchLines())
 
-    def _open_session_at_handle(self, metrics: RunMetrics, gripper: Gripper, handle: Handle) -> Session:
+    def _open_session_at_handle(
+        self, metrics: RunMetrics | None, gripper: Gripper, handle: Handle
+    ) -> Session:
         """Return a session of a robot that has been put to the handle if its base does not drive there."""
         from kineverse.manipulation import stand_at_handle  # for start-up time
 
         session, world = self._open_session(metrics), self._world
+        if world is None or metrics is None:
+            return session
         target, base = self._scene.target, self._scene.robot.base
         put = stand_at_handle(session, world, handle, target, gripper=gripper, seed=self._arguments.seed)
         if put and base is not None:

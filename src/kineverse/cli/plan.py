@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kineverse.control import Hold
-from kineverse.errors import InvalidValueError
+from kineverse.errors import InvalidValueError, SimulationError
 from kineverse.expressions.printing import format_number
 from kineverse.formats import read_srdf
 from kineverse.geometry import Rule
 from kineverse.planning import Planner
 from kineverse.planning.trajectories.trajectory import check_trajectory_name
+from kineverse.worlds import Robot
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
-from .output import format_table, name_options, show_activity
+from .output import format_table, join_lines, name_options, show_activity
+from .outside_robot import ConnectedRobot, check_world, connect_robot
 from .pages import (
     add_page_options,
     check_picture_path,
@@ -46,6 +48,7 @@ from .plan_arguments import (
 if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.planning import Path
+    from kineverse.planning.trajectories.trajectory import Trajectory
 
 HELP = """\
 A goal is values of coordinates (NAME=VALUE), poses of frames, or a state of an SRDF. FRAME@FRAME brings a
@@ -59,6 +62,9 @@ reached with the hold kept, and bodies of both frames may touch.
 
 The first plan of a robot takes a while: its shapes are covered by spheres, and code is compiled. Both are
 kept. This needs a C compiler and the extra 'geometry'. The exit status is 1 if no path was found.
+
+With --world ros the path begins where a robot behind topics of ROS 2 is, and the robot follows it; the exit
+status is 1, too, if that is given up.
 
 examples:
   kineverse plan shelf_door --to shelf_door/door=80deg
@@ -136,6 +142,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--optimize", action="store_true", help="use all of these seconds to shorten the path"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (0)")
+    parser.add_argument(
+        "--world",
+        metavar="ros[:FILE]",
+        help="begin where the robot is, and have it follow the path, by topics of ROS 2 (settings: .toml)",
+    )
     parser.add_argument("--save", metavar="FILE", help="write the trajectory to a file (.json)")
     parser.add_argument("--picture", metavar="FILE", help="write a picture (.png) of the motion")
     parser.add_argument("--view", action="store_true", help="play the trajectory in the browser")
@@ -162,6 +173,7 @@ class _Problem:
     start_tasks: list[Hold]  # poses of frames at both ends
     goal_tasks: list[Hold]
     grips: list[Hold | None]  # holds along the path; None for those that depend on the start
+    robot: ConnectedRobot | None  # the robot that is to follow the path
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -177,6 +189,8 @@ def run(arguments: argparse.Namespace) -> int:
     holds = [parse_frame_target(word, "--along") for word in arguments.along]
     margin = parse_length(arguments.margin)
     check_picture_path(arguments.picture)
+    if arguments.world is not None:
+        check_world(arguments.world)
     if arguments.save is not None:
         check_trajectory_name(arguments.save)
     if not arguments.seconds > 0 or math.isinf(arguments.seconds):
@@ -193,15 +207,31 @@ def run(arguments: argparse.Namespace) -> int:
     preparation = perf_counter() - begin - path.seconds
     if arguments.save is not None and trajectory is not None:
         trajectory.save(arguments.save)
+    why = "" if problem.robot is None or trajectory is None else _follow(problem.robot, trajectory)
     if arguments.json:
-        print(json.dumps(path_to_json(path, preparation), allow_nan=False))
+        answer = path_to_json(path, preparation)
+        if problem.robot is not None:
+            answer |= {"world": problem.robot.name, "followed": path.found and not why, "given_up": why}
+        print(json.dumps(answer, allow_nan=False))
     else:
         print_path(arguments, path, preparation)
+        if problem.robot is not None and path.found:
+            print(f"not followed: {why}" if why else "followed by the robot")
     if arguments.picture is not None:
         _write_picture(arguments.picture, problem, path)
     if arguments.view:
         _view(arguments, problem, path)
-    return FOUND if path.found else NOT_FOUND
+    return FOUND if path.found and not why else NOT_FOUND
+
+
+def _follow(robot: ConnectedRobot, trajectory: Trajectory) -> str:
+    """Have a robot follow a path, and return why it has not; empty if it has."""
+    try:
+        with show_activity("following the path"):
+            robot.follow(trajectory)
+    except SimulationError as error:
+        return join_lines(error)
+    return ""
 
 
 def _prepare(
@@ -212,8 +242,15 @@ def _prepare(
         standing: dict[kv.Symbol, float] = {}
         robot = next(iter(model.frames), "").partition("/")[0]
         if arguments.robot is not None:
-            robot, standing = include_robot(arguments, model)
-    srdf = None if arguments.srdf is None else read_srdf(arguments.srdf, model, _srdf_prefix(model, robot))
+            # Whose joints are whose, a robot outside is told by prefixes, as kineverse open does.
+            prefix = "" if arguments.world is None else None
+            robot, standing = include_robot(arguments, model, prefix)
+    outside: ConnectedRobot | None = None
+    read: dict[kv.Symbol, float] = {}
+    if arguments.world is not None:
+        outside, read = _connect(arguments, Robot.of(model, _prefix(model, robot)), start)
+        standing = {s: v for s, v in read.items() if s in outside.robot.planar_base}
+    srdf = None if arguments.srdf is None else read_srdf(arguments.srdf, model, _prefix(model, robot))
     for line in () if srdf is None else srdf.warnings[:3]:
         print(f"kineverse: note: {arguments.srdf}: {line}", file=sys.stderr)
     states = {} if srdf is None else srdf.states
@@ -246,12 +283,31 @@ def _prepare(
     still = [name for name in goal.values if model.symbol(name) not in planner.symbols]
     if still:
         raise InvalidValueError(f"--to has a value of '{still[0]}', which --move does not list.")
-    state = model.default_state().updated(standing).updated(start.values)
+    if outside is not None and (driven := [str(s) for s in planner.symbols if s in standing]):
+        raise InvalidValueError(
+            f"--world: a robot follows paths of its joints, and '{driven[0]}' is of its base. --move names "
+            "joints."
+        )
+    state = model.default_state().updated(standing).updated(read).updated(start.values)
     planner.place(state)
-    return _Problem(model, planner, state, start, goal, holds, start_tasks, goal_tasks, grips)
+    return _Problem(model, planner, state, start, goal, holds, start_tasks, goal_tasks, grips, outside)
 
 
-def _srdf_prefix(model: kv.Model, robot: str) -> str:
+def _connect(
+    arguments: argparse.Namespace, robot: Robot, start: Request
+) -> tuple[ConnectedRobot, dict[kv.Symbol, float]]:
+    """Return the robot of ``--world``, and its readings; where it stands, nobody else says."""
+    own = [name for name in start.values if robot.moves(robot.model.symbol(name))]
+    if own or start.targets:
+        name = own[0] if own else start.targets[0].frame
+        raise InvalidValueError(f"--from {name}: with --world, the robot says itself where it is.")
+    if arguments.robot is not None and robot.base is not None and "@" in arguments.robot:
+        raise InvalidValueError("--robot ROBOT@X,Y,ANGLE: a robot with a base says itself where it stands.")
+    connected = arguments.opened.enter_context(connect_robot(arguments.world, robot, ()))
+    return connected, dict(connected.observe().joints)
+
+
+def _prefix(model: kv.Model, robot: str) -> str:
     """Return the prefix of a robot's names; empty if the model's names have none."""
     return robot if any(name.startswith(f"{robot}/") for name in model.frames) else ""
 

@@ -100,14 +100,19 @@ def add_robot_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def include_robot(arguments: argparse.Namespace, model: kv.Model) -> tuple[str, dict[kv.Symbol, float]]:
-    """Put the robot of ``--robot`` into a model; return its prefix and the place of its base by symbol."""
+def include_robot(
+    arguments: argparse.Namespace, model: kv.Model, prefix: str | None = ""
+) -> tuple[str, dict[kv.Symbol, float]]:
+    """Put the robot of ``--robot`` into a model; return its prefix and the place of its base by symbol.
+
+    Its names are those of its description, or below a prefix, as :func:`.place_robot` says.
+    """
     source, place = parse_robot(arguments.robot)
     robot = place_robot(
         model,
         source,
         place,
-        prefix="",
+        prefix=prefix,
         root=arguments.root,
         strict=arguments.strict,
         loops=arguments.loops,

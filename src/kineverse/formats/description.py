@@ -82,6 +82,7 @@ class LinkDescription:
     fixed_joint_name: str = ""  # name of the fixed joint to the parent, if nothing moves
     is_articulation: bool = False  # True if an articulation of the model has that name
     dynamics: Mapping[str, Any] = field(default_factory=dict)
+    is_loose: bool = False  # True if it moves as no joint of the format; the pose is that at home
 
 
 @dataclass(frozen=True)

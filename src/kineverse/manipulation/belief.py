@@ -260,8 +260,8 @@ class TrackedBelief:
             self._history.append((self._now, time, self._vector(commands)))
         self._now = time
         self._read_robot(observation)
-        if observation.poses and observation.stamp > self._looked:
-            self._looked = observation.stamp
+        if observation.poses and observation.picture_stamp > self._looked:
+            self._looked = observation.picture_stamp
             self._look(observation)
         oldest = min(self._read, self._picture)
         self._history = [one for one in self._history if one[1] > oldest]
@@ -329,7 +329,7 @@ class TrackedBelief:
         self._spread = (1.0 - gain) * spread
 
     def _look(self, observation: Observation) -> None:
-        stamp, self._shared = observation.stamp, None
+        stamp, self._shared = observation.picture_stamp, None
         poses = np.tile(np.eye(4), (len(self._index), 1, 1))
         mask = np.zeros(len(poses), dtype=bool)
         names = [name for name in observation.poses if name in self._index]

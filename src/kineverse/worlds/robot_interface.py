@@ -28,12 +28,20 @@ class Observation:
         Observed poses world_T_frame (4, 4) of marked frames [m], the visible ones alone.
     touching
         Frames of the robot that a touch sensor reports.
+    seen
+        Time of the poses where it is another one, as cameras are slower than encoders [s].
     """
 
     stamp: float
     joints: Mapping[Symbol, float]
     poses: Mapping[str, Array] = field(default_factory=dict)
     touching: frozenset[str] = frozenset()
+    seen: float | None = None
+
+    @property
+    def picture_stamp(self) -> float:
+        """Time of the poses [s]."""
+        return self.stamp if self.seen is None else self.seen
 
 
 class RobotInterface(Protocol):

@@ -23,7 +23,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from kineverse import position, rotation_z
-from kineverse._extras import install_studies
+from kineverse._extras import STUDIES, install_distribution
 from kineverse._runtime import no_collection
 from kineverse._version import __version__
 from kineverse.compilation import CompilerInformation, compile, compiler_information
@@ -215,7 +215,7 @@ def install_advice(module: str) -> str:
     distribution = DISTRIBUTIONS.get(module, module)
     if module in PEERS_EXTRA:
         called = "" if distribution == module else f" (the package {distribution!r})"
-        return f"{module} is not installed: {install_studies('peers')} brings it{called}"
+        return f"{module} is not installed: {install_distribution(STUDIES, 'peers')} brings it{called}"
     return f"{module} is not installed: it is the package {distribution!r}"
 
 

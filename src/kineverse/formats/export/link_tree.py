@@ -142,7 +142,10 @@ _UNIT_COEFFICIENTS = (IDENTITY_COEFFICIENTS, (0.0, -1.0))
 
 
 class LinkTreeBuilder:
-    """Builder of the robot description of one model."""
+    """Builder of the robot description of one model.
+
+    With ``loose``, frames that the format cannot move are loose links, and each link is a frame.
+    """
 
     def __init__(
         self,
@@ -151,8 +154,10 @@ class LinkTreeBuilder:
         leave_out: Iterable[str] = (),
         tolerance: float | None = None,
         strict: bool = False,
+        loose: bool = False,
     ) -> None:
         self.model, self.capabilities = model, target
+        self._loose = loose
         self.unsupported = UnsupportedFeatures(target.name, strict)
         self.remarks: list[str] = []
         # Symbols of refused frames: their limits are not reported a second time.
@@ -189,8 +194,13 @@ class LinkTreeBuilder:
         self._check_rates(chains)
         joints = TakenNames(s.path for s in self._coordinates)
         independent = self._independent_motions(chains)
-        links = [self._link(name, chain, independent, joints) for name, chain in chains.items()]
-        links += self._carrier_links(chains, set(independent), links)
+        links = [
+            self._link(name, chains[name], independent, joints) if name in chains else self._loose_link(name)
+            for name in names
+            if name in chains or self._loose
+        ]
+        if not self._loose:
+            links += self._carrier_links(chains, set(independent), links)
         description = RobotDescription(links, self.model.bodies.get(WORLD, NO_BODY), loops=self._loops)
         simple = list(self._expressible_constraints(found, approximation))
         assign_limits(description, simple, self.capabilities, self.unsupported)
@@ -258,7 +268,8 @@ class LinkTreeBuilder:
         factors = [self._factor(f) for f in self.model.frames[name].factors]
         record = self._articulation_of(name)
         follows = record is not None and record.follows is not None
-        if any(has_given_gradient(f) for f in factors if isinstance(f, Expression)):
+        given = any(has_given_gradient(f) for f in factors if isinstance(f, Expression))
+        if given and not self._loose:
             self.unsupported.refuse(name, "moves with a gradient that was given and is not the derivative")
             self._refused_symbols.update(s for f in factors if isinstance(f, Expression) for s in f.symbols)
             return None
@@ -290,7 +301,8 @@ class LinkTreeBuilder:
         symbols = dict.fromkeys(s for f in factors if isinstance(f, Expression) for s in f.symbols)
         self._refused_symbols.update(symbols)
         moves = f"it moves with {', '.join(map(str, symbols))}" if symbols else "loops hold it where it is"
-        self.unsupported.refuse(name, f"{problem}; {moves}")
+        if not self._loose:
+            self.unsupported.refuse(name, f"{problem}; {moves}")
 
     def _factor(self, factor: Pose | Expression) -> Pose | Expression:
         if isinstance(factor, Pose):
@@ -369,6 +381,12 @@ class LinkTreeBuilder:
             record is not None,
             _joint_dynamics(record),
         )
+
+    def _loose_link(self, name: str) -> LinkDescription:
+        parent, body = self.model.frames[name].parent, self.model.bodies.get(name, NO_BODY)
+        pose, home = self.model.fk(name, parent), self.model.default_state()
+        values = {symbol: home[symbol] for symbol in pose.symbols}
+        return LinkDescription(name, parent, pose(values), body=body, is_loose=True)
 
     def _dynamics_of(
         self, joint: JointDescription | BallJointDescription, record: Articulation | None, count: int

@@ -55,6 +55,7 @@ from kineverse.model.body import (
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
 
 from .operations import urdf_operations
 from .reader import parse_urdf
@@ -158,13 +159,35 @@ def to_urdf(
     leave_out: Iterable[str] = (),
     tolerance: float | None = None,
     strict: bool = False,
+    loose: bool = False,
 ) -> WrittenFile:
-    """Convert a model to URDF."""
-    builder = LinkTreeBuilder(model, URDF_CAPABILITIES, leave_out, tolerance, strict)
+    """Convert a model to URDF.
+
+    With ``loose``, links are the frames of the model and no others, for readers that have the poses from
+    elsewhere: what moves as no single joint of URDF is a floating joint, at home where the model is.
+    """
+    builder = LinkTreeBuilder(model, URDF_CAPABILITIES, leave_out, tolerance, strict, loose)
     description = builder.build()
+    if loose:
+        _loosen_links(description)
     content = UrdfWriter(description, path, builder.unsupported).document()
     _check_read_back(content, path)
     return WrittenFile(content, tuple(description.remarks), description.errors, builder.unsupported.left_out)
+
+
+def _loosen_links(description: RobotDescription) -> None:
+    """Have all links loose that more than one joint of URDF would move, or one that mimics their joints."""
+    single: set[Symbol] = set()
+    for link in description.links:
+        joints = [joint for joint in link.joints if isinstance(joint, JointDescription)]
+        is_single = len(joints) == len(link.joints) == 1 and not any(joints[0].point)
+        if link.joints and not is_single:
+            link.is_loose = True
+        elif is_single and joints[0].is_independent:
+            single.add(joints[0].symbol)
+    for link in description.links:
+        if any(isinstance(joint, JointDescription) and joint.symbol not in single for joint in link.joints):
+            link.is_loose = True
 
 
 def _check_read_back(content: bytes, path: Path) -> None:
@@ -222,7 +245,12 @@ class UrdfWriter:
         roots = [link for link in self._description.links if link.parent == WORLD]
         if len(roots) != 1 or self._description.world_body != NO_BODY:
             return None
-        if roots[0].joints or roots[0].is_articulation or not np.array_equal(roots[0].pose, np.eye(4)):
+        if (
+            roots[0].joints
+            or roots[0].is_loose
+            or roots[0].is_articulation
+            or not np.array_equal(roots[0].pose, np.eye(4))
+        ):
             return None
         return roots[0]
 
@@ -233,6 +261,14 @@ class UrdfWriter:
             return
         parent, pose = link.parent, link.pose
         compound = self._compound(link)
+        if compound is None and link.is_loose:
+            self._bodies.write(self._root.add("link", name=link.name), link.body)
+            name = self._joints.take(link.name, f"{link.name}/floating")
+            self._description.remarks.append(
+                f"'{link.name}' is floating, as no single joint of URDF moves so"
+            )
+            self._joint(name, "floating", parent, link.name, pose)
+            return
         if compound is not None:
             name, kind, axis = compound
             self._bodies.write(self._root.add("link", name=link.name), link.body)

@@ -171,8 +171,8 @@ class PartBelief:
         joints = {s: v for s, v in observation.joints.items() if s in self._symbols}
         self._state = self._state.updated(joints)
         self._world_T_hand = self._hand(self._state.vector(self._hand.inputs))
-        if observation.poses and observation.stamp > self._looked:
-            self._looked = observation.stamp
+        if observation.poses and observation.picture_stamp > self._looked:
+            self._looked = observation.picture_stamp
             self._look(observation)
         if self.path is not None and self.held is not None and self.held.pose is not None:
             self.path.project(inverse(self.reference_pose) @ self._world_T_hand @ self.held.pose)
@@ -193,7 +193,7 @@ class PartBelief:
                 mean.add(seen.poses[name])
         if self.monitor is not None:
             known = {name: pose for name, pose in seen.poses.items() if name in self.monitor.frames}
-            self.monitor.update(known, at=seen.stamp)
+            self.monitor.update(known, at=seen.picture_stamp)
         if any(name in seen.poses for name in self._marker_T_part):
             self._look_at_part(seen)
 
