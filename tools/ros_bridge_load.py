@@ -33,7 +33,11 @@ def measure(seconds: float) -> dict[str, Any]:
     # The wheels restart each Python once; a child that finds this done would not find their libraries.
     variables = {k: v for k, v in os.environ.items() if not k.startswith("_ROS_WHEELS_")}
     child = subprocess.Popen(
-        [sys.executable, __file__, "--node"], env=variables, stdout=subprocess.PIPE, text=True
+        [sys.executable, __file__, "--node"],
+        env=variables,
+        stdout=subprocess.PIPE,
+        text=True,
+        encoding="utf-8",
     )
     try:
         assert child.stdout is not None

@@ -70,7 +70,12 @@ def make_tf2_msgs(prefix: Path) -> None:
             ["cmake", "--build", build, "--parallel", "2", "--target", "install"],
         ):
             done = subprocess.run(
-                command, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+                command,
+                env=variables,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                encoding="utf-8",
             )
             if done.returncode:
                 sys.exit(f"{done.stdout}\ntf2_msgs cannot be made.")
@@ -79,7 +84,9 @@ def make_tf2_msgs(prefix: Path) -> None:
 def link_packages(python: str) -> None:
     """Have this environment import the packages of another one, behind its own."""
     show = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    other = subprocess.run([python, "-c", show], capture_output=True, text=True, check=True).stdout.strip()
+    other = subprocess.run(
+        [python, "-c", show], capture_output=True, text=True, encoding="utf-8", check=True
+    ).stdout.strip()
     own = Path(sysconfig.get_path("purelib"))
     # The folder and what its own .pth files name, such as editable installations.
     (own / "zz_kineverse.pth").write_text(f"import site; site.addsitedir({other!r})\n", "utf-8")

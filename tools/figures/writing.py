@@ -32,12 +32,19 @@ def run_command(command: str, needs_data: bool) -> str:
     """
     words = shlex.split(command)
     if words[0] == "make":
-        return subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True, cwd=ROOT).stdout
+        return subprocess.run(
+            words, check=True, stdout=subprocess.PIPE, text=True, encoding="utf-8", cwd=ROOT
+        ).stdout
     words = [sys.executable, "-m", *words, "--markdown"]
     with tempfile.TemporaryDirectory() as empty:
         folder = DATA if needs_data else empty
         return subprocess.run(
-            words, check=True, stdout=subprocess.PIPE, text=True, encoding="utf-8", cwd=folder
+            words,
+            check=True,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+            cwd=folder,
         ).stdout
 
 

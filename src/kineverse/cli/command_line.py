@@ -61,7 +61,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "fit": ("fit", "identify the joint of a part from a table of its poses"),
         "serve": ("serve", "serve a model that other processes read and edit, and keep it"),
         "keys": ("keys", "make the keys of a model server and its users, for other computers"),
-        "relay": ("relay", "relay a site's clients to a model server elsewhere"),
+        "relay": ("exchange:RELAY", "relay a site's clients to a model server elsewhere"),
         "ls": ("exchange:LS", "list the model servers of this user"),
         "status": ("exchange:STATUS", "print how a model server is: times, clients, refused edits"),
         "watch": ("exchange:WATCH", "print a line for each commit of a served model"),
