@@ -17,6 +17,7 @@ import pytest
 
 pytest.importorskip("zenoh")
 pytest.importorskip("cryptography")
+pytest.importorskip("resource")  # there are no units elsewhere
 
 from faults.costs import write_on_paper
 from faults.edge import HOST, find_port
