@@ -411,7 +411,8 @@ def test_the_settings_on_the_page_can_be_read(tmp_path):
         ("joint_states = 'joint states'", "'joint states' is no name of a topic"),
         ("[controllers]\n'2nd' = ['lift', 'pan']", "'2nd/commands' is no name of a topic"),
         ("[observed]\nnowhere = 'x'", "there is no frame 'nowhere'"),
-        ("[observed]\ndoor = 'tf:a'\nwall = 'tf:a'", "'a' in TF stands for 'door' and for 'wall'"),
+        ("[observed]\ndoor = 'tf:a'\nwall = 'tf:a'", "'tf:a' stands for 'door' and for 'wall'"),
+        ("[observed]\ndoor = 'tf:'", "'tf:' is no name of a topic"),
     ],
 )
 def test_bad_settings_are_one_error_each(started, tmp_path, text, match):
