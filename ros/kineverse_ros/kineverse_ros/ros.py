@@ -63,4 +63,3 @@ def import_ros() -> Any:
         STEADY=clock.Clock(clock_type=clock.ClockType.STEADY_TIME),
         **messages,
     )
-
