@@ -61,7 +61,7 @@ MESSAGES = (
     TransformStamped,
     _message("geometry_msgs", "PoseStamped", header=Header(), pose=Pose()),
     _message("geometry_msgs", "Twist", linear=Vector3(), angular=Vector3()),
-    _message("rcl_interfaces", "ParameterDescriptor", description=""),
+    _message("rcl_interfaces", "ParameterDescriptor", description="", read_only=False, type=0),
     _message("sensor_msgs", "JointState", header=Header(), name=[], position=[], velocity=[], effort=[]),
     _message("std_msgs", "Float64MultiArray", data=[]),
     _message("std_msgs", "String", data=""),
@@ -218,6 +218,12 @@ class FakeNode:
 
     def declare_parameter(self, name: str, value: Any, descriptor: Any = None) -> SimpleNamespace:
         return self.parameters.setdefault(name, SimpleNamespace(value=value))
+
+    def describe_parameter(self, name: str) -> SimpleNamespace:
+        return SimpleNamespace(type=0)
+
+    def set_descriptor(self, name: str, descriptor: Any) -> None:
+        self.parameters[name].descriptor = descriptor
 
     def has_parameter(self, name: str) -> bool:
         return name in self.parameters

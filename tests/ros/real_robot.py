@@ -31,7 +31,7 @@ from kineverse_ros.simulated_robot import SimulatedRobot, make_world
 
 SPEEDS = {"bot/base/x": 0.1, "bot/base/angle": 0.2, "bot/pan": -0.1, "bot/lift": 0.0}
 PERIOD = 0.01
-LOOKING = 0.4  # time after a cut in which nothing may move again [s]
+LOOKING = 0.25  # time after a cut in which nothing may move again [s]
 HELD = 0.1  # longest step of the world [s]
 
 
@@ -102,7 +102,7 @@ class Robot:
     def await_motion(self) -> None:
         """Live until the skill has moved the robot for a while."""
         count = len(self.heard)
-        self.wait(lambda: sum(speed > 0.0 for _, speed in self.heard[count:]) > 30)
+        self.wait(lambda: sum(speed > 0.0 for _, speed in self.heard[count:]) > 10)
 
     def measure(self, cut: Callable[[], object]) -> float:
         """Return the time from a cut until the robot was told to stand."""

@@ -30,8 +30,8 @@ BOX = """<robot name="box">
     <collision><geometry><box size="0.02 0.4 0.3"/></geometry></collision>
   </link>
   <joint name="flap" type="prismatic">
-    <origin xyz="0.92 0 0.5"/><parent link="wall"/><child link="front"/><axis xyz="1 0 0"/>
-    <limit lower="0" upper="0.06" velocity="1" effort="9"/>
+    <origin xyz="0.915 0 0.5"/><parent link="wall"/><child link="front"/><axis xyz="1 0 0"/>
+    <limit lower="0" upper="0.03" velocity="1" effort="9"/>
   </joint>
 </robot>"""
 
@@ -74,7 +74,7 @@ def test_a_skill_moves_an_object_through_topics_alone(ros_python, tmp_path, monk
     )  # fmt: skip
     try:
         assert simulated.stdout.readline().startswith("robot: arm in the kinematic world")
-        words = ["--what", "flap", "--hand", "arm/finger", "--to", "6cm", "--world", "ros", "--json"]
+        words = ["--what", "flap", "--hand", "arm/finger", "--to", "3cm", "--world", "ros", "--json"]
         done = subprocess.run(
             [ros_python, "-m", "kineverse", "push", *robot, *words],
             cwd=tmp_path, capture_output=True, text=True, timeout=120,
@@ -82,7 +82,7 @@ def test_a_skill_moves_an_object_through_topics_alone(ros_python, tmp_path, monk
         assert done.stdout, done.stderr[-3000:]
         answer = json.loads(done.stdout)
         assert (answer["claimed"], answer["done"], answer["world"]) == (True, True, "ros"), answer["reason"]
-        assert answer["value"] == pytest.approx(0.06, abs=answer["measures"]["tolerance"])
+        assert answer["value"] == pytest.approx(0.03, abs=answer["measures"]["tolerance"])
         assert done.returncode == 0
     finally:
         simulated.send_signal(signal.SIGTERM)

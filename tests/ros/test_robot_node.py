@@ -152,7 +152,7 @@ def test_the_robot_stands_when_the_skill_is_silent(bench):
     assert not bench.stands
     bench.run(0.015)
     assert bench.stands
-    assert bench.notes == ["The last command is 0.08 s old. The robot stops."]
+    assert bench.notes == ["The last command, or the readings for it, are 0.08 s old. The robot stops."]
     count = len(bench.twists)
     bench.run(1.0)
     assert (
@@ -236,6 +236,29 @@ def test_markers_in_tf_are_poses(bench):
     bench.say_joints()
     (pose,) = bench.readings[-1].poses
     assert (pose.frame, pose.parent, pose.numbers[0]) == ("door", "bot/camera", 2.0)
+
+
+@pytest.mark.parametrize(("pose", "parent"), [(POSE, "lost"), ((math.nan, *POSE[1:]), "odom")])
+def test_a_way_in_tf_that_is_lost_is_said_and_stops_the_robot(bench, pose, parent):
+    bench.command()
+    for _ in range(20):
+        bench.ros.advance(0.005)
+        bench.say_joints()
+        bench.say_base(frames=("base_link", "lost"))
+        bench.say_base(pose, frames=(parent, "base_link"))
+        bench.node.watch()
+    bench.ros.deliver()
+    assert bench.stands
+    assert bench.notes[0] == "TF has no way from 'odom' to 'base_link' any more, or one without numbers."
+
+
+def test_a_clock_that_is_set_back_begins_anew(bench):
+    bench.ros.nanoseconds -= 500 * SECOND
+    bench.say_all()
+    bench.say_pose()
+    bench.say_joints()
+    assert bench.readings[-1].poses
+    assert bench.notes == ["The clock was set back by 500 s."]
 
 
 def test_what_is_missing_is_said():

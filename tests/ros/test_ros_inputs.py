@@ -88,6 +88,12 @@ def test_the_first_of_two_sources_has_a_joint_until_it_is_silent():
     assert not listener.hear(["a"], [1.0], at=1.1)
 
 
+def test_a_source_of_nothing_that_is_used_has_no_joint():
+    listener = Listener()
+    listener.hear(["a", "b", "b"], [math.nan, 1.0, 1.0], source="/broken")
+    assert listener.hear(["a", "b"], [1.0, 2.0]).positions == {"arm/a": 1.0, "arm/b": 2.0}
+
+
 def test_a_kind_of_complaint_is_said_once_a_second():
     listener = Listener()
     for step in range(250):

@@ -195,12 +195,20 @@ def test_a_simulated_robot_refuses_what_is_no_command():
     other.create_subscription(ros.TFMessage, "/tf", heard.append, ros.QUEUED)
     twist = ros.Twist()
     twist.linear.x = math.nan
-    path = ros.JointTrajectory(joint_names=["nothing"], points=[ros.JointTrajectoryPoint(positions=[1.0])])
+
+    def path(name, *positions):
+        point = ros.JointTrajectoryPoint(positions=list(positions))
+        point.time_from_start.sec = 1
+        return ros.JointTrajectory(joint_names=[name], points=[point])
+
     for topic, message in (
         ("cmd_vel", twist),
         ("velocity_controller/commands", ros.Float64MultiArray(data=[1.0])),
         ("velocity_controller/commands", ros.Float64MultiArray(data=[1.0, math.inf])),
-        ("joint_trajectory_controller/joint_trajectory", path),
+        *(
+            ("joint_trajectory_controller/joint_trajectory", message)
+            for message in (path("nothing", 1.0), path("lift", 1.0, 2.0), path("lift", math.nan))
+        ),
     ):
         other.create_publisher(type(message), topic, 1).publish(message)
     ros.deliver()
@@ -208,7 +216,7 @@ def test_a_simulated_robot_refuses_what_is_no_command():
     robot.step(0.1)
     ros.deliver()
     assert dict(world.state) == dict(start)
-    assert [text.partition(" ")[0] for _, text in node.logged] == ["A", "velocity_controller/commands", "A"]
+    assert [text.split(" ")[1] for _, text in node.logged] == ["Twist", "takes", "path", "path"]
     (message,) = heard
     assert [one.child_frame_id for one in message.transforms] == ["base_link", "tag"]
 
@@ -411,7 +419,8 @@ def test_the_settings_on_the_page_can_be_read(tmp_path):
         ("joint_states = 'joint states'", "'joint states' is no name of a topic"),
         ("[controllers]\n'2nd' = ['lift', 'pan']", "'2nd/commands' is no name of a topic"),
         ("[observed]\nnowhere = 'x'", "there is no frame 'nowhere'"),
-        ("[observed]\ndoor = 'tf:a'\nwall = 'tf:a'", "'a' in TF stands for 'door' and for 'wall'"),
+        ("[observed]\ndoor = 'tf:a'\nwall = 'tf:a'", "'tf:a' stands for 'door' and for 'wall'"),
+        ("[observed]\ndoor = 'tf:'", "'tf:' is no name of a topic"),
     ],
 )
 def test_bad_settings_are_one_error_each(started, tmp_path, text, match):

@@ -17,7 +17,10 @@ MOST_AHEAD, MOST_BEHIND = SECOND // 2, SECOND
 """Largest distances of a stamp from the present of the clock, ahead and behind."""
 
 _SILENCE = SECOND  # after which another source may have a joint
-_PATIENCE = 3  # seconds until a topic that nobody serves is named
+PATIENCE = 3
+"""Seconds until what nobody serves is named."""
+
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"  # ROS has this name until it knows a node
 
 
 class Complaints:
@@ -141,25 +144,25 @@ class JointStateFilter:
         speeds: dict[str, float] = {}
         bad: list[str] = []
         unknown: list[str] = []
+        counts = Counter(names)
         for index, name in enumerate(names):
             joint = self._names.to_model(name)
             if joint is None:
                 if name not in self._unknown:
                     unknown.append(name)
-            elif joint in self._wanted and self._is_from(source, joint, now):
-                value = positions[index]
-                if not math.isfinite(value):
-                    bad.append(name)
-                    continue
-                found[joint] = value
+            elif joint not in self._wanted or counts[name] > 1:
+                continue
+            elif not math.isfinite(positions[index]):
+                bad.append(name)
+            elif self._is_from(source, joint, now):
+                found[joint] = positions[index]
                 # Controllers without a measurement of speeds send NaN.
                 if len(velocities) and math.isfinite(velocities[index]):
                     speeds[joint] = velocities[index]
-        if len(set(names)) < len(names):
-            for name in self._name_doubled(source, names, now):
-                joint = self._names.to_model(name) or ""
-                found.pop(joint, None)
-                speeds.pop(joint, None)
+        if len(counts) < len(names):
+            doubled = [name for name, count in counts.items() if count > 1]
+            text = f"{source} has joints twice in one message: {list_some(doubled, 4)}. They are not used."
+            self._complaints.add(f"doubled {source}", text, now)
         if unknown:
             text = f"{source} has names that are no joints of the model: {list_some(unknown, 4)}."
             if self._complaints.add(f"unknown {source}", text, now):
@@ -188,12 +191,6 @@ class JointStateFilter:
         )
         self._complaints.add(f"form {source}", text, now)
         return False
-
-    def _name_doubled(self, source: str, names: Sequence[str], now: int) -> list[str]:
-        doubled = [name for name, count in Counter(names).items() if count > 1]
-        text = f"{source} has joints twice in one message: {list_some(doubled, 4)}. They are not used."
-        self._complaints.add(f"doubled {source}", text, now)
-        return doubled
 
     def _is_from(self, source: str, joint: str, now: int) -> bool:
         owner, heard = self._owners.get(joint, (source, now))
@@ -271,7 +268,7 @@ class Topics:
             if others:
                 text = f"{name} has {kind} here, and messages of another type by {list_some(others, 3)}."
                 self._complaints.add_once(text)
-            elif waited >= _PATIENCE:
+            elif waited >= PATIENCE:
                 self._complaints.add_once(f"Nobody serves {name} ({kind}).")
 
     def _count(self, source: str, info: Any) -> None:
@@ -303,4 +300,6 @@ class Topics:
 
 
 def _name(info: Any) -> str:
+    if info.node_name == _UNKNOWN:
+        return "an unknown node"
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"

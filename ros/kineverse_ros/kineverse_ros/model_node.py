@@ -22,6 +22,7 @@ import numpy.typing as npt
 import kineverse as kv
 from kineverse.cli.output import format_count, join_lines
 from kineverse.errors import (
+    DuplicateNameError,
     InvalidValueError,
     KineverseError,
     OfflineError,
@@ -34,7 +35,7 @@ from kineverse.lie import Array, to_quaternion
 from kineverse.model.frame import WORLD
 
 from .description import describe, make_markers
-from .inputs import SECOND, Complaints, JointStateFilter, Readings, Topics
+from .inputs import PATIENCE, SECOND, Complaints, JointStateFilter, Readings, Topics
 from .model_output import ModelOutput, Stamps
 from .model_settings import ModelSettings, Value, declare_settings
 from .names import NameMap, covers
@@ -49,6 +50,8 @@ JOINT_STATES, ALL_JOINT_STATES = "joint_states", "joint_states/all"
 DESCRIPTION, DOCUMENT, MARKERS = "robot_description", "kineverse_document", "visualization_marker_array"
 
 _FRESH = SECOND  # age up to which a reading is said again with others
+_BEFORE = 1  # stamp of what was read before the clock was set back: it is older than all that comes [ns]
+_LOOK = 0.05  # longest time between two looks for messages [s]
 _SPIN = 0.2  # time between two looks at what is not read in each period, such as services [s]
 _IDLE = 4.0  # time without another look at an edited model, in times of what the last one took
 
@@ -98,7 +101,9 @@ class CoordinateValues:
             place = before.places.get(name)
             if place is not None and before.stamps[place]:
                 self.values[own], self.speeds[own] = before.values[place], before.speeds[place]
-                self.stamps[own] = before.stamps[place]
+                # One nanosecond later, since TF keeps the first of two transforms with one stamp.
+                stamp = before.stamps[place]
+                self.stamps[own] = stamp if stamp == _BEFORE else stamp + 1
 
     def take(self, readings: Readings) -> None:
         """Take over readings; older ones than there are have no effect."""
@@ -155,12 +160,11 @@ class ModelNode:
             ros, self.inputs, settings.observed, self._complaints, self._now, self._observe
         )
         self._poses.follow(self._tables.frames, (WORLD, *self._tables.model.frames), output.parents)
-        for topic in settings.sources:
-            self.inputs.subscribe(ros.JointState, topic, self._hear, ros.QUEUED)
-        self.joint_topic = ALL_JOINT_STATES if JOINT_STATES in settings.sources else JOINT_STATES
+        node.create_timer(PATIENCE, self._poses.name_missing, clock=ros.STEADY)
+        self.joint_topic = self._subscribe(settings.sources)
         self._tf = node.create_publisher(ros.TFMessage, "/tf", ros.QUEUED)
         self._joint_states = node.create_publisher(ros.JointState, self.joint_topic, ros.QUEUED)
-        self._static_tf = node.create_publisher(ros.TFMessage, "/tf_static", ros.STATIC)
+        self._static_tf = node.create_publisher(ros.TFMessage, "/tf_static", ros.LATCHED)
         self._description = node.create_publisher(ros.String, DESCRIPTION, ros.LATCHED)
         self._document = node.create_publisher(ros.String, DOCUMENT, ros.LATCHED)
         self._markers = node.create_publisher(ros.MarkerArray, MARKERS, ros.LATCHED)
@@ -204,13 +208,26 @@ class ModelNode:
 
     # -- what comes in -------------------------------------------------------------------------------------
 
+    def _subscribe(self, sources: Sequence[str]) -> str:
+        """Subscribe to topics of joint states, and return the one on which all joints go out."""
+        resolve = self._node.resolve_topic_name
+        names = [resolve(topic) for topic in sources]
+        own = ALL_JOINT_STATES if resolve(JOINT_STATES) in names else JOINT_STATES
+        if len(set(names)) < len(names):
+            raise DuplicateNameError("sources: a topic is there twice.")
+        if resolve(own) in names:
+            raise InvalidValueError(f"sources has {resolve(own)}, where this node says itself what it reads.")
+        for topic in sources:
+            self.inputs.subscribe(self._ros.JointState, topic, self._hear, self._ros.QUEUED)
+        return own
+
     def _now(self) -> int:
         """Return the time [ns]; begin anew if the clock was set back."""
         now = int(self._node.get_clock().now().nanoseconds)
         if now < self._last_now:
             self._sent_joints = 0
-            self._values.stamps = np.minimum(self._values.stamps, 1)  # read, and older than all that comes
-            self._sent[:] = 1
+            self._values.stamps = np.minimum(self._values.stamps, _BEFORE)
+            self._sent[:] = _BEFORE
             self._tracking.forget()
         self._last_now = now
         return now
@@ -329,7 +346,7 @@ class ModelNode:
         """Publish what is static, and prepare messages of what moves."""
         tables, ros = self._tables, self._ros
         output, frames = tables.output, tables.frames
-        self._sent: Stamps = np.zeros(len(output.moving), dtype=np.int64)
+        self._sent: Stamps = np.full(len(output.moving), _BEFORE, dtype=np.int64)
         names = {
             child: (frames.to_ros(parent), frames.to_ros(child)) for child, parent in output.parents.items()
         }
@@ -446,12 +463,16 @@ def run_model_node(
     """
     ros = import_ros()
     try:
-        # Ctrl-C is an exception, as in any command.
-        ros.rclpy.init(args=[*ros_arguments], signal_handler_options=ros.NO_SIGNALS)
-    except Exception as error:  # of its C code, of several classes
-        raise InvalidValueError(f"ROS refuses its arguments: {join_lines(error)}") from None
-    try:
-        node = ros.rclpy.create_node("kineverse_model", automatically_declare_parameters_from_overrides=True)
+        try:
+            # Ctrl-C is an exception, as in any command.
+            ros.rclpy.init(args=[*ros_arguments], signal_handler_options=ros.NO_SIGNALS)
+            node = ros.rclpy.create_node(
+                "kineverse_model", automatically_declare_parameters_from_overrides=True
+            )
+        except Exception as error:  # of its C code, of several classes; a list that is empty has no type
+            raise InvalidValueError(
+                f"ROS refuses its arguments, or a parameter without a value: {join_lines(error)}"
+            ) from None
         settings = declare_settings(ros, node, given)
         model_node = ModelNode(ros, node, load_model(settings.model), settings)
         started(model_node)
@@ -470,12 +491,13 @@ def _spin(ros: Any, node: Any, model_node: ModelNode, rate: float) -> None:
     with _ending_signals() as is_over:
         while not is_over():
             model_node.inputs.drain()
-            model_node.tick()
-            if is_simulated or due >= spin_due:  # /clock is read by the executor
+            if (now := time.monotonic()) >= due:
+                model_node.tick()
+                due = max(due + 1.0 / rate, time.monotonic())
+            if is_simulated or now >= spin_due:  # /clock is read by the executor
                 executor.spin_once(timeout_sec=0.0)
-                spin_due = due + _SPIN
-            due = max(due + 1.0 / rate, time.monotonic())
-            time.sleep(max(due - time.monotonic(), 0.0))
+                spin_due = now + _SPIN
+            time.sleep(min(max(due - time.monotonic(), 0.0), _LOOK))
 
 
 @contextmanager

@@ -10,6 +10,8 @@ from typing import Any
 from kineverse._checks import finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
 
+from .names import TF, check_topics
+
 Value = str | float | list[str]
 
 _OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides")  # parameters of any node
@@ -84,8 +86,11 @@ class ModelSettings:
         rules = {name: _read_rules(name, lists[name]) for name in ("observed", "joint_names", "frame_names")}
         if texts["robot"]:
             rules["joint_names"].setdefault(f"{texts['robot'].rstrip('/')}/", "")
-        if len(set(lists["sources"])) < len(lists["sources"]):
-            raise DuplicateNameError("sources: a topic is there twice.")
+        poses = [*rules["observed"].values()]
+        check_topics([*lists["sources"], *(one for one in poses if not one.startswith(TF) or one == TF)])
+        for source in poses:
+            if poses.count(source) > 1:
+                raise DuplicateNameError(f"observed has the source '{source}' twice, for two frames.")
         if not lists["model"]:
             raise InvalidValueError(
                 "model is not given: the name of a model, the path of a file, or live:NAME."
@@ -130,6 +135,8 @@ def given_settings(arguments: argparse.Namespace) -> dict[str, Value]:
 def declare_settings(ros: Any, node: Any, given: Mapping[str, Value]) -> ModelSettings:
     """Declare the settings as parameters of a node, and return their values; its own ones come first.
 
+    They cannot be set later, as they count at the start alone.
+
     Raises
     ------
     UnknownNameError
@@ -142,10 +149,13 @@ def declare_settings(ros: Any, node: Any, given: Mapping[str, Value]) -> ModelSe
             )
     values: dict[str, Any] = {}
     for name, setting in SETTINGS.items():
-        if not node.has_parameter(name):
-            # An empty list has no type in ROS.
-            value = given.get(name, setting.default) or ([""] if isinstance(setting.default, list) else "")
-            node.declare_parameter(name, value, ros.ParameterDescriptor(description=setting.help))
+        descriptor = ros.ParameterDescriptor(description=setting.help, read_only=True)
+        if node.has_parameter(name):
+            descriptor.type = node.describe_parameter(name).type
+            node.set_descriptor(name, descriptor)
+        else:
+            value = given.get(name, setting.default)
+            node.declare_parameter(name, [""] if value == [] else value, descriptor)  # [] has no type in ROS
         values[name] = node.get_parameter(name).value
     return ModelSettings.from_values(values)
 

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
+
+TF = "tf:"
+"""Begins the source of a pose that is a frame of TF, and no topic."""
+
+_TOPIC = re.compile(r"(~?/)?([A-Za-z_]\w*/)*[A-Za-z_]\w*", re.ASCII)
 
 
 class NameMap:
@@ -65,6 +71,22 @@ class NameMap:
     def to_model(self, name: str) -> str | None:
         """Return the name in the model of a name of ROS; None for one of something else."""
         return self._to_model.get(name)
+
+
+def check_topics(topics: Iterable[str]) -> None:
+    """Check names of topics; ROS has its own words for those that it refuses.
+
+    Raises
+    ------
+    InvalidValueError
+        For a name that no topic can have.
+    """
+    for topic in topics:
+        if _TOPIC.fullmatch(topic) is None:
+            raise InvalidValueError(
+                f"'{topic}' is no name of a topic in ROS: words of letters, digits and _, with slashes "
+                "between them."
+            )
 
 
 def covers(key: str, name: str) -> bool:

@@ -72,12 +72,12 @@ class Watchdog:
 
     def explain(self, time: float, heard: float) -> str:
         """Return why the robot must not move at a time by a command of another one [s]; empty if it may."""
-        if time - heard >= self.timeout:
-            return f"The last command is {time - heard:.2f} s old."
         if math.isinf(self.read):
             return "Not all of the robot has been read yet."
         if time - self.read >= self.timeout:
             return f"The robot's readings are {time - self.read:.2f} s old."
+        if time - heard >= self.timeout:
+            return f"The last command, or the readings for it, are {time - heard:.2f} s old."
         return ""
 
 
@@ -196,7 +196,9 @@ class RobotNode:
             topics.drain()
 
     def _ros_now(self) -> int:
-        return int(self._node.get_clock().now().nanoseconds)
+        present = int(self._node.get_clock().now().nanoseconds)
+        self._stamps.follow_clock(present)
+        return present
 
     def _to_steady(self, stamp: int, present: int) -> float:
         """Return the time of a stamp in that of messages [s]; one ahead of the clock counts as of now."""
@@ -223,6 +225,9 @@ class RobotNode:
             found = self._tree.find(moving, (fixed,))
             if found is not None:
                 self._hear_base(found[1], found[2])
+            elif self._base is not None:
+                text = f"TF has no way from '{fixed}' to '{moving}' any more, or one without numbers."
+                self._complaints.add("base", text, self._ros_now())
 
     def _hear_base(self, stamp: int | None, pose: Array) -> None:
         present = self._ros_now()

@@ -27,16 +27,14 @@ from kineverse.model.frame_dependence import FrameDependence
 from kineverse.symbols import Symbol
 from kineverse.worlds import Robot
 
-from .names import NameMap
+from .names import TF, NameMap, check_topics
 from .robot_link import Wiring
 
 TIMEOUT = 0.08
 """Age of commands and readings at which a robot stops [s]: with the way of a message it is below 100 ms."""
 
 _BASES = ("base_footprint", "base_link")  # frames whose speed a Twist says, by custom
-_TF = "tf:"
 _NO_TOPIC = re.compile(r"[^A-Za-z0-9_/]|(?<=/)(?=\d)")  # what a name of a topic lacks, in one of a frame
-_TOPIC = re.compile(r"[~/]?([A-Za-z_]\w*/)*[A-Za-z_]\w*", re.ASCII)
 
 
 class BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -168,7 +166,7 @@ def connect_names(robot: Robot, settings: RobotSettings, marked: Iterable[str]) 
         settings.use_sim_time,
     )
     topics = [own.command, *(topic for topic, _ in wiring.controllers), *poses.values()]
-    _check_topics([settings.joint_states, settings.trajectory, *topics])
+    check_topics([settings.joint_states, settings.trajectory, *topics])
     return RobotConnection(wiring, base_speeds, frame, frame_in_base, tuple(controllers.values()), joints)
 
 
@@ -250,22 +248,13 @@ def _find_observed(
             raise UnknownNameError(
                 f"[observed]: there is no frame '{name}'. {suggest(name, frames, 'frame')}"
             )
-    transforms: dict[str, str] = {}
+    poses, transforms = dict[str, str](), dict[str, str]()
+    sources: dict[str, str] = {}
     for name, source in given.items():
-        if source.startswith(_TF):
-            seen = source.removeprefix(_TF)
-            if seen in transforms:
-                raise DuplicateNameError(
-                    f"[observed]: '{seen}' in TF stands for '{transforms[seen]}' and for '{name}'."
-                )
-            transforms[seen] = name
-    return {name: topic for name, topic in given.items() if not topic.startswith(_TF)}, transforms
-
-
-def _check_topics(topics: Iterable[str]) -> None:
-    for topic in topics:
-        if _TOPIC.fullmatch(topic) is None:
-            raise InvalidValueError(
-                f"'{topic}' is no name of a topic in ROS: words of letters, digits and _, with slashes "
-                "between them."
-            )
+        if (other := sources.setdefault(source, name)) != name:
+            raise DuplicateNameError(f"[observed]: '{source}' stands for '{other}' and for '{name}'.")
+        if source.startswith(TF) and source != TF:
+            transforms[source.removeprefix(TF)] = name
+        else:
+            poses[name] = source
+    return poses, transforms

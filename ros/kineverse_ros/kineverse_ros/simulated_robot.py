@@ -17,7 +17,7 @@ import numpy as np
 
 from kineverse.cli.plan_arguments import parse_robot
 from kineverse.compilation import compile
-from kineverse.errors import UnknownNameError
+from kineverse.errors import KineverseError, UnknownNameError
 from kineverse.lie import Array, to_quaternion
 from kineverse.manipulation import place_robot
 from kineverse.model.frame import WORLD
@@ -59,6 +59,7 @@ class SimulatedRobot:
         self._twist: Array = np.zeros(3)
         self._path: tuple[Trajectory, float] | None = None  # with the time of the world at which it began
         self._read = [model.symbol(name) for name in wiring.read]
+        self._moved = {str(v.position): v.position for group in names.controllers for v in group}
         self._joint_names = [names.joints.to_ros(name) for name in wiring.read]
         self._joints = node.create_publisher(ros.JointState, wiring.joint_states, ros.QUEUED)
         self._frames = {frame: name for name, frame in wiring.frames.items()}
@@ -107,17 +108,19 @@ class SimulatedRobot:
 
     def _take_path(self, message: Any) -> None:
         joints = [self._names.joints.to_model(name) for name in message.joint_names]
-        symbols = [self._world.model.symbol(name) for name in joints if name is not None]
+        symbols = tuple(self._moved[name] for name in joints if name in self._moved)
         times = [nanoseconds(point.time_from_start) / SECOND for point in message.points]
-        if None in joints or not times or min(np.diff([0.0, *times])) <= 0.0:
-            self._refuse(
-                "A path has joints that are not there, or times that do not increase; it is refused."
-            )
-            return
         rest, now = [0.0] * len(symbols), self._world.state
         points = [(list(one.positions), list(one.velocities) or rest) for one in message.points]
         positions, velocities = zip(([now[s] for s in symbols], rest), *points, strict=True)
-        path = Trajectory(tuple(symbols), np.array([0.0, *times]), np.array(positions), np.array(velocities))
+        if len(symbols) < len(joints) or any(len(row) != len(symbols) for row in (*positions, *velocities)):
+            self._refuse("A path is refused: it has joints that no controller moves, or not their numbers.")
+            return
+        try:
+            path = Trajectory(symbols, np.array([0.0, *times]), np.array(positions), np.array(velocities))
+        except KineverseError as error:
+            self._refuse(f"A path is refused: {error}")
+            return
         self._path = path, self._world.time
 
     # -- time ----------------------------------------------------------------------------------------------

@@ -12,10 +12,8 @@ from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 
 from .inputs import SECOND, Complaints, Readings, StampCheck, Topics
-from .names import NameMap
+from .names import TF, NameMap
 from .transforms import TransformTree, nanoseconds, to_matrix, to_numbers
-
-TF = "tf:"  # begins the source of a pose that is a frame of TF, and no topic
 
 _LAG = 0.3  # time by which the poses of one camera may be later than those of another [s]
 
@@ -111,6 +109,7 @@ class PoseInputs:
         for frame, source in observed.items():
             if not source.startswith(TF):
                 topics.subscribe(ros.PoseStamped, source, partial(self._hear_pose, frame), ros.QUEUED)
+        self._missing = set(self._by_transform)  # frames of TF that have not come
         if self._by_transform:
             topics.subscribe(ros.TFMessage, "/tf", self._hear_transforms, ros.QUEUED)
             topics.subscribe(ros.TFMessage, "/tf_static", self._hear_static, ros.STATIC)
@@ -136,6 +135,11 @@ class PoseInputs:
         own_names = frozenset(frames.to_ros(name) for name in names)
         self._frames, self._ancestors = frames, own_names - self._by_transform.keys()
 
+    def name_missing(self) -> None:
+        """Say which frames of TF have not come."""
+        for name in sorted(self._missing):
+            self._complaints.add_once(f"'{name}' does not come on /tf, where it is to be observed.")
+
     def _hear_pose(self, frame: str, message: Any, source: str) -> None:
         pose = to_matrix(to_numbers(message.pose.position, message.pose.orientation))
         self._hear(frame, message.header.frame_id, pose, nanoseconds(message.header.stamp), source)
@@ -151,6 +155,7 @@ class PoseInputs:
             name = transform.child_frame_id
             if name not in self._by_transform:
                 continue
+            self._missing.discard(name)
             found = self._tree.find(name, self._ancestors)
             if found is None:
                 text = f"'{name}' in TF hangs on no frame of the model, or has no numbers: it is not used."

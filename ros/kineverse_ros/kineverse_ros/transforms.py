@@ -14,7 +14,6 @@ from .inputs import SECOND
 
 _UNIT = 1e-3  # largest difference of the norm of a quaternion from 1
 _MOST_PACKED = 32  # of sets of frames that move together
-_DEEPEST = 100  # largest number of transforms between two frames
 
 
 class _Transform(NamedTuple):
@@ -41,19 +40,18 @@ class TransformTree:
         The time is that of the transform nearest to the frame; None if all are static. Without such an
         ancestor, or where a transform has no numbers, it is None.
         """
-        pose, stamp = np.eye(4), None
-        for _ in range(_DEEPEST):
-            if frame in ancestors:
-                return frame, stamp, pose
+        pose, stamp, passed = np.eye(4), None, set[str]()
+        while frame not in ancestors:
             found = self._transforms.get(frame)
-            if found is None:
+            if found is None or frame in passed:  # frames that hang on each other
                 return None
+            passed.add(frame)
             matrix = to_matrix(to_numbers(found.transform.translation, found.transform.rotation))
             if matrix is None:
                 return None
             frame, pose = found.parent, matrix @ pose
             stamp = found.stamp if stamp is None else stamp
-        return None
+        return frame, stamp, pose
 
 
 class TransformPublisher:
