@@ -7,6 +7,7 @@ from typing import ClassVar
 import pytest
 
 import kineverse as kv
+from finger_and_flap import ARM, make_box
 from kineverse.cli import outside_robot
 from kineverse.errors import OfflineError, SimulationError
 from kineverse.worlds import KinematicWorld, Observation
@@ -14,27 +15,7 @@ from kineverse.worlds import KinematicWorld, Observation
 pytest.importorskip("coal")
 pytest.importorskip("daqp")
 
-ARM = """<robot name="arm">
-  <link name="root"/>
-  <link name="finger">
-    <collision><origin xyz="0.2 0 0"/><geometry><box size="0.4 0.03 0.03"/></geometry></collision>
-  </link>
-  <joint name="slide" type="prismatic">
-    <parent link="root"/><child link="finger"/><axis xyz="1 0 0"/>
-    <limit lower="0" upper="1" velocity="1" effort="9"/>
-  </joint>
-</robot>"""
-
-BOX = """<robot name="box">
-  <link name="wall"/>
-  <link name="front">
-    <collision><geometry><box size="0.02 0.4 0.3"/></geometry></collision>
-  </link>
-  <joint name="flap" type="prismatic">
-    <origin xyz="0.92 0 0.5"/><parent link="wall"/><child link="front"/><axis xyz="1 0 0"/>
-    <limit lower="0" upper="0.06" velocity="1" effort="9"/>
-  </joint>
-</robot>"""
+BOX = make_box(0.92, 0.06)
 
 PUSH = ["push", "box.urdf", "--robot", "arm.urdf@0.5,0,0.5,0", "--what", "flap", "--hand", "arm/finger"]
 PLAN = ["plan", "box.urdf", "--robot", "arm.urdf@0.5,0,0.5,0"]

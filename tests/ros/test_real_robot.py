@@ -10,30 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from finger_and_flap import ARM, make_box
+
 HERE = Path(__file__).parent
 pytestmark = pytest.mark.ros
 
-ARM = """<robot name="arm">
-  <link name="root"/>
-  <link name="finger">
-    <collision><origin xyz="0.2 0 0"/><geometry><box size="0.4 0.03 0.03"/></geometry></collision>
-  </link>
-  <joint name="slide" type="prismatic">
-    <parent link="root"/><child link="finger"/><axis xyz="1 0 0"/>
-    <limit lower="0" upper="1" velocity="1" effort="9"/>
-  </joint>
-</robot>"""
-
-BOX = """<robot name="box">
-  <link name="wall"/>
-  <link name="front">
-    <collision><geometry><box size="0.02 0.4 0.3"/></geometry></collision>
-  </link>
-  <joint name="flap" type="prismatic">
-    <origin xyz="0.915 0 0.5"/><parent link="wall"/><child link="front"/><axis xyz="1 0 0"/>
-    <limit lower="0" upper="0.03" velocity="1" effort="9"/>
-  </joint>
-</robot>"""
+BOX = make_box(0.915, 0.03)
 
 
 def run_robot(python: str, *words: str) -> dict:
