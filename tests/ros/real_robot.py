@@ -64,6 +64,7 @@ class Robot:
         self.world, self.simulation = world, SimulatedRobot(ros, node, world, names)
         self.heard: list[tuple[float, float]] = []
         self.silent = False
+        self.stood = 0.0  # longest time that this process was held up by the machine [s]
         node.create_subscription(
             ros.Twist, "cmd_vel", lambda m: self.note(m.linear.x, m.linear.y, m.angular.z), 1
         )
@@ -82,8 +83,13 @@ class Robot:
 
     def live(self, seconds: float) -> None:
         """Let time pass."""
-        end = monotonic() + seconds
-        while (time := monotonic()) < end:
+        before = monotonic()
+        end = before + seconds
+        while True:
+            time = monotonic()
+            self.stood, before = max(self.stood, time - before - PERIOD), time
+            if time >= end:
+                return
             if time >= self.due:
                 self.due = time + PERIOD
                 if not self.silent:
@@ -105,12 +111,12 @@ class Robot:
         self.wait(lambda: sum(speed > 0.0 for _, speed in self.heard[count:]) > 10)
 
     def measure(self, cut: Callable[[], object]) -> float:
-        """Return the time from a cut until the robot was told to stand."""
-        begin = monotonic()
+        """Return the time from a cut until the robot was told to stand, without that of a machine that stands."""
+        begin, self.stood = monotonic(), 0.0
         cut()
         self.live(LOOKING)
         moved = max(time for time, speed in self.heard if speed > 0.0)
-        return min(time for time, speed in self.heard if speed == 0.0 and time > moved) - begin
+        return min(time for time, speed in self.heard if speed == 0.0 and time > moved) - begin - self.stood
 
     def end(self) -> None:
         self.skill.kill()
