@@ -31,7 +31,7 @@ from kineverse_ros.simulated_robot import SimulatedRobot, make_world
 
 SPEEDS = {"bot/base/x": 0.1, "bot/base/angle": 0.2, "bot/pan": -0.1, "bot/lift": 0.0}
 PERIOD = 0.01
-LOOKING = 0.25  # time after a cut in which nothing may move again [s]
+LOOKING = 0.5  # time after a cut in which nothing may move again [s]
 HELD = 0.1  # longest step of the world [s]
 
 
