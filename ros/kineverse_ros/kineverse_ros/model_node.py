@@ -31,7 +31,7 @@ from kineverse.errors import (
     suggest,
 )
 from kineverse.formats.document import to_json
-from kineverse.lie import Array, to_quaternion
+from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 
 from .description import describe, make_markers
@@ -41,7 +41,7 @@ from .model_settings import ModelSettings, Value, declare_settings
 from .names import NameMap, covers
 from .ros import import_ros
 from .tracking import PoseInputs, PoseTracking
-from .transforms import TransformPublisher, make_transform, nanoseconds
+from .transforms import TransformPublisher, from_matrix, make_transform, nanoseconds, to_stamp
 
 if TYPE_CHECKING:
     from kineverse.exchange import Connection, StatePublisher, StateReader
@@ -308,16 +308,12 @@ class ModelNode:
         output, message = self._tables.output, self._joint_message
         velocities = output.velocities[places]
         is_moving = bool(np.isfinite(velocities).all())
-        message.header.stamp = self._time(stamp)
+        message.header.stamp = to_stamp(self._ros, stamp)
         message.name = [self._joint_names[place] for place in places.tolist()]
         message.position = array("d", output.positions[places].tobytes())
         message.velocity = array("d", velocities.tobytes() if is_moving else b"")
         self._sent_joints = stamp
         self._joint_states.publish(message)
-
-    def _time(self, stamp: int) -> Any:
-        seconds, nanoseconds = divmod(stamp, SECOND)
-        return self._ros.Time(sec=seconds, nanosec=nanoseconds)
 
     # -- edits ---------------------------------------------------------------------------------------------
 
@@ -355,8 +351,7 @@ class ModelNode:
         self._joint_message = ros.JointState()
         now, static = self._now(), []
         for child, pose in output.static.items():
-            numbers = [*pose[:3, 3].tolist(), *to_quaternion(pose[:3, :3]).tolist()]
-            static.append(make_transform(ros, names[child], now, numbers))
+            static.append(make_transform(ros, names[child], now, from_matrix(pose)))
         self._static_tf.publish(ros.TFMessage(transforms=static))
         self._markers.publish(make_markers(ros, tables.model, frames, tables.shown))
         self._describe_anew()

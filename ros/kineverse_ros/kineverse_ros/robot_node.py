@@ -26,13 +26,13 @@ from typing import Any
 import msgspec
 
 from kineverse.errors import KineverseError, list_some
-from kineverse.lie import Array, to_quaternion
+from kineverse.lie import Array
 
 from .inputs import SECOND, Complaints, JointStateFilter, StampCheck, Topics
 from .names import NameMap
 from .robot_link import Beat, End, Follow, Link, Note, Pose, Readings, Speeds, Start, Wiring, now
 from .ros import import_ros
-from .transforms import TransformTree, nanoseconds, to_matrix, to_numbers
+from .transforms import TransformTree, from_matrix, nanoseconds, to_matrix, to_numbers
 
 _NEWEST = 10  # depth of queues: of a few publishers, and no more, since what is old is of no use
 _POLL, _SPIN = 0.003, 0.2  # times between two looks for messages, and for timers [s]
@@ -233,8 +233,7 @@ class RobotNode:
         present = self._ros_now()
         stamp = present if stamp is None else stamp
         if stamp != self._base_stamp and self._stamps.accepts("the base in TF", stamp, present):
-            numbers = (*pose[:3, 3].tolist(), *to_quaternion(pose[:3, :3]).tolist())
-            self._base, self._base_stamp = (numbers, self._to_steady(stamp, present)), stamp
+            self._base, self._base_stamp = (from_matrix(pose), self._to_steady(stamp, present)), stamp
             if not self._wiring.read:
                 self._report()
 
@@ -262,7 +261,7 @@ class RobotNode:
                 self._complaints.add(f"frame {source}", text, present)
                 return
             parent, pose = self._wiring.frames[found[0]], found[2] @ pose
-            numbers = (*pose[:3, 3].tolist(), *to_quaternion(pose[:3, :3]).tolist())
+            numbers = from_matrix(pose)
         self._poses.append(Pose(frame, parent, self._to_steady(stamp, present), numbers))
 
     def _report(self) -> None:

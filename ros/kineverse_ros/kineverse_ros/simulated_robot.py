@@ -18,7 +18,7 @@ import numpy as np
 from kineverse.cli.plan_arguments import parse_robot
 from kineverse.compilation import compile
 from kineverse.errors import KineverseError, UnknownNameError
-from kineverse.lie import Array, to_quaternion
+from kineverse.lie import Array
 from kineverse.manipulation import place_robot
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
@@ -29,7 +29,7 @@ from kineverse.worlds import KinematicWorld, Observation, Robot, Sensors, Simula
 from .inputs import SECOND, Complaints
 from .robot_settings import RobotConnection, RobotSettings, connect_names, read_settings
 from .ros import import_ros
-from .transforms import make_transform, nanoseconds
+from .transforms import from_matrix, make_transform, nanoseconds, to_stamp
 
 _PERIOD = 0.01  # time between two joint states [s]
 _LONGEST = 0.05  # longest step: a world that is slower than that per step is slower than real time [s]
@@ -150,12 +150,12 @@ class SimulatedRobot:
         """Publish what the robot says now."""
         seen = self._world.observe()
         now = self._now()
-        stamp = self._ros.Time(sec=now // SECOND, nanosec=now % SECOND)
+        stamp = to_stamp(self._ros, now)
         transforms = []
         if self._names.wiring.odometry is not None:
             fixed, moving = self._names.wiring.odometry
             place = self._place(np.array([seen.joints[s] for s in self._place.inputs]))
-            transforms.append(make_transform(self._ros, (fixed, moving), now, _to_numbers(place)))
+            transforms.append(make_transform(self._ros, (fixed, moving), now, from_matrix(place)))
         transforms += self._publish_poses(seen, now, stamp)
         if transforms and self._transforms is not None:
             self._transforms.publish(self._ros.TFMessage(transforms=transforms))
@@ -174,16 +174,12 @@ class SimulatedRobot:
                 message = self._ros.PoseStamped()
                 message.header.stamp, message.header.frame_id = stamp, world
                 place, turn = message.pose.position, message.pose.orientation
-                place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = _to_numbers(pose)
+                place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = from_matrix(pose)
                 self._poses[frame].publish(message)
             elif frame in self._seen_in_tf:
                 name = self._seen_in_tf[frame]
-                transforms.append(make_transform(self._ros, (world, name), now, _to_numbers(pose)))
+                transforms.append(make_transform(self._ros, (world, name), now, from_matrix(pose)))
         return transforms
-
-
-def _to_numbers(pose: Array) -> tuple[float, ...]:
-    return (*pose[:3, 3].tolist(), *to_quaternion(pose[:3, :3]).tolist())
 
 
 def make_world(

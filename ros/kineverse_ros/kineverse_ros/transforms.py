@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.lie import Array, quaternion, transform
+from kineverse.lie import Array, quaternion, to_quaternion, transform
 
 from .inputs import SECOND
 
@@ -142,7 +142,7 @@ def make_transform(ros: Any, frames: tuple[str, str], stamp: int, pose: Sequence
     """Return a TransformStamped from parent to child, with a stamp [ns] and a pose (7,), as above."""
     message = ros.TransformStamped(child_frame_id=frames[1])
     message.header.frame_id = frames[0]
-    message.header.stamp = ros.Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
+    message.header.stamp = to_stamp(ros, stamp)
     place, turn = message.transform.translation, message.transform.rotation
     place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = pose
     return message
@@ -151,6 +151,16 @@ def make_transform(ros: Any, frames: tuple[str, str], stamp: int, pose: Sequence
 def nanoseconds(stamp: Any) -> int:
     """Return the time of a stamp [ns]."""
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
+
+
+def to_stamp(ros: Any, time: int) -> Any:
+    """Return the stamp of a time [ns]."""
+    return ros.Time(sec=time // SECOND, nanosec=time % SECOND)
+
+
+def from_matrix(pose: Array) -> tuple[float, ...]:
+    """Return the position and the quaternion (7,) of a transform (4, 4)."""
+    return (*pose[:3, 3].tolist(), *to_quaternion(pose[:3, :3]).tolist())
 
 
 def to_numbers(position: Any, rotation: Any) -> tuple[float, ...]:
