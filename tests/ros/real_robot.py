@@ -64,7 +64,6 @@ class Robot:
         self.world, self.simulation = world, SimulatedRobot(ros, node, world, names)
         self.heard: list[tuple[float, float]] = []
         self.silent = False
-        self.stood = 0.0  # longest time that this process was held up by the machine [s]
         node.create_subscription(
             ros.Twist, "cmd_vel", lambda m: self.note(m.linear.x, m.linear.y, m.angular.z), 1
         )
@@ -83,13 +82,8 @@ class Robot:
 
     def live(self, seconds: float) -> None:
         """Let time pass."""
-        before = monotonic()
-        end = before + seconds
-        while True:
-            time = monotonic()
-            self.stood, before = max(self.stood, time - before - PERIOD), time
-            if time >= end:
-                return
+        end = monotonic() + seconds
+        while (time := monotonic()) < end:
             if time >= self.due:
                 self.due = time + PERIOD
                 if not self.silent:
@@ -111,12 +105,12 @@ class Robot:
         self.wait(lambda: sum(speed > 0.0 for _, speed in self.heard[count:]) > 10)
 
     def measure(self, cut: Callable[[], object]) -> float:
-        """Return the time from a cut until the robot was told to stand, without that of a machine that stands."""
-        begin, self.stood = monotonic(), 0.0
+        """Return the time from a cut until the robot was told to stand."""
+        begin = monotonic()
         cut()
         self.live(LOOKING)
         moved = max(time for time, speed in self.heard if speed > 0.0)
-        return min(time for time, speed in self.heard if speed == 0.0 and time > moved) - begin - self.stood
+        return min(time for time, speed in self.heard if speed == 0.0 and time > moved) - begin
 
     def end(self) -> None:
         self.skill.kill()
